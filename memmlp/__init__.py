@@ -25,14 +25,14 @@ _HOMES = {
 
 
 def __dir__() -> list[str]:
-    """The public names."""
+    """Return the public names."""
     return __all__
 
 
 if not TYPE_CHECKING:  # to a type checker it would say that every name is there
 
     def __getattr__(name):
-        """A public name, imported when it is asked for, so that the import of the package is quick."""
+        """Return a public name, which is imported when first used, so that importing the package is quick."""
         if name in _HOMES:
             return getattr(import_module(_HOMES[name]), name)
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

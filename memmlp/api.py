@@ -1,7 +1,7 @@
-"""What a script or a notebook does with finished runs: open, compare, predict, draw, stream.
+"""What scripts and notebooks need for finished runs: functions to open, compare, predict, draw and stream.
 
-Its names are those of the package (`memmlp.load_run`). Reading runs and results needs no torch, which is
-imported where a network is.
+Its names are those of the package (`memmlp.load_run`). Reading runs and results needs no torch; torch is
+imported only when a network is used.
 """
 
 from __future__ import annotations
@@ -41,16 +41,17 @@ COLUMNS = ("run", "seed", "mode", "branch", "clip", "group", "frames", *UNITS)
 
 
 def load_run(name: StrPath, outputs: StrPath | None = None, *, plugins: Sequence[str] = ()) -> TrainedRun:
-    """The finished run of a motion network.
+    """Open the finished run of a motion network.
 
     Args:
-        name: an id, the beginning of one, or a run's folder.
+        name: the run's id, the beginning of its id, or its folder.
         outputs: the folder of runs; by default that of the command line, $MEMMLP_OUTPUTS or "outputs".
-        plugins: packages with components of your own, whose code may be run. Installed ones that have an
-            entry point need no naming; a run's record alone never makes anything be imported.
+        plugins: packages with components of your own, whose code may be run. Installed packages with an entry
+            point need not be named; a run's record alone never causes an import.
 
     Raises:
-        InputError: where there is none, there are several, or it is not finished, or a package is not there.
+        InputError: if there is no such run or several, if the run is not finished, or if a package can't be
+            imported.
     """
     _use(plugins)
     run = find_run(_outputs(outputs), os.fspath(name))
@@ -61,14 +62,14 @@ def load_run(name: StrPath, outputs: StrPath | None = None, *, plugins: Sequence
 class Runs(Sequence["TrainedRun"]):
     """The finished runs of motion networks below an outputs folder, the newest first.
 
-    They are those of the moment when this was made. A slice is the runs of a part.
+    They are the runs that existed when this object was made. A slice is again an object of this class.
 
     Args:
         outputs: the folder of runs; by default that of the command line, $MEMMLP_OUTPUTS or "outputs".
         plugins: packages with components of your own, as for `load_run`.
 
     Raises:
-        InputError: where it has no runs' folder, or a package is not there.
+        InputError: if it has no folder of runs, or if a package can't be imported.
     """
 
     def __init__(self, outputs: StrPath | None = None, *, plugins: Sequence[str] = ()):
@@ -85,7 +86,7 @@ class Runs(Sequence["TrainedRun"]):
     def __getitem__(self, index: slice) -> Runs: ...
 
     def __getitem__(self, index: int | slice) -> TrainedRun | Runs:
-        """A run by its place, or the runs of a slice."""
+        """Return a run by its index, or the runs in a slice."""
         if isinstance(index, slice):
             part = object.__new__(Runs)
             part._runs = self._runs[index]
@@ -93,27 +94,27 @@ class Runs(Sequence["TrainedRun"]):
         return self._runs[index]
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Return the number of runs."""
         return len(self._runs)
 
     def __repr__(self) -> str:
         return f"Runs({self._runs})"
 
     def per_clip(self) -> pd.DataFrame:
-        """The rows of all runs in one DataFrame (`TrainedRun.per_clip`)."""
+        """Return the rows of all runs in one DataFrame (`TrainedRun.per_clip`)."""
         return _frame(row for run in self._runs for row in run._rows())
 
 
 class TrainedRun(os.PathLike[str]):
-    """A finished run of a motion network: its config, its results, its network.
+    """A finished run of a motion network, with its config, its results and its network.
 
-    Made by `load_run` and `Runs`. Config and results need the run's folder alone. `clips`, `model` and
-    `predict` need its data too; a relative path in the config counts from the current folder, as it did in
+    Objects are made by `load_run` and `Runs`. Config and results need only the run's folder. `clips`, `model`
+    and `predict` also need its data; a relative path in the config is relative to the current folder, as in
     training.
 
     Attributes:
         id: 16 hex digits.
-        folder: where it lies, absolute.
+        folder: the run's folder, an absolute path.
     """
 
     def __init__(self, run: Run):
@@ -122,7 +123,7 @@ class TrainedRun(os.PathLike[str]):
         self.folder: Path = self._run.folder
 
     def __fspath__(self) -> str:
-        """The folder, so that a run stands wherever a path of one does."""
+        """Return the folder, so that a run can be used wherever a path is expected."""
         return str(self.folder)
 
     def __repr__(self) -> str:
@@ -135,14 +136,14 @@ class TrainedRun(os.PathLike[str]):
 
     @property
     def seed(self) -> int:
-        """The seed of its training."""
+        """The seed of the run's training."""
         return int(self.config["seed"])
 
     @property
     def results(self) -> dict[str, dict[str, dict[str, float]]]:
-        """Mode -> branch -> metric, the mean over the test clips, in the units of `per_clip`.
+        """The mean results over the test clips: mode -> branch -> metric, in the units of `per_clip`.
 
-        Raises InputError where a file of results is damaged.
+        Raises InputError if a file of results is damaged.
         """
         return {
             mode: {branch: _numbers(errors) for branch, errors in branches.items()}
@@ -150,42 +151,42 @@ class TrainedRun(os.PathLike[str]):
         }
 
     def per_clip(self) -> pd.DataFrame:
-        """One row for each mode, branch and test clip.
+        """Return a DataFrame with one row for each mode, branch and test clip.
 
-        Columns are run, seed, mode, branch, clip, group (the clips of one take or subject have one), frames
-        at 60 Hz, and the metrics, whose units are in `.attrs["units"]`: MPJRE and geodesic in degrees (NaN in
-        the position branch), MPJPE and the other PE in cm, MPJVE in cm/s, Jitter in 10^2 m/s^3. Lower is
-        better, but for metrics of a package that says otherwise. A network without a position branch has the
-        joints of its rotations there.
+        Columns are run, seed, mode, branch, clip, group (clips of the same take or subject share a group),
+        frames at 60 Hz, and the metrics, whose units are in `.attrs["units"]`: MPJRE and geodesic in degrees
+        (NaN in the position branch), MPJPE and the other PE in cm, MPJVE in cm/s, Jitter in 10^2 m/s^3. Lower
+        is better, except for metrics of a package that says otherwise. For a network without a position
+        branch, that branch has the joints that follow from its rotations.
 
         Raises:
-            InputError: where pandas is not installed, or a file of results is damaged.
+            InputError: if pandas is not installed, or a file of results is damaged.
         """
         return _frame(self._rows())
 
     @property
     def clips(self) -> list[str]:
-        """The names of its test clips. Raises InputError where its data is not there or has changed."""
+        """The names of the run's test clips. Raises InputError if its data is missing or has changed."""
         return list(self._opened.test.names)
 
     @cached_property
     def model(self) -> MotionModel:
         """The trained network, a torch module in evaluation mode on the processor.
 
-        Raises InputError where it has code of a package that is not here, or that nobody named.
+        Raises InputError if it needs the code of a package that can't be imported, or that was not named.
         """
         return self._opened.network()
 
     def predict(self, clip: str, mode: Mode = "stream") -> Prediction:
-        """What the network makes of a test clip.
+        """Return the network's prediction for a test clip.
 
         Args:
             clip: one of `clips`.
-            mode: "stream", frame by frame with the network's own past, as live; or "window", in
+            mode: "stream" for frame by frame with the network's own past, as in live use; "window" for
                 non-overlapping windows.
 
         Raises:
-            InputError: for another clip or mode, or where its data is not there or has changed.
+            InputError: for another clip or mode, or if the run's data is missing or has changed.
         """
         from memmlp.config.open_run import clip_of
         from memmlp.evaluation.predictions import predict_clip
@@ -215,9 +216,9 @@ class TrainedRun(os.PathLike[str]):
         floor: float = 0.0,
         ik: LBFGS | None = None,
     ) -> Stream:
-        """The network to be fed live, from its ONNX file; the arguments are those of `Stream`.
+        """Return a live stream of the network, from its ONNX file; the arguments are those of `Stream`.
 
-        Raises InputError as that does, and where the run has no ONNX file yet.
+        Raises InputError as `Stream` does, and if the run has no ONNX file yet.
         """
         return Stream(
             self._run, space=space, rotations=rotations, offsets=offsets, height=height, floor=floor, ik=ik
@@ -231,7 +232,7 @@ class TrainedRun(os.PathLike[str]):
         return open_found(self._run)
 
     def _rows(self) -> Iterator[dict[str, Any]]:
-        """The rows of `per_clip`."""
+        """Yield the rows of `per_clip`."""
         measured = load(self.folder)
         for mode, branches in sorted(measured.means.items()):
             for branch in branches:
@@ -243,17 +244,19 @@ class TrainedRun(os.PathLike[str]):
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """A test clip of N frames at 60 Hz as a network predicts it, beside the truth.
+    """A network's prediction for a test clip of N frames at 60 Hz, with the truth.
 
-    Positions are metres in AMASS' world (Z up); local rotations are matrices, the root's global.
+    Positions are metres in AMASS' world (Z up); local rotations are matrices, except for the root's, which is
+    global.
 
     Attributes:
-        run: the run's id. clip: the clip's name. mode: "stream" or "window".
-        true_positions, true_rotations: (N, 22, 3) and (N, 22, 3, 3).
-        positions: of the rotation branch (N, 22, 3): forward kinematics, the head on its tracker.
-        rotations: of the rotation branch (N, 22, 3, 3).
+        run: the run's id; clip: the clip's name; mode: "stream" or "window".
+        true_positions, true_rotations: the truth's joints (N, 22, 3) and rotations (N, 22, 3, 3).
+        positions: joints of the rotation branch (N, 22, 3), by forward kinematics with the head on its
+            tracker.
+        rotations: rotations of the rotation branch (N, 22, 3, 3).
         rest: rest joints of the body (22, 3), SMPL's body frame: Y up, the person faces +Z.
-        position_branch: of the position branch (N, 22, 3); None for a network without one.
+        position_branch: joints of the position branch (N, 22, 3); None for a network without one.
     """
 
     run: str
@@ -273,13 +276,13 @@ class Prediction:
         return self.position_branch
 
     def __len__(self) -> int:
-        """N."""
+        """Return N, the number of frames."""
         return len(self.true_positions)
 
     def errors(self, branch: Branch = "rotation") -> np.ndarray:
-        """Each joint's distance from the truth (N, 22), cm; their mean is the clip's MPJPE.
+        """Return each joint's distance from the truth (N, 22), cm; their mean is the clip's MPJPE.
 
-        Raises InputError for another branch, or one that the network has not.
+        Raises InputError for another branch, or one that the network does not have.
         """
         return self._take(branch).errors[branch]
 
@@ -295,17 +298,17 @@ class Prediction:
         """Draw the truth and the prediction, coloured by error.
 
         Args:
-            path: FILE.png, so many poses in a row; FILE.gif or .mp4, a film at 30 pictures a second.
-            branch: whose joints are drawn.
-            begin, end: of the piece, seconds; by default the whole clip.
-            poses: of a PNG, evenly spaced, 1 to 20.
+            path: FILE.png for `poses` poses in a row; FILE.gif or .mp4 for a film at 30 pictures per second.
+            branch: the branch whose joints are drawn.
+            begin, end: beginning and end of the drawn piece, seconds; by default the whole clip.
+            poses: number of poses in a PNG, evenly spaced, 1 to 20.
 
         Returns:
             The file's path.
 
         Raises:
-            InputError: for another kind of file, a folder that is not there, another branch, a piece without
-                frames, a number of poses out of range, or where MP4 is asked for and PyAV is not installed.
+            InputError: for another kind of file, a folder that does not exist, another branch, a piece
+                without frames, a number of poses out of range, or an MP4 without PyAV installed.
         """
         from memmlp.render.clip_piece import span
         from memmlp.render.figure_or_film import check_picture, write_picture
@@ -319,18 +322,18 @@ class Prediction:
         return file
 
     def save(self, path: StrPath, *, truth: bool = False) -> Path:
-        """Write the rotation branch, or the truth at the same frames, as motion that other programs open.
+        """Write the rotation branch, or the truth at the same frames, as a motion file for other programs.
 
         Args:
             path: FILE.bvh (centimetres, Y up), FILE.glb (glTF: metres, Y up, with a body to look at), or
                 FILE.npz (AMASS' layout: metres, Z up; poses, trans and mocap_framerate).
-            truth: whether the truth is written.
+            truth: whether to write the truth instead of the prediction.
 
         Returns:
             The file's path.
 
         Raises:
-            InputError: for another kind of file, or one that cannot be written there.
+            InputError: for another kind of file, or if the file can't be written.
         """
         from memmlp.evaluation.predictions import motion_clip
         from memmlp.motion.exporting.write import format_of, write_motion
@@ -345,7 +348,7 @@ class Prediction:
         return file
 
     def _take(self, branch: Branch, first: int = 0, last: int | None = None) -> Take:
-        """The frames of a branch from one up to another, to be drawn."""
+        """Return the frames of a branch from one index up to another, for drawing."""
         from memmlp.render.clip_piece import Take
 
         _check("branch", branch, [name for name, joints in self._joints.items() if joints is not None])
@@ -359,12 +362,12 @@ class Prediction:
 
 
 def _outputs(given: StrPath | None) -> Path:
-    """The outputs folder of an argument, or the command line's."""
+    """Return the outputs folder given by an argument, or else the command line's."""
     return Path(os.environ.get("MEMMLP_OUTPUTS", "outputs") if given is None else given)
 
 
 def _use(plugins: Sequence[str]) -> None:
-    """Use packages of one's own. Raises InputError for a single text, or where one is not there."""
+    """Use the user's packages. Raises InputError for a single text, or if a package can't be imported."""
     if isinstance(plugins, str):
         raise InputError(f"plugins {plugins!r}: allowed is a list of names, [{plugins!r}]")
     if plugins:
@@ -374,19 +377,19 @@ def _use(plugins: Sequence[str]) -> None:
 
 
 def _check(key: str, value: object, allowed: Iterable[object]) -> None:
-    """Raise InputError for a value that is none of the allowed ones."""
+    """Raise InputError for a value that is not one of the allowed ones."""
     known = list(allowed)
     if value not in known:
         raise InputError(f"{key} {value}: allowed are {', '.join(map(str, known))}")
 
 
 def _numbers(errors: Mapping[str, Any]) -> dict[str, float]:
-    """Metrics as numbers; files hold NaN as a word."""
+    """Return metrics as numbers; files hold NaN as a word."""
     return {name: float(value) for name, value in errors.items()}
 
 
 def _frame(rows: Iterable[dict[str, Any]]) -> pd.DataFrame:
-    """Make a pandas DataFrame of rows, with its metrics' units. Raises InputError without pandas."""
+    """Make a pandas DataFrame from rows, with the metrics' units. Raises InputError without pandas."""
     try:
         import pandas as pd
     except ImportError:

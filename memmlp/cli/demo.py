@@ -47,7 +47,7 @@ def demo(overrides: tuple[str, ...]) -> None:
 
 
 def fit_recurrent_poser(overrides: Sequence[str]) -> bool:
-    """Return whether the overrides of a demo choose no other network and go with RecurrentPoser, too."""
+    """Return whether a demo's overrides choose no other network, and can be used for RecurrentPoser, too."""
     from hydra import version
 
     from memmlp.common.errors import InputError
@@ -66,7 +66,7 @@ def fit_recurrent_poser(overrides: Sequence[str]) -> bool:
 
 
 def train_demo(overrides: Sequence[str]) -> list[Outcome]:
-    """Bring the run of these overrides to its end, show its results and return them."""
+    """Finish the run with these overrides, show its results and return them."""
     from memmlp.cli.train import run_training, train
 
     outcomes: list[Outcome] = []
@@ -80,12 +80,12 @@ def train_demo(overrides: Sequence[str]) -> list[Outcome]:
 
 
 def next_steps(overrides: Sequence[str], environment: Path | None = None, runs: Sequence[str] = ()) -> str:
-    """Return the commands to try next, which train as the demo did.
+    """Return the commands to try next, with the demo's settings.
 
     Args:
-        overrides: those of the demo, which the same network without its memory needs, too.
-        environment: the folder of an environment that this shell has not entered; None for none.
-        runs: ids of the demo's runs; two are drawn beside the truth.
+        overrides: the demo's overrides, which the same network without its memory needs, too.
+        environment: the folder of an environment that is not activated in this shell; None for none.
+        runs: ids of the demo's runs; two of them are drawn beside the truth.
     """
     words = " ".join(map(shlex.quote, ["memmlp", "train", *overrides, "memory=none"]))
     both = (
@@ -105,12 +105,12 @@ def next_steps(overrides: Sequence[str], environment: Path | None = None, runs: 
 
 
 def machine(overrides: Sequence[str]) -> list[str]:
-    """Return the words among the overrides that say how large and on what to train, whatever the data."""
+    """Return the overrides for the size of the training and the machine, which don't depend on the data."""
     return [shlex.quote(word) for word in overrides if word.startswith(("profile=", "threads=", "device="))]
 
 
 def unentered() -> Path | None:
-    """Return the folder of the environment of this Python, where the shell would not find its commands."""
+    """Return the folder of this Python's environment if the shell does not find its commands, else None."""
     here = Path(sys.prefix)
     found = shutil.which("memmlp")
     inside = found is not None and Path(found).parent == here / "bin"

@@ -1,4 +1,4 @@
-"""`memmlp eval`: the metrics of a finished run, read where they were measured before, else measured now."""
+"""`memmlp eval`: the metrics of a finished run, read if they were measured before, else measured now."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`memmlp export`: the ONNX file of a finished run, checked against torch and what runtimes publish."""
+"""`memmlp export`: the ONNX file of a finished run, checked against torch and against runtimes' operators."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ if TYPE_CHECKING:
     from memmlp.networks.streaming import StreamingGraph
 
 TARGETS = ("onnxruntime", "web", "wasm", "webgpu", "webnn", "unity", "tensorrt", "coreml", "qnn")
-"""Those of memmlp.deploy.operator_support, without importing ONNX Runtime for the help."""
+"""The names in memmlp.deploy.operator_support, repeated so that the help need not import ONNX Runtime."""
 
 FULL_TOLERANCE = 0.1
-"""In metres and in entries of rotation matrices: what fp16 changes is far less, what is broken far more."""
+"""Limit in metres and entries of rotation matrices: fp16 changes far less, a broken file far more."""
 
 
 class Form(NamedTuple):
-    """What file is wanted of a run.
+    """The kind of file that is wanted from a run.
 
     Attributes:
         graph: "auto", "streaming" or "naive".
         precision: "fp32", "fp16", "int8" or "int8_blocks".
         opset: the file's ONNX opset.
-        full: the frame of reference and the format of the joints' rotations, for a file that covers the whole
-            way from trackers to joints; None for the network's step.
+        full: the frame of reference and the format of the joints' rotations, for a file that covers
+            everything from trackers to joints; None for the network's step alone.
     """
 
     graph: str
@@ -148,15 +148,15 @@ def export(
 
 
 def write(run: str, out: Path, outputs: Path, form: Form, clips: int, max_growth: float) -> None:
-    """Write the file of a run, provided that it is as it should be.
+    """Write the file of a run, provided that it passes the checks.
 
     Args:
         run: the run's id, its beginning, or its folder.
         out: the file to write.
         outputs: the folder in which runs are kept.
-        form: what file is wanted.
-        clips: how many test clips a float32 file is checked on; 0 for all.
-        max_growth: the fraction by which MPJPE may grow with less precision (0.01 is 1 %).
+        form: the kind of file that is wanted.
+        clips: the number of test clips on which a float32 file is checked; 0 for all.
+        max_growth: the fraction by which MPJPE may grow with lower precision (0.01 is 1 %).
     """
     from memmlp.common.errors import InputError
     from memmlp.common.progress import tell
@@ -194,18 +194,18 @@ def write_exact(
     clips: list[Tensor],
     form: Form,
 ) -> None:
-    """Write the float32 ONNX file, provided that it computes on all clips what the trained model does.
+    """Write the float32 ONNX file, provided that it matches the trained model on all clips.
 
     Args:
         model: the network as it was trained.
         network: the graph to export, the model itself or its streaming graph.
         out: the file to write.
         run_id: the run's id, for the file's metadata.
-        clips: frames (N, 252) of each clip to compare on.
-        form: what file is wanted.
+        clips: frames (N, 252) of each clip on which they are compared.
+        form: the kind of file that is wanted.
 
     Raises:
-        ClickException: where file and model differ by more than rounding explains; nothing is written then.
+        ClickException: if file and model differ by more than rounding explains; nothing is written then.
     """
     import tempfile
 
@@ -234,7 +234,7 @@ def write_exact(
 
 
 def write_graph(network: MotionModel | StreamingGraph, path: Path, run_id: str, form: Form) -> None:
-    """Write the ONNX file of the network, or of the whole way, in float32 and unchecked."""
+    """Write the ONNX file of the network's step, or of the full graph, in float32 and unchecked."""
     from memmlp.deploy.export import export as export_network
     from memmlp.live.full_graph import export_full
 
@@ -254,10 +254,10 @@ def write_less_precise(
     form: Form,
     max_growth: float,
 ) -> None:
-    """Write the ONNX file of less precision, provided that it is accurate enough, and say what it costs.
+    """Write the ONNX file with lower precision, provided that it is accurate enough, and report its cost.
 
-    What it costs is measured of the network, for a file of the whole way too: its layers are the same. That
-    file is compared with torch on the first test clip, too.
+    The cost in accuracy is measured on the network's step, even for a file with the full graph, whose layers
+    are the same. Such a file is also compared with torch on the first test clip.
 
     Args:
         model: the network as it was trained.
@@ -265,13 +265,13 @@ def write_less_precise(
         out: the file to write.
         run_id: the run's id, for the file's metadata.
         train: frames (N, 252) of the clips that calibrate int8.
-        test: frames (N, 252) of the clips that the cost is measured on.
-        form: what file is wanted.
+        test: frames (N, 252) of the clips on which the cost is measured.
+        form: the kind of file that is wanted.
         max_growth: the fraction by which MPJPE may grow (0.01 is 1 %).
 
     Raises:
-        ClickException: where MPJPE grows by more, or a file of the whole way is not the network's; nothing is
-            written then.
+        ClickException: if MPJPE grows by more, or a full graph does not match the network; nothing is written
+            then.
     """
     import tempfile
 
@@ -302,10 +302,10 @@ def write_less_precise(
 
 
 def check(path: Path, targets: tuple[str, ...]) -> None:
-    """Print what of a file lies outside of what the targets publish, with where that is published.
+    """Print which operators of a file the targets do not support, and where that is published.
 
     Raises:
-        ClickException: where anything does.
+        ClickException: if there are any.
     """
     from memmlp.deploy import operator_support as published
 

@@ -143,7 +143,7 @@ def live(network: str, send: bool, save_avatar: Path | None, **options: Any) -> 
 
 
 class InputOptions(NamedTuple):
-    """What the command's options name: a network, and the poses that it is fed."""
+    """The options that choose the input: a network, and the poses that it gets."""
 
     network: str
     clip: str | None
@@ -159,7 +159,7 @@ FED = InputOptions._fields[1:]
 
 
 class ShowOptions(NamedTuple):
-    """What the command's options say of the wearer, and of where the body goes."""
+    """The options about the wearer, and about where the body goes."""
 
     height: float | None
     floor: float | None
@@ -175,7 +175,7 @@ class ShowOptions(NamedTuple):
 
 
 def check_options(given: InputOptions, shown: ShowOptions, send: bool) -> None:
-    """Raise InputError for options that contradict each other, or need what is not installed."""
+    """Raise InputError for options that contradict each other, or need something that is not installed."""
     from memmlp.common.errors import InputError
     from memmlp.common.page_access import check_token
     from memmlp.live.session.packets import needs_osc
@@ -206,7 +206,7 @@ def check_options(given: InputOptions, shown: ShowOptions, send: bool) -> None:
 
 
 def source_of(given: InputOptions) -> TrackerSource:
-    """Return the source of the poses: packets at a port, or a clip that is repeated."""
+    """Return the source of the poses: packets at a port, or a clip that is played repeatedly."""
     from memmlp.live.session.packets import from_json, from_osc
     from memmlp.live.session.sources import PacketSource
 
@@ -228,7 +228,7 @@ def load_clip(given: InputOptions) -> TrackedClip:
     """Load the clip of --clip: an AMASS npz on the network's body, or a test clip of the run.
 
     Raises:
-        InputError: for a test clip where the network is an ONNX file, which has none, or an unknown name.
+        InputError: for a test clip if the network is an ONNX file, which has none, or for an unknown name.
     """
     from memmlp.common.errors import InputError
     from memmlp.live.exported import ExportedNetwork
@@ -316,7 +316,7 @@ def network_file(given: InputOptions) -> tuple[Path, str]:
 
 
 def known_of(shown: ShowOptions, space: SpaceName, stream: Stream) -> Calibration:
-    """Return what is known of the wearer: by the file of --calibration, and by the options before it."""
+    """Return the facts about the wearer, from --calibration's file and the options, which take precedence."""
     from memmlp.live.calibration_file import Calibration, read_calibration
     from memmlp.live.wearer import stature
 
@@ -348,7 +348,7 @@ def outputs_of(shown: ShowOptions, stream: Stream) -> Outputs:
 
 
 def page_files(avatar: str | None, stream: Stream) -> Mapping[str, File]:
-    """Return the files of the page, with those of an avatar where one is asked for."""
+    """Return the page's files, with those of an avatar if one is asked for."""
     from memmlp.live.session.server import FILES
 
     if avatar is None:

@@ -22,7 +22,7 @@ from memmlp.common.termination import termination_interrupts
 
 
 class Command(NamedTuple):
-    """Where a sub-command is implemented, and its line in the help."""
+    """The place of a sub-command's implementation, and its line in the help."""
 
     module: str
     attribute: str
@@ -63,18 +63,18 @@ REFUSED = {
     errno.ENOSPC,
     errno.EDQUOT,
 }
-"""Errors of the operating system that blame a path which a person gave, or the disk that it is on."""
+"""Errors of the operating system that are about a path given by the user, or about its disk."""
 
 
 class Commands(click.Group):
-    """A group of commands that imports each one when it is called."""
+    """A group of commands that imports each command only when it is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the commands' names in the order of COMMANDS."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import and return the command of that name; None where there is none."""
+        """Import and return the command with that name; None if there is none."""
         if cmd_name not in COMMANDS:
             return None
         command = COMMANDS[cmd_name]
@@ -106,11 +106,11 @@ def commands() -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run a command line. Exits with 1 for a failed run, 2 for bad input, 130 when interrupted.
+    """Run a command line. Exits with 1 for a failed run, 2 for bad input, 130 after an interruption.
 
-    A process of its own takes SIGTERM, a scheduler's request to end, as a Ctrl-C.
+    If this is the whole process (no `argv`), it treats SIGTERM, a scheduler's request to end, like Ctrl-C.
 
-    With MEMMLP_TRACEBACK=1 in the environment the error is raised, to show where it came from.
+    With MEMMLP_TRACEBACK=1 in the environment the error is raised, which shows where it came from.
     """
     own = argv is None
     if own:
@@ -140,7 +140,7 @@ def _run(arguments: list[str]) -> None:
 
 
 def _exit_code(error: Exception) -> int | None:
-    """Return the exit code of an error that one line explains; None for a bug, which needs its traceback."""
+    """Return the exit code for an error that one line explains; None for a bug, which needs its traceback."""
     if isinstance(error, click.Abort):  # what click makes of Ctrl-C
         return 130
     if isinstance(error, click.ClickException):
@@ -166,8 +166,8 @@ def _line(error: Exception) -> str:
 def _complete(arguments: list[str]) -> None:
     """Answer a shell that asks for completions.
 
-    `memmlp train -sc install=bash` prints a script that calls `memmlp -sc query=bash` at every tab. Here the
-    names of commands are completed; below `memmlp train` Hydra does it.
+    `memmlp train -sc install=bash` prints a script that calls `memmlp -sc query=bash` at every tab. This
+    function completes the names of commands; after `memmlp train`, Hydra completes.
     """
     words = os.environ.get("COMP_LINE", "").split(" ")
     if len(words) <= 2:

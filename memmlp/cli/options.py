@@ -16,7 +16,7 @@ PATH = click.Path(path_type=Path)
 
 
 class Finite(click.FloatRange):
-    """A number in a range, NaN and infinity excluded."""
+    """A number in a range, without NaN and infinity."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the number; click itself accepts NaN and infinity."""
@@ -27,12 +27,12 @@ class Finite(click.FloatRange):
 
 
 class Device(click.ParamType):
-    """The name of a device, as the key `device` takes it."""
+    """The name of a device, in the form of the key `device`."""
 
     name = "auto|cpu|cuda|cuda:INDEX|mps"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Return the name; whether there is such a device is seen when it is used."""
+        """Return the name; whether the device exists is checked when it is used."""
         from memmlp.config.schema.rules import DEVICE
 
         if not DEVICE.allows(value):
@@ -50,12 +50,12 @@ device_option = click.option(
 
 
 class Program(click.ParamType):
-    """Where another program takes datagrams: HOST, or HOST:PORT."""
+    """The address at which another program takes datagrams: HOST, or HOST:PORT."""
 
     name = "HOST[:PORT]"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return host and port; None for a port that was not given."""
+        """Return host and port; the port is None if it was not given."""
         if isinstance(value, tuple):
             return value
         host, colon, port = value.rpartition(":")
@@ -67,7 +67,7 @@ class Program(click.ParamType):
 
 
 class Sender(click.ParamType):
-    """An IPv4 address, or a network of them, as 192.168.1.0/24."""
+    """An IPv4 address, or a network of addresses such as 192.168.1.0/24."""
 
     name = "ADDRESS"
 
@@ -116,7 +116,7 @@ token_option = click.option(
 
 
 def _use(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
-    """Use the packages of one's own that the option names, and those of the environment."""
+    """Use the users' packages that the option names, and those in the environment."""
     from memmlp.config.plugins import activate, listed
 
     if not ctx.resilient_parsing:

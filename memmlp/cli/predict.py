@@ -1,4 +1,4 @@
-"""`memmlp predict`: what a finished run's network makes of clips, as files that other programs open."""
+"""`memmlp predict`: a finished run's predictions for clips, as files for other programs."""
 
 from __future__ import annotations
 
@@ -80,10 +80,10 @@ def predict(
 
 
 def chosen_branch(evaluation: Evaluation, branch: str | None) -> str:
-    """Return what --branch says, else the evaluation's best: with inverse kinematics or without.
+    """Return the branch of --branch, else the evaluation's best one: with inverse kinematics if it has any.
 
     Raises:
-        InputError: where --branch combined has no inverse kinematics.
+        InputError: for --branch combined without inverse kinematics.
     """
     from memmlp.common.errors import InputError
     from memmlp.evaluation.ik import NoIK
@@ -99,10 +99,10 @@ def chosen_branch(evaluation: Evaluation, branch: str | None) -> str:
 def predict_test_clip(
     predictor: ClipPredictor, run: OpenedRun, name: str, out: Path, format_: str | None
 ) -> ExportReport:
-    """Write what the network makes of a test clip.
+    """Write the network's prediction for a test clip.
 
     Raises:
-        InputError: where there is no such clip, or `out` is not a file of that format or cannot be written.
+        InputError: if there is no such clip, or `out` is not a file of that format or can't be written.
     """
     from memmlp.common.errors import InputError
     from memmlp.motion.body import FPS

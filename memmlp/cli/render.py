@@ -91,7 +91,7 @@ def render(
 
 
 def check_labels(runs: tuple[str, ...], labels: tuple[str, ...]) -> None:
-    """Raise InputError where there is not one label for each run."""
+    """Raise InputError unless there is one label for each run, or none at all."""
     from memmlp.common.errors import InputError
 
     if labels and len(labels) != len(runs):
@@ -106,18 +106,18 @@ def taken(
     branch: str,
     mode: str,
 ) -> Take:
-    """Return the piece of a clip between two times as these runs predict it.
+    """Return the piece of a clip between two times, with these runs' predictions.
 
     Args:
         runs: the opened runs.
         labels: a label for each run; empty for their ids.
         clip: the test clip's name; None for the first.
         times: begin and end of the piece, seconds; None for the clip's end.
-        branch: "rotation" (forward kinematics, the head on its tracker) or "position".
+        branch: "rotation" (forward kinematics, with the head on its tracker) or "position".
         mode: "stream" or "window".
 
     Raises:
-        InputError: where labels repeat, the piece is empty, or the runs have different truths for the clip.
+        InputError: if labels repeat, the piece is empty, or the runs have different truths for the clip.
     """
     import numpy as np
 

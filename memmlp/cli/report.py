@@ -64,7 +64,7 @@ def report(
 
 
 def one_file(chapters: Sequence[Chapter], outputs: Path, extra: str, replays: bool) -> str:
-    """Return the page of these sweeps as one file, with further HTML beside it."""
+    """Return the page of these sweeps as one file, with further HTML on a page of its own."""
     from memmlp.cli.ui import predict
     from memmlp.config.plan_sweep import sweep_folder
     from memmlp.report.ui.answers import Answers
@@ -79,7 +79,7 @@ def one_file(chapters: Sequence[Chapter], outputs: Path, extra: str, replays: bo
 
 
 def chapters_of(names: Sequence[str], overrides: Sequence[str], outputs: Path) -> list[Chapter]:
-    """Return the tables of some names with the finished runs behind them; each run is read once."""
+    """Return the tables for some names, with the finished runs behind them; each run is read once."""
     from memmlp.cli.table import SHOWN_MODES, gathered
     from memmlp.report.html import Chapter
     from memmlp.tables.measured_run import load

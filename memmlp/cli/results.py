@@ -1,4 +1,4 @@
-"""`memmlp results`: runs' results that are kept with the code, and the pages that are made of them."""
+"""`memmlp results`: runs' results that are kept with the code, and the pages made from them."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def docs(folder: Path, check: bool) -> None:
 
 
 def sources(folder: Path) -> dict[str, KeptTable]:
-    """Return the tables of all results that are kept below a folder, by the stems of their files."""
+    """Return the tables of all results kept below a folder, by the stems of their files."""
     from memmlp.report.kept_results import load_kept
     from memmlp.report.markdown import KeptTable
     from memmlp.tables.build_table import titled
@@ -177,11 +177,11 @@ def sources(folder: Path) -> dict[str, KeptTable]:
 
 
 def _trends(kept: Kept, stem: str) -> Trends | None:
-    """Return the effects of kept results against their sweep's scale; None where it has none.
+    """Return the effects of kept results against their sweep's scale; None if it has none.
 
     Args:
         kept: the results.
-        stem: the name of their page.
+        stem: the name of the results' page.
     """
     from memmlp.config.plan_sweep import find_sweep
     from memmlp.tables.effects_along_axes import trends
@@ -194,15 +194,15 @@ def _trends(kept: Kept, stem: str) -> Trends | None:
 
 
 def _with_seeds(sweep: Sweep, kept: Kept) -> Sweep:
-    """Return the sweep with the seeds that any of the kept runs has."""
+    """Return the sweep with all seeds that any of the kept runs has."""
     seeds = sorted({seed for runs in kept.runs.values() for seed in runs})
     return sweep.with_overrides([f"seed={','.join(map(str, seeds))}"])
 
 
 def _table(kept: Kept, source: str | None = None) -> Table:
-    """Compute the table of kept results, over the seeds that any of their runs has.
+    """Compute the table of kept results, over all seeds of their runs.
 
-    With a source's name it is that of the source's test clips alone.
+    With a source's name, it is the table of that source's test clips alone.
     """
     from memmlp.cli.seed_rounds import of_another
     from memmlp.config.plan_sweep import find_sweep
@@ -240,7 +240,7 @@ def _count(runs: Mapping[str, RunsBySeed]) -> int:
 
 
 def _merged(path: Path, before: Kept, kept: Kept, ids: Mapping[tuple[str, int], str]) -> Kept:
-    """Return what a file has with what is kept now, whose runs need not be those that are planned."""
+    """Return a file's results merged with those kept now; its runs may differ from the planned ones."""
     planned = {one: run for one, run in ids.items() if one[1] not in kept.runs.get(one[0], {})}
     try:
         merged = before.merged(kept)
@@ -258,7 +258,7 @@ def _templates(folder: Path) -> dict[str, str]:
 
 
 def _text(path: Path) -> str | None:
-    """Return a file's text; None where there is no file."""
+    """Return a file's text; None if there is no file."""
     return path.read_bytes().decode("utf-8", "replace") if path.exists() else None
 
 
@@ -271,7 +271,7 @@ def _stale(folder: Path, made: Mapping[str, str]) -> list[str]:
 
 
 def _pictures(folder: Path, found: Mapping[str, KeptTable]) -> dict[str, Trends]:
-    """Return the figures whose files are not there or show other numbers, by the files' names."""
+    """Return the figures whose files are missing or show other numbers, by the files' names."""
     from memmlp.report.scaling_section import picture_name
 
     wanted = {

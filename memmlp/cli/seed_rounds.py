@@ -1,4 +1,4 @@
-"""Seeds in rounds for arms with open verdicts: `memmlp sweep --until-decided`, and tables of such sweeps."""
+"""`memmlp sweep --until-decided`: seeds are added in rounds, for the arms whose verdicts are open."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def rounds_path(sweep: Sweep, outputs: Path) -> Path:
-    """Return the file where a sweep's rounds are kept."""
+    """Return the file in which a sweep's rounds are kept."""
     from memmlp.config.plan_sweep import sweep_folder
     from memmlp.tables.seed_rounds_file import NAME
 
@@ -27,15 +27,16 @@ def rounds_path(sweep: Sweep, outputs: Path) -> Path:
 
 
 def current_rounds(sweep: Sweep, outputs: Path, most: int | None) -> Rounds:
-    """Return the rounds of a sweep as far as they went; new ones where no look was taken yet.
+    """Return the rounds of a sweep so far; new ones if no look was taken yet.
 
     Args:
         sweep: the sweep as it is now.
         outputs: the folder of runs and caches.
-        most: the seeds of an arm at most (--max-seeds); None for those of the kept rounds, or the default.
+        most: the largest number of seeds of an arm (--max-seeds); None for that of the kept rounds, or the
+            default.
 
     Raises:
-        InputError: where looks were taken of another sweep than it is now, or with another maximum.
+        InputError: if looks were taken of a sweep that has changed since, or with another maximum.
     """
     from memmlp.tables.seed_rounds import MOST, begin
     from memmlp.tables.seed_rounds_file import read
@@ -53,7 +54,7 @@ def current_rounds(sweep: Sweep, outputs: Path, most: int | None) -> Rounds:
 
 
 def check(overrides: Sequence[str], wanted: bool, most: int | None) -> None:
-    """Refuse words of the command line that don't go together. Raises InputError."""
+    """Raise InputError for options of the command line that don't go together."""
     from memmlp.tables.seed_rounds import MOST
     from memmlp.tables.statistics import looks
 
@@ -72,11 +73,11 @@ def run_until_decided(
     """Take look after look until none can be taken, and return the last rounds and plan.
 
     Args:
-        sweep: the sweep as it was begun with.
+        sweep: the sweep with which the rounds began.
         outputs: the folder of runs and caches.
         rounds: the rounds so far.
-        work: brings the runs of a sweep's plan to their end.
-        fail_fast: whether the first failed run ends it.
+        work: finishes the runs of a sweep's plan.
+        fail_fast: whether the first failed run ends the rounds.
     """
     from dataclasses import replace
 
@@ -101,7 +102,7 @@ def run_until_decided(
 def look(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
     """Take the next look that can be taken, record it, and return the rounds.
 
-    Another process may have taken a look in the meantime; its rounds are returned then.
+    If another process has taken a look in the meantime, its rounds are returned.
     """
     from memmlp.common.files import write_json
     from memmlp.common.lease import Lock
@@ -131,7 +132,7 @@ def names(rounds: Rounds, sweep: Sweep, plan: Plan) -> dict[str, str]:
 
 
 def _difference(kept: Rounds, wanted: Rounds) -> str | None:
-    """Name in a word what differs between two rounds of a sweep; None where nothing does."""
+    """Name in a word what differs between two rounds of a sweep; None if nothing does."""
     if kept.seeds != wanted.seeds:
         return "seeds"
     if (kept.looks, kept.levels) != (wanted.looks, wanted.levels):
@@ -140,13 +141,13 @@ def _difference(kept: Rounds, wanted: Rounds) -> str | None:
 
 
 class SweepToShow(NamedTuple):
-    """What a table shows of a sweep whose seeds may have been spent in rounds.
+    """The part of a sweep that a table shows, if seeds may have been spent in rounds.
 
     Attributes:
         sweep: the sweep with the seeds that were spent.
         plan: the plan of its runs.
-        rounds: the rounds whose verdicts stand; None where no verdict of rounds does.
-        flags: what a reader has to know where rounds were taken of something else.
+        rounds: the rounds that decided the verdicts; None if no rounds did.
+        flags: what a reader has to know if rounds were taken of something else.
     """
 
     sweep: Sweep
@@ -156,9 +157,9 @@ class SweepToShow(NamedTuple):
 
 
 def sweep_to_show(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> SweepToShow:
-    """Return the sweep with its rounds, where rounds were taken and fit what the sweep is now.
+    """Return the sweep with its rounds, if rounds were taken and fit the sweep's present form.
 
-    Otherwise the sweep is shown with its own seeds, and a flag says so where rounds were taken.
+    Otherwise the sweep is shown with its own seeds; if rounds were taken, a flag says so.
     """
     from memmlp.config.plan_sweep import make_plan
     from memmlp.tables.seed_rounds_file import read, same_runs
@@ -182,7 +183,7 @@ def sweep_to_show(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> Swee
 
 
 def of_another(kept: Rounds, sweep: Sweep, chosen: bool = False) -> str | None:
-    """Return a flag if the kept looks were taken of a different sweep than today's; else None.
+    """Return a flag if the sweep has changed since the kept looks were taken; else None.
 
     `chosen` says that the sweep's seeds were chosen by hand.
     """
@@ -197,7 +198,7 @@ def of_another(kept: Rounds, sweep: Sweep, chosen: bool = False) -> str | None:
 
 
 def spent_before(sweep: Sweep, outputs: Path) -> tuple[str, ...]:
-    """Return a flag for a table of a fixed number of seeds if rounds were taken of the sweep before."""
+    """Return a flag for a table with a fixed number of seeds if rounds were taken of the sweep before."""
     from memmlp.tables.seed_rounds_file import read
 
     kept = read(rounds_path(sweep, outputs))
@@ -215,7 +216,7 @@ def schedule(rounds: Rounds) -> str:
 
 
 def told(rounds: Rounds, sweep: Sweep, last: Look | None = None) -> list[str]:
-    """Say how far each arm is: comparisons decided and open, seeds so far, and its next look."""
+    """Describe each arm's progress: comparisons decided and open, seeds so far, and its next look."""
     from memmlp.tables.seed_rounds import standings
 
     arms = standings(rounds, sweep)
@@ -262,7 +263,7 @@ def _outlooks(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> l
 
 
 def _spent(rounds: Rounds, sweep: Sweep) -> str:
-    """Say how many runs were spent, beside how many a fixed number of seeds would have taken."""
+    """Say how many runs were spent, and how many a fixed number of seeds would have taken."""
     used, arms = sum(rounds.counts(sweep).values()), len(sweep.runnable())
     last = max((look.seeds for look in rounds.taken), default=rounds.looks[0])
     fixed = [f"{arms * seeds} with {seeds} seeds for every arm" for seeds in sorted({last, rounds.looks[-1]})]

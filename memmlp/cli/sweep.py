@@ -1,4 +1,4 @@
-"""`memmlp sweep`: bring all runs of a table, or of a sweep file of one's own, to their end."""
+"""`memmlp sweep`: finish all runs of a table, or of a user's sweep file."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def sweep(
 
 
 def reset(plan: Plan) -> None:
-    """Remove the plan's networks, trained or begun, so that they are trained again; upstream runs stay."""
+    """Remove the plan's networks, finished or begun, so that they are trained again; upstream runs stay."""
     for run in {task.id: plan.run_of(task) for task in plan.tasks if task.kind == NETWORK}.values():
         with run.lock():
             run.reset()
@@ -130,7 +130,7 @@ def devices(plan: Plan) -> set[str]:
 
 
 def show(chosen: Sweep, plan: Plan) -> None:
-    """Print the board once, and the runs that earlier versions of the sweep file left behind."""
+    """Print the board once, and the runs left over from earlier versions of the sweep file."""
     from rich.console import Console
 
     from memmlp.config.plan_sweep import orphans
@@ -145,14 +145,14 @@ def show(chosen: Sweep, plan: Plan) -> None:
 
 
 def unprepared(chosen: Sweep, plan: Plan) -> int:
-    """Return how many of the sweep's runs the plan lacks, since their data is not prepared yet."""
+    """Return how many of the sweep's runs the plan lacks because their data is not prepared yet."""
     return len(chosen.arm_seeds()) - len(plan.entries)
 
 
 def show_forecast(chosen: Sweep, plan: Plan, workers: int) -> None:
     """Print how long the remaining runs may take.
 
-    Which VQ-VAEs there are besides is only known of runs whose data is prepared.
+    The VQ-VAEs that are needed, too, are known only for runs whose data is prepared.
     """
     from memmlp.sweep.forecast import forecast
 
@@ -169,9 +169,9 @@ def show_forecast(chosen: Sweep, plan: Plan, workers: int) -> None:
 
 
 def show_outcome(shown: SweepToShow, words: Sequence[str], chosen: Sweep) -> None:
-    """Print the table, what is done, what failed, and the next command.
+    """Print the table, finished and failed runs, and the next command.
 
-    Exits with 1 where something failed.
+    Exits with 1 if something failed.
     """
     from memmlp.cli.seed_rounds import closing
     from memmlp.cli.table import SHOWN_MODES, on_screen, table_of_plan

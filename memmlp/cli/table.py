@@ -120,9 +120,9 @@ def table(
 
 @contextmanager
 def _uncollected() -> Iterator[None]:
-    """Switch garbage collection off for a while.
+    """Switch garbage collection off within the context.
 
-    Everything that is read of the runs is kept, so searching it for garbage would cost a second for nothing.
+    Everything that is read from the runs stays in use, so searching it for garbage would waste a second.
     """
     gc.disable()
     try:
@@ -149,23 +149,23 @@ def gathered(
     source: str | None = None,
     untrained: bool = False,
 ) -> list[SweepTable]:
-    """Gather the tables that some names stand for.
+    """Gather the tables with the given names.
 
-    A table of the paper whose config lacks something (such as the folder of AMASS) shows the paper's values
-    alone and says so.
+    A table of the paper whose config lacks something (such as the folder of AMASS) shows only the paper's
+    values, and says so.
 
     Args:
-        names: names of sweeps, as `memmlp table` takes them.
+        names: names of sweeps, as given to `memmlp table`.
         overrides: the command line's overrides.
         outputs: the folder of runs and caches.
         modes: modes of evaluation to show.
         read: reads a run (`memmlp.tables.measured_run.load`).
-        branch: shows this branch in place of the arms' own; None for theirs.
-        source: shows the test clips of this source alone; None for all.
-        untrained: whether the costs of networks without a run are measured.
+        branch: the branch to show in place of the arms' own; None for the arms' own.
+        source: the only source whose test clips are shown; None for all.
+        untrained: whether to measure the costs of networks without a run.
 
     Raises:
-        InputError: where none of them can be composed with the command line's overrides.
+        InputError: if none of them can be composed with the command line's overrides.
     """
     from memmlp.cli.seed_rounds import sweep_to_show
     from memmlp.tables.build_table import without_runs
@@ -197,9 +197,9 @@ def table_of_plan(
     source: str | None = None,
     untrained: bool = False,
 ) -> SweepTable:
-    """Return a planned sweep's finished runs and its table, of one source's test clips where it is given.
+    """Return a planned sweep's finished runs and its table, for one source's test clips if one is given.
 
-    With `untrained` networks that have no run are measured as they are before training.
+    With `untrained`, networks without a run are measured with random weights.
     """
     from memmlp.tables.build_table import finished_runs, make_table, on_source, titled
     from memmlp.tables.runs_of_plan import finder, older, states
@@ -223,7 +223,7 @@ def table_of_plan(
 
 
 def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
-    """Return the sweeps of some names, with the overrides, and the command that runs each."""
+    """Return the sweeps with some names, with the overrides applied, and the command that runs each."""
     from memmlp.config.package_data import packaged
     from memmlp.config.plan_sweep import find_sweep
     from memmlp.config.plugins import words
@@ -236,7 +236,7 @@ def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, 
 
 
 def on_screen(tables: Sequence[Table]) -> None:
-    """Print tables as wide as the screen."""
+    """Print tables in the width of the screen."""
     from rich.console import Console
 
     from memmlp.tables.formats import show
@@ -284,7 +284,7 @@ def _needed(wanted: Sequence[Need]) -> str:
 
 
 def _formatted(tables: Sequence[Table], form: str, alone: bool) -> str:
-    """Return the tables as one text; in JSON a single object if `alone`, else a list."""
+    """Return the tables as one text; in JSON, it is a single object if `alone`, else a list."""
     from memmlp.tables.formats import FORMATS
 
     texts = [FORMATS[form](one) for one in tables]
@@ -294,7 +294,7 @@ def _formatted(tables: Sequence[Table], form: str, alone: bool) -> str:
 
 
 def _form_of(out: Path | None) -> str:
-    """Return the format that a file's ending tells. Raises InputError for an unknown ending."""
+    """Return the format for a file's suffix. Raises InputError for an unknown suffix."""
     from memmlp.tables.formats import FORMATS
 
     ending = out.suffix.removeprefix(".") if out else ""
@@ -304,7 +304,7 @@ def _form_of(out: Path | None) -> str:
 
 
 def write(out: Path, text: str) -> None:
-    """Write the file of --out and say where it is. Raises InputError where it can't be written."""
+    """Write the file of --out and print its path. Raises InputError if it can't be written."""
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text, encoding="utf-8")

@@ -70,7 +70,7 @@ def sync(names: tuple[str, ...], uri: str | None, project: str, full: bool, outp
 
 
 def _trackers(names: Sequence[str], uri: str | None, project: str, outputs: Path) -> list[Tracker]:
-    """Return the trackers of these names. Raises InputError where a package is missing."""
+    """Return the trackers with these names. Raises InputError if a package is missing."""
     from memmlp.experiment_tracking.mlflow_tracker import MLflow
     from memmlp.experiment_tracking.tensorboard_tracker import TensorBoard
     from memmlp.experiment_tracking.wandb_tracker import WandB
@@ -84,7 +84,7 @@ def _trackers(names: Sequence[str], uri: str | None, project: str, outputs: Path
 
 
 def show_in_trackers(plan: Plan, folder: Path, table: Table) -> None:
-    """Leave the sweep's summary in its folder, and show it where its runs are shown."""
+    """Write the sweep's summary into its folder, and show it in the trackers that show its runs."""
     from omegaconf import OmegaConf
 
     from memmlp.config.build import build_tracking

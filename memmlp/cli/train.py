@@ -1,4 +1,4 @@
-"""`memmlp train`: a Hydra application whose errors take one line each and come before anything runs."""
+"""`memmlp train`: a Hydra application with errors of one line, which are raised before anything runs."""
 
 from __future__ import annotations
 
@@ -44,7 +44,8 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
         job: what to do with each composed and checked config; by default, to train it.
 
     Raises:
-        InputError: for bad input; of several failed jobs, the last one's failure, the others' being printed.
+        InputError: for bad input; of several failed jobs, the last failure is raised and the others are
+            printed.
     """
     args, parser = parse(argv)
     register()
@@ -71,14 +72,14 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
 
 
 def _runs(args: argparse.Namespace) -> bool:
-    """Return whether the arguments ask to train, and not only to show something."""
+    """Return whether the arguments ask to train, rather than only to show something."""
     shows = (args.help, args.hydra_help, args.cfg, args.info, args.shell_completion)
     return not any(shows)
 
 
 @contextmanager
 def _raising(overrides: Sequence[str]) -> Iterator[None]:
-    """Make Hydra raise its errors instead of printing them, and put its own complaints into one line."""
+    """Make Hydra raise its errors instead of printing them, and put its own messages into one line."""
     before = os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
@@ -109,10 +110,10 @@ def _collecting(
 
 
 def run_training(cfg: DictConfig) -> Outcome | None:
-    """Check the config, bring its run to its end, and print and return the results.
+    """Check the config, finish its run, and print and return the results.
 
     Returns:
-        None in the processes that trained along.
+        The outcome; None in the processes that trained along.
     """
     import torch
 

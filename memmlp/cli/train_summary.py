@@ -20,7 +20,7 @@ COLUMNS = [(mode, branch) for mode in ("stream", "window") for branch in BRANCHE
 
 
 def show(outcome: Outcome) -> None:
-    """Print a run's metrics in both modes, its latency and sizes where there are any, and where to look."""
+    """Print a run's metrics in both modes, its latency and sizes if it has any, and where its files are."""
     console = Console(highlight=False)
     run, results = outcome.run, outcome.results
     console.print(said(outcome), soft_wrap=True)
@@ -38,9 +38,9 @@ def show(outcome: Outcome) -> None:
 
 
 def show_side_by_side(outcomes: Mapping[str, Outcome]) -> None:
-    """Print what networks, by their names, make of the same test clips, and what they cost.
+    """Print the errors of several networks, by name, on the same test clips, and their costs.
 
-    The errors are those of the rotations, in stream mode where that was measured.
+    The errors are those of the rotation branch, in stream mode if that was measured.
     """
     found = {name: outcome.results for name, outcome in outcomes.items()}
     mode = "stream" if all("stream" in results for results in found.values()) else "window"
@@ -61,7 +61,7 @@ def show_side_by_side(outcomes: Mapping[str, Outcome]) -> None:
 
 
 def show_latency(console: Console, record: Mapping[str, Any]) -> None:
-    """Print what a frame takes in the exported file that was asked for, and how large that is."""
+    """Print the time of a frame in the exported file that was asked for, and the file's size."""
     measured, precision = as_deployed(record), deployed_precision(record)
     file = "" if precision == "fp32" else f" in {precision}"
     console.print(
@@ -80,7 +80,7 @@ def show_latency(console: Console, record: Mapping[str, Any]) -> None:
 
 
 def size(measured: Mapping[str, Any]) -> str:
-    """Say how large the network is, and with the frozen VQ-VAE where it has one."""
+    """Describe the network's size, with and without the frozen VQ-VAE if it has one."""
     own, whole = measured["parameters"], measured["parameters_with_vqvae"]
     frozen = f" ({whole / 1e6:.2f} M with the frozen VQ-VAE)" if whole != own else ""
     return (
@@ -90,7 +90,7 @@ def size(measured: Mapping[str, Any]) -> str:
 
 
 def said(outcome: Outcome) -> str:
-    """Say which stages were made now and which existed already."""
+    """Say which stages were made now, and which existed already."""
     if not outcome.made:
         return f"run {outcome.run.id} is finished already; nothing was done (force=true does it again)"
     wanted = [stage for stage in STAGES if stage != "deployment" or "latency" in outcome.results]
@@ -100,7 +100,7 @@ def said(outcome: Outcome) -> str:
 
 
 def older_code(run: Run, changed: Sequence[str]) -> str:
-    """Return the warning that code changed since the run was made, though no recipe version was raised."""
+    """Return a warning that code has changed since the run was made, though no recipe version was raised."""
     names = ", ".join(changed[:5]) + (f" and {len(changed) - 5} more" if len(changed) > 5 else "")
     return (
         f"run {run.id} was made before the code of {names} changed, under the same recipe versions: "
@@ -109,7 +109,7 @@ def older_code(run: Run, changed: Sequence[str]) -> str:
 
 
 def source_tables(run: Run, stages: Sequence[str]) -> Iterator[Table]:
-    """Yield a table of the metrics on each source's test clips, where the run's data has several sources.
+    """Yield a table of the metrics on each source's test clips, if the run's data has several sources.
 
     Args:
         run: the run.

@@ -65,10 +65,10 @@ def tune(
 
 
 class Setup(NamedTuple):
-    """A search, where it is kept, and what makes its trials' runs.
+    """A search, its folder, and the settings of its trials' runs.
 
     Attributes:
-        search: what is searched.
+        search: the parsed search.
         words: the command line's overrides for all trials.
         outputs: the folder of runs and caches.
         folder: the folder of the search.
@@ -84,16 +84,16 @@ class Setup(NamedTuple):
     def overrides(self, values: Mapping[str, Value]) -> list[str]:
         """Return a trial's overrides: the search's base, the command line's, and the trial's values.
 
-        Trials are judged on validation alone, and exported and timed only where that is asked for.
+        Trials are judged on validation alone; they are exported and timed only if that is asked for.
         """
         return ["export.graph=off", *self.search.base, *self.words, *self.search.overrides(values)]
 
 
 def prepare_search(words: Sequence[str], config_dir: Path | None, outputs: Path) -> Setup:
-    """Return the search of a command line, its keys and ranges checked against the config.
+    """Return the search of a command line, with keys and ranges checked against the config.
 
     Raises:
-        InputError: naming the key that is wrong.
+        InputError: if a key is wrong; the message names it.
     """
     from memmlp.common.files import digest
     from memmlp.config.plugins import activate, named
@@ -114,7 +114,7 @@ def prepare_search(words: Sequence[str], config_dir: Path | None, outputs: Path)
 
 
 def _search_config(words: Sequence[str], config_dir: Path | None) -> dict[str, Any]:
-    """Compose the config of the search alone."""
+    """Compose only the part of the config that describes the search."""
     from memmlp.config.compose import composed_plain
 
     found = composed_plain("tune", words, config_dir).get("search")
@@ -124,16 +124,16 @@ def _search_config(words: Sequence[str], config_dir: Path | None) -> dict[str, A
 
 
 def _check_space(setup: Setup) -> str:
-    """Check the ranges of a search, and describe what a trial's numbers follow from.
+    """Check the ranges of a search, and describe what a trial's numbers depend on.
 
     Returns:
         A text that names the first trial's run, its interval of validations, and how its network is used. It
-        enters the digest in the name of the search's folder, so that another config or other data is another
-        search.
+        is part of the digest in the name of the search's folder, so that another config or other data makes
+        another search.
 
     Raises:
-        InputError: where a searched key is set on the command line or changes no training, or the config
-            refuses a value.
+        InputError: if a searched key is set on the command line or does not change the training, or if the
+            config refuses a value.
     """
     from memmlp.runs.identity import inference, trained_with
 
@@ -158,7 +158,7 @@ def _check_space(setup: Setup) -> str:
 
 
 def _tasks(setup: Setup, values: Mapping[str, Value]) -> list[Sequence[RunTask]]:
-    """Return the runs of a trial with these values, a list of tasks for each seed; the data is prepared."""
+    """Return the runs of a trial with these values, as a list of tasks for each seed; prepares the data."""
     from memmlp.config.plan_sweep import tasks_of
 
     experiments = _experiments(setup, values)
@@ -166,7 +166,7 @@ def _tasks(setup: Setup, values: Mapping[str, Value]) -> list[Sequence[RunTask]]
 
 
 def _experiments(setup: Setup, values: Mapping[str, Value]) -> list[Experiment]:
-    """Build the checked experiments of a trial: one with the config's seed, and one for each that follows."""
+    """Build the checked experiments of a trial: one for the config's seed, and one for each further seed."""
     from memmlp.config.build import build_experiment
     from memmlp.config.compose import composed
 
@@ -181,7 +181,7 @@ def _experiments(setup: Setup, values: Mapping[str, Value]) -> list[Experiment]:
 
 
 def show(setup: Setup) -> None:
-    """Print how far the search is."""
+    """Print the progress of the search."""
     from rich.console import Console
 
     from memmlp.sweep.search.progress_table import render
@@ -192,7 +192,7 @@ def show(setup: Setup) -> None:
 
 
 def search(setup: Setup, study: Study, workers: Workers) -> None:
-    """Bring the study to as many trials as are wanted."""
+    """Run the study until it has as many trials as are wanted."""
     from memmlp.sweep.plan import Plan
     from memmlp.sweep.search.director import Director, direct
     from memmlp.sweep.search.progress_table import SearchBoard
@@ -204,7 +204,7 @@ def search(setup: Setup, study: Study, workers: Workers) -> None:
 
 
 def leave(setup: Setup, study: Study) -> None:
-    """Write what the search found into its folder."""
+    """Write the results of the search into its folder."""
     from memmlp.config.package_data import packaged
     from memmlp.sweep.search import results
 
@@ -217,9 +217,9 @@ def leave(setup: Setup, study: Study) -> None:
 
 
 def summary(setup: Setup, study: Study) -> None:
-    """Print the best trials, what mattered, where everything lies, and the next command.
+    """Print the best trials, the importance of the keys, where the files are, and the next command.
 
-    Exits with 1 where no trial is complete.
+    Exits with 1 if no trial is complete.
     """
     from rich.console import Console
     from rich.text import Text

@@ -47,10 +47,10 @@ def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path)
 
 
 def predict(run: Run, clip: str, mode: str) -> Mapping[str, np.ndarray]:
-    """Return what a run's network makes of a test clip (`prediction_arrays`), on one thread of the CPU.
+    """Return a run's prediction for a test clip (`prediction_arrays`), computed on one thread of the CPU.
 
     Raises:
-        InputError: where the run's data is not prepared here any more, or there is no such clip.
+        InputError: if the run's data is no longer prepared here, or there is no such clip.
     """
     import torch
 

@@ -1,4 +1,4 @@
-"""`memmlp web`: a static site that times, plays and wears networks in the browser it is opened in."""
+"""`memmlp web`: a static site that times networks, plays clips and shows the wearer, in a browser."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from memmlp.live.web.networks import SiteNetwork
 
 BASE = ("profile=paper", "model=avatar_poser")
-"""What the bench compares with: AvatarPoser of the paper's size, with random weights."""
+"""The network with which the bench compares: AvatarPoser in the paper's size, with random weights."""
 
 
 CALIBRATION = 2  # clips: int8's ranges do not matter for the time
@@ -78,7 +78,7 @@ def web(
 
 
 def clips_of(opened: OpenedRun, count: int, seconds: float) -> list[SiteClip]:
-    """Return the middle of some test clips of a run, evenly spaced among all of them."""
+    """Return the middle parts of some test clips of a run, evenly spread over all of them."""
     import numpy as np
 
     from memmlp.live.web.clips import packed
@@ -89,7 +89,7 @@ def clips_of(opened: OpenedRun, count: int, seconds: float) -> list[SiteClip]:
 
 
 def network_of(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:
-    """Return a run's network as a site has it."""
+    """Return a run's network in the form that a site needs."""
     from memmlp.live.web.networks import SiteNetwork
     from memmlp.runs.identity import flatten
     from memmlp.runs.shown_name import run_name
@@ -101,7 +101,7 @@ def network_of(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:
 
 
 def base() -> SiteNetwork:
-    """Return AvatarPoser of the paper's size."""
+    """Return AvatarPoser in the paper's size."""
     from memmlp.config.build import untrained
     from memmlp.live.web.networks import SiteNetwork
 

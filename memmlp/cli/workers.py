@@ -1,4 +1,4 @@
-"""The workers of `memmlp sweep` and `memmlp tune`: which executor, how many, with which GPUs."""
+"""The workers of `memmlp sweep` and `memmlp tune`: their executor, number and GPUs."""
 
 from __future__ import annotations
 
@@ -34,9 +34,10 @@ class Workers:
     Attributes:
         executor: the executor's name.
         words: the executor's own settings, KEY -> VALUE of words like slurm.KEY=VALUE.
-        count: how many run at once; None leaves it to the machine.
-        gpus_per_worker: GPUs of a worker of this machine; None for 1 where there are any.
-        workers_per_gpu: the most workers that share a GPU of this machine; None for as many as it takes.
+        count: how many run at once; None for a number that fits the machine.
+        gpus_per_worker: GPUs of a worker on this machine; None for 1 if there are GPUs.
+        workers_per_gpu: the largest number of workers that share a GPU of this machine; None for as many as
+            are needed.
     """
 
     executor: str = "local"
@@ -70,7 +71,7 @@ class Workers:
         return None
 
     def script(self, folder: Path) -> str | None:
-        """Return the file that sbatch would be given; None for executors without one."""
+        """Return the file that sbatch would get; None for executors without one."""
         if self.executor != "slurm":
             return None
         from memmlp.sweep.executors.slurm import script
@@ -84,10 +85,10 @@ class Workers:
         return worker_count(shared or [], self.count, self.workers_per_gpu)
 
     def shares(self, devices: Iterable[str]) -> list[Share]:
-        """Return the shares of this machine's GPUs that local workers get for runs on devices of these names.
+        """Return the shares of this machine's GPUs that local workers get for runs on these devices.
 
         Raises:
-            InputError: where a run asks for a GPU that its worker can't have.
+            InputError: if a run asks for a GPU that its worker can't have.
         """
         from memmlp.sweep.executors.gpus import shares, visible_gpus
 
@@ -99,7 +100,7 @@ class Workers:
 
 
 def check_devices(wanted: Iterable[str], gpus: Share, executor: str) -> None:
-    """Check that the GPUs that runs ask for can be those of workers.
+    """Check that workers can have the GPUs for which runs ask.
 
     Args:
         wanted: the values of the key `device` of runs that may use a GPU.
@@ -107,7 +108,7 @@ def check_devices(wanted: Iterable[str], gpus: Share, executor: str) -> None:
         executor: the executor's name.
 
     Raises:
-        InputError: naming the key.
+        InputError: if they can't; the message names the key.
     """
     for name in wanted:
         if ":" in name:
@@ -122,13 +123,14 @@ def check_devices(wanted: Iterable[str], gpus: Share, executor: str) -> None:
 
 
 def logs(folder: Path) -> Path:
-    """Return the path of the workers' logs in the folder of a sweep or search, %j for a worker's number."""
+    """Return the path of the workers' logs for a sweep or search, with %j for a worker's number."""
     return folder / "workers" / "%j"
 
 
 def worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options about workers to a command, which gets what they say as `workers`, and the rest of
-    its overrides.
+    """Add the options about workers to a command, which gets their values as `workers`.
+
+    The command gets the remaining words as its overrides.
     """
     options = (
         click.option(
@@ -165,7 +167,7 @@ def worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def split_executor(words: Iterable[str]) -> tuple[str, dict[str, str], tuple[str, ...]]:
-    """Split words into the executor's name, its own settings, and Hydra's overrides.
+    """Split words into the executor's name, the executor's settings, and Hydra's overrides.
 
     Raises:
         InputError: for an unknown executor, or settings of another one.
@@ -190,7 +192,7 @@ def split_executor(words: Iterable[str]) -> tuple[str, dict[str, str], tuple[str
 
 
 def executor(workers: Workers, folder: Path, shared: list[Share], gpus: bool) -> Executor:
-    """Return the executor; its workers' logs lie in `folder`/workers.
+    """Return the executor; its workers' logs are in `folder`/workers.
 
     Args:
         workers: what the command line asks for.
@@ -220,19 +222,19 @@ def executor(workers: Workers, folder: Path, shared: list[Share], gpus: bool) ->
 
 
 def hire(folder: Path, plan: Plan, workers: Workers, devices: Iterable[str]) -> tuple[Path, Fleet]:
-    """Save the plan in a file of this process' own, and return that file with a fleet of workers for it.
+    """Save the plan in a file for this process alone, and return the file with a fleet of workers for it.
 
     No worker is started yet. Other processes that work on the same sweep have files of their own, so that
-    nobody changes the plan under this one's workers.
+    none of them changes the plan of this one's workers.
 
     Args:
-        folder: the folder of the sweep or search, where the workers' logs lie too.
+        folder: the folder of the sweep or search, which also holds the workers' logs.
         plan: the plan to work on.
         workers: what the command line asks for.
         devices: the values of the key `device` of the plan's runs.
 
     Raises:
-        InputError: where workers can't have the GPUs that are asked for.
+        InputError: if workers can't have the GPUs that are asked for.
     """
     from memmlp.config.worker_process import start_lone_worker, start_worker
     from memmlp.sweep.controller import Fleet

@@ -1,8 +1,8 @@
 """Data-parallel training of one run by several processes, as torchrun starts them.
 
 Every process draws the whole batch of a step, from the same seed, and works on its own rows, its share of the
-batch. What is learned from is the mean over all, so that the run is the one that a single process trains.
-Without torchrun there is one process, and nothing here does anything.
+batch. The gradients are averaged over all processes, so that the run is the same that a single process
+trains. Without torchrun there is one process, and the functions here have no effect.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ PATIENCE = timedelta(days=7)  # others may wait while the first process prepares
 
 
 class _Step:
-    """Where this process is: whether it works on its share of a batch."""
+    """The state of this process: whether it works on its share of a batch."""
 
     shared = False
 
@@ -38,17 +38,17 @@ def rank() -> int:
 
 
 def local_rank() -> int:
-    """Return this process' number among those of its machine, which is also that of its GPU."""
+    """Return this process' number among those on its machine, which is also the index of its GPU."""
     return int(os.environ["LOCAL_RANK"]) if size() > 1 else 0
 
 
 def first() -> bool:
-    """Return whether this is the process that writes."""
+    """Return whether this process is the first, which writes files."""
     return rank() == 0
 
 
 def connect(kind: str) -> None:
-    """Join the other processes, if that was not done before; `kind` is the device's, such as "cuda"."""
+    """Join the other processes, unless that was done before; `kind` is the device's kind, such as "cuda"."""
     from torch import distributed
 
     if size() == 1 or distributed.is_initialized():
@@ -61,7 +61,7 @@ def connect(kind: str) -> None:
 
 
 def leave() -> None:
-    """Part from the other processes, once all have the last message: one that still receives would abort."""
+    """Leave the other processes once all have received the last message; otherwise a late receiver aborts."""
     if size() > 1:
         from torch import distributed
 
@@ -70,7 +70,7 @@ def leave() -> None:
 
 
 def of_first(value: T) -> T:
-    """Return the first process' value in all of them."""
+    """Return the first process' value, in all processes."""
     if size() == 1:
         return value
     from torch import distributed
@@ -82,7 +82,7 @@ def of_first(value: T) -> T:
 
 @contextlib.contextmanager
 def sharing() -> Iterator[None]:
-    """Within this context, tensors are this process' share of the batch, if there are several processes."""
+    """Within this context, tensors are this process' share of a batch, if there are several processes."""
     _Step.shared = size() > 1
     try:
         yield
@@ -91,12 +91,12 @@ def sharing() -> Iterator[None]:
 
 
 def shared() -> bool:
-    """Return whether this process works on its share of a batch at this moment."""
+    """Return whether this process is working on its share of a batch."""
     return _Step.shared
 
 
 def own_rows(batch: Tensor) -> Tensor:
-    """Return this process' rows of a whole batch (B, ...), whose B the number of processes divides."""
+    """Return this process' rows of a whole batch (B, ...); the number of processes divides B."""
     return batch.chunk(size())[rank()] if _Step.shared else batch
 
 
@@ -117,7 +117,7 @@ def drawn(draw: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
 
     Args:
         draw: draws, given a tensor with the shape of the whole batch.
-        like: this process' rows (b, ...) of that tensor; of the others' only the shape counts.
+        like: this process' rows (b, ...) of that tensor; its values are not used for the other rows.
     """
     if not _Step.shared:
         return draw(like)
@@ -125,7 +125,7 @@ def drawn(draw: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
 
 
 def mean(values: Tensor) -> Tensor:
-    """Average a tensor over all processes, whose shares of the batch are equally large."""
+    """Return a tensor's mean over all processes, whose shares of the batch are equally large."""
     if size() == 1:
         return values
     from torch import distributed
@@ -148,7 +148,7 @@ def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
 
 
 def align(module: nn.Module) -> None:
-    """Give the first process' parameters and buffers to all, so that they can't drift apart."""
+    """Copy the first process' parameters and buffers to all processes, so that they can't drift apart."""
     if size() == 1:
         return
     from torch import distributed

@@ -7,15 +7,15 @@ BREAKING = ("Cc", "Cs", "Zl", "Zp")  # Unicode's controls, surrogates, separator
 
 
 def one_line(text: str) -> str:
-    r"""Return the text with every character that would break its line or a terminal as an escape, like \n."""
+    r"""Return the text with escapes for all characters that would break its line or a terminal, like \n."""
     return "".join(repr(c)[1:-1] if unicodedata.category(c) in BREAKING else c for c in text)
 
 
 class InputError(ValueError):
-    """Bad user input, told in one line that names the file or key, what is wrong and what is allowed.
+    """Bad user input; the message is one line that names the file or key, what is wrong and what is allowed.
 
-    The command line prints it without a traceback and exits with code 2. Its message is one line, even
-    if the name of a file in it has a line feed.
+    The command line prints it without a traceback and exits with code 2. Its message is one line, even if it
+    contains a file name with a line feed.
     """
 
     def __init__(self, message: str) -> None:
@@ -39,12 +39,12 @@ class TrainingDiverged(RuntimeError):
 
 
 class LeaseLost(RuntimeError):
-    """Another process took over what this one held, because it stood still for too long.
+    """Another process took over the folder that this one held, because this one stood still for too long.
 
-    What was to be written is not written. The message is one line; the exit code is 1.
+    What this process was about to write is not written. The message is one line; the exit code is 1.
     """
 
 
 def of_the_disk(error: Exception) -> bool:
-    """Return whether an error says that the disk is full or read-only, which is no run's fault."""
+    """Return whether an error means that the disk is full or read-only, which is no run's fault."""
     return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS)

@@ -1,6 +1,6 @@
 """Atomic writing of files, and JSON that can hold every number.
 
-JSON has no word for NaN and infinities: they are stored as the strings "nan", "inf" and "-inf".
+JSON has no NaN and infinities, so they are stored as the strings "nan", "inf" and "-inf".
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ def plain(value: Any) -> Any:
 
 
 def atomic_write(path: Path, content: bytes | str) -> None:
-    """Write a file whole or not at all, as `atomic_file` does."""
+    """Write a file completely or not at all, as `atomic_file` does."""
     with atomic_file(path) as file:
         file.write(content.encode() if isinstance(content, str) else content)
 
 
 @contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[BinaryIO]:
-    """Open a file to write that is there whole or not at all, even if the machine stops.
+    """Open a file for writing that will be complete or absent, even if the machine stops.
 
-    It is a temporary file, which is synced and renamed at the end.
+    It is written under a temporary name, then synced and renamed.
 
     Raises:
         LeaseLost: if this process held the file's folder and has lost it (memmlp.common.lease_fences).
@@ -90,7 +90,7 @@ def file_digest(path: Path) -> str:
 def digest(value: Any) -> str:
     """Return the SHA-256 digest (hex) of a value that JSON can hold.
 
-    What JSON can't hold enters as its text, so a dataclass has to be given as its `asdict`.
+    A value that JSON can't hold is converted to text, so a dataclass has to be given as its `asdict`.
     """
     return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()
 

@@ -1,4 +1,4 @@
-"""What of a training of mixed precision (`optim.precision=bf16`) is computed in float32 all the same."""
+"""Which parts of a mixed-precision training (`optim.precision=bf16`) are computed in float32 anyway."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import torch
 
 
 def in_float32(device: torch.device) -> AbstractContextManager[object]:
-    """Compute in float32 what is inside, in a training of mixed precision too.
+    """Compute in float32 within the context, even in a mixed-precision training.
 
-    Where precision is not mixed this is nothing, and nothing of it is in an exported graph.
+    Without mixed precision it has no effect, and it leaves nothing in an exported graph.
     """
     mixed = torch.is_autocast_enabled(device.type)
     return torch.autocast(device.type, enabled=False) if mixed else nullcontext()

@@ -1,14 +1,14 @@
-"""Leases: a folder belongs to one process at a time, whether or not the file system knows locks.
+"""Leases: a folder belongs to one process at a time, whether or not the file system supports locks.
 
-Whoever wants the folder makes the file of the next number, `.lease-N`, which only one can make. The highest
-number is the owner's; the owner touches its file every few seconds. A folder is let go by a claim of nobody
-with the next number, so that numbers only grow. Who may make the next claim:
+A process that wants the folder makes the file with the next number, `.lease-N`, which only one process can
+make. The highest number is the owner's; the owner touches its file every few seconds. A folder is released by
+a claim for nobody with the next number, so that numbers only grow. The next claim may be made by
 
-- anybody where the last one is nobody's, or of a process of this machine that is dead;
-- who has seen the last claim unchanged for longer than LEASE, by a clock of its own.
+- any process, if the last claim is nobody's or belongs to a dead process on this machine;
+- a process that has seen the last claim unchanged for longer than LEASE, by its own clock.
 
-The kernel's lock (`.lock`) is taken where it can be had. While another process has it, a claim is over only
-when its lease has expired. A lock that is free proves nothing: some file systems know none.
+The kernel's lock (`.lock`) is taken as well, if possible. While another process has it, a claim ends only
+when its lease has expired. A free lock proves nothing, since some file systems have no locks.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Lease:
         self.lost = False
 
     def check(self) -> None:
-        """Raise LeaseLost if another process made a later claim."""
+        """Raise LeaseLost if another process has made a later claim."""
         if not self.lost:
             self._look()
         if self.lost:
@@ -64,7 +64,7 @@ class Lease:
             )
 
     def _look(self) -> None:
-        """Touch the claim, which asks the server where folders are shared, and look for later claims."""
+        """Touch the claim, which reaches the server of a shared folder, and look for later claims."""
         try:
             os.utime(self.claims.path(self.number))
         except OSError as error:
@@ -75,7 +75,7 @@ class Lease:
 
     @contextlib.contextmanager
     def kept(self) -> Iterator[None]:
-        """Show signs of life for the time of the context, then let the folder go."""
+        """Show signs of life during the context, then release the folder."""
         ended = threading.Event()
         thread = threading.Thread(target=self._beat, args=(ended,), daemon=True)
         thread.start()
@@ -87,13 +87,13 @@ class Lease:
             self._release()
 
     def _beat(self, ended: threading.Event) -> None:
-        """Look after the claim until it is lost or `ended` is set."""
+        """Keep the claim alive until it is lost or `ended` is set."""
         while not (self.lost or ended.wait(BEAT)):
             with contextlib.suppress(OSError):
                 self._look()
 
     def _release(self) -> None:
-        """Claim the folder for nobody. Where the disk refuses it, the claim expires instead."""
+        """Claim the folder for nobody. If the disk refuses that, the claim expires instead."""
         with contextlib.suppress(OSError):
             if not self.lost and self.claims.make(self.number + 1):
                 self.claims.path(self.number).unlink(missing_ok=True)
@@ -104,7 +104,7 @@ class Lock:
 
     Args:
         folder: the folder in which claims are made.
-        name: the folder inside it that is held; by default it is `folder` itself.
+        name: the folder inside it that is locked; by default `folder` itself.
     """
 
     def __init__(self, folder: Path, name: str = ""):
@@ -116,11 +116,11 @@ class Lock:
     def hold(self, say: Callable[[str], None] | None = None, wait: bool = True) -> Iterator[Lease | None]:
         """Hold the lock, and yield the lease; None if another process has it.
 
-        Inside, everything that this process publishes below the folder is fenced: once another process took
-        the folder over, LeaseLost is raised instead.
+        Within the context, everything that this process publishes below the folder is fenced: once another
+        process has taken over the folder, LeaseLost is raised instead.
 
         Args:
-            say: told in one line whom this process waits for; by default the line goes to stderr.
+            say: gets a line about the process for which this one waits; by default the line goes to stderr.
             wait: whether to wait while another process has the lock.
         """
         key = (os.getpid(), threading.get_ident(), os.path.realpath(self.kernel))
@@ -142,15 +142,15 @@ class Lock:
 
     @property
     def owner(self) -> dict[str, Any] | None:
-        """What is known of the process that holds the lock; None if none does."""
+        """The description of the process that holds the lock; None if none does."""
         last = self.claims.last()
         return last.owner if last else None
 
     @property
     def held(self) -> bool | None:
-        """Whether the process that holds the lock lives, as far as is known; None if no process holds it.
+        """Whether the process that holds the lock is alive, as far as is known; None if no process holds it.
 
-        A process of another machine counts as living until its signs of life have stayed away for LEASE.
+        A process on another machine counts as alive until it has shown no sign of life for LEASE.
         """
         last, idle = self._look()
         if last is None or last.free:
@@ -158,12 +158,12 @@ class Lock:
         return last.lives or _open(last, idle)
 
     def settle(self, say: Callable[[str], None] | None = None) -> None:
-        """Watch the process that holds the lock until it is known whether it lives.
+        """Watch the process that holds the lock until it is known whether it is alive.
 
-        That takes up to LEASE where it is of another machine, and no time otherwise.
+        That takes up to LEASE for a process on another machine, and no time otherwise.
 
         Args:
-            say: told in one line that it takes time; by default the line goes to stderr.
+            say: gets a line if it takes time; by default the line goes to stderr.
         """
         first, idle = self._look()
         last = first
@@ -192,7 +192,7 @@ class Lock:
     def _take(self, stack: ExitStack) -> Lease | None:
         """Make the next claim if the last one is over, and return the lease; None if it is not.
 
-        What is to be undone afterwards goes on the stack.
+        Actions to be undone later are pushed on the stack.
         """
         last, idle = self._look()
         over = last is None or last.free or last.lives is False
@@ -208,7 +208,7 @@ class Lock:
             return lease
 
     def _claim(self, last: Claim | None) -> Lease | None:
-        """Make the claim after `last`; None where somebody else did, be it long ago."""
+        """Make the claim after `last`; None if another process has made it, even long ago."""
         number = last.number + 1 if last else 1
         if not self.claims.make(number, {**myself(), "since": now()}):
             return None
@@ -247,7 +247,7 @@ class Lock:
 
 
 def _open(claim: Claim | None, idle: float) -> bool:
-    """Return whether only time will tell if the claim's owner lives, after `idle` seconds without a sign."""
+    """Return whether only waiting can tell if the claim's owner lives, after `idle` seconds without sign."""
     return claim is not None and not claim.free and claim.lives is None and idle <= LEASE
 
 

@@ -14,12 +14,12 @@ from memmlp.common.liveness import lives
 
 
 class Claim(NamedTuple):
-    """A claim on a folder as it was seen.
+    """A claim on a folder, as it was read.
 
     Attributes:
-        number: its number.
-        text: what the claim's file holds.
-        touched: when it was touched last, nanoseconds of the file system's clock.
+        number: the claim's number.
+        text: the content of the claim's file.
+        touched: when the file was last touched, nanoseconds of the file system's clock.
     """
 
     number: int
@@ -28,10 +28,10 @@ class Claim(NamedTuple):
 
     @property
     def owner(self) -> dict[str, Any] | None:
-        """The process that made the claim; empty for nobody, None where that cannot be read.
+        """The process that made the claim; empty for nobody, None if that cannot be read.
 
-        An empty file is nobody's. Who writes into it later (see Claims.make) is stopped by the fence
-        (memmlp.common.lease_fences).
+        An empty file is nobody's. A process that writes into it later (see Claims.make) is stopped by the
+        fence (memmlp.common.lease_fences).
         """
         try:
             found = json.loads(self.text or "{}")
@@ -41,12 +41,12 @@ class Claim(NamedTuple):
 
     @property
     def free(self) -> bool:
-        """Whether the claim is nobody's."""
+        """Whether the claim belongs to nobody."""
         return self.owner == {}
 
     @property
     def lives(self) -> bool | None:
-        """Whether its owner is a living process of this machine; None if it is of another, or not known."""
+        """Whether its owner is a living process on this machine; None for another one, or if not known."""
         return lives(self.owner) if self.owner else None
 
 
@@ -70,7 +70,7 @@ class Claims:
         return sorted(int(match[1]) for match in found if match)
 
     def last(self) -> Claim | None:
-        """Return the claim that counts, the last one; None where there was never any."""
+        """Return the last claim, which is the valid one; None if there was never any."""
         while numbers := self.numbers():
             with contextlib.suppress(FileNotFoundError):  # it has been superseded meanwhile
                 return self._read(numbers[-1])
@@ -81,10 +81,10 @@ class Claims:
             return Claim(number, file.read(), os.fstat(file.fileno()).st_mtime_ns)
 
     def make(self, number: int, owner: dict[str, Any] | None = None) -> bool:
-        """Make a claim, by default nobody's, and return whether nobody else had made that one.
+        """Make a claim, by default nobody's, and return whether no other process had made it before.
 
-        An owner's claim is a link to a finished file, so that nobody sees it empty, which is nobody's. Where
-        links are not to be had it is written after it is made.
+        An owner's claim is a link to a finished file, so that no other process sees it empty, which would
+        mean nobody's. If links are not supported, the file is written after it is made.
         """
         text = json.dumps(owner) if owner else ""
         if not text:
@@ -102,19 +102,19 @@ class Claims:
         return True
 
     def _draft(self, number: int) -> Path:
-        """Return a name of its own for a claim in the making, under which the next owner removes it."""
+        """Return a unique name for a claim that is being made, under which the next owner can remove it."""
         stem = self.prefix.removesuffix("lease-")
         return self.folder / f"{stem}claim.lease-{number}.{uuid.uuid4().hex[:12]}.tmp"
 
     def remove_below(self, number: int) -> None:
-        """Remove superseded claims in ascending order: cut short, it leaves no earlier one as the last."""
+        """Remove superseded claims in ascending order: if cut short, it leaves no earlier one as the last."""
         for old in self.numbers():
             if old < number:
                 self.path(old).unlink(missing_ok=True)
 
 
 def _write_new(path: Path, text: str) -> bool:
-    """Write a file that is not there yet; return False where it is."""
+    """Write a new file; return False if it exists already."""
     try:
         handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
     except FileExistsError:
@@ -127,7 +127,7 @@ def _write_new(path: Path, text: str) -> bool:
 
 
 def _links(path: Path) -> int:
-    """Return how many names a file has; 0 where it is gone."""
+    """Return how many names a file has; 0 if it is gone."""
     try:
         return os.stat(path).st_nlink
     except FileNotFoundError:

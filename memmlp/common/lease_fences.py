@@ -1,9 +1,9 @@
-"""Fences: what a process writes below a folder that it holds by a lease, it writes as the lease's owner.
+"""Fences: a process that holds a folder by a lease can write below it only while it owns the lease.
 
-A lease has a number, and the next owner's is higher (memmlp.common.lease). Files are made under a temporary
-name that has the number, checked, and renamed. The next owner removes temporary files of lower numbers before
-it begins. So a process that wakes up after it was superseded, even between check and rename, finds that its
-file is gone, and publishes nothing.
+A lease has a number, and the next owner's is higher (memmlp.common.lease). A file is made under a temporary
+name that contains the number; the fence is checked, and the file renamed. The next owner removes temporary
+files of lower numbers before it begins. So a process that wakes up after it was superseded, even between
+check and rename, finds that its file is gone, and publishes nothing.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Fence(Protocol):
     number: int
 
     def check(self) -> None:
-        """Raise LeaseLost if the folder has another owner by now."""
+        """Raise LeaseLost if the folder has another owner now."""
 
 
 _FENCES: dict[Path, Fence] = {}
@@ -34,7 +34,7 @@ _FENCES: dict[Path, Fence] = {}
 
 @contextlib.contextmanager
 def fenced(folder: Path, fence: Fence) -> Iterator[None]:
-    """Let this process write below the folder only while the fence's check passes."""
+    """Within this context, let this process write below the folder only while the fence's check passes."""
     key = _real(folder)
     _FENCES[key] = fence
     try:
@@ -44,7 +44,7 @@ def fenced(folder: Path, fence: Fence) -> Iterator[None]:
 
 
 def fence_of(path: Path) -> Fence | None:
-    """Return the fence of the folder that the path lies in; None where this process holds none."""
+    """Return the fence of the folder that contains the path; None if this process holds none."""
     real = _real(path)
     return next((_FENCES[folder] for folder in (real, *real.parents) if folder in _FENCES), None)
 
@@ -52,25 +52,26 @@ def fence_of(path: Path) -> Fence | None:
 def check_owner(path: Path) -> None:
     """Raise LeaseLost if this process held the path's folder and has lost it.
 
-    To be called before a file is appended to or removed. A freeze after the check is not noticed there.
+    Call this before appending to a file or removing it. A freeze of the process after the check is not
+    noticed.
     """
     if fence := fence_of(path):
         fence.check()
 
 
 def temporary(path: Path) -> Path:
-    """Return a name for the unfinished form of a file, beside it and used by nobody else."""
+    """Return a unique name for the unfinished form of a file, beside the file."""
     fence = fence_of(path)
     owner = f"lease-{fence.number}." if fence else ""
     return path.with_name(f".{path.name}.{owner}{uuid.uuid4().hex[:12]}.tmp")
 
 
 def publish(unfinished: Path, path: Path) -> None:
-    """Give a finished file, or folder, its name.
+    """Give a finished file or folder its final name.
 
     Args:
-        unfinished: its name so far, from `temporary`.
-        path: its name.
+        unfinished: its present name, from `temporary`.
+        path: its final name.
 
     Raises:
         LeaseLost: if this process held the path's folder and has lost it.
@@ -84,7 +85,7 @@ def publish(unfinished: Path, path: Path) -> None:
 
 
 def remove_unfinished(folder: Path, number: int) -> None:
-    """Remove what owners with lower numbers left unfinished of a folder, and below it."""
+    """Remove unfinished files of owners with lower numbers, below a folder and of the folder itself."""
     for path in [*folder.rglob(".*.tmp"), *folder.parent.glob(f".{folder.name}.*.tmp")]:
         found = FENCED.match(path.name)
         if found and int(found[1]) < number:

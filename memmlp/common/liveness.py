@@ -1,7 +1,7 @@
-"""Whether a process lives: on this machine by its number, elsewhere by its signs of life.
+"""Whether a process is alive: on this machine by its number, elsewhere by its signs of life.
 
-A sign of life of another machine is never compared with this machine's clock, for clocks may be hours apart.
-What counts is for how long this process has seen no change in it.
+A sign of life from another machine is never compared with this machine's clock, since clocks may differ by
+hours. What counts is how long this process has seen no change in it.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ DEAD = ("Z", "X")  # states of a process that is over, though its parent has not
 
 @functools.cache
 def place() -> str:
-    """Return a digest of machine, start and container: within one, a number means one process."""
+    """Return a digest of machine, boot and container, within which a number identifies a process."""
     words = [platform.node(), _text(PROC / "sys/kernel/random/boot_id"), _link(PROC / "self/ns/pid")]
     return hashlib.sha256("\n".join(words).encode()).hexdigest()[:12]
 
 
 def myself() -> dict[str, Any]:
-    """Describe this process, so that `lives` can be asked about it wherever processes see the same files."""
+    """Describe this process, so that `lives` can be asked about it wherever the same files are visible."""
     return {"pid": os.getpid(), "born": _born(os.getpid()), "place": place()}
 
 
 def lives(process: Mapping[str, Any]) -> bool | None:
-    """Return whether a process that described itself lives; None where it is of another machine."""
+    """Return whether a process that described itself is alive; None if it is on another machine."""
     if process.get("place") != place():
         return None
     pid = int(process["pid"])
@@ -40,18 +40,18 @@ def lives(process: Mapping[str, Any]) -> bool | None:
 
 
 class Changes:
-    """Measures how long values have stayed unchanged, by this process' clock, which never jumps."""
+    """Measures how long values have been unchanged, by this process' clock, which never jumps."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic):
         self.clock = clock
         self.seen: dict[Hashable, tuple[object, float]] = {}
 
     def unchanged(self, key: Hashable, look: Callable[[], object]) -> float:
-        """Look at a thing, and return the seconds for which it surely was as it is now; 0 at the first look.
+        """Look at a value, and return the seconds for which it was certainly unchanged; 0 at the first look.
 
         Args:
-            key: the thing's name.
-            look: returns what is seen of it.
+            key: the value's name.
+            look: returns the value.
         """
         before = self.clock()  # if this process is frozen while it looks, the time must not count
         sight = look()
@@ -73,13 +73,13 @@ def _runs(pid: int) -> bool:
 
 
 def _born(pid: int) -> str | None:
-    """Return when a process was started, in the kernel's ticks, by which a number's next user differs."""
+    """Return when a process was started, in the kernel's ticks; the next process with its number differs."""
     fields = _stat(pid)
     return fields[19] if len(fields) > 19 else None
 
 
 def _stat(pid: int) -> list[str]:
-    """Return the kernel's fields of a process from its state on; none where there is no /proc."""
+    """Return the kernel's fields of a process, from its state on; empty without /proc."""
     return _text(PROC / str(pid) / "stat").rpartition(")")[2].split()
 
 

@@ -1,4 +1,4 @@
-"""Pinned packages of the npm registry, whose files pages are made of: fetched once, checked, and kept.
+"""Pinned packages from the npm registry, whose files are parts of pages: fetched once, checked, and kept.
 
 The registry is the one that npm would ask: `NPM_CONFIG_REGISTRY`, else what `npm config get registry` says,
 else `~/.npmrc`, else registry.npmjs.org. Tarballs are kept below the user's cache folder. They are read
@@ -37,9 +37,9 @@ class Package:
     """A package of one version.
 
     Attributes:
-        name: its name, with its scope where it has one.
-        version: its version.
-        integrity: its tarball's digest as npm writes it: "sha512-" and the digest in base 64.
+        name: the package's name, with its scope if it has one.
+        version: the package's version.
+        integrity: the digest of its tarball in npm's form: "sha512-" and the digest in base 64.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Package:
 
     @property
     def file(self) -> str:
-        """The tarball's name, as `npm pack` gives it."""
+        """The tarball's file name, as in `npm pack`."""
         return f"{self.name.removeprefix('@').replace('/', '-')}-{self.version}.tgz"
 
     def url(self, registry: str) -> str:
@@ -82,11 +82,11 @@ IWER = Package(  # a headset in software, for tests
 
 
 def read(package: Package, names: Collection[str]) -> dict[str, bytes]:
-    """Return files of a package, by their names in it, such as "dist/ort.min.mjs".
+    """Return files of a package, by their names in the package, such as "dist/ort.min.mjs".
 
     Raises:
-        InputError: where the package cannot be had.
-        KeyError: where it has no such file.
+        InputError: if the package can't be downloaded.
+        KeyError: if it has no such file.
     """
     found = {}
     with tarfile.open(tarball(package), "r:gz") as archive:
@@ -100,10 +100,10 @@ def read(package: Package, names: Collection[str]) -> dict[str, bytes]:
 
 
 def tarball(package: Package) -> Path:
-    """Return the tarball of a package, whose digest was checked; it is fetched where it is not kept yet.
+    """Return the tarball of a package, with its digest checked; it is fetched if it is not kept yet.
 
     Raises:
-        InputError: where it can't be fetched, or is not the file that is pinned.
+        InputError: if it can't be fetched, or does not have the pinned digest.
     """
     if (given := os.environ.get(FOLDER)) and (path := Path(given) / package.file).is_file():
         if _is(package, path.read_bytes()):
@@ -118,18 +118,18 @@ def tarball(package: Package) -> Path:
 
 
 def cache() -> Path:
-    """Return the folder in which tarballs are kept."""
+    """Return the folder where tarballs are kept."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "memmlp" / "npm"
 
 
 def registry() -> str:
-    """Return the address of the registry that npm is configured with."""
+    """Return the address of the registry with which npm is configured."""
     asked = next((value for key, value in os.environ.items() if key.upper() == "NPM_CONFIG_REGISTRY"), "")
     return asked or _of_npm() or _of_npmrc() or DEFAULT_REGISTRY
 
 
 def _of_npm() -> str | None:
-    """Return the registry that npm itself names; None without npm."""
+    """Return the registry that npm itself reports; None without npm."""
     npm = shutil.which("npm")
     if npm is None:
         return None
@@ -142,7 +142,7 @@ def _of_npm() -> str | None:
 
 
 def _of_npmrc() -> str | None:
-    """Return the registry that the user's npmrc names; None where it names none."""
+    """Return the registry in the user's npmrc; None if there is none."""
     path = Path(os.environ.get("NPM_CONFIG_USERCONFIG") or Path.home() / ".npmrc")
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -154,7 +154,7 @@ def _of_npmrc() -> str | None:
 
 
 def _download(package: Package, host: str) -> bytes:
-    """Fetch a package's tarball. Raises InputError where that fails, or another file comes."""
+    """Fetch a package's tarball. Raises InputError if that fails, or if the file is another one."""
     tell(f"fetch {package} from the npm registry; it is kept in {cache()}")
     try:
         with urllib.request.urlopen(package.url(host), timeout=SECONDS) as answer:
@@ -170,7 +170,7 @@ def _download(package: Package, host: str) -> bytes:
 
 
 def _way(package: Package) -> str:
-    """Return how to go on without the registry."""
+    """Say how to continue without the registry."""
     return f"allowed is also {FOLDER}=FOLDER with {package.file} in it, as npm pack {package} writes it"
 
 

@@ -1,8 +1,8 @@
-"""Who may ask the server of a page: this machine's own browser, or whoever has the token.
+"""Who may send requests to a page's server: this machine's own browser, or whoever has the token.
 
-At this machine's own address a request must name that address, since another name that leads here is DNS
-rebinding, and must not come from another site's page. At any other address each request needs the token: from
-the address that was printed, and from then on in a cookie, so that it stands in no history.
+At this machine's own address, a request must name that address, since another name that leads here is DNS
+rebinding, and must not come from another site's page. At any other address, each request needs the token:
+first in the printed address, and from then on in a cookie, so that the token is in no browser history.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class Access:
     """The rules of a server.
 
     Args:
-        host: the address that it serves at.
-        token: what requests need at another address than this machine's own; None for a new one.
+        host: the address at which the server listens.
+        token: what requests need at any address but this machine's own; None for a new random token.
 
     Attributes:
         token: the token; None at this machine's own address, which needs none.
@@ -37,7 +37,7 @@ class Access:
         self.token = None if loopback(host) else token or secrets.token_urlsafe(24)
 
     def allows(self, path: str, headers: Message, port: int) -> bool:
-        """Return whether a request may be answered: by its host, where it comes from, and its token."""
+        """Return whether a request may be answered, given its host, its origin and its token."""
         url = urllib.parse.urlsplit(path)
         if headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
             return headers.get("Sec-Fetch-Mode") == "navigate" and url.path == "/"
@@ -57,18 +57,18 @@ class Access:
         return dict(urllib.parse.parse_qsl(query)).get("token", "")
 
     def settled(self, token: str, port: int) -> Mapping[str, str]:
-        """Return the headers that lead to the page with the token in a cookie instead of its address."""
+        """Return the headers that redirect to the page with the token in a cookie instead of the address."""
         named = f"{COOKIE}_{port}={urllib.parse.quote(token)}"
         return {"Location": "/", "Set-Cookie": f"{named}; HttpOnly; SameSite=Strict; Path=/"}
 
     def url(self, name: str, port: int) -> str:
-        """Return the page's address, with the token where one is needed."""
+        """Return the page's address, with the token if one is needed."""
         ending = f"?token={urllib.parse.quote(self.token)}" if self.token else ""
         return f"http://{name}:{port}/{ending}"
 
 
 def loopback(host: str) -> bool:
-    """Return whether an address is 127.0.0.1 or localhost, at which nobody else can reach this machine."""
+    """Return whether an address is 127.0.0.1 or localhost, at which no other machine can reach this one."""
     try:
         return host == "localhost" or (ip_address(host).is_loopback and ip_address(host).version == 4)
     except ValueError:
@@ -76,7 +76,7 @@ def loopback(host: str) -> bool:
 
 
 def check_token(host: str, token: str | None) -> None:
-    """Raise InputError for a token that is not needed at an address, or too short."""
+    """Raise InputError for a token that is too short, or not needed at an address."""
     if token is not None and loopback(host):
         raise InputError("--token: goes with --host; this machine's own address needs none")
     if token is not None and len(token) < SHORTEST:

@@ -1,4 +1,4 @@
-"""What a package of one's own tells of its components: options of slots, metrics, recipe versions."""
+"""What a user's package declares about its components: options of slots, metrics, recipe versions."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ MEASURED = ("positions", "rotations")
 
 @dataclass(frozen=True)
 class Metric:
-    """A metric of one's own, measured on test clips where `evaluation.metrics` names it.
+    """A custom metric, measured on test clips if `evaluation.metrics` names it.
 
     Attributes:
         function: the dotted path of a function of the prediction and the truth of one clip, which returns one
             number; nothing is imported before it is needed.
         unit: the unit; empty for a number without one.
-        smallest: the smallest difference that matters, in the unit: what two methods may differ by and still
-            be called as good as each other.
-        better: "lower" or "higher", what is better.
-        of: what the function is given: "positions" (N, 22, 3), metres in the world at 60 Hz, in both
-            branches, or "rotations" (N, 22, 3, 3), local with the root's global, in the rotation branch.
-        recipe: raised when what the function computes changes.
+        smallest: the smallest difference that matters, in the unit: two methods may differ by this much and
+            still count as equally good.
+        better: which values are better, "lower" or "higher".
+        of: what the function gets: "positions" (N, 22, 3), metres in the world at 60 Hz, in both branches, or
+            "rotations" (N, 22, 3, 3), local except for the root's, which is global, in the rotation branch.
+        recipe: the recipe version, to be raised when the function's results change.
     """
 
     function: str
@@ -37,16 +37,18 @@ class Metric:
 
 @dataclass(frozen=True)
 class Plugin:
-    """What a package adds, in an attribute `plugin` of its module. A package without one adds nothing, but
-    configs may name its classes.
+    """What a user's package adds, given in an attribute `plugin` of its module.
+
+    A package without this attribute adds nothing, but configs may name its classes.
 
     Attributes:
-        conf: the folder of configs inside the package, whose options are beside memmlp's; it need not exist.
+        conf: the folder of configs inside the package, whose options are offered beside memmlp's; it need not
+            exist.
         schemas: the dotted path of the dataclass with an option's keys, by the option's name with its group:
             "memory_mean". An option without one has the keys of its slot.
-        recipes: numbers of components, such as {"memory.mean": 2}: raised when what one computes changes, so
-            that its runs are made again.
-        metrics: metrics of one's own by name, a word.
+        recipes: recipe versions of components, such as {"memory.mean": 2}, to be raised when a component's
+            results change, so that its runs are made again.
+        metrics: custom metrics by name, which is one word.
     """
 
     conf: str = "conf"
@@ -60,7 +62,7 @@ METRICS: dict[str, Metric] = {}
 
 
 def faults(plugin: Plugin) -> Iterator[str]:
-    """Yield what is wrong with what a package tells, a line each."""
+    """Yield what is wrong with a package's declarations, one line each."""
     for name, metric in plugin.metrics.items():
         if not re.fullmatch(r"[A-Za-z]\w*", name):
             yield f"metric '{name}': allowed is a word of letters, digits and _"

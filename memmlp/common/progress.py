@@ -1,4 +1,4 @@
-"""What is said of work that takes long: bars with the time left on a terminal, elsewhere lines for a log."""
+"""Progress reports on long work: bars with the time left on a terminal, elsewhere lines for a log."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ _SAY: ContextVar[Callable[[str], None] | None] = ContextVar("what is told of wor
 
 
 def to_log(line: str) -> None:
-    """Write a line to stderr, unless that is a terminal, which has the bars."""
+    """Write a line to stderr, unless stderr is a terminal, which has the bars."""
     if not sys.stderr.isatty():
         print(line, file=sys.stderr, flush=True)
 
 
 @contextmanager
 def telling(say: Callable[[str], None] = to_log) -> Iterator[None]:
-    """Hand the lines about work in this context to `say`: what begins, and now and then how far it is."""
+    """Send the lines about work in this context to `say`: what begins and, now and then, the progress."""
     token = _SAY.set(say)
     try:
         yield
@@ -38,14 +38,14 @@ def telling(say: Callable[[str], None] = to_log) -> Iterator[None]:
 
 
 def tell(line: str) -> None:
-    """Say a line about the work, such as what begins now, where somebody listens (`telling`)."""
+    """Report a line about the work, such as what begins now, to the listener set by `telling`, if any."""
     if say := _SAY.get():
         say(line)
 
 
 @contextmanager
 def during(name: str) -> Iterator[None]:
-    """Name what the work in this context is part of, such as a validation, wherever it is counted."""
+    """Name the larger work, such as a validation, to which work that is counted in this context belongs."""
     token = _DURING.set(name)
     try:
         yield
@@ -54,13 +54,13 @@ def during(name: str) -> Iterator[None]:
 
 
 class Count:
-    """How much of some work is done.
+    """Counts how much of some work is done.
 
-    A terminal shows it as a bar; who listens (`telling`) gets a line of it every EVERY seconds.
+    A terminal shows a bar; a listener (`telling`) gets a line every EVERY seconds.
 
     Args:
-        display: what draws the bar.
-        row: the bar's row in it.
+        display: draws the bar.
+        row: the bar's row in the display.
         unit: what is counted, such as frames.
     """
 
@@ -76,12 +76,12 @@ class Count:
             tell(self.line)
 
     def note(self, text: str) -> None:
-        """Replace the remark behind the numbers, such as the loss."""
+        """Replace the remark after the numbers, such as the loss."""
         self.display.update(self.row, note=text)
 
     @property
     def line(self) -> str:
-        """The work so far in a line, such as "Mem-MLP: 400 of 4000 steps, loss 2.31, 6 min left"."""
+        """The progress in a line, such as "Mem-MLP: 400 of 4000 steps, loss 2.31, 6 min left"."""
         task = self.display.tasks[0]
         far = f"{task.completed:.0f}" + ("" if task.total is None else f" of {task.total:.0f}")
         far = f"{far} {self.unit}".rstrip()
@@ -90,7 +90,7 @@ class Count:
 
 
 def duration(seconds: float) -> str:
-    """Return a time as text, in minutes where it is long."""
+    """Return a duration as text, in minutes if it is long."""
     return f"{seconds / 60:.0f} min" if seconds >= 90 else f"{seconds:.0f} s"
 
 
@@ -98,12 +98,12 @@ def duration(seconds: float) -> str:
 def counting(
     description: str, total: float | None, done: int = 0, shown: bool = True, unit: str = ""
 ) -> Iterator[Count]:
-    """Show how far some work is: description, bar, count, elapsed time, time left, and a note, on stderr.
+    """Show the progress of some work on stderr: description, bar, count, elapsed and remaining time, a note.
 
     Args:
-        description: what is worked on.
+        description: the name of the work.
         total: how much there is to do; None if that is not known.
-        done: how much of it was done before.
+        done: how much of it is done already.
         shown: whether this process shows it.
         unit: what is counted, such as frames.
     """
@@ -136,7 +136,7 @@ def progress_bar(
     Args:
         items: what to iterate over.
         description: the bar's label.
-        total: the number of items, where `items` does not know its length.
+        total: the number of items, if `items` has no length.
         unit: what the items are, such as frames.
     """
     if total is None and isinstance(items, Sized):

@@ -1,4 +1,4 @@
-"""How a command ends that was told to end: what it has begun is finished first."""
+"""How a command ends on request: what it has begun is finished first."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import Protocol
 
 
 class Closing(Protocol):
-    """What is to be finished."""
+    """An object that has to be finished."""
 
     def close(self) -> None:
-        """Finish it."""
+        """Finish the work."""
 
 
 @contextlib.contextmanager
 def closed_in_peace(thing: Closing) -> Iterator[None]:
-    """Close an object at the end of the context; a further Ctrl-C or SIGTERM does not interrupt that."""
+    """Close an object at the end of the context, even if another Ctrl-C or SIGTERM arrives meanwhile."""
     try:
         yield
     finally:
@@ -31,7 +31,7 @@ def closed_in_peace(thing: Closing) -> Iterator[None]:
 
 @contextlib.contextmanager
 def termination_interrupts() -> Iterator[None]:
-    """Take a request to end (SIGTERM) as a Ctrl-C."""
+    """Treat a request to end (SIGTERM) like a Ctrl-C."""
 
     def interrupt(number: int, frame: object) -> None:
         raise KeyboardInterrupt

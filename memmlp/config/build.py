@@ -1,4 +1,4 @@
-"""Build the objects that a composed config describes."""
+"""Builds the objects that a composed config describes."""
 
 from __future__ import annotations
 
@@ -64,11 +64,11 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
 
     Args:
         cfg: the config.
-        elsewhere: whether others will perform it, maybe on another machine, so that this one need not have
-            its device.
+        elsewhere: whether other processes will perform it, perhaps on another machine, so that this machine
+            need not have its device.
 
     Raises:
-        InputError: where the config's device, or the code of a component of one's own, is not there.
+        InputError: if the config's device, or the code of a custom component, does not exist here.
     """
     outputs = Path(cfg.paths.outputs)
     unrefined = build_experiment(_unrefined(cfg), elsewhere) if cfg.refiner is not None else None
@@ -100,20 +100,20 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
 
 
 def _unrefined(cfg: DictConfig) -> DictConfig:
-    """Return the config of the same network without its refiner, which is not made again nor shown."""
+    """Return the config of the same network without its refiner, not forced and without saved predictions."""
     bare = cfg.copy()
     bare.refiner, bare.force, bare.save_predictions = None, False, None
     return bare
 
 
 def build_upstream(cfg: DictConfig, config: dict[str, Any]) -> tuple[UpstreamTraining, ...]:
-    """Build how the runs are trained that a checked config's network builds upon, in order.
+    """Build the trainings of the upstream runs of a checked config's network, in order.
 
-    Upstream of a refiner is its network, and nothing else.
+    The only run upstream of a refiner is its network's.
 
     Args:
         cfg: the config.
-        config: the same, resolved.
+        config: the same config, resolved.
     """
     if cfg.refiner is not None:
         return ()
@@ -130,7 +130,7 @@ def build_upstream(cfg: DictConfig, config: dict[str, Any]) -> tuple[UpstreamTra
 
 
 def build_training(cfg: DictConfig, metrics: dict[str, UserMetric]) -> NetworkTraining | RefinerTraining:
-    """Build how a checked config's network is trained, or the refiner behind it."""
+    """Build the training of a checked config's network, or of the refiner behind it."""
     common = {"seed": cfg.seed, "optim": built(cfg.optim), "weighting": cfg.data.weighting}
     common |= {"shares": shares(cfg.data), "mirror": cfg.data.mirror, "metrics": metrics}
     if cfg.refiner is not None:
@@ -140,7 +140,7 @@ def build_training(cfg: DictConfig, metrics: dict[str, UserMetric]) -> NetworkTr
 
 
 def untrained(overrides: Sequence[str]) -> MotionModel:
-    """Build the network of a command line's overrides, with random weights, on the built-in body."""
+    """Build the network for a command line's overrides, with random weights, on the built-in body."""
     architecture = build_architecture(composed(list(overrides)))
     torch.manual_seed(0)
     codes = architecture.vqvae() if architecture.uses_codes else None
@@ -149,13 +149,13 @@ def untrained(overrides: Sequence[str]) -> MotionModel:
 
 
 def build_tracking(cfg: DictConfig) -> Tracking:
-    """Build what shows the config's runs elsewhere: any number of trackers."""
+    """Build the tracking of a config, which shows runs in any number of trackers."""
     outputs = Path(cfg.paths.outputs)
     return Tracking(tuple(built(node, outputs=outputs) for node in cfg.tracking.values()), outputs)
 
 
 def build_architecture(cfg: DictConfig) -> Architecture:
-    """Build the architecture of a checked config, which makes and loads its network."""
+    """Build the architecture of a checked config, which makes and loads the network."""
     network = build_network(cfg)
     if cfg.refiner is None:
         return network
@@ -184,7 +184,7 @@ def build_network(cfg: DictConfig) -> Architecture:
 
 
 def build_coordinates(name: str) -> Coordinates:
-    """Build the coordinates of that name, or of that path of a class of one's own."""
+    """Build the coordinates with that name, or those of a custom class with that path."""
     if name in COORDINATES:
         return COORDINATES[name]()
     found = located(name, "frame.coordinates")
@@ -196,7 +196,7 @@ def build_coordinates(name: str) -> Coordinates:
 
 
 def build_metrics(names: Iterable[str]) -> dict[str, UserMetric]:
-    """Return the metrics of one's own with these names."""
+    """Return the custom metrics with these names."""
     own = {name: METRICS[name] for name in names}
     return {
         name: UserMetric(located(metric.function, f"metric {name}"), metric.of)
@@ -210,13 +210,13 @@ def memory_class(cfg: DictConfig) -> type[Memory]:
 
 
 def build_loss(cfg: DictConfig) -> Callable[[frozenset[str]], Loss]:
-    """Return a function that makes the loss for the branches that a network has.
+    """Return a function that makes the loss for a network's branches.
 
-    Mem-MLP's loss is put together from the weighting, the hand term, a term of one's own and the branches. A
+    Mem-MLP's loss is put together from the weighting, the hand term, a custom term and the branches. A
     baseline's loss is complete and ignores the branches.
 
     Raises:
-        InputError: for a term beside a complete loss, or of a branch that the predictor lacks.
+        InputError: for a custom term beside a complete loss, or for a branch that the predictor lacks.
     """
     loss = built(cfg.loss)
     if isinstance(loss, Loss):
@@ -234,7 +234,7 @@ def build_loss(cfg: DictConfig) -> Callable[[frozenset[str]], Loss]:
 
 
 def build_deployment(cfg: DictConfig) -> Deployment | None:
-    """Build how a checked config's network is exported and timed; None where it is not to be."""
+    """Build the deployment of a checked config's network; None if it is not deployed."""
     return None if cfg.export.graph == "off" else Deployment(**cfg.export)
 
 
@@ -247,7 +247,7 @@ def build_ik(cfg: DictConfig) -> IK:
 def build_vqvae_optim(cfg: DictConfig, frames: int) -> Optim:
     """Build the optimisation of the VQ-VAE, whose length may be given in epochs.
 
-    An epoch is as many training frames as there are in the training part (`frames`).
+    An epoch has as many frames as the training part (`frames`).
     """
     own, often = cfg.vqvae, {name: cfg.optim[name] for name in ("checkpoint_every", "log_every")}
     steps = own.steps or math.ceil(own.epochs * frames / own.batch)
@@ -262,8 +262,8 @@ def config_of(run: Run, overrides: Sequence[str] = ()) -> DictConfig:
         overrides: KEY=VALUE words that replace keys of its config.
 
     Raises:
-        InputError: where the run is not finished, its config does not fit this version, an override is
-            wrong, or code of one's own is not here or nobody said that it may be imported.
+        InputError: if the run is not finished, its config does not fit this version, an override is wrong, or
+            custom code is not here or was not allowed to be imported.
     """
     check_trained(run)
     plugins.activate(plugins.named(overrides))
@@ -280,7 +280,7 @@ def config_of(run: Run, overrides: Sequence[str] = ()) -> DictConfig:
 
 
 def _override(cfg: DictConfig, word: str) -> None:
-    """Set a key of a typed config as a word KEY=VALUE says."""
+    """Set a key of a typed config as given by a word KEY=VALUE."""
     key, equals, _ = word.partition("=")
     if not equals:
         raise InputError(f"{word}: allowed is KEY=VALUE")

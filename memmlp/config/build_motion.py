@@ -1,4 +1,4 @@
-"""Build the motion source of a config's `data`. It needs no torch, so that finished work is found quickly."""
+"""Builds the motion source of a config's `data`, without torch, so that finished work is found quickly."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from memmlp.motion.preparing.splits import MixedSplit, SeededSplit, Split
 def build_motion(cfg: DictConfig) -> MotionSource:
     """Build the source of an experiment's motion.
 
-    A synthetic folder's name holds its length and seed, or the path and settings of a generator of one's own,
-    so that other settings and other generators never find stale files.
+    A synthetic folder's name contains its length and seed, or the path and settings of a custom generator, so
+    that other settings and generators never find stale files.
 
     Raises:
-        InputError: if a list of groups can't be read, two folders of a list have one name, or there is no
-            such generator.
+        InputError: if a list of groups can't be read, two folders of a list have the same name, or the
+            generator does not exist.
     """
     data = cfg.data
     root, split = _clips(data)
@@ -53,20 +53,20 @@ def _synthesize(folder: Path, minutes: float, seed: int) -> None:
 
 
 def shares(data: DictConfig) -> Mapping[str, float] | None:
-    """Return how often a training window is of each source; None where no source has a weight."""
+    """Return the relative weight of each source in training windows; None if no source has a weight."""
     weights = {name: source.get("weight") for name, source in (data.get("sources") or {}).items()}
     return weights if any(weights.values()) else None
 
 
 class _Clips(NamedTuple):
-    """Where the clips are, and how they are split."""
+    """The folders of the clips, and the split."""
 
     root: Root
     split: Split
 
 
 def _clips(data: DictConfig) -> _Clips:
-    """Return the folder or folders of the clips, and the split: each source is split by itself."""
+    """Return the folder or folders of the clips, and their split; each source is split separately."""
     split = built(data.split)
     if sources := data.get("sources"):
         folders = Folders({name: Path(source.root) for name, source in sources.items()})
@@ -80,7 +80,7 @@ def _clips(data: DictConfig) -> _Clips:
 
 
 def _own_split(split: SeededSplit, name: str, source: DictConfig) -> SeededSplit:
-    """Return the split of one source, with what ties its clips and the fractions that it has of its own."""
+    """Return the split of one source, with its own groups and fractions."""
     own = {part: source.get(part) for part in ("test", "val") if source.get(part) is not None}
     groups = [*split.groups, *(source.get("groups") or ())]
     try:

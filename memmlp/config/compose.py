@@ -1,4 +1,4 @@
-"""Compose and check configs from the overrides of a command line; every error is explained in one line."""
+"""Composes and checks configs from a command line's overrides; every error is explained in one line."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ CONFIG = "train"
 
 
 def parse(argv: Sequence[str]) -> tuple[argparse.Namespace, argparse.ArgumentParser]:
-    """Parse Hydra's command line, whose flags may stand anywhere among the overrides.
+    """Parse Hydra's command line; flags may be anywhere among the overrides.
 
     Raises:
         InputError: for flags that Hydra does not know or that are not allowed here.
@@ -51,10 +51,10 @@ def parse(argv: Sequence[str]) -> tuple[argparse.Namespace, argparse.ArgumentPar
 
 
 class UserConfigs(SearchPathPlugin):
-    """Tells Hydra, wherever it composes, of the folders of configs that are searched beside memmlp's."""
+    """Makes Hydra search further folders of configs beside memmlp's, wherever it composes."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Add the folders, after memmlp's own."""
+        """Add the folders after memmlp's own."""
         for provider, folder in plugins.folders():
             search_path.append(provider, f"file://{folder}")
 
@@ -73,7 +73,7 @@ def composed(overrides: Sequence[str]) -> DictConfig:
 
 
 def composed_plain(name: str, overrides: Sequence[str], folder: Path | None = None) -> dict[str, Any]:
-    """Compose a config that is not `memmlp train`'s and return it as plain dictionaries.
+    """Compose a config other than that of `memmlp train`, and return it as plain dictionaries.
 
     Args:
         name: the config's name.
@@ -101,8 +101,8 @@ def preflight(args: argparse.Namespace) -> list[DictConfig]:
 def _compose(args: argparse.Namespace, overrides: list[str]) -> DictConfig:
     """Compose the config of one job as Hydra does, but choose the options of groups only once for all jobs.
 
-    A sweep has many configs that differ in values alone, and nine tenths of the time go into reading and
-    merging the files of the groups. Folders of the user's own may change meanwhile, and are read each time.
+    A sweep has many configs that differ only in values, and reading and merging the files of groups takes
+    nine tenths of the time. Users' own folders may change meanwhile, so they are read each time.
     """
     parsed = OverridesParser.create().parse_overrides(overrides)
     own = args.config_name or args.config_path or args.config_dir or any(plugins.folders())
@@ -118,18 +118,18 @@ def _compose(args: argparse.Namespace, overrides: list[str]) -> DictConfig:
 
 
 def _chooses_option(override: Override, loader: ConfigLoaderImpl) -> bool:
-    """Return whether an override chooses an option of a group, by Hydra's rule; others set values."""
+    """Return whether an override chooses an option of a group, by Hydra's rule; others only set values."""
     return not isinstance(override.value(), dict) and loader.repository.group_exists(override.key_or_group)
 
 
 @functools.lru_cache(maxsize=64)
 def _with_options(*options: str) -> bytes:
-    """Return the config of `memmlp train` with options of groups, pickled: so it is copied the quickest."""
+    """Return the config of `memmlp train` with options of groups, pickled, as that is the fastest to copy."""
     return pickle.dumps(compose(CONFIG, list(options)))
 
 
 def _check_plugins(cfg: DictConfig) -> None:
-    """Check that the packages of one's own were known before the config was composed."""
+    """Check that users' packages were known before the config was composed."""
     for name in cfg.plugins:
         if name not in plugins.active():
             raise InputError(
@@ -165,7 +165,7 @@ def help_text(args: argparse.Namespace) -> str:
 
 @contextmanager
 def _hydra(args: argparse.Namespace) -> Iterator[None]:
-    """Initialise Hydra with the search path that the arguments ask for, the same as when the jobs run."""
+    """Initialise Hydra with the search path that the arguments ask for, as when the jobs run."""
     path = create_config_search_path(str(_folder(args.config_path or packaged("conf"), "--config-path")))
     if args.config_dir:
         own = f"file://{_folder(args.config_dir, '--config-dir')}"
@@ -178,7 +178,7 @@ def _hydra(args: argparse.Namespace) -> Iterator[None]:
 
 
 def _folder(name: str | Path, option: str) -> Path:
-    """Return the absolute path of the folder that an option names. Raises InputError where there is none."""
+    """Return the absolute path of the folder that an option names. Raises InputError if it does not exist."""
     if not Path(name).is_dir():
         raise InputError(f"{option} {name}: allowed is an existing folder")
     return Path(name).absolute()
@@ -195,7 +195,7 @@ def _jobs(args: argparse.Namespace) -> list[list[str]]:
 
 @contextmanager
 def _explained(overrides: Sequence[str]) -> Iterator[None]:
-    """Turn whatever composing raises into an InputError of one line."""
+    """Turn any error while composing into an InputError of one line."""
     try:
         yield
     except InputError:

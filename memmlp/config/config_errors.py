@@ -1,4 +1,4 @@
-"""Explain what Hydra and OmegaConf raise in one line that names the key and says what is allowed."""
+"""Explains errors of Hydra and OmegaConf in one line that names the key and says what is allowed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ WORDS = {int: "an integer", float: "a number", bool: "true or false", str: "text
 
 
 def explain(error: Exception, overrides: Sequence[str]) -> str:
-    """Return the line for an error that composing these overrides raised."""
+    """Return the line for an error that was raised while composing these overrides."""
     if isinstance(error, OverrideParseException):
         return f"{error.override}: cannot be read; allowed is KEY=VALUE, +KEY=VALUE or ~KEY"
     if isinstance(error, MissingConfigException):
@@ -43,7 +43,7 @@ def explain(error: Exception, overrides: Sequence[str]) -> str:
 
 
 def _missing_option(error: MissingConfigException) -> str:
-    """Explain that a group has no such option, or that there is no such config."""
+    """Explain that a group lacks an option, or that a config does not exist."""
     group, _, option = (error.missing_cfg_file or "").rpartition("/")
     if not error.options:
         return _first_line(error)
@@ -53,13 +53,13 @@ def _missing_option(error: MissingConfigException) -> str:
 
 
 def _offender(error: Exception) -> str | None:
-    """Return the override that Hydra was merging when it failed; None where it does not say."""
+    """Return the override that Hydra was merging when it failed; None if the error does not say."""
     match = re.match(r"Error merging override (.*)", str(error), re.DOTALL)
     return match[1] if match else None
 
 
 def _typed(error: OmegaConfBaseException, override: str | None) -> str:
-    """Explain what the schema refused: an unknown key, a value of the wrong type, or the removal of a key."""
+    """Explain what the schema rejected: an unknown key, a value of a wrong type, or a key's removal."""
     name = str(error.full_key or override)
     schema = error.object_type
     if not dataclasses.is_dataclass(schema) and ("SourceConfig" in str(error) or name.startswith(SOURCES)):
@@ -80,7 +80,7 @@ def _typed(error: OmegaConfBaseException, override: str | None) -> str:
 
 
 def _expected(name: str, schema: Any, error: OmegaConfBaseException) -> str:
-    """Return the type that the schema wants for a key, with its limits, in words."""
+    """Return in words the type and limits that the schema has for a key."""
     if not dataclasses.is_dataclass(schema):
         return f"{_words(error.ref_type)} ({_first_line(error)})"
     own = name.split(".")[-1]
@@ -92,7 +92,7 @@ def _expected(name: str, schema: Any, error: OmegaConfBaseException) -> str:
 
 
 def _words(hint: Any) -> str:
-    """Return a type in words."""
+    """Return a type, in words."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
         return " or ".join(dict.fromkeys(_words(part) for part in parts))
@@ -104,7 +104,7 @@ def _words(hint: Any) -> str:
 
 
 def _composition(text: str) -> str:
-    """Return Hydra's own complaint without its advice on other ways to write the command."""
+    """Return Hydra's own message without its advice on other ways to write the command."""
     ambiguous = re.match(r"Ambiguous value for argument '(.*)'", text)
     if ambiguous:
         return f"{ambiguous[1]}: more than one value; allowed is one, a list [a,b], or several with -m"

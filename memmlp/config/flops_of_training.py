@@ -1,4 +1,4 @@
-"""What the trainings of configs take, counted without doing them."""
+"""Counts the operations of configs' trainings without running them."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from memmlp.training.train_network import NetworkTraining
 from memmlp.training.training_flops import training_flops
 
 ELSEWHERE = ("seed", "data", "paths", "profile", "tracking", "evaluation", "export", "device", "threads")
-"""Groups and keys that a training's operations don't follow from."""
+"""Groups and keys on which a training's number of operations does not depend."""
 
 
 def flops_of(cfg: DictConfig) -> int:
     """Count the FLOPs of a checked config's training (see `memmlp.training.training_flops`).
 
     Raises:
-        InputError: for a refiner, whose training is not that of a network.
+        InputError: for a refiner, since its training is not counted.
     """
     training = build_training(cfg, {})
     if not isinstance(training, NetworkTraining):
@@ -45,7 +45,7 @@ def flops_of(cfg: DictConfig) -> int:
 def with_flops(runs: Mapping[str, RunsBySeed]) -> dict[str, RunsBySeed]:
     """Return finished runs with the FLOPs of their trainings, each counted from its own config.
 
-    Those of a run that is kept without its folder stay as they are.
+    Runs that are kept without their folders are left unchanged.
     """
     known: dict[str, int] = {}
 
@@ -64,13 +64,13 @@ def with_flops(runs: Mapping[str, RunsBySeed]) -> dict[str, RunsBySeed]:
 
 
 def predicted_flops(sweep: Sweep) -> dict[str, float]:
-    """Count the FLOPs of the training of the effects' control, with `scale.predict` in place of its cell.
+    """Count the FLOPs of training the effects' control arm, with `scale.predict` in place of its cell.
 
     Returns:
-        The number by these overrides as one line; empty where nothing is to be predicted.
+        The number, by these overrides as one line; empty if nothing is to be predicted.
 
     Raises:
-        InputError: where effects have different controls, whose trainings would not be one number.
+        InputError: if effects have different controls, whose trainings would have different numbers.
     """
     words = sweep.scale.predict if sweep.scale else ()
     controls = {other.own_overrides: other for _, other in in_cells(sweep)}

@@ -1,4 +1,4 @@
-"""Build a component from its config."""
+"""Builds a component from its config."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from memmlp.common.errors import InputError
 def built(node: DictConfig, **given: Any) -> Any:
     """Build the object that a slot's option stands for, or a constructor with its keys filled in.
 
-    All keys of the option but `name` become arguments, and so do those in `given`. An option with `_partial_`
-    gives a partial constructor, which is called once the rest of the arguments is known.
+    All keys of the option except `name` become arguments, and so do those in `given`. An option with
+    `_partial_` gives a partial constructor, which is called once the remaining arguments are known.
 
     Raises:
-        InputError: naming the class, where there is none or its constructor refuses the arguments.
+        InputError: if the class does not exist, or its constructor refuses the arguments; the message names
+            the class.
     """
     resolved: dict[str, Any] = OmegaConf.to_container(node, resolve=True)  # type: ignore[assignment]
     own = {key: value for key, value in resolved.items() if key != "name"}
@@ -34,7 +35,7 @@ def _reason(error: InstantiationException) -> str:
 
 
 def located(path: str, key: str) -> Any:
-    """Return the class or function at a dotted path. Raises InputError, naming the key, for none."""
+    """Return the class or function at a dotted path. Raises InputError, naming the key, if there is none."""
     try:
         return get_object(path)
     except (ImportError, ValueError, InstantiationException) as error:

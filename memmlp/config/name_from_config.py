@@ -1,4 +1,4 @@
-"""A run's name for people: what its config has that a default one has not, such as "memory=gru · seed 1"."""
+"""A run's readable name, which says how its config differs from the default, as in "memory=gru · seed 1"."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from memmlp.runs.shown_name import kind_words
 MOST = 6  # words
 BETWEEN = " · "
 OF_MODELS = ("ema",)
-"""Keys of a profile that a model sets; another value is seen where it is read."""
+"""Keys of a profile that a model sets; other values show up in the groups that read them."""
 
 
 def readable_name(kind: str, config: Mapping[str, Any]) -> str:
     """Return a name for a run.
 
-    Slots are named by their option, other keys by their value where it is not the option's own. Data is no
-    part of it, nor is where and how the run is made.
+    The name has the option of a slot, and the value of any other key that differs from the option's default.
+    It does not include the data, or where and how the run is made.
 
     Args:
         kind: the kind of run (see `Identity`).
@@ -49,7 +49,7 @@ def readable_name(kind: str, config: Mapping[str, Any]) -> str:
 
 
 def _differences(config: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the words for slots and keys that are not as `memmlp train` has them without overrides."""
+    """Yield words for slots and keys that differ from those of `memmlp train` without overrides."""
     profile = tuple(f"profile.{k}={_word(v)}" for k, v in _sizes(config).items())
     model = _option(config, "model")
     chosen = (f"model={model}",) if _shipped("model", model) else ()
@@ -68,7 +68,7 @@ def _differences(config: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _keys(config: Mapping[str, Any], default: Mapping[str, Any], foreign: list[str]) -> Iterator[str]:
-    """Yield words for the keys that have another value than by default; a component of one's own has none."""
+    """Yield words for the keys whose values differ from the default; a custom component has no default."""
     own, usual = flatten(config), {"data.weighting": "frames"} | flatten(default)
     for key in dict.fromkeys(
         [*trained_by(config), *trained_by(default)]
@@ -81,7 +81,7 @@ def _keys(config: Mapping[str, Any], default: Mapping[str, Any], foreign: list[s
 
 
 def _option(config: Mapping[str, Any], slot: str) -> str | None:
-    """Return the name of the option in a slot. Mem-MLP itself is no option with a name."""
+    """Return the name of the option in a slot; Mem-MLP itself has no name in the config."""
     return chosen(config, slot) or ("mem_mlp" if slot == "model" else None)
 
 
@@ -98,7 +98,7 @@ def _word(value: Any) -> str:
 
 @functools.lru_cache(maxsize=64)
 def _default(overrides: tuple[str, ...]) -> dict[str, Any]:
-    """Return the config of `memmlp train` with these overrides, beside whatever Hydra is busy with."""
+    """Return the config of `memmlp train` with these overrides, without disturbing Hydra's present work."""
     register()
     hydra = GlobalHydra.instance()
     before, hydra.hydra = hydra.hydra, None  # that of `memmlp train`, which has but one at a time
@@ -115,12 +115,12 @@ def _default(overrides: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _sizes(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a config's profile without what its model has set there."""
+    """Return a config's profile, without the keys that its model has set there."""
     return {key: value for key, value in (config.get("profile") or {}).items() if key not in OF_MODELS}
 
 
 def _profile(config: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the profile's name if it is not `small`, and the keys that are not as it has them."""
+    """Yield the profile's name unless it is `small`, and the keys that differ from that profile."""
     if not config:
         return
     values = {path.stem: _values(path) for path in sorted((packaged("conf") / "profile").glob("*.yaml"))}

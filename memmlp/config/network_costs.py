@@ -1,4 +1,4 @@
-"""Costs of networks that were not trained, for tables that show nothing else: their sizes and times."""
+"""Costs of networks that were not trained, for tables of costs alone: their sizes and times."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from memmlp.tables.measured_run import Measured, of_untrained
 def with_costs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> tuple[dict[str, RunsBySeed], tuple[str, ...]]:
     """Measure untrained networks for a sweep's arms that have no finished run.
 
-    Times are measured where the sweep's table shows some.
+    Times are measured only if the sweep's table shows any.
 
     Returns:
-        The runs by arm and seed, those networks among them, and flags that say so.
+        The runs by arm and seed, including those networks, and flags that say so.
 
     Raises:
         InputError: as `check_costs` does.
@@ -41,7 +41,7 @@ def with_costs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> tuple[dict[str, 
 
 
 def check_costs(sweep: Sweep) -> None:
-    """Check that a sweep's table shows costs alone. Raises InputError where it needs runs."""
+    """Check that a sweep's table shows costs alone. Raises InputError if it needs runs."""
     if beyond := [metric for metric in sweep.metrics if metric not in COSTS]:
         raise InputError(
             f"--untrained: sweep {sweep.name} shows {', '.join(beyond)}; "
@@ -50,10 +50,10 @@ def check_costs(sweep: Sweep) -> None:
 
 
 def measure_costs(overrides: tuple[str, ...], timed: bool) -> Measured:
-    """Measure the network of some overrides, with random weights, and the ONNX file of its live step.
+    """Measure the network for some overrides, with random weights, and the ONNX file of its live step.
 
     Args:
-        overrides: of the config.
+        overrides: the config's overrides.
         timed: whether its steps are timed, too, as a run's deployment times them.
     """
     from memmlp.deploy.export import export  # slow to import

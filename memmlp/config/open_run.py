@@ -1,6 +1,6 @@
-"""Open a finished run with its experiment and data, for the commands that look at it again.
+"""Opens a finished run with its experiment and data, for the commands that use it again.
 
-It lies in config because only config builds experiments from configs.
+This is in config because only config builds experiments from configs.
 """
 
 from __future__ import annotations
@@ -51,20 +51,20 @@ def open_run(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequ
         overrides: KEY=VALUE for keys of the evaluation and the export.
 
     Raises:
-        InputError: where there is no such run, an override would change its training, or its data is no
-            longer what it was trained and tested on.
+        InputError: if there is no such run, an override would change its training, or its data has changed
+            since it was trained and tested.
     """
     return open_found(find_run(outputs, name), device_name, overrides)
 
 
 def open_found(run: Run, device_name: str = "cpu", overrides: Sequence[str] = ()) -> OpenedRun:
-    """Open a run that was found already; see `open_run`."""
+    """Open a run that was already found; see `open_run`."""
     experiment = experiment_of(run, device_name, overrides)
     return OpenedRun(run, experiment, data_of(run, experiment))
 
 
 def data_of(run: Run, experiment: Experiment) -> Prepared:
-    """The prepared data of a run. Raises InputError where it is no longer what the run was trained on."""
+    """Return the prepared data of a run. Raises InputError if it has changed since the training."""
     # What it was trained on may be looked at, however much of its list that is: the digest proves it.
     data = replace(experiment.data, partial=True).prepare()
     if data.digest != run.manifest["data"]:
@@ -74,7 +74,7 @@ def data_of(run: Run, experiment: Experiment) -> Prepared:
 
 
 def experiment_of(run: Run, device_name: str = "cpu", overrides: Sequence[str] = ()) -> Experiment:
-    """The experiment of a finished run, without its data; raises InputError as `open_run` does."""
+    """Return the experiment of a finished run, without its data; raises InputError as `open_run` does."""
     experiment = replace(
         build_experiment(config_of(run, overrides), elsewhere=True), device=device(device_name)
     )
@@ -85,19 +85,25 @@ def experiment_of(run: Run, device_name: str = "cpu", overrides: Sequence[str] =
 
 
 def trained_network(run: Run, experiment: Experiment) -> MotionModel:
-    """The trained network of a run, in evaluation mode, on the experiment's device."""
+    """Return the trained network of a run, in evaluation mode, on the experiment's device."""
     return experiment.architecture.load(run.weights()).to(experiment.device)
 
 
 def clip_of(test: MotionDataset, name: str, key: str = "--clip") -> Tensor:
-    """All frames (N, 252) of a test clip. Raises InputError where there is none of that name."""
+    """Return all frames (N, 252) of a test clip. Raises InputError if there is no clip with that name."""
     return test.clip(clip_index(test, name, key))
 
 
 def clip_index(test: MotionDataset, name: str, key: str = "--clip") -> int:
-    """The place of a test clip. Raises InputError, which lists them, where there is none of that name.
+    """Return the index of a test clip.
 
-    key: what the name was given as, for that line.
+    Args:
+        test: the test clips.
+        name: the clip's name.
+        key: the option or argument that gave the name, for the error.
+
+    Raises:
+        InputError: if there is no clip with that name; the message lists the names.
     """
     if name not in test.names:
         raise InputError(

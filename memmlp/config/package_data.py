@@ -1,4 +1,4 @@
-"""The folders that travel with the package: conf and sweeps."""
+"""The folders of data in the package: conf and sweeps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import memmlp
 def packaged(name: str) -> Path:
     """Return the folder `conf` or `sweeps`.
 
-    In a checkout it lies beside the package. In an installed package it lies inside, named `_conf` or
+    In a checkout, the folder is beside the package. In an installed package, it is inside, named `_conf` or
     `_sweeps`.
     """
     package = Path(memmlp.__file__).resolve().parent

@@ -1,9 +1,9 @@
-"""Make the plan of a sweep file: every arm is composed, checked and given its run's identity.
+"""Makes the plan of a sweep file: every arm is composed and checked, and gets its run's identity.
 
-It lies in config because only config composes.
+This is in config because only config composes.
 
-Composing takes a moment for each arm. So the plan of a sweep that was started is kept, and used again as long
-as the sweep, the configs, the code and the data are unchanged.
+Composing takes a moment for each arm. So the plan of a sweep that was started is kept, and used again for as
+long as the sweep, the configs, the code and the data are unchanged.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ if TYPE_CHECKING:
 
 
 def find_sweep(name: str, overrides: Sequence[str] = ()) -> Sweep:
-    """Load the sweep of a path, of a shipped file's name, or of a table's number.
+    """Load the sweep with a path, a shipped file's name, or a table's number.
 
-    Packages of one's own that its base or the overrides name are in use afterwards.
+    Users' packages that its base or the overrides name are in use afterwards.
 
     Args:
         name: the path, name or number.
         overrides: the command line's overrides (see `Sweep.with_overrides`).
 
     Raises:
-        InputError: where there is none, or the file is wrong.
+        InputError: if there is no such sweep, or its file is wrong.
     """
     activate(named(overrides))
     return load_sweep(_path(name), lambda base: activate(named(base))).with_overrides(overrides)
 
 
 def _path(name: str) -> Path:
-    """Return the file of a sweep. Raises InputError where there is no shipped one of that name."""
+    """Return the file of a sweep. Raises InputError if there is no shipped sweep with that name."""
     if is_path(name):
         return Path(name)
     folder = packaged("sweeps")
@@ -63,16 +63,16 @@ def is_path(name: str) -> bool:
 
 
 def sweep_folder(sweep: Sweep, outputs: Path) -> Path:
-    """Return the folder of a sweep with its overrides, where its plan and its workers' logs are kept."""
+    """Return the folder of a sweep with its overrides, which holds its plan and its workers' logs."""
     key = f"-{digest(sweep.command_line)[:8]}" if sweep.command_line else ""
     return outputs / "sweeps" / f"{sweep.name}{key}"
 
 
 def make_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
-    """Return the plan of a sweep, the kept one where it still holds.
+    """Return the plan of a sweep: the kept plan if it is still valid.
 
-    A look at a sweep that was never started leaves nothing in the outputs, and one at fewer of its seeds, or
-    while its data is not there, leaves the kept plan as it is.
+    Looking at a sweep that was never started writes nothing into the outputs. Looking at fewer of its seeds,
+    or while its data is absent, leaves the kept plan unchanged.
 
     Args:
         sweep: the sweep with the command line's overrides.
@@ -81,7 +81,7 @@ def make_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
             identity and are left out.
 
     Raises:
-        InputError: naming arm and key, where a config is wrong.
+        InputError: if a config is wrong; the message names arm and key.
     """
     path = sweep_folder(sweep, outputs) / "plan_stamp.json"
     if not prepare and not path.parent.is_dir():
@@ -101,14 +101,14 @@ def make_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
 
 
 def _has_all(sweep: Sweep, plan: Plan, path: Path) -> bool:
-    """Return whether a plan has all entries of the kept one, but for those of arms that are gone."""
+    """Return whether a plan has all entries of the kept plan, except those of arms that are gone."""
     labels = {arm.label for arm in sweep.arms}
     cells = {(one.get("label"), one.get("seed")) for one in read_json(path).get("entries", ())}
     return {cell for cell in cells if cell[0] in labels} <= {(one.label, one.seed) for one in plan.entries}
 
 
 def plan_anew(sweep: Sweep, outputs: Path) -> Plan:
-    """Return the plan of a sweep as far as its data is prepared, and leave nothing in the outputs.
+    """Return the plan of a sweep as far as its data is prepared, and write nothing into the outputs.
 
     Raises:
         InputError: as `make_plan` does.
@@ -117,7 +117,7 @@ def plan_anew(sweep: Sweep, outputs: Path) -> Plan:
 
 
 def orphans(sweep: Sweep, plan: Plan) -> list[Entry]:
-    """Return the begun runs of earlier versions of the sweep that it no longer has.
+    """Return the begun runs of earlier versions of the sweep that the sweep no longer has.
 
     Their arm's label is gone, or the arm has another config now.
     """
@@ -136,7 +136,7 @@ def orphans(sweep: Sweep, plan: Plan) -> list[Entry]:
 
 
 def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[str, Any]] | None]:
-    """Make the plan, and list the data that it relies on; None for the list where some is not prepared."""
+    """Make the plan, and list the data that it relies on; the list is None if some data is not prepared."""
     planned: list[tuple[Entry, list[RunTask]]] = []
     data: dict[str, dict[str, Any]] = {}
     complete = True
@@ -154,7 +154,7 @@ def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[s
 
 
 def _experiments(sweep: Sweep, arm: Arm, outputs: Path) -> Iterable[tuple[int, Experiment]]:
-    """Yield the checked experiments of an arm with their seeds."""
+    """Yield the checked experiments of an arm, with their seeds."""
     from memmlp.config.build import build_experiment
     from memmlp.config.compose import composed
 
@@ -170,7 +170,7 @@ def _experiments(sweep: Sweep, arm: Arm, outputs: Path) -> Iterable[tuple[int, E
 
 
 def tasks_of(experiment: Experiment, data: str) -> list[RunTask]:
-    """Return the runs that an experiment needs on prepared data with this digest, its own run last."""
+    """Return the runs that an experiment needs on data with this digest, its own run last."""
     own = experiment.identity(data)
     upstream = [
         RunTask(one.id, one.kind, experiment.config, one.upstream.id if one.upstream else None)
@@ -184,7 +184,7 @@ def tasks_of(experiment: Experiment, data: str) -> list[RunTask]:
 
 
 def _data_digest(experiment: Experiment, prepare: bool, known: dict[str, dict[str, Any]]) -> str | None:
-    """Return the digest of the experiment's prepared data; None where it is not prepared.
+    """Return the digest of the experiment's prepared data; None if it is not prepared.
 
     The digest is looked up once for each data config and kept in `known`.
     """
@@ -201,7 +201,7 @@ def _data_digest(experiment: Experiment, prepare: bool, known: dict[str, dict[st
 def _fresh(data: dict[str, Any], prepare: bool) -> bool:
     """Return whether the data that a kept plan relies on is unchanged, and if `prepare`, fit to train on.
 
-    Which of its clips belong together counts, too: evaluations have their identity from it.
+    The groups of clips count, too, since identities of evaluations depend on them.
     """
     from omegaconf import OmegaConf
 
@@ -217,9 +217,9 @@ def _fresh(data: dict[str, Any], prepare: bool) -> bool:
 
 
 def _stamp(sweep: Sweep, outputs: Path) -> str:
-    """Return a digest of everything but the data that a plan follows from.
+    """Return a digest of everything except the data on which a plan depends.
 
-    That is the sweep, the outputs folder, the configs, and the package's code, with those of one's own.
+    That is the sweep, the outputs folder, the configs, and the code of memmlp and of users' packages.
     """
     package = Path(__file__).parent.parent
     files = [*packaged("conf").rglob("*.yaml"), *package.rglob("*.py")]
@@ -229,7 +229,7 @@ def _stamp(sweep: Sweep, outputs: Path) -> str:
 
 
 def _remember(sweep: Sweep, plan: Plan, path: Path) -> None:
-    """Add the plan's entries to the record of all entries that the sweep ever had."""
+    """Add the plan's entries to the record of all entries that the sweep has ever had."""
     before = read_json(path).get("entries", [])
     every = {(e["label"], e["seed"], e["id"]): e for e in [*before, *map(asdict, plan.entries)]}
     write_json(path, {"entries": list(every.values())})

@@ -1,9 +1,9 @@
-"""Packages with components of one's own: which are in use, and whose code a run may so name.
+"""Users' packages with custom components: which are in use, and whose code a run may therefore name.
 
 A package is used where the user's command (`plugins=[NAME]`, `--plugins NAME`) or script (`load_run(ID,
 plugins=[NAME])`), a sweep's base, the environment (MEMMLP_PLUGINS) or an installed entry point of the group
 `memmlp.plugins` names it. Reading a run imports no package by itself: a run's folder may come from anybody,
-and any module that lies on the path (a script in the current folder, too) would do something when imported.
+and any module on the path (even a script in the current folder) would be executed by an import.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ _own: ContextVar[Path | None] = ContextVar("config_dir", default=None)
 
 
 def activate(names: Iterable[str] = ()) -> None:
-    """Use packages: those named, those of the environment, and installed ones with an entry point.
+    """Use packages: the named ones, those in the environment, and installed ones with an entry point.
 
     Raises:
-        InputError: naming the package, where it can't be imported or something that it tells is wrong.
+        InputError: if a package can't be imported, or declares something wrong; the message names it.
     """
     for name in (*installed(), *in_environment(), *names):
         if name not in _active:
@@ -66,7 +66,7 @@ def in_environment() -> list[str]:
 
 
 def listed(words: str) -> list[str]:
-    """Return the names between commas."""
+    """Return the names in a text, which are separated by commas."""
     return [name.strip() for name in words.split(",") if name.strip()]
 
 
@@ -89,14 +89,14 @@ def active() -> Mapping[str, Plugin]:
 
 
 def folders() -> list[tuple[str, Path]]:
-    """Return the folders of configs that are searched beside memmlp's: by name of the package, and own."""
+    """Return the folders of configs searched beside memmlp's: the packages', by name, and the user's."""
     own = _own.get()
     return [*_folders.items(), *([("command-line", own)] if own else [])]
 
 
 @contextmanager
 def searching(folder: Path | None) -> Iterator[None]:
-    """Search a folder of the user's own configs, the one of `--config-dir`, for a while."""
+    """Search a folder of the user's own configs, that of `--config-dir`, within the context."""
     token = _own.set(folder.absolute() if folder else None)
     try:
         yield
@@ -105,20 +105,20 @@ def searching(folder: Path | None) -> Iterator[None]:
 
 
 def words() -> list[str]:
-    """Return the words `--config-dir FOLDER` for a command that is to search the same folder, or none."""
+    """Return the words `--config-dir FOLDER` for a command that should search the same folder, or none."""
     own = _own.get()
     return ["--config-dir", str(own)] if own else []
 
 
 def texts() -> list[tuple[str, str]]:
-    """Return code and configs that are no part of memmlp, as (name, text): a plan depends on them."""
+    """Return code and configs from outside memmlp, as (name, text), on which a plan depends."""
     found = [(f"{name}:{file}", text) for name in _active for file, text in package_sources(name).items()]
     paths = [path for _, folder in folders() for path in sorted(folder.rglob("*.yaml"))]
     return [*found, *((str(path), path.read_text(encoding="utf-8")) for path in paths)]
 
 
 def _use(name: str) -> None:
-    """Import a package, and let everything know what it tells."""
+    """Import a package, and register everything that it declares."""
     module = _imported(name)
     plugin = getattr(module, "plugin", None)
     plugin = plugin if isinstance(plugin, Plugin) else Plugin()
@@ -136,7 +136,7 @@ def _use(name: str) -> None:
 
 
 def _add_schemas(name: str, plugin: Plugin) -> None:
-    """Make the schemas of a package's options known. Raises InputError for one that is none of its slot."""
+    """Register the schemas of a package's options. Raises InputError for one that does not fit its slot."""
     if not plugin.schemas:
         return
     from memmlp.config.schema import add_schema
@@ -150,7 +150,7 @@ def _add_schemas(name: str, plugin: Plugin) -> None:
 
 
 def _imported(name: str) -> ModuleType:
-    """Import the package. Raises InputError where there is none, or it raises something itself."""
+    """Import the package. Raises InputError if it does not exist, or if it raises an error itself."""
     if not NAME.fullmatch(name) or _reserved(name):
         raise InputError(f"plugins: '{name}'; allowed is the name of a package of your own")
     try:
@@ -177,7 +177,7 @@ def _folder(module: ModuleType, plugin: Plugin) -> Path:
 
 
 def _taken(plugin: Plugin) -> Iterator[str]:
-    """Yield the names that something else has already."""
+    """Yield the declared names that are already taken."""
     from memmlp.sweep.spec import COSTS
 
     for name in plugin.metrics:
@@ -189,7 +189,7 @@ def _taken(plugin: Plugin) -> Iterator[str]:
 
 
 def _hidden(module: ModuleType, plugin: Plugin) -> Iterator[str]:
-    """Yield the package's options that one of memmlp or of another package would hide."""
+    """Yield those of the package's options that an option of memmlp or another package would hide."""
     folder = _folder(module, plugin)
     for path in sorted(folder.rglob("*.yaml")):
         option = path.relative_to(folder)
@@ -198,7 +198,7 @@ def _hidden(module: ModuleType, plugin: Plugin) -> Iterator[str]:
 
 
 def foreign(config: Mapping[str, Any]) -> list[str]:
-    """Return the paths of the classes and functions outside of memmlp that a config names."""
+    """Return the paths of classes and functions outside memmlp that a config names."""
     flat = flatten(config)
     paths = [str(value) for key, value in flat.items() if key.rsplit(".", 1)[-1] == "_target_"]
     coordinates = str(flat.get("frame.coordinates", ""))
@@ -207,13 +207,13 @@ def foreign(config: Mapping[str, Any]) -> list[str]:
 
 
 def owner(path: str) -> str:
-    """Return the package in use that a path lies in; where there is none, the first name of the path."""
+    """Return the package in use that contains a path, or else the path's first name."""
     fits = [name for name in _active if path.startswith(f"{name}.")]
     return max(fits, key=len, default=path.split(".")[0])
 
 
 def used(config: Mapping[str, Any]) -> list[str]:
-    """Return the packages that a config's classes and metrics come from, and see that they are in use."""
+    """Return the packages of a config's classes and metrics, after a check that they are in use."""
     measured = (config.get("evaluation") or {}).get("metrics") or ()
     paths = [known.METRICS[name].function for name in measured if name in known.METRICS]
     found = sorted({owner(path) for path in [*foreign(config), *paths]})
@@ -222,12 +222,12 @@ def used(config: Mapping[str, Any]) -> list[str]:
 
 
 def check_allowed(config: Mapping[str, Any], recorded: Mapping[str, Any], where: str) -> None:
-    """Check that the code which a recorded config names may be imported.
+    """Check that the code named in a recorded config may be imported.
 
     Args:
         config: the config.
-        recorded: what was recorded of the packages that made the run, by name.
-        where: what the config is of, for the error.
+        recorded: the recorded facts about the packages that made the run, by name.
+        where: what the config belongs to, for the error.
 
     Raises:
         InputError: one line that names the package, and what to do.
@@ -245,7 +245,7 @@ def check_allowed(config: Mapping[str, Any], recorded: Mapping[str, Any], where:
 
 
 def _defined(path: str, name: str) -> bool:
-    """Return whether a package defines what lies at a path, and does not only import it: mine.os.system."""
+    """Return whether a package defines what is at a path, and not only imports it, as mine.os.system."""
     from memmlp.config.instantiate import located
 
     module = getattr(located(path, name), "__module__", "") or ""
@@ -253,7 +253,7 @@ def _defined(path: str, name: str) -> bool:
 
 
 def _refusal(name: str, recorded: Mapping[str, Any]) -> str:
-    """Say why a package's code is not imported, and what to do."""
+    """Say why a package's code is not imported, and what to do about it."""
     version = (recorded.get(name) or {}).get("version")
     said = f"{name} {version}" if version else name
     if not NAME.fullmatch(name) or importlib.util.find_spec(name.split(".")[0]) is None:

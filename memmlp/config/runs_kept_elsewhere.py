@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 
 
 class SharedRuns(NamedTuple):
-    """A sweep's runs with those of other sweeps' kept results among them.
+    """A sweep's runs, including those from other sweeps' kept results.
 
     Attributes:
         runs: the runs by the arm's label and the seed.
-        files: the names of the files that some were taken from.
-        flags: what a reader has to know of these.
-        skipped: a line for each file that could not be used, and why.
+        files: the names of the files from which some were taken.
+        flags: what a reader has to know about these.
+        skipped: a line for each file that could not be used, with the reason.
     """
 
     runs: Mapping[str, RunsBySeed]
@@ -37,11 +37,11 @@ class SharedRuns(NamedTuple):
 
 
 def with_kept(found: Mapping[str, RunsBySeed], plan: Plan, files: Iterable[Path]) -> SharedRuns:
-    """Return a sweep's runs with those added that are kept in files of other sweeps' results.
+    """Return a sweep's runs, with runs added from files of other sweeps' kept results.
 
-    A kept run stands for an entry only if its file's sweep, planned today, has the same run with the same
-    evaluations and deployment there, and no recipe of it has changed since. An evaluation's defaults that
-    changed without a recipe are not seen.
+    A kept run is used for an entry only if its file's sweep, planned now, has the same run with the same
+    evaluations and deployment, and none of its recipe versions has changed since. Changed defaults of an
+    evaluation are not noticed if its recipe version is unchanged.
 
     Args:
         found: the sweep's own finished runs by the arm's label and the seed.
@@ -49,7 +49,7 @@ def with_kept(found: Mapping[str, RunsBySeed], plan: Plan, files: Iterable[Path]
         files: files of kept results.
 
     Raises:
-        InputError: where a file holds no results.
+        InputError: if a file has no results.
     """
     from memmlp.report.kept_results import load_kept
 
@@ -74,13 +74,13 @@ def with_kept(found: Mapping[str, RunsBySeed], plan: Plan, files: Iterable[Path]
 
 
 def _of_rounds(name: str, entries: Iterable[Entry]) -> str:
-    """Say of which arms seeds were spent in rounds, which no interval of a fixed number of seeds knows."""
+    """Say which arms had seeds spent in rounds, for which intervals of a fixed number of seeds don't hold."""
     labels = ", ".join(dict.fromkeys(f"'{entry.label}'" for entry in entries))
     return f"seeds of {labels} were spent in rounds of {name}, so that these verdicts do not keep the 5 %"
 
 
 def _by_key(kept: Kept, outputs: Path) -> dict[str, Measured]:
-    """Return the kept runs that their sweep has today, by the keys of the plan's entries."""
+    """Return those kept runs that their sweep has now, by the keys of the plan's entries."""
     seeds = sorted({seed for runs in kept.runs.values() for seed in runs})
     sweep = find_sweep(kept.sweep, [*kept.overrides, f"seed={','.join(map(str, seeds))}"])
     pairs = [

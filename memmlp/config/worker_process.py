@@ -1,6 +1,6 @@
-"""What a worker of a sweep does with a task: it builds the experiment and brings its run to its end.
+"""What a worker of a sweep does with a task: it builds the experiment and finishes its run.
 
-It lies in config because only config builds experiments from configs.
+This is in config because only config builds experiments from configs.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ if TYPE_CHECKING:
 
 
 def start_worker(path: str, threads: int, controller: str, gpu: bool) -> str | None:
-    """Work on the tasks of the plan in that file for as long as the process of its controller lives.
+    """Work on the tasks of the plan in a file for as long as its controller's process is alive.
 
     Args:
         path: the plan's file.
-        threads: torch's threads where the config leaves them open; 0 leaves the choice to torch.
-        controller: the file that says which process the controller is (`Presence`).
-        gpu: whether this worker is to have a GPU.
+        threads: torch's threads if the config leaves them open; 0 leaves the choice to torch.
+        controller: the file that identifies the controller's process (`Presence`).
+        gpu: whether this worker should have a GPU.
 
     Returns:
-        A line, and nothing was done, where there is no such GPU; else None.
+        A line if there is no such GPU, in which case nothing was done; else None.
     """
     if gpu and (line := missing_gpu()):
         return line
@@ -36,17 +36,17 @@ def start_worker(path: str, threads: int, controller: str, gpu: bool) -> str | N
 
 
 def start_lone_worker(path: str, gpu: bool) -> str | None:
-    """Work on the tasks of the plan in that file until none is left, on a machine apart from the controller.
+    """Work on the tasks of the plan in a file until none is left, on another machine than the controller.
 
-    A worker on a cluster outlives the process that started it: a closed plan (a sweep's) is worked to its
-    end, an open one (a search's) while its controller still shows signs of life.
+    A worker on a cluster outlives the process that started it: it works on a closed plan (a sweep's) to its
+    end, and on an open one (a search's) while its controller shows signs of life.
 
     Args:
         path: the plan's file.
-        gpu: whether this worker is to have a GPU.
+        gpu: whether this worker should have a GPU.
 
     Returns:
-        A line, and nothing was done, where there is no such GPU; else None.
+        A line if there is no such GPU, in which case nothing was done; else None.
     """
     if gpu and (line := missing_gpu()):
         return line
@@ -55,22 +55,22 @@ def start_lone_worker(path: str, gpu: bool) -> str | None:
 
 
 def missing_gpu() -> str | None:
-    """Return a line that says so where torch finds no GPU in a worker that is to have one."""
+    """Return a line that says that torch finds no GPU in a worker that should have one; None if it does."""
     from memmlp.pipeline import devices  # it imports torch
 
     return devices.missing_gpu()
 
 
 def perform(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
-    """Bring the task's run to its end.
+    """Finish the task's run.
 
     Args:
-        path: the plan's file, read again on the way to see whether the run is still wanted.
-        threads: torch's threads where the config leaves them open; 0 leaves the choice to torch.
+        path: the plan's file, read again during the training, to see whether the run is still wanted.
+        threads: torch's threads if the config leaves them open; 0 leaves the choice to torch.
 
     Raises:
-        Cancelled: when the plan no longer wants the run.
-        InputError: when data or code changed since the plan was made.
+        Cancelled: if the plan no longer wants the run.
+        InputError: if data or code changed since the plan was made.
     """
     import torch
     from omegaconf import OmegaConf
@@ -92,7 +92,7 @@ def perform(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
 
 
 def check_identity(experiment: Experiment, task: RunTask) -> None:
-    """Raise InputError where this code and data give the task's config another identity than the plan has."""
+    """Raise InputError if this code and data give the task another identity than the plan has."""
     from memmlp.config.plan_sweep import tasks_of
 
     digest = experiment.data.prepare().digest
@@ -102,7 +102,7 @@ def check_identity(experiment: Experiment, task: RunTask) -> None:
 
 
 def check_wanted(path: Path, run_id: str, step: int, values: dict[str, float]) -> None:
-    """Raise Cancelled once the plan in that file no longer wants this run, or was stopped as a whole."""
+    """Raise Cancelled once the plan in a file no longer wants this run, or was stopped as a whole."""
     plan = Plan.load(path)
     if run_id in plan.cancelled or plan.stopped:
         raise Cancelled(f"run {run_id} was cancelled at step {step}")

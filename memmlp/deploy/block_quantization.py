@@ -1,10 +1,10 @@
-"""int8 of an exported stream in blocks: weights of eight bits with a scale for every 32 of an output.
+"""int8 of an exported stream in blocks: 8-bit weights with a scale for every 32 inputs of an output.
 
 The inputs of a product are rounded to eight bits while it is computed, with a scale for every 32 of them
-(`MatMulNBits` of ONNX Runtime's own operators). So nothing is calibrated, and a layer is one operation in
-place of four: it is for networks without a window, whose products have one row. Those of a window's rows are
-slower than in float32. What rounding adds to a frame is seen as jitter, finer scales or not, so that the
-graph says here, too, which modules stay in float32.
+(`MatMulNBits`, one of ONNX Runtime's own operators). So no calibration is needed, and a layer is one
+operation instead of four. It is meant for networks without a window, whose products have one row; products
+with a window's rows are slower than in float32. Rounding errors differ from frame to frame and show as
+jitter, even with fine scales, so the graph says here, too, which modules stay in float32.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def quantise_blocks(source: Path, path: Path, kept: Sequence[str]) -> None:
 
 
 def in_blocks(model: ModelProto, kept: Sequence[str]) -> ModelProto:
-    """Return the graph with the weights of its inner layers in blocks; see `quantise_blocks`."""
+    """Return the graph with the weights of its inner layers stored in blocks; see `quantise_blocks`."""
     inner, graph = set(inner_layers(model, kept)), model.graph
     constants = Constants(graph)
     nodes = [_product(node, constants) if node.name in inner else node for node in graph.node]
@@ -51,7 +51,7 @@ def in_blocks(model: ModelProto, kept: Sequence[str]) -> ModelProto:
 
 
 def _product(node: NodeProto, constants: Constants) -> NodeProto:
-    """Return a layer's product, a Gemm or MatMul, with its weight in blocks."""
+    """Return the product of a layer, which was a Gemm or MatMul, with its weight stored in blocks."""
     values, name, *bias = node.input
     weight = constants.value(name)
     transposed = any(one.name == "transB" and one.i for one in node.attribute)
@@ -76,7 +76,7 @@ def _product(node: NodeProto, constants: Constants) -> NodeProto:
 def blocks(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return a weight (outputs, inputs) as bytes (outputs, blocks, 32) and scales (outputs, blocks).
 
-    The last block is filled with zeros.
+    The last block is padded with zeros.
     """
     outputs, inputs = weight.shape
     padded = np.pad(weight, ((0, 0), (0, -inputs % BLOCK))).reshape(outputs, -1, BLOCK)

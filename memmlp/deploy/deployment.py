@@ -1,4 +1,4 @@
-"""What a trained network is deployed as: its live step as ONNX, checked and timed, and as int8 if asked."""
+"""How a trained network is deployed: its live step as ONNX, checked and timed, and int8 or fp16 if asked."""
 
 from __future__ import annotations
 
@@ -39,9 +39,10 @@ class Deployment:
     Attributes:
         latency_steps: number of timed steps, after a warm-up.
         graph: "auto", "streaming" or "naive" (see GRAPHS).
-        precision: "fp32", or "int8", "int8_blocks" or "fp16" for such a file beside the float32 one.
+        precision: "fp32" for the float32 file alone; "int8", "int8_blocks" or "fp16" for a second file in
+            that precision.
         opset: the files' ONNX opset, one of memmlp.deploy.opsets.OPSETS.
-        alone: whether the network alone is timed, too, without conversions and forward kinematics.
+        alone: whether the network is also timed alone, without conversions and forward kinematics.
     """
 
     latency_steps: int
@@ -65,10 +66,11 @@ class Deployment:
             deployed: where the files go.
             run_id: the run's id, for the files' metadata.
             train: training clips (N, 252), to calibrate int8.
-            test: test clips (N, 252), to check the file and measure what less precision costs.
+            test: test clips (N, 252), to check the file, and to measure what lower precision costs in
+                accuracy.
 
         Returns:
-            The files' sizes, times and the accuracy of the one of less precision.
+            The files' sizes and times, and the accuracy of the file with lower precision.
 
         Raises:
             RuntimeError: if ONNX Runtime's numbers differ from torch's by more than rounding explains.
@@ -97,12 +99,12 @@ class Deployment:
         return record
 
     def times(self, model: MotionModel, path: Path) -> dict[str, float]:
-        """Time a step of a network's exported file, and the network alone where that is asked for."""
+        """Time a step of a network's exported file, and of the network alone if that is asked for."""
         record = latency.measure_step(path, self.latency_steps)
         return record | self._alone(model) if self.alone else record
 
     def _alone(self, model: MotionModel) -> dict[str, float]:
-        """Return the times of the network alone, from features to its own outputs; no file is kept."""
+        """Return the times of the network alone, from features to its own outputs; its file is deleted."""
         from memmlp.deploy.export import export
 
         with tempfile.TemporaryDirectory() as folder:
@@ -118,7 +120,7 @@ class Deployment:
         train: Sequence[Tensor],
         test: Sequence[Tensor],
     ) -> dict[str, Any]:
-        """Write the file of less precision beside the other; return its accuracy, times and size."""
+        """Write the file with lower precision beside the other; return its accuracy, times and size."""
         path = deployed.file(self.precision)
         lower(self.precision, deployed.onnx, path, network, train)
         cost = compared(deployed.onnx, path, self.precision, network.normalizer, test)
@@ -127,13 +129,13 @@ class Deployment:
 
 
 def lower(precision: str, source: Path, path: Path, network: StreamingGraph, train: Sequence[Tensor]) -> None:
-    """Write a file of less precision.
+    """Write a file with lower precision.
 
     Args:
         precision: "int8", "int8_blocks" or "fp16".
         source: the float32 ONNX file of a streaming graph.
         path: the file to write.
-        network: the graph, which says what of it stays in float32.
+        network: the graph, which says which of its modules stay in float32.
         train: training clips (N, 252), to calibrate int8.
     """
     if precision == "int8":

@@ -2,8 +2,8 @@
 
 Inputs: `sparse` (1, 54), the world features of the newest frame (order: memmlp.motion.body), and `state.*`,
 all zeros for a fresh start. Outputs: `rotation6d` (1, 22, 6) local rotations, `position` (1, 22, 3) metres in
-the world (the position branch's; of networks without one by forward kinematics), and the new `state.*` under
-the same names with the suffix `.next`.
+the world (from the position branch, or from forward kinematics for networks without one), and the new
+`state.*` under the same names with the suffix `.next`.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def export(model: MotionModel | StreamingGraph, path: Path, run_id: str, opset: 
     """Write the model's streaming step, on the CPU in float32, as one ONNX file with its metadata.
 
     Raises:
-        InputError: for an opset that the step cannot be brought to.
+        InputError: for an opset to which the step can't be converted.
     """
     step = OneStep(model.cpu().eval())
     names = [f"state.{name}" for name in step.names]
@@ -81,14 +81,14 @@ def save(
     Args:
         step: the module to export.
         arguments: example arguments of its `forward`.
-        inputs: their names in the file.
+        inputs: the arguments' names in the file.
         outputs: names of its outputs in the file.
         path: the file to write.
         meta: the file's metadata.
         opset: one of memmlp.deploy.opsets.OPSETS.
 
     Raises:
-        InputError: for an opset that the step cannot be brought to.
+        InputError: for an opset to which the step can't be converted.
     """
     with silenced(), deterministic(step):
         program = torch.onnx.export(
@@ -141,10 +141,10 @@ SIMPLER = onnx_ir.passes.Sequential(
 
 
 def simplify(model: onnx_ir.Model) -> None:
-    """Fold a graph's constants, and take out what is unused or there twice.
+    """Fold a graph's constants, and remove what is unused or a duplicate.
 
-    The exporter's own optimiser does the same and tries its rewriting rules, too: they find next to nothing
-    in these graphs, and take up to half of an export's time.
+    The exporter's own optimiser does the same, but also tries its rewriting rules, which find next to nothing
+    in these graphs and take up to half of an export's time.
     """
     common.InlinePass()(model)
     fold_constants(model, onnx_shape_inference=True)

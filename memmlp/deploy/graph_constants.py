@@ -7,7 +7,7 @@ from onnx import GraphProto, numpy_helper
 
 
 class Constants:
-    """The constants of a graph, to which new ones can be added."""
+    """The constants of a graph; new ones can be added."""
 
     def __init__(self, graph: GraphProto):
         self.graph = graph
@@ -29,7 +29,7 @@ class Constants:
         return name
 
     def remove_unused(self) -> None:
-        """Take out the constants that no node uses any more."""
+        """Remove the constants that no node uses any more."""
         used = {name for node in self.graph.node for name in node.input}
         used |= {output.name for output in self.graph.output}
         kept = [tensor for tensor in self.graph.initializer if tensor.name in used]

@@ -1,10 +1,10 @@
-"""fp16 of an exported stream: the weights of its inner layers in sixteen bits, which halves the file.
+"""fp16 of an exported stream: its inner layers have 16-bit weights, which halves the file's size.
 
-As under autocast, the products of these layers take and give sixteen bits, and everything between them stays
-float32: sums, normalisations, the modules at the network's ends (`StreamingGraph.float32_modules`), inputs,
-outputs and states. A world position of 4 m has a resolution of 4 mm in sixteen bits, and a state that adds
-up small steps stops where they fall below its own. ONNX Runtime's converter is not used since it rounds every
-value between two nodes that are to stay float32.
+As under autocast, the products of these layers have 16-bit inputs and outputs, and everything between them
+stays float32: sums, normalisations, the modules at the network's ends (`StreamingGraph.float32_modules`),
+inputs, outputs and states. A world position of 4 m has a resolution of 4 mm in sixteen bits, and a state that
+adds up small steps stops changing where the steps fall below its resolution. ONNX Runtime's converter is not
+used, since it rounds every value between two nodes that are to stay float32.
 """
 
 from __future__ import annotations
@@ -69,7 +69,11 @@ def _cast(name: str, output: str, kind: int) -> NodeProto:
 
 
 def _half(name: str, weight: np.ndarray) -> np.ndarray:
-    """Return a weight in sixteen bits. Raises InputError if they cannot hold it."""
+    """Return a weight in sixteen bits.
+
+    Raises:
+        InputError: if the weight exceeds the range of sixteen bits.
+    """
     if not np.abs(weight).max() <= LARGEST:
         raise InputError(f"{name}: has weights beyond {LARGEST:.0f}; allowed is fp32")
     return weight.astype(np.float16)

@@ -31,9 +31,9 @@ YARDSTICK_SHAPE = (41, 512, 8)  # rows, width, layers: 86 M multiply-adds of pla
 def measure_step(path: Path, steps: int = 200) -> dict[str, Any]:
     """Time one step of an exported file on one thread: median and 95th percentile, in milliseconds.
 
-    The step and the yardstick are timed in turn, step by step, in the same minute, so that their ratio
-    compares machines. At least 200 steps are timed, however few are asked for. `core_share` is how much of
-    that time the thread had a core: where that is far less than 1, other work is in all of these times.
+    The step is timed in alternation with the yardstick, a fixed computation, so that their ratio compares
+    machines. At least 200 steps are timed, however few are asked for. `core_share` is the share of that time
+    in which the thread had a core: if it is far less than 1, these times include waiting for other processes.
     """
     stream, yardstick = OnnxStream(path), yardstick_session()
     sparse = np.zeros((1, SPARSE_DIM), np.float32)
@@ -60,9 +60,9 @@ def measure_step(path: Path, steps: int = 200) -> dict[str, Any]:
 
 
 def time_in_turn(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, np.ndarray]:
-    """Time a step of each exported file on one thread, the files in turn in each round.
+    """Time the steps of exported files on one thread, with all files in turn in each round.
 
-    A file's first steps of a round, in which the caches fill, do not count.
+    A file's first steps in each round, in which the caches fill, are not counted.
 
     Returns:
         For each file the seconds of its steps (rounds, steps).
@@ -138,7 +138,7 @@ def macs(model: MotionModel | StreamingGraph) -> int:
 
 
 def yardstick_session() -> onnxruntime.InferenceSession:
-    """Open the yardstick for comparing machines, on one thread."""
+    """Open the yardstick, a fixed computation that compares machines, on one thread."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     return onnxruntime.InferenceSession(
@@ -147,7 +147,7 @@ def yardstick_session() -> onnxruntime.InferenceSession:
 
 
 def yardstick() -> onnx.ModelProto:
-    """Make the yardstick: a fixed stack of matrix products and ReLUs."""
+    """Make the yardstick, a fixed stack of matrix products and ReLUs."""
     rows, width, layers = YARDSTICK_SHAPE
     weight = np.random.default_rng(0).standard_normal((width, width), np.float32) / np.sqrt(width)
     nodes, name = [], "input"
@@ -167,7 +167,7 @@ def yardstick() -> onnx.ModelProto:
 
 
 def _milliseconds(prefix: str, seconds: list[float]) -> dict[str, float]:
-    """Return median and 95th percentile of seconds, in milliseconds, their keys preceded by the prefix."""
+    """Return median and 95th percentile of seconds, in milliseconds, with the prefix before their keys."""
     return {
         f"{prefix}median_ms": 1000 * float(np.median(seconds)),
         f"{prefix}p95_ms": 1000 * float(np.percentile(seconds, 95)),

@@ -1,6 +1,6 @@
-"""A network alone: features in, its own outputs out, which is what papers time.
+"""A network alone, from features to its own outputs, which is what papers time.
 
-The step that is deployed converts coordinates and makes joints by forward kinematics beside.
+The deployed step also converts coordinates, and makes joints by forward kinematics.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ Model = TypeVar("Model", bound=MotionModel)
 
 
 class NoConversion(Normalizer):
-    """A normalizer that leaves everything as it is: inputs are features, outputs are in network space."""
+    """A normalizer that changes nothing: inputs are features already, outputs stay in network space."""
 
     def encode_sparse(self, sparse: Tensor, origin: Tensor) -> Tensor:
-        """Return the inputs (..., 54)."""
+        """Return the inputs (..., 54) unchanged."""
         return sparse
 
     def encode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
-        """Return the motion (..., 198)."""
+        """Return the motion (..., 198) unchanged."""
         return motion
 
     def decode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
-        """Return the motion (..., 198)."""
+        """Return the motion (..., 198) unchanged."""
         return motion
 
     def rotations_out(self, rotations: Tensor, origin: Tensor) -> Tensor:
-        """Return the rotations (..., 6 n)."""
+        """Return the rotations (..., 6 n) unchanged."""
         return rotations
 
     def posed(self, rotation: Tensor, sparse: Tensor) -> Tensor:
@@ -54,8 +54,8 @@ class NoConversion(Normalizer):
 def network_alone(model: Model) -> Model:
     """Copy a network without the conversions before and after it and without its forward kinematics.
 
-    What a network does with joints between its own layers (AvatarJLM's tokens, MANIKIN's limbs) is its own
-    and stays. The copy is good for timing alone.
+    What a network does with joints between its own layers (AvatarJLM's tokens, MANIKIN's limbs) belongs to
+    the network and stays. The copy is only good for timing.
     """
     made = copy.deepcopy(model)
     for module in list(made.modules()):

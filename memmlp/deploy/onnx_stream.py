@@ -17,7 +17,7 @@ class OnnxStream:
     """An ONNX file whose inputs `state.*` are fed by its outputs `state.*.next`.
 
     The state is held in two sets of arrays: a step reads the old state from one and writes the new one to the
-    other, and the two change places. So nothing is allocated or copied at a step.
+    other, and the two are then swapped. So nothing is allocated or copied at a step.
 
     Args:
         path: the ONNX file.
@@ -25,10 +25,11 @@ class OnnxStream:
 
     Attributes:
         inputs: arrays of the other inputs, to be written before a step.
-        outputs: arrays of the other outputs, which hold those of the last step until the next one.
+        outputs: arrays of the other outputs, which keep the last step's values until the next step.
 
     Raises:
-        InputError: if the file is missing, does not run, or does not have the form of such a step.
+        InputError: if the file is missing, does not run, or does not have the inputs and outputs of an
+            exported step.
     """
 
     def __init__(self, path: Path, profile: Path | None = None):

@@ -1,7 +1,7 @@
-"""Which operators of an ONNX file lie outside of what a runtime publishes (`memmlp export --check`).
+"""Which operators of an ONNX file are not among those that a runtime publishes (`memmlp export --check`).
 
 The lists are data of this package (memmlp/deploy/operators), each with the document that it was taken from.
-ONNX Runtime's own is asked of the runtime that is installed here.
+The list of ONNX Runtime itself is read from the installed runtime.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ class Rule:
     """What a list says of an operator.
 
     Attributes:
-        versions: the versions of it that are supported, such as "7-12,13+"; empty for all.
+        versions: the supported versions of the operator, such as "7-12,13+"; empty for all.
         constant: the inputs, by index, that must be constants.
         rank: the largest rank of some inputs, by index.
-        types: the numbers that its first input may have; empty where the list does not say.
-        not_on: parts of the target that lack it.
-        note: a condition that is not looked into.
+        types: the number types that the first input may have; empty where the list does not say.
+        not_on: parts of the target that lack the operator.
+        note: a condition that is not checked.
     """
 
     versions: str = ""
@@ -71,13 +71,13 @@ class Published:
     """The operators that a runtime publishes as its own.
 
     Attributes:
-        title, version, address: of the document.
-        outside: what becomes of a file with operators beside them.
-        operators: what is said of each, by name; those of Microsoft's domain are "com.microsoft.NAME".
-        dated, read: the dates of the document and of when it was read; empty where there is none.
+        title, version, address: title, version and address of the document.
+        outside: what the runtime does with a file that has other operators.
+        operators: the rule for each operator, by name; those of Microsoft's domain are "com.microsoft.NAME".
+        dated, read: the date of the document, and the date on which it was read; empty where unknown.
         opsets: the first and the last opset; empty where the document does not say.
-        folds: whether what follows from constants alone is computed beforehand.
-        expands: whether operators that ONNX defines by others are expanded to these.
+        folds: whether the runtime computes in advance what depends on constants alone.
+        expands: whether the runtime expands operators that ONNX defines by other operators.
     """
 
     title: str
@@ -93,18 +93,18 @@ class Published:
 
     @property
     def source(self) -> str:
-        """The document in words: what it is, its version and date, where it lies, when it was read."""
+        """The document in words: its title, version and date, its address, and when it was read."""
         dated = f", {self.dated}" if self.dated else ""
         where = f" ({self.address}; read {self.read})" if self.address else ""
         return f"{self.title}, {self.version}{dated}{where}"
 
 
 class UnsupportedOperator(NamedTuple):
-    """Something of a graph that a list does not have.
+    """An operator or opset of a graph that a list does not support.
 
     Attributes:
         what: the operator with its version, or the opset.
-        nodes: how many it concerns; 0 for the opset.
+        nodes: the number of nodes that it concerns; 0 for the opset.
         why: what is wrong with it.
     """
 
@@ -126,7 +126,7 @@ def published(name: str) -> Published:
 
 
 def findings(model: ModelProto, listed: Published) -> list[UnsupportedOperator]:
-    """Return what of a graph lies outside a list; each operator once for each reason."""
+    """Return a graph's operators that a list lacks, each once per reason, and its opset if it is outside."""
     opset = next((o.version for o in model.opset_import if o.domain in ("", "ai.onnx")), 0)
     outside = Counter[tuple[str, str]]()
     facts = _Facts(model, listed.folds)
@@ -163,7 +163,7 @@ def load_graph(path: Path) -> ModelProto:
 
 
 class _Facts:
-    """What must be known of a graph: its nodes, its constants, and the types and ranks of its tensors."""
+    """What the checks need to know of a graph: its nodes, constants, and its tensors' types and ranks."""
 
     def __init__(self, model: ModelProto, folds: bool):
         inferred = _inferred(model)
@@ -183,7 +183,7 @@ class _Facts:
 
 
 def _inferred(model: ModelProto) -> GraphProto:
-    """Return a model's graph with the types and ranks of its tensors, as far as onnx can tell."""
+    """Return a model's graph with the types and ranks of its tensors, as far as onnx can infer them."""
     try:
         return onnx.shape_inference.infer_shapes(model).graph
     except onnx.shape_inference.InferenceError:
@@ -191,7 +191,7 @@ def _inferred(model: ModelProto) -> GraphProto:
 
 
 def _reasons(node: NodeProto, version: int, listed: Published, facts: _Facts) -> Iterator[str]:
-    """Yield why a node lies outside a list."""
+    """Yield the reasons why a list does not support a node."""
     rule = listed.operators.get(_name(node))
     if rule is None:
         if not (listed.expands and _is_function(node, version)):
@@ -212,7 +212,7 @@ def _reasons(node: NodeProto, version: int, listed: Published, facts: _Facts) ->
 
 
 def _nodes(graph: GraphProto) -> Iterator[NodeProto]:
-    """Yield the nodes of a graph and of the graphs in it."""
+    """Yield the nodes of a graph, including those of its subgraphs."""
     for node in graph.node:
         yield node
         for attribute in node.attribute:
@@ -225,7 +225,7 @@ def _name(node: NodeProto) -> str:
 
 
 def _version(node: NodeProto, opset: int) -> int:
-    """Return the opset that gave an operator its form in the graph; 1 if onnx does not know it."""
+    """Return the opset that introduced the present form of an operator; 1 if onnx does not know it."""
     if node.domain in ("", "ai.onnx") and onnx.defs.has(node.op_type, opset):
         return onnx.defs.get_schema(node.op_type, opset).since_version
     return 1
@@ -237,7 +237,7 @@ def _is_function(node: NodeProto, version: int) -> bool:
 
 
 def _type(kind: int) -> str:
-    """Return the name of a type of numbers; empty for one that is not known."""
+    """Return the name of a number type; empty if the type is unknown."""
     return "" if kind == TensorProto.UNDEFINED else str(helper.tensor_dtype_to_np_dtype(kind))
 
 

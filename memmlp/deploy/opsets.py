@@ -1,8 +1,8 @@
-"""Exported graphs in other operator sets: older ones for engines that read no newer, newer ones on demand.
+"""Conversion of exported graphs to other operator sets: older ones for older engines, newer ones on demand.
 
-torch's exporter writes opset 18. Newer sets are made by onnx's own converter. It cannot go down for the
-operators that these graphs have, so that is done here: the few operators whose form differs are rewritten,
-and any other one that differs is refused.
+torch's exporter writes opset 18. Newer sets are made by onnx's own converter. That converter cannot go down
+for the operators that these graphs have, so this module does it: the few operators with another form in the
+older opset are rewritten, and a graph with any other operator that differs is refused.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ WIDENED = ("Identity", "LeakyRelu", "Where")
 
 
 def converted(model: ModelProto, opset: int) -> ModelProto:
-    """Return a graph of opset 18 in another one; it computes the same.
+    """Return a graph of opset 18 in another opset; it computes the same.
 
     Raises:
-        InputError: for an opset that is none of OPSETS, or that the installed onnx does not know.
+        InputError: for an opset that is not one of OPSETS, or that the installed onnx does not know.
     """
     newest = min(OPSETS[-1], onnx.defs.onnx_opset_version())
     if not OPSETS[0] <= opset <= newest:
@@ -46,7 +46,7 @@ def converted(model: ModelProto, opset: int) -> ModelProto:
 
 
 def _lowered(model: ModelProto, opset: int) -> ModelProto:
-    """Return a graph of opset 18 in an older one."""
+    """Return a graph of opset 18 in an older opset."""
     made = ModelProto()
     made.CopyFrom(model)
     graph, constants = made.graph, Constants(made.graph)
@@ -64,7 +64,7 @@ Rewriting = Callable[[NodeProto, Constants], Iterator[NodeProto]]
 
 
 def _rewritten(node: NodeProto, opset: int, constants: Constants) -> Iterator[NodeProto]:
-    """Yield the nodes that an older opset has for a node of opset 18."""
+    """Yield the nodes by which an older opset expresses a node of opset 18."""
     kind = node.op_type
     if kind in WIDENED or _since(kind, opset) == _since(kind, NATIVE):
         yield node
@@ -77,7 +77,7 @@ def _rewritten(node: NodeProto, opset: int, constants: Constants) -> Iterator[No
 
 
 def _since(kind: str, opset: int) -> int:
-    """Return the opset that gave an operator the form that it has in an opset; 0 if it is not there yet."""
+    """Return the opset that introduced an operator's form in a given opset; 0 if it has no such operator."""
     if not onnx.defs.has(kind, opset):
         return 0
     return onnx.defs.get_schema(kind, opset).since_version
@@ -88,25 +88,25 @@ def _attributes(node: NodeProto) -> dict[str, Any]:
 
 
 def _reduced(node: NodeProto, constants: Constants) -> Iterator[NodeProto]:
-    """Before opset 18 the axes of a reduction are an attribute."""
+    """Yield a reduction as before opset 18: its axes are an attribute."""
     keep = _attributes(node).get("keepdims", 1)
     axes = constants.value(node.input[1]).tolist()
     yield helper.make_node(node.op_type, node.input[:1], node.output, node.name, axes=axes, keepdims=keep)
 
 
 def _split(node: NodeProto, constants: Constants) -> Iterator[NodeProto]:
-    """Before opset 18 equal parts are what no sizes mean, and their number is not said."""
+    """Yield a split as before opset 18: without sizes the parts are equal, and their number is not given."""
     yield helper.make_node("Split", node.input, node.output, node.name, axis=_attributes(node).get("axis", 0))
 
 
 def _padded(node: NodeProto, constants: Constants) -> Iterator[NodeProto]:
-    """Before opset 18 there are no axes."""
+    """Yield a padding as before opset 18, where it has no axes; the node stays as it is."""
     assert len(node.input) <= 3 or not node.input[3]
     yield node
 
 
 def _normalised(node: NodeProto, constants: Constants) -> Iterator[NodeProto]:
-    """Before opset 17 a LayerNormalization is written out, in the form that runtimes know and fuse again."""
+    """Yield a LayerNormalization as before opset 17: written out, in a form that runtimes fuse again."""
     attributes = _attributes(node)
     assert attributes.get("axis", -1) == -1
     name, x = node.output[0], node.input[0]

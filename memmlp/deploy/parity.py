@@ -27,7 +27,7 @@ TIE = 1e-4  # the margin below which rounding may choose another code-vector; se
 
 @contextmanager
 def deterministic(model: nn.Module) -> Iterator[None]:
-    """Replace a sampled m (reading 7) by its mean, since torch and ONNX Runtime could not share draws."""
+    """Replace a sampled m (reading 7) by its mean, since torch and ONNX Runtime can't share random draws."""
     sampled = [module for module in model.modules() if isinstance(module, Blend) and module.sampled]
     values = [blend.value for blend in sampled]
     try:
@@ -40,12 +40,12 @@ def deterministic(model: nn.Module) -> Iterator[None]:
 
 
 def parity(model: MotionModel, path: Path, clip: Tensor) -> float:
-    """Return the largest difference between torch and ONNX Runtime, each on its own history, over a clip.
+    """Return the largest difference between torch and ONNX Runtime over a clip, each on its own history.
 
     Args:
         model: the trained network.
         path: the exported file.
-        clip: (N, 252).
+        clip: the clip's frames (N, 252).
     """
     return float(differences(model, path, clip).max())
 
@@ -54,9 +54,10 @@ def parity(model: MotionModel, path: Path, clip: Tensor) -> float:
 def differences(model: MotionModel, path: Path, clip: Tensor) -> Tensor:
     """Return each frame's largest difference (N,) between torch and ONNX Runtime over a clip (N, 252).
 
-    The positions of a network without a position branch are compared with those that follow, in float64, from
-    ONNX Runtime's rotations. Where 6D columns are almost parallel, which an untrained network produces now
-    and then, a difference between rotations within float32's rounding would otherwise come out a hundredfold.
+    The positions of a network without a position branch are compared with the positions that follow, in
+    float64, from ONNX Runtime's rotations. Where 6D columns are almost parallel, which an untrained network
+    produces now and then, a difference between rotations within float32's rounding would otherwise be
+    amplified a hundredfold.
     """
     model, clip = model.cpu().eval(), clip.cpu()
     made, found = in_torch(model, clip), streamed(OnnxStream(path), clip)
@@ -69,12 +70,13 @@ def differences(model: MotionModel, path: Path, clip: Tensor) -> Tensor:
 
 @torch.no_grad()
 def tolerated(model: MotionModel, path: Path, clip: Tensor, apart: float) -> bool:
-    """Return whether a difference between torch and ONNX Runtime over a clip (N, 252) is rounding.
+    """Return whether a difference between torch and ONNX Runtime over a clip (N, 252) is due to rounding.
 
-    Up to TOLERANCE it is. Up to ROUNDING it may be, where a rotation is ill-conditioned, as that of a hip is
-    whose swivel is counted about a straight leg from an axis along it (MANIKIN): then torch's own rotations
-    in float32 differ from those in float64 by half as much or more. However large it is, it may be that
-    rounding chose another code-vector (`begins_at_ties`).
+    A difference of at most TOLERANCE always is. One of at most ROUNDING may be, where a rotation is
+    ill-conditioned, such as that of a hip whose swivel about a straight leg is measured from an axis along
+    the leg (MANIKIN): it is accepted if torch's own rotations in float32 differ from those in float64 by at
+    least half as much. A difference of any size is accepted if rounding chose another code-vector
+    (`begins_at_ties`).
     """
     if not apart > TOLERANCE:  # NaN is not
         return apart <= TOLERANCE
@@ -89,11 +91,12 @@ def tolerated(model: MotionModel, path: Path, clip: Tensor, apart: float) -> boo
 
 @torch.no_grad()
 def begins_at_ties(model: MotionModel, clip: Tensor, apart: Tensor | np.ndarray) -> bool:
-    """Return whether differences (N,) over a clip's inputs (N, 252 or 54) come of ties between code-vectors.
+    """Return whether differences (N,) over a clip (N, 252 or 54) come from ties between code-vectors.
 
-    Where a latent lies as far from one code-vector as from another, rounding chooses. Two programs then part
-    for as long as the frame is in the window, and they agree again. So each frame that differs by more than
-    TOLERANCE has to follow another one, or to be within a window after a tie, and most frames don't differ.
+    Where a latent is equally far from two code-vectors, rounding decides. Two programs then differ for as
+    long as the frame is in the window, and agree again after it. So each frame that differs by more than
+    TOLERANCE has to follow another such frame, or lie within a window after a tie, and most frames must not
+    differ.
     """
     since_tie, explained = float("inf"), False
     for margin, one in zip(smallest_margins(model, clip), apart.tolist(), strict=True):
@@ -105,7 +108,7 @@ def begins_at_ties(model: MotionModel, clip: Tensor, apart: Tensor | np.ndarray)
 
 
 def smallest_margins(model: MotionModel, clip: Tensor) -> list[float]:
-    """Return for each frame of inputs (N, 252 or 54) the smallest margin of a latent (`Codebook.margins`)."""
+    """Return the smallest margin of a latent (`Codebook.margins`) for each frame of inputs (N, 252 or 54)."""
     found: list[float] = []
     smallest = []
 
@@ -124,20 +127,21 @@ def smallest_margins(model: MotionModel, clip: Tensor) -> list[float]:
 
 
 def codebooks(model: MotionModel) -> list[Codebook]:
-    """Return the codebooks that a network looks into."""
+    """Return the codebooks that a network contains."""
     return [module for module in model.modules() if isinstance(module, Codebook)]
 
 
 @torch.no_grad()
 def in_torch(model: MotionModel, clip: Tensor) -> Tensor:
-    """Return the world motion (N, 198) that the network streams of a clip's inputs (N, 252 or 54)."""
+    """Return the world motion (N, 198) that torch's network streams for a clip's inputs (N, 252 or 54)."""
     return torch.stack(list(motions(model, clip)))
 
 
 def motions(model: MotionModel, clip: Tensor) -> Iterator[Tensor]:
     """Yield the world motion (198,) that the network streams, for each frame of a clip (N, 252 or 54).
 
-    By one thread: a frame is little work, which several do more slowly, by far where the machine is busy.
+    One thread computes it: a frame is little work, which several threads do more slowly, and far more slowly
+    on a busy machine.
     """
     state = model.initial_state(1)
     with deterministic(model), one_thread():

@@ -1,4 +1,4 @@
-"""What a file of less precision costs in accuracy."""
+"""What a file with lower precision costs in accuracy."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ TEST_FRAMES = 20_000  # accuracy is measured on at most this many
 def accuracy(path: Path, normalizer: Normalizer, clips: Sequence[Tensor]) -> dict[str, float]:
     """Measure the rotation branch's metrics, streamed in ONNX Runtime: means over clips (N, 252).
 
-    At most 20,000 frames are streamed; where there are more, the same share of each clip.
+    At most 20,000 frames are streamed; if there are more, the first part of each clip is, with the same share
+    of all clips.
     """
     stream, share = OnnxStream(path), min(1.0, TEST_FRAMES / sum(map(len, clips)))
     rows = []
@@ -37,13 +38,13 @@ def accuracy(path: Path, normalizer: Normalizer, clips: Sequence[Tensor]) -> dic
 def compared(
     exact: Path, other: Path, precision: str, normalizer: Normalizer, clips: Sequence[Tensor]
 ) -> dict[str, Any]:
-    """Measure what less precision costs on test clips.
+    """Measure on test clips what lower precision costs in accuracy.
 
     Args:
         exact: the float32 file.
-        other: the same network in less precision.
-        precision: its name, such as "int8".
-        normalizer: the network's.
+        other: the same network with lower precision.
+        precision: name of the lower precision, such as "int8".
+        normalizer: the network's normalizer.
         clips: frames (N, 252) of each clip.
 
     Returns:

@@ -1,9 +1,9 @@
-"""int8 of an exported stream, by ONNX Runtime's static quantisation, and what it costs in accuracy.
+"""int8 of an exported stream, by ONNX Runtime's static quantisation.
 
-Weights get one scale for each output and seven bits: CPUs without VNNI add products of eight-bit numbers in
-sixteen bits, and overflow. Activations get eight bits and one scale, found by streaming training clips
+Weights get one scale for each output, and seven bits: with eight bits, CPUs without VNNI overflow, since they
+add products in sixteen bits. Activations get eight bits and one scale, found by streaming training clips
 through the network. The modules at the network's ends stay in float32, as the graph says
-(`StreamingGraph.float32_modules`): the stem's input has outliers, and rounding in the heads would be seen as
+(`StreamingGraph.float32_modules`): the stem's input has outliers, and rounding in the heads would show as
 jitter.
 """
 
@@ -26,9 +26,9 @@ CALIBRATION_CLIPS, CALIBRATION_FRAMES, CALIBRATION_EVERY = 40, 400, 20
 
 
 class ActivationSamples(CalibrationDataReader):
-    """Calibration samples, inputs and states: every twentieth frame of streams of clips (N, 252).
+    """Calibration samples, which are inputs and states: every twentieth frame of streams of clips (N, 252).
 
-    Of each clip the middle 400 frames are streamed.
+    The middle 400 frames of each clip are streamed.
     """
 
     def __init__(self, path: Path, clips: Sequence[Tensor]):
@@ -82,7 +82,7 @@ def quantise(source: Path, path: Path, kept: Sequence[str], clips: Sequence[Tens
 
 
 def inner_layers(graph: onnx.ModelProto, kept: Sequence[str]) -> list[str]:
-    """Return the names of the nodes that multiply by a layer's weight, except those of the kept modules."""
+    """Return the names of the nodes that multiply by a layer's weight, except those in the kept modules."""
     weights = {tensor.name for tensor in graph.graph.initializer}
     beginnings = tuple(f"model.{name}." for name in kept)
     return [

@@ -26,11 +26,11 @@ class Evaluation:
     """How a network is evaluated.
 
     Attributes:
-        modes: the evaluation modes, of "stream" and "window".
-        batch: how many clips are evaluated side by side, at most.
-        ik: inverse kinematics, whose result is reported as a branch beside the network's own.
-        seed: seed of the draws of a blend that is sampled.
-        metrics: metrics of one's own, by name.
+        modes: the evaluation modes, out of "stream" and "window".
+        batch: the largest number of clips that are evaluated side by side.
+        ik: inverse kinematics, whose result is reported as one more branch.
+        seed: seed for networks that draw random numbers, such as a sampled blend.
+        metrics: custom metrics, by name.
     """
 
     modes: Sequence[str]
@@ -44,10 +44,11 @@ class Evaluation:
 
         Returns:
             "mean", the metrics by branch, and "clips", a row for each clip with its metrics by branch; and
-            "offline" of a network that is no stream.
+            "offline" for a network that can't run as a stream.
 
         Raises:
-            InputError: if the network learns no positions, and its own are not those of its rotations.
+            InputError: if the network does not learn positions, and its positions do not follow from its
+                rotations.
         """
         torch.manual_seed(self.seed)  # a mode's result does not depend on which modes came before it
         found = modes.evaluate(model, test, [mode], self.batch, self.ik, self.metrics)
@@ -60,10 +61,10 @@ class Evaluation:
 
 
 def check_positions(network: str, rows: Sequence[dict[str, Any]]) -> None:
-    """Check that positions which a network does not learn follow from its rotations by forward kinematics.
+    """Check that the positions of a network that does not learn them follow by forward kinematics.
 
     Raises:
-        InputError: if they don't: then the network, or the way it was loaded, is broken.
+        InputError: if they don't; then the network, or the way it was loaded, is broken.
     """
     for row in rows:
         own, followed = row["position"]["MPJPE"], row["rotation"]["MPJPE"]

@@ -1,5 +1,4 @@
-"""The inverse-kinematics slot: finds local rotations that bring the pose to the position branch (App. A), or
-hands to their trackers.
+"""The inverse-kinematics slot: finds local rotations that match the position branch (App. A) or the trackers.
 
 The paper runs L-BFGS for at most 15 iterations from the rotation branch's pose (Table 6, reading 11).
 """
@@ -29,7 +28,7 @@ Objective = Callable[[Tensor, Tensor], Tensor]
 
 
 class NoIK:
-    """No inverse kinematics: there is no third result beside the two branches."""
+    """No inverse kinematics: there is no third result besides the two branches."""
 
     def solutions(self, normalizer: Normalizer, motion: Tensor, sparse: Tensor) -> dict[str, Tensor]:
         """Return an empty dict: there is no branch `combined`."""
@@ -38,30 +37,30 @@ class NoIK:
 
 @dataclass(frozen=True)
 class LBFGS:
-    """L-BFGS on every frame by itself: Table 6's "Rotation + Position Branch".
+    """L-BFGS on each frame separately: Table 6's "Rotation + Position Branch".
 
     The variables are an axis-angle increment for each joint, applied on the right of its predicted rotation:
-    smooth around the start, without the redundant scale of 6D. The head stays on its tracker as in
-    `Normalizer.pose`, so that what is minimised is what is measured. A rotation that moves no joint (those of
-    the leaves) stays as predicted. All of it is computed in float64, so that a frame's result does not depend
-    on its neighbours.
+    the increment is smooth around the start, and lacks the redundant scale of 6D. The head stays on its
+    tracker as in `Normalizer.pose`, so that the minimised distance is the one that is measured. A rotation
+    that moves no joint (those of the leaves) stays as predicted. Everything is computed in float64, so that a
+    frame's result does not depend on its neighbours.
 
     torch.optim.LBFGS (strong Wolfe) is not used: over a batch it has one step length and one curvature for
-    all frames, so that a frame's result depends on which others stand beside it. Measured on 3000 streamed
+    all frames, so that a frame's result depends on the other frames of the batch. Measured on 3000 streamed
     frames of CMU salsa, one thread, 15 iterations: the distance between the branches falls from 3.13 cm to
     0.98 cm in 2 s and Jitter rises from 16.4 to 17.9; torch's L-BFGS reaches 1.02 cm in 5 s with a Jitter of
     16.6.
 
     Attributes:
-        iterations: number of iterations, at most.
-        chunk: number of frames that are solved side by side.
+        iterations: largest number of iterations.
+        chunk: number of frames that are solved together.
     """
 
     iterations: int = 15
     chunk: int = 4096
 
     def solutions(self, normalizer: Normalizer, motion: Tensor, sparse: Tensor) -> dict[str, Tensor]:
-        """Return the motion (N, 198) with the rotations that fit best, under the name "combined".
+        """Return the motion (N, 198) with the best-fitting rotations, under the name "combined".
 
         Args:
             normalizer: converts between the world and network space; its rest pose is used.
@@ -83,13 +82,13 @@ class LBFGS:
 
 
 class Arms:
-    """The arms alone, in closed form: wrists at their trackers (`memmlp.networks.reaching_arms`).
+    """The arms alone, in closed form: wrists are brought to their trackers (`memmlp.networks.reaching_arms`).
 
-    It needs no positions, and so goes with every network.
+    It needs no predicted positions, so it works with every network.
     """
 
     def solutions(self, normalizer: Normalizer, motion: Tensor, sparse: Tensor) -> dict[str, Tensor]:
-        """Return the motion (N, 198) with the rotations of arms that reach, under the name "combined".
+        """Return the motion (N, 198) with arms that reach the trackers, under the name "combined".
 
         Args:
             normalizer: its rest pose is used.
@@ -151,11 +150,11 @@ def _joints(start: Tensor, turn: Tensor, rest: Tensor) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _units(rest: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return each joint's unit of turning (22, 1) for 66 coordinates of a rest pose; made once for each.
+    """Return each joint's unit of rotation (22, 1) for 66 coordinates of a rest pose; cached per rest pose.
 
-    Turning a hip moves more than turning a wrist. Each variable gets a unit in which the objective's
-    curvature is about the same, so that few iterations get far and neighbouring frames go the same way
-    (without: 1.19 cm, Jitter 24).
+    Turning a hip moves more joints than turning a wrist. With these units, the objective's curvature is about
+    the same for each variable, so that few iterations get far and neighbouring frames get similar solutions
+    (without them: 1.19 cm, Jitter 24).
     """
     still = torch.eye(3, dtype=dtype, device=device).expand(1, N_JOINTS, 3, 3)
     pose = torch.tensor(rest, dtype=dtype, device=device).unflatten(0, (N_JOINTS, 3))
@@ -164,12 +163,12 @@ def _units(rest: tuple[float, ...], dtype: torch.dtype, device: torch.device) ->
 
 
 class Curvature(NamedTuple):
-    """How the gradient changed along a step that was taken: what L-BFGS knows of the curvature.
+    """The change of the gradient along a step that was taken, from which L-BFGS estimates the curvature.
 
     Attributes:
         x: change of the variables (N, D).
         gradient: change of the gradient (N, D).
-        inverse: 1 / (their inner product) (N,), or 0 for a row where the step says nothing.
+        inverse: 1 / (their inner product) (N,), or 0 for a row whose step is not used.
     """
 
     x: Tensor
@@ -183,10 +182,10 @@ CURVATURE = 1e-12  # a step's product with the gradient's change must exceed thi
 
 
 def minimise(objective: Objective, x: Tensor, iterations: int, history: int = 10) -> Tensor:
-    """Run L-BFGS (Nocedal and Wright, Algorithm 7.4) on every row of x (N, D) by itself.
+    """Run L-BFGS (Nocedal and Wright, Algorithm 7.4) on each row of x (N, D) separately.
 
     Each row has its own curvature and step length (halved from 1 until Armijo's condition holds), and stays
-    where it is when no step helps: the objective never rises.
+    unchanged when no step helps: the objective never rises.
 
     Returns:
         The variables (N, D) at the end.
@@ -213,7 +212,7 @@ def value_and_gradient(objective: Objective, x: Tensor, rows: Tensor) -> tuple[T
 
 
 def curvature(x: Tensor, gradient: Tensor) -> Curvature:
-    """Return the curvature of a step from its changes (N, D); rows without positive curvature say nothing."""
+    """Return the curvature of a step from its changes (N, D); rows without positive curvature are unused."""
     product = (x * gradient).sum(-1)
     useful = product > CURVATURE * gradient.square().sum(-1)
     return Curvature(x, gradient, torch.where(useful, 1 / torch.where(useful, product, 1), 0))
@@ -235,7 +234,7 @@ def two_loop(gradient: Tensor, steps: list[Curvature]) -> Tensor:
 def first_guess(gradient: Tensor, steps: list[Curvature]) -> Tensor:
     """Return the first estimate of the inverse Hessian, a multiple (N,) of the identity.
 
-    It comes from the row's newest useful step; without one it makes the first step at most 1 long.
+    It comes from the row's newest usable step; without such a step, it limits the first step's length to 1.
     """
     length = 1 / gradient.norm(dim=-1).clamp_min(1)
     for step in steps:
@@ -251,7 +250,7 @@ def line_search(
     """Halve each row's step until it is good enough (Armijo's condition).
 
     Returns:
-        Variables (N, D) and values (N,) after the step; a row that found no good step is unchanged.
+        Variables (N, D) and values (N,) after the step; a row for which no step is good enough is unchanged.
     """
     slope = (gradient * direction).sum(-1)
     rows = (slope < 0).nonzero()[:, 0]

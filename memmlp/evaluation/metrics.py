@@ -1,6 +1,7 @@
 """The field's metrics as pure functions of one clip; lower is better.
 
-Positions (N, 22, 3) are metres in the world at 60 Hz; rotations (N, 22, 3, 3) are local, the root's global.
+Positions (N, 22, 3) are metres in the world at 60 Hz; rotations (N, 22, 3, 3) are local, except for the
+root's, which is global.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ def mpjre(predicted: Tensor, truth: Tensor) -> Tensor:
     """Return AGRoL's MPJRE in degrees: the mean absolute difference of the axis-angle components.
 
     The 63 components are those of joints 1-21, and each difference is wrapped to [-pi, pi]. This is not an
-    angle: an error of 5 degrees reads 2.5 to 3.2.
+    angle: an error of 5 degrees gives a value of 2.5 to 3.2.
     """
     difference = matrix_to_axis_angle(predicted[:, 1:]) - matrix_to_axis_angle(truth[:, 1:])
     wrapped = torch.remainder(difference + math.pi, 2 * math.pi) - math.pi
@@ -36,7 +37,7 @@ def geodesic(predicted: Tensor, truth: Tensor) -> Tensor:
 
 
 def position_error(predicted: Tensor, truth: Tensor, joints: tuple[int, ...] | None = None) -> Tensor:
-    """Return the mean distance over frames and the given joints (all 22 by default), in cm."""
+    """Return the mean distance over frames and the given joints (all 22 by default), in centimetres."""
     distance = (predicted - truth).norm(dim=-1)
     return 100 * (distance if joints is None else distance[:, list(joints)]).mean()
 
@@ -44,13 +45,13 @@ def position_error(predicted: Tensor, truth: Tensor, joints: tuple[int, ...] | N
 def velocity_error(predicted: Tensor, truth: Tensor) -> Tensor:
     """Return the mean norm of the difference of velocities between frames (MPJVE), in cm/s.
 
-    It is NaN under 2 frames.
+    It is NaN for fewer than 2 frames.
     """
     return 100 * FPS * (predicted.diff(dim=0) - truth.diff(dim=0)).norm(dim=-1).mean()
 
 
 def jitter(positions: Tensor) -> Tensor:
-    """Return the mean norm of the third difference of positions, in 10^2 m/s^3; NaN under 4 frames."""
+    """Return the mean norm of the positions' third difference, in 10^2 m/s^3; NaN for fewer than 4 frames."""
     return positions.diff(n=3, dim=0).norm(dim=-1).mean() * FPS**3 / 100
 
 
@@ -73,11 +74,11 @@ def rotations_report(predicted: Tensor, truth: Tensor) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class UserMetric:
-    """A metric of one's own.
+    """A custom metric.
 
     Attributes:
         function: maps prediction and truth of one clip to one number.
-        of: what it is given: "positions" (N, 22, 3) or "rotations" (N, 22, 3, 3).
+        of: what the function gets: "positions" (N, 22, 3) or "rotations" (N, 22, 3, 3).
     """
 
     function: Callable[[Tensor, Tensor], Tensor]
@@ -88,10 +89,10 @@ UserMetrics = Mapping[str, UserMetric]
 
 
 def own_report(own: UserMetrics, of: str, predicted: Tensor, truth: Tensor) -> dict[str, float]:
-    """Return the metrics of one's own that are given positions, or those given rotations, of one clip.
+    """Return one clip's values of those custom metrics that take positions, or of those that take rotations.
 
     Raises:
-        InputError: naming the metric, where it returns no number.
+        InputError: if a metric does not return a number; the message names the metric.
     """
     return {name: _number(name, one, predicted, truth) for name, one in own.items() if one.of == of}
 

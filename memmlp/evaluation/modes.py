@@ -1,12 +1,15 @@
 """Evaluation in the two modes of the field, with all clips side by side in one batch.
 
-`stream` is live use: one frame at a time, on the network's own history, the last frame of each window kept.
-`window` is AGRoL's: non-overlapping windows whose T frames all count; the tail window is shifted back and its
-overlap dropped, and what a network recalls of its past is shifted with it. A network that recalls the window
-which ended one frame before is led through each window frame by frame, so that it recalls what it was trained
-on: in one call it would get the window of T frames ago. Its result for a window is the last call's output. A
-network without a window is a stream in both. One that makes the windows of a clip together
-(`MotionModel.joint`) gets the whole clip, and is no stream.
+The mode `stream` is live use: one frame at a time, on the network's own history, with only the last frame of
+each window kept. The mode `window` is AGRoL's: non-overlapping windows, all of whose T frames are kept; the
+last window of a clip is shifted back to end with the clip, its overlap is dropped, and what a network recalls
+of its past is shifted with it.
+
+Some networks are evaluated otherwise in window mode. A network that recalls the window which ended one frame
+before gets each window frame by frame, so that it recalls what it was trained on: in one call it would get
+the window of T frames ago. Its result for a window is the last call's output. A network without a window is a
+stream in both modes. A network that makes the windows of a clip together (`MotionModel.joint`) gets the whole
+clip, and can't be a stream.
 """
 
 from __future__ import annotations
@@ -35,7 +38,7 @@ class Evaluable(Protocol):
 
     @property
     def normalizer(self) -> Normalizer:
-        """Converts between the world and network space."""
+        """The normalizer, which converts between the world and network space."""
 
     @property
     def shift(self) -> int:
@@ -43,11 +46,11 @@ class Evaluable(Protocol):
 
     @property
     def windowless(self) -> bool:
-        """Whether the network has no window, so that both modes are the stream."""
+        """Whether the network has no window, so that it is a stream in both modes."""
 
     @property
     def joint(self) -> bool:
-        """Whether window mode makes all windows of a clip together, by `whole`."""
+        """Whether window mode passes a whole clip to `whole`, which makes all its windows together."""
 
     def initial_state(self, batch: int = 1) -> State:
         """Return the state of a fresh start."""
@@ -56,14 +59,14 @@ class Evaluable(Protocol):
         """Map new inputs (B, n, 54) to motion in the world, and the new state.
 
         The motion (B, newest, 198) is that of the newest frames; by default that of all frames that the
-        network makes of its window.
+        network predicts.
         """
 
     def rewound(self, state: State, frames: Tensor) -> State:
-        """Return the state as it was `frames` (B,) ago, for a window that takes in frames again."""
+        """Return the state as it was `frames` (B,) ago, for a window that takes in frames a second time."""
 
     def whole(self, sparse: Tensor) -> Tensor:
-        """Map the inputs of a clip (N, 54), N >= T, to its motion (N, 198) in the world."""
+        """Map the inputs (N, 54) of a whole clip, N >= T, to its motion (N, 198) in the world."""
 
 
 def stream(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor]:
@@ -86,8 +89,8 @@ def window(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor]:
 def frame_by_frame(network: Evaluable, clips: Sequence[Tensor], size: int) -> list[Tensor]:
     """Predict the motion (N, 198) of clips (N, 252) by calls of one new frame each.
 
-    Each window of `size` frames (and what is left at a clip's end) is taken from the call that took in its
-    last frame. With `size` 1 that is a live stream.
+    The motion of each window of `size` frames (or fewer at a clip's end) comes from the call that took in the
+    window's last frame. With `size` 1, this is a live stream.
     """
     order = sorted(range(len(clips)), key=lambda i: -len(clips[i]))
     lengths = [len(clips[i]) for i in order]
@@ -129,7 +132,7 @@ def window_by_window(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor
 
 @torch.no_grad()
 def clip_by_clip(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor]:
-    """Predict the motion (N, 198) of clips (N, 252), each as a whole."""
+    """Predict the motion (N, 198) of clips (N, 252), by one call for each whole clip."""
     inputs = [_at_least(clip[:, :SPARSE_DIM], network.frames) for clip in clips]
     motions = [network.whole(sparse) for sparse in progress_bar(inputs, "windows together", unit="clips")]
     return [motion[-len(clip) :] for motion, clip in zip(motions, clips, strict=True)]
@@ -151,15 +154,15 @@ def evaluate(
 ) -> dict[str, Any]:
     """Compute the metrics of a dataset: `{"mean": {mode: {branch: {metric: value}}}, "clips": [...]}`.
 
-    The mean is over clips of each clip's mean over frames.
+    Each clip's metrics are means over its frames; the mean is the mean over clips.
 
     Args:
         network: the network to evaluate.
         dataset: the clips.
         modes: the evaluation modes.
-        batch: how many clips are evaluated side by side, at most.
-        ik: inverse kinematics, whose result is a further branch.
-        own: metrics of one's own.
+        batch: the largest number of clips that are evaluated side by side.
+        ik: inverse kinematics, whose result is one more branch.
+        own: custom metrics.
     """
     clips = dataset.clips()
     rows: list[dict[str, Any]] = [
@@ -178,7 +181,7 @@ def evaluate(
 
 
 def predict(network: Evaluable, clips: Sequence[Tensor], mode: str, batch: int) -> list[Tensor]:
-    """Predict the motion (N, 198) of each clip (N, 252), at most `batch` clips side by side."""
+    """Predict the motion (N, 198) of each clip (N, 252), with at most `batch` clips side by side."""
     groups = [clips[i : i + batch] for i in range(0, len(clips), batch)]
     return [motion for group in groups for motion in MODE_FUNCTIONS[mode](network, group)]
 
@@ -190,7 +193,7 @@ def clip_report(
     ik: IK | None = None,
     own: metrics.UserMetrics | None = None,
 ) -> dict[str, dict[str, float]]:
-    """Return the metrics of both branches and of `ik`'s result, for motion (N, 198) and truth (N, 252)."""
+    """Return the metrics of both branches and of `ik`'s result, from motion (N, 198) and truth (N, 252)."""
     sparse, target = truth[:, :SPARSE_DIM], truth[:, SPARSE_DIM:]
     positions = joint_positions(motion), joint_positions(target)
     position = metrics.positions_report(*positions) | metrics.own_report(own or {}, "positions", *positions)
@@ -202,9 +205,10 @@ def clip_report(
 def rotations_report(
     normalizer: Normalizer, motion: Tensor, truth: Tensor, own: metrics.UserMetrics | None = None
 ) -> dict[str, float]:
-    """Return the metrics of the rotations of motion (N, 198) against the truth (N, 252).
+    """Return the metrics of the rotations in motion (N, 198) against the truth (N, 252).
 
-    The positions that they are measured by follow by forward kinematics, the head on its tracker.
+    Position metrics are included; these positions follow from the rotations by forward kinematics, with the
+    head on its tracker.
     """
     sparse, target = truth[:, :SPARSE_DIM], truth[:, SPARSE_DIM:]
     rotations = local_rotations(motion), local_rotations(target)
@@ -227,7 +231,7 @@ def joint_positions(motion: Tensor) -> Tensor:
 def chunks(dataset: MotionDataset, length: int, least: int) -> list[Tensor]:
     """Cut a dataset's clips into pieces of `length` frames.
 
-    Pieces under `least` frames are left out, unless all of them are so short.
+    Pieces of fewer than `least` frames are left out, unless all pieces are that short.
     """
     pieces = [piece for clip in dataset.clips() for piece in clip.split(length)]
     return [p for p in pieces if len(p) >= least] or pieces
@@ -237,7 +241,7 @@ def chunks(dataset: MotionDataset, length: int, least: int) -> list[Tensor]:
 def quick_stream(
     network: Evaluable, pieces: Sequence[Tensor], own: metrics.UserMetrics | None = None
 ) -> dict[str, float]:
-    """Return the stream-mode metrics, means over pieces of clips, for validation during training."""
+    """Return the stream-mode metrics, averaged over pieces of clips, for validation during training."""
     motions = stream(network, pieces)
     pairs = zip(motions, pieces, strict=True)
     mean = _mean([clip_report(network.normalizer, motion, piece, own=own) for motion, piece in pairs])
@@ -245,14 +249,14 @@ def quick_stream(
 
 
 def _at_least(sparse: Tensor, size: int) -> Tensor:
-    """Repeat the first of the inputs (N, 54) in front until there are `size` frames."""
+    """Pad inputs (N, 54) to at least `size` frames by repeating their first frame in front."""
     return torch.cat([sparse[:1].expand(max(size - len(sparse), 0), -1), sparse])
 
 
 def _mean(rows: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
-    """Return each branch's metrics, mean over clips; a clip too short for a metric does not count in it.
+    """Return each branch's metrics, mean over clips; clips that are too short for a metric are left out.
 
-    A clip on which the network's numbers are none counts: all means of that branch are NaN then.
+    A clip for which the network returned NaN is not left out: all means of that branch are then NaN.
     """
     return {
         branch: {name: _mean_of([row[branch] for row in rows], name) for name in values}

@@ -1,4 +1,4 @@
-"""Files of a network's predictions: as arrays beside the truth, and as clips that other programs open."""
+"""Files of a network's predictions: as arrays together with the truth, and as clips for other programs."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ def save_predictions(evaluation: Evaluation, model: MotionModel, test: MotionDat
 
 
 def predict_clip(model: MotionModel, clip: Tensor, mode: str) -> dict[str, np.ndarray]:
-    """What a network makes of a clip's frames (N, 252) in a mode, beside the truth (`prediction_arrays`).
+    """Return a network's prediction of a clip's frames (N, 252), beside the truth (`prediction_arrays`).
 
-    A network that draws numbers draws the same ones for a clip each time.
+    A network that draws random numbers draws the same ones for a clip each time.
     """
     with torch.random.fork_rng():
         torch.manual_seed(0)
@@ -57,12 +57,13 @@ def predict_clip(model: MotionModel, clip: Tensor, mode: str) -> dict[str, np.nd
 def prediction_arrays(normalizer: Normalizer, clip: Tensor, motion: Tensor, ik: IK) -> dict[str, np.ndarray]:
     """Return the content of a prediction file, float32.
 
-    `*_positions` (N, 22, 3) are metres in the world; `*_rotations` (N, 22, 3, 3) local, the root's global.
+    `*_positions` (N, 22, 3) are metres in the world; `*_rotations` (N, 22, 3, 3) are local, except for the
+    root's, which is global.
 
     Returns:
-        `predicted_positions` by forward kinematics of `predicted_rotations`, the head on its tracker;
-        `predicted_positions_of_position_branch`, the same for a network without such a branch;
-        `true_positions` and `true_rotations`; `combined_positions` and `combined_rotations` of inverse
+        `predicted_positions` by forward kinematics of `predicted_rotations`, with the head on its tracker;
+        `predicted_positions_of_position_branch`, which are the same for a network without such a branch;
+        `true_positions` and `true_rotations`; `combined_positions` and `combined_rotations` from inverse
         kinematics, if any.
     """
     sparse, truth = clip[:, :SPARSE_DIM], clip[:, SPARSE_DIM:]
@@ -84,8 +85,8 @@ def motion_clip(name: str, rotations: np.ndarray, positions: np.ndarray, rest: n
 
     Args:
         name: the clip's name.
-        rotations: local rotations (N, 22, 3, 3), the root's global.
-        positions: joints (N, 22, 3), metres, world; the root's count, the others follow.
+        rotations: local rotations (N, 22, 3, 3), except for the root's, which is global.
+        positions: joints (N, 22, 3), metres, world; only the root's are used, the others follow.
         rest: the body's rest joints.
     """
     poses = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec()
@@ -94,13 +95,13 @@ def motion_clip(name: str, rotations: np.ndarray, positions: np.ndarray, rest: n
 
 @dataclass(frozen=True)
 class ClipPredictor:
-    """A trained network that makes clips of clips.
+    """Makes predicted clips from recorded clips, with a trained network.
 
     Attributes:
         model: the network.
         mode: "stream" or "window".
-        branch: of KINDS_OF_POSES: the rotation branch with the head on its tracker, the result of the
-            evaluation's inverse kinematics, or the truth, which is what came in.
+        branch: one of KINDS_OF_POSES: the rotation branch with the head on its tracker, the result of the
+            evaluation's inverse kinematics, or the truth, which is the recorded clip itself.
         evaluation: how the network is evaluated: batches, inverse kinematics, seed.
     """
 
@@ -115,7 +116,7 @@ class ClipPredictor:
         return self.model.normalizer.rest.cpu().double().numpy()
 
     def predict(self, names: Sequence[str], clips: Sequence[Tensor]) -> list[Clip]:
-        """Return what the network makes of clips' frames (N, 252), as clips of N frames at 60 Hz."""
+        """Return the network's predictions for clips' frames (N, 252), as clips of N frames at 60 Hz."""
         torch.manual_seed(self.evaluation.seed)
         clips = [clip.to(self.model.normalizer.rest.device) for clip in clips]
         ik = self.evaluation.ik if self.branch == "combined" else NoIK()
@@ -126,16 +127,17 @@ class ClipPredictor:
         ]
 
     def _clip(self, name: str, arrays: Mapping[str, np.ndarray]) -> Clip:
-        """Return the branch of `prediction_arrays` as a clip."""
+        """Return this predictor's branch of `prediction_arrays` as a clip."""
         kind = KINDS_OF_POSES[self.branch]
         return motion_clip(name, arrays[f"{kind}_rotations"], arrays[f"{kind}_positions"], self.rest)
 
     def export(self, plan: ExportPlan, *, strict: bool = False) -> ExportReport:
-        """Write what the network makes of a plan's clips.
+        """Write the network's predictions for a plan's clips.
 
         Args:
             plan: what to write.
-            strict: whether a bad file raises; otherwise it is skipped and reported, if there are others.
+            strict: whether a bad file raises InputError; otherwise it is skipped and reported, if other files
+                can be read.
 
         Raises:
             InputError: if no clip could be read, or a file cannot be written.
@@ -154,7 +156,11 @@ class ClipPredictor:
         return ExportReport(tuple(written), seconds, tuple(skipped))
 
     def _frames(self, target: Target) -> Tensor:
-        """Read a clip's frames (N, 252), as in a cache on the network's body. Raises InputError."""
+        """Read a clip's frames (N, 252), computed on the network's body as in a cache.
+
+        Raises:
+            InputError: if the file can't be read, or has fewer than two frames at 60 Hz.
+        """
         clip, _ = resample(read_motion(target))
         if len(clip) < 2:
             few = f"{target.source}: one frame at {FPS} Hz"

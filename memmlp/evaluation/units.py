@@ -1,6 +1,6 @@
 """The field's metrics by name: their units, and the smallest differences that matter. Lower is better.
 
-Metrics of one's own come in addition, where a package has some (memmlp.config.plugins).
+A user's package can add custom metrics (memmlp.config.plugins).
 """
 
 UNITS = {

@@ -1,1 +1,4 @@
-"""Runs shown elsewhere while they happen: MLflow, TensorBoard, W&B. The run folder stays the record."""
+"""Trackers, which show runs elsewhere as they happen: MLflow, TensorBoard, W&B.
+
+The run folder stays the record.
+"""

@@ -1,4 +1,4 @@
-"""A run's side of tracking: what it tells the process that follows it, which it never waits for."""
+"""A run's side of tracking: it sends events to the process that follows the run, and never waits for it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MOST = 10.0  # seconds of that at most
 
 @dataclass(frozen=True)
 class Tracking:
-    """Where an experiment's runs are shown; nowhere, if there are no trackers.
+    """The trackers in which an experiment's runs are shown.
 
     Attributes:
         trackers: the trackers.
@@ -36,9 +36,9 @@ class Tracking:
 
     @contextlib.contextmanager
     def following(self, run: Run) -> Iterator[None]:
-        """Show a run, which has begun, while the context lasts, and then its end or failure.
+        """Show a run, which has begun, for the duration of the context, and then its end or failure.
 
-        Nothing of that can fail: at worst there is a line on stderr.
+        This never fails: at worst there is a line on stderr.
         """
         feed, begun = feed_of(self), time.monotonic()
         feed.tell("begin", run.folder)
@@ -49,17 +49,17 @@ class Tracking:
             feed.wait(run.folder, min(SHARE * (time.monotonic() - begun), MOST))
 
     def sweep(self, folder: Path, seconds: float = MOST) -> None:
-        """Show a sweep's runs as one group, by what its folder says, and wait so long for it at most."""
+        """Show a sweep's runs as one group, from its folder's record, and wait at most `seconds` for it."""
         feed = feed_of(self)
         feed.tell("sweep", folder)
         feed.wait(folder, seconds)
 
 
 class Feed:
-    """The pipe to a process that shows runs. Nothing of it blocks or raises.
+    """The pipe to a process that shows runs. No method blocks for long or raises.
 
     Attributes:
-        dropped: how many events the process did not take, because it is gone or its pipe is full.
+        dropped: how many events were dropped, because the process is gone or its pipe is full.
     """
 
     def __init__(self, tracking: Tracking):
@@ -102,11 +102,11 @@ class Feed:
 
     @property
     def alive(self) -> bool:
-        """Whether the process is there."""
+        """Whether the process is alive."""
         return self.process is not None and self.process.poll() is None
 
     def tell(self, event: str, folder: Path) -> None:
-        """Tell the process of an event. A line that it can't take at once is dropped and counted."""
+        """Send the process an event. A line that it can't take at once is dropped and counted."""
         if self.process is None:
             return
         assert self.process.stdin is not None
@@ -122,7 +122,7 @@ class Feed:
             warn(f"the {event} of {folder.name} is not shown: its follower does not listen")
 
     def wait(self, folder: Path, seconds: float) -> bool:
-        """Wait at most so long until all trackers have shown or missed a run's end; say if so."""
+        """Wait, at most `seconds`, until all trackers have shown or missed a run's end; return whether so."""
         wanted = [(str(folder.absolute()), name) for name in self.names]
         with self.answered:
             return self.answered.wait_for(
@@ -130,13 +130,13 @@ class Feed:
             )
 
     def close(self) -> None:
-        """Let the process end, once it has shown what it was told."""
+        """Let the process end after it has shown everything that it was told."""
         if self.process is not None and self.process.stdin is not None:
             with contextlib.suppress(OSError):
                 self.process.stdin.close()
 
     def _listen(self, answers: IO[bytes]) -> None:
-        """Read what the process says, until it ends."""
+        """Read the process's answers until it ends."""
         with contextlib.suppress(ValueError, OSError), answers:
             for line in answers:
                 answer = json.loads(line)
@@ -163,7 +163,7 @@ _FEEDS: dict[Tracking, Feed] = {}
 
 
 def feed_of(tracking: Tracking) -> Feed:
-    """Return this process' feed of these trackers; a new one where its process has died."""
+    """Return this process' feed for these trackers; a new one if its process has died."""
     feed = _FEEDS.get(tracking)
     if feed is not None and tracking.trackers and not feed.alive:
         feed.close()

@@ -1,9 +1,9 @@
 """The process beside a run that shows it in trackers.
 
-It is told by lines on its standard input which runs begin and end. What there is to show it reads from the
-run's own folder: so nothing that a run logs waits for a tracker, and nothing is lost where one is slow. Each
-tracker has a thread and a bounded inbox of its own. When a tracker fails, it is tried again after longer and
-longer pauses; what it misses in the end is filled in by `memmlp track sync`.
+Lines on its standard input tell it which runs begin and end. It reads the content from the runs' own folders,
+so a run never waits for a tracker, and a slow tracker loses nothing. Each tracker has its own thread and
+bounded inbox. A tracker that fails is tried again after longer and longer pauses; `memmlp track sync` fills
+in what it missed in the end.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ Tell = Callable[[Event], None]
 
 
 class Followed:
-    """A run that one tracker is shown, with its failures.
+    """A run that one tracker shows, with the state of its failures.
 
     Attributes:
         run: the run.
-        ended: when its end was told (monotonic seconds); None while it goes on.
-        next: when it is looked at next.
+        ended: when its end was announced (monotonic seconds); None while it goes on.
+        next: when to look at it next.
     """
 
     def __init__(self, run: Run):
@@ -53,23 +53,23 @@ class Followed:
         self.failures, self.next = 0, 0.0
 
     def failed(self, now: float) -> None:
-        """Put off the next try, the longer the more often it failed."""
+        """Postpone the next try, for longer the more often it has failed."""
         self.failures += 1
         pause = min(PACE * 2**self.failures, SLOWEST)
         self.next = now + (min(pause, 2 * PACE) if self.ended is not None else pause)
 
     def late(self, now: float) -> bool:
-        """Return whether the run ended so long ago that its tracker is given up."""
+        """Return whether the run ended so long ago that the tracker should give up on it."""
         return self.ended is not None and now - self.ended > GRACE
 
 
 class Desk:
-    """What one tracker is shown, in a thread of its own.
+    """The runs that one tracker shows, in a thread of its own.
 
     Args:
         tracker: the tracker.
-        ledgers: the folder in which is kept what it has.
-        tell: is told of runs that were shown to their end, of failures and of events that were dropped.
+        ledgers: the folder of notes about what the tracker has.
+        tell: gets a report of runs that were shown to their end, of failures and of dropped events.
     """
 
     def __init__(self, tracker: Tracker, ledgers: Path, tell: Tell):
@@ -80,14 +80,14 @@ class Desk:
         self.thread = threading.Thread(target=self._work, daemon=True)
 
     def put(self, event: Event) -> None:
-        """Hand over an event; where the inbox is full it is dropped and counted."""
+        """Hand over an event; if the inbox is full, the event is dropped and counted."""
         try:
             self.inbox.put_nowait(event)
         except queue.Full:
             self.dropped += 1
 
     def _work(self) -> None:
-        """Work until the event "stop" has come and every run is shown or given up."""
+        """Work until the event "stop" has come and every run has been shown or given up."""
         stopping = False
         while not stopping or self.runs:
             for event in self._arrived():
@@ -99,7 +99,7 @@ class Desk:
             self.look(time.monotonic())
 
     def _arrived(self) -> list[Event]:
-        """Return the events that came, after at most a pause of PACE."""
+        """Return the events that have arrived, after waiting for at most PACE."""
         found = []
         with contextlib.suppress(queue.Empty):
             found.append(self.inbox.get(timeout=PACE))
@@ -108,7 +108,7 @@ class Desk:
         return found
 
     def take(self, event: Event) -> None:
-        """Take note of a run's beginning or end, or show a sweep."""
+        """Register a run's beginning or end, or show a sweep."""
         folder = event["folder"]
         if event["event"] == "sweep":
             self._sweep(Path(folder))
@@ -120,13 +120,13 @@ class Desk:
             one.ended, one.next = time.monotonic(), 0.0
 
     def _end_all(self) -> None:
-        """The process that these runs were of is gone."""
+        """Mark all runs as ended, because the process that worked on them is gone."""
         for one in self.runs.values():
             if one.ended is None:
                 one.ended, one.next = time.monotonic(), 0.0
 
     def look(self, now: float) -> None:
-        """Show what is new of every run whose turn it is."""
+        """Show what is new in every run that is due."""
         for folder, one in list(self.runs.items()):
             if now < one.next:
                 continue
@@ -180,14 +180,14 @@ class Desk:
 
 
 class MachineLog:
-    """Writes what the machine does into the logs of the runs that go on."""
+    """Appends measurements of the machine to the logs of the running runs."""
 
     def __init__(self, pid: int):
         self.machine = Machine(pid)
         self.logs: dict[str, tuple[MetricsLog, int]] = {}
 
     def take(self, event: Event) -> None:
-        """Take note of a run's beginning or end."""
+        """Register a run's beginning or end."""
         folder = event.get("folder", "")
         if event["event"] == "begin":
             self.logs[folder] = (MetricsLog(Path(folder) / SYSTEM), next_sample(Run(folder)))
@@ -210,7 +210,7 @@ def reason_of(error: BaseException) -> str:
 
 
 def ledgers(outputs: Path, tracker: Tracker) -> Path:
-    """Return the folder in which is kept what a tracker has of the runs of an outputs folder."""
+    """Return the folder of notes about what a tracker has of the runs in an outputs folder."""
     place = hashlib.sha256(tracker.place.encode()).hexdigest()[:8]
     return outputs / "tracking" / f"{tracker.name}-{place}"
 
@@ -218,14 +218,14 @@ def ledgers(outputs: Path, tracker: Tracker) -> Path:
 def follow(
     trackers: Sequence[Tracker], outputs: Path, pid: int, told: queue.Queue[Event], tell: Tell
 ) -> None:
-    """Follow runs until the event "stop" comes, and then for as long as GRACE to the end of what began.
+    """Follow runs until the event "stop" comes, and then finish showing them, for at most GRACE.
 
     Args:
-        trackers: where to show them.
+        trackers: where to show the runs.
         outputs: the outputs folder.
-        pid: the process of the runs.
+        pid: the process that works on the runs.
         told: the events.
-        tell: is told what became of them.
+        tell: gets reports of the outcome of events.
     """
     desks = [Desk(tracker, ledgers(outputs, tracker), tell) for tracker in trackers]
     sampler, sampled = MachineLog(pid), time.monotonic()
@@ -254,7 +254,7 @@ def follow(
 
 
 def main() -> None:
-    """Read the trackers and then events from the standard input; write what became of them to the output."""
+    """Read the trackers, then events from the standard input; write the outcomes to the standard output."""
     with contextlib.suppress(OSError):
         os.nice(10)  # a run goes before what shows it
     given: dict[str, Any] = pickle.load(sys.stdin.buffer)  # from the process that started this one

@@ -20,7 +20,7 @@ from memmlp.runs.run import Run
 from memmlp.runs.shown_name import run_name
 
 SYSTEM = "system.jsonl"
-"""The log of what a run's machine did meanwhile, in its folder."""
+"""The log of the machine's load during a run, in the run's folder."""
 
 
 class CurvePoint(NamedTuple):
@@ -41,19 +41,19 @@ class CurvePoint(NamedTuple):
 
 @dataclass(frozen=True)
 class RunFacts:
-    """What a run's folder says of it beside its curves.
+    """The facts in a run's folder, besides its curves.
 
     Attributes:
         id: the run's id.
-        name: a name that people can read.
-        folder: its folder.
+        name: the run's readable name.
+        folder: the run's folder.
         status: "running", "done", "failed" or "killed".
         reason: why it failed; None if it did not.
         started, ended: seconds since 1970; `ended` is None while it runs.
-        config: its config by dotted key, as text.
-        origin: facts of its origin by name.
-        tags: the tags that people gave it.
-        note: their note; empty for none.
+        config: the run's config by dotted key, as text.
+        origin: facts about its origin, by name.
+        tags: the tags that users gave it.
+        note: the users' note; empty for none.
         data: name and digest of its data.
         results: its results by name, as curves of one point.
         files: the small files that are worth showing.
@@ -76,7 +76,7 @@ class RunFacts:
 
     @property
     def title(self) -> str:
-        """The name with the beginning of the id, which tells runs of the same name apart."""
+        """The name with the beginning of the id, which distinguishes runs with the same name."""
         return f"{self.name} · {self.id[:8]}"
 
 
@@ -85,7 +85,7 @@ def facts_of(run: Run, running: bool = False) -> RunFacts:
 
     Args:
         run: the run.
-        running: whether somebody is at it; its end is told as the folder has it, if not.
+        running: whether a process works on it; if not, its end is read from the folder.
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
     status = "running" if running else _status(run)
@@ -113,18 +113,18 @@ def facts_of(run: Run, running: bool = False) -> RunFacts:
 
 
 def _status(run: Run) -> str:
-    """A run that nobody is at, and that neither finished nor failed, was killed or stopped."""
+    """Return the status of a run on which no process works: failed, done, or else killed."""
     return "failed" if run.failure else "done" if run.done else "killed"
 
 
 def _ended(run: Run, started: float) -> float:
-    """When the run finished or failed; else the time of its last line."""
+    """Return when the run finished or failed, or else the time of its last line in the log."""
     when = read_json(run.folder / "FAILED").get("when") or run.manifest.get("finished")
     return _seconds(when) if when else max((entry.time for entry in run.metrics()), default=started)
 
 
 def _origin(manifest: Mapping[str, Any]) -> dict[str, str]:
-    """Return what the manifest says of the run's origin, as far as it is known."""
+    """Return the manifest's facts about the run's origin, as far as they are known."""
     git = manifest.get("git") or {}
     names = ("kind", "data", "upstream", "started", "version", "user", "host", "device", "gpu", "threads")
     tags = {name: manifest.get(name) for name in names}
@@ -145,7 +145,7 @@ def final(facts: RunFacts, step: int) -> list[CurvePoint]:
 
 
 def fingerprint(run: Run, facts: RunFacts) -> str:
-    """Return a digest of all that a tracker shows of the run."""
+    """Return a digest of everything that a tracker shows of the run."""
     logs = [file_digest(path) for path in (run.metrics_path, run.folder / SYSTEM) if path.exists()]
     files = [file_digest(path) for path in facts.files]
     text = json.dumps(plain([asdict(facts), logs, files]), sort_keys=True, default=str)
@@ -153,7 +153,7 @@ def fingerprint(run: Run, facts: RunFacts) -> str:
 
 
 class Tail:
-    """Reads a run's logs: first all that there is, then what is added, at most so many lines at a time."""
+    """Reads a run's logs: first all lines so far, then added lines, a limited number at a time."""
 
     MOST = 1000
 
@@ -161,7 +161,7 @@ class Tail:
         self.places = {run.metrics_path: 0, run.folder / SYSTEM: 0}
 
     def history(self) -> list[CurvePoint]:
-        """Return all values so far; of a step that a resumed run repeated, the last ones."""
+        """Return all values so far; if a resumed run repeated a step, its last values."""
         entries = {(entry.phase, entry.step): entry for entry in self._entries(sys.maxsize)}
         return [point for entry in entries.values() for point in points(entry)]
 
@@ -182,16 +182,16 @@ class Tail:
 
 @dataclass(frozen=True)
 class SweepFacts:
-    """What a sweep's folder says of it.
+    """The facts in a sweep's folder.
 
     Attributes:
         name: the sweep's name.
-        folder: its folder.
+        folder: the sweep's folder.
         status: "running", "done" or "failed".
         arms: run id -> the label of its arm.
         aggregates: means over seeds, by LABEL/MODE/METRIC.
         verdicts: verdicts on differences from the controls, by LABEL/MODE/METRIC.
-        files: its table as Markdown and HTML.
+        files: the sweep's table as Markdown and HTML.
     """
 
     name: str
@@ -206,7 +206,7 @@ class SweepFacts:
 
     @classmethod
     def read(cls, folder: Path) -> SweepFacts | None:
-        """Read a sweep's facts; None where it left none."""
+        """Read a sweep's facts; None if its folder has none."""
         found = read_json(folder / cls.RECORD)
         if not {"name", "status", "labels", "aggregates", "verdicts"} <= found.keys():
             return None

@@ -1,4 +1,4 @@
-"""The tracker that shows runs in MLflow: one MLflow run for each run folder, known by a tag."""
+"""The tracker that shows runs in MLflow: one MLflow run for each run folder, identified by a tag."""
 
 from __future__ import annotations
 
@@ -57,12 +57,12 @@ class MLflow:
         return self.uri or os.environ.get("MLFLOW_TRACKING_URI") or local
 
     def has(self, run_id: str) -> bool:
-        """Return whether MLflow has a run of that id."""
+        """Return whether MLflow has a run for that id."""
         with self._client() as client:
             return bool(found(client, experiment_id(client, self), run_id))
 
     def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> ShownInMLflow:
-        """Show a run: MLflow's own is brought up to date, or replaced where it contradicts the folder."""
+        """Show a run: MLflow's run is updated, or replaced if it contradicts the folder."""
         with self._client() as client:
             experiment = experiment_id(client, self)
             kept = None
@@ -83,8 +83,8 @@ class MLflow:
     def sweep(self, facts: SweepFacts) -> None:
         """Make a sweep the parent of its runs, with its aggregates, verdicts and table.
 
-        A run that several sweeps share stays a child of the first one; a tag for each sweep holds its label
-        there.
+        A run that several sweeps share stays a child of the first one; one tag per sweep holds the run's
+        label in that sweep.
         """
         with self._client() as client:
             experiment = experiment_id(client, self)
@@ -100,7 +100,7 @@ class MLflow:
 
     @contextlib.contextmanager
     def _client(self) -> Iterator[MlflowClient]:
-        """A client that prints nothing. Of processes that use one sqlite store, one at a time does."""
+        """Yield a client that prints nothing; a lock lets only one process at a time use a sqlite store."""
         self.outputs.mkdir(parents=True, exist_ok=True)
         local = self.place.startswith("sqlite:")
         guard = FileLock(self.outputs / ".mlflow.lock") if local else contextlib.nullcontext()
@@ -112,12 +112,12 @@ class MLflow:
 
 @dataclass(frozen=True)
 class ShownInMLflow:
-    """A run that MLflow shows.
+    """A run as shown in MLflow.
 
     Attributes:
         tracker: the tracker.
         mlflow_id: MLflow's own id of the run.
-        known: keys and steps that MLflow has.
+        known: keys and steps of the values that MLflow has.
     """
 
     tracker: MLflow
@@ -140,7 +140,7 @@ class ShownInMLflow:
                 self.known.update((metric.key, metric.step) for metric in part)
 
     def end(self, facts: RunFacts, results: Sequence[CurvePoint]) -> None:
-        """Send results and files, and end MLflow's run as the run ended."""
+        """Send results and files, and end MLflow's run with the run's own status."""
         self.log(results)
         with self.tracker._client() as client:
             describe(client, client.get_run(self.mlflow_id), facts)
@@ -154,7 +154,7 @@ class ShownInMLflow:
 
 
 def experiment_id(client: MlflowClient, tracker: MLflow) -> str:
-    """Return the id of MLflow's experiment, which is created if it is missing."""
+    """Return the id of MLflow's experiment; it is created if it does not exist."""
     experiment = client.get_experiment_by_name(EXPERIMENT)
     if experiment is not None:
         return experiment.experiment_id
@@ -164,15 +164,15 @@ def experiment_id(client: MlflowClient, tracker: MLflow) -> str:
 
 
 def found(client: MlflowClient, experiment: str, run_id: str) -> list[MlflowRun]:
-    """Return MLflow's runs that show the run of that id: one, unless somebody made more."""
+    """Return MLflow's runs for a run id: one, unless somebody made more."""
     return list(client.search_runs([experiment], f"tags.`memmlp.run_id` = '{run_id}'"))
 
 
 def contradicts(client: MlflowClient, old: MlflowRun, facts: RunFacts, points: Sequence[CurvePoint]) -> bool:
-    """Return whether MLflow's run has anything that the folder has not.
+    """Return whether MLflow's run has anything that contradicts the folder.
 
-    MLflow can't take back values and parameters, so that such a run has to be made anew. It is one of an
-    earlier start, or of steps that were repeated with other values.
+    MLflow can't remove values and parameters, so such a run has to be made anew. It comes from an earlier
+    start, or from steps that were repeated with other values.
     """
     if old.data.tags.get("memmlp.started") not in (None, facts.origin.get("started")):
         return True
@@ -189,7 +189,7 @@ def contradicts(client: MlflowClient, old: MlflowRun, facts: RunFacts, points: S
 
 
 def _steps(points: Sequence[CurvePoint]) -> set[int]:
-    """The step at which results lie: the last one of training."""
+    """Return the step at which results are placed: the last one of training."""
     return {max((point.step for point in points if not point.key.startswith("system/")), default=0)}
 
 
@@ -203,7 +203,7 @@ def _known(client: MlflowClient, run: MlflowRun) -> set[tuple[str, int]]:
 
 
 def describe(client: MlflowClient, run: MlflowRun, facts: RunFacts) -> None:
-    """Bring name, parameters, tags, note, dataset and source of MLflow's run up to date."""
+    """Update the name, parameters, tags, note, dataset and source of MLflow's run."""
     from mlflow.entities import Param, RunTag
 
     name, tags = run.info.run_id, _run_tags(facts)
@@ -251,7 +251,7 @@ def _run_tags(facts: RunFacts) -> dict[str, str]:
 
 
 def _sweep_run(client: MlflowClient, experiment: str, facts: SweepFacts) -> str:
-    """Return MLflow's id of the sweep's run, which has its aggregates and verdicts."""
+    """Return MLflow's id of the sweep's run, after updating its aggregates and verdicts."""
     from mlflow.entities import Metric, RunTag
 
     parents = client.search_runs([experiment], f"tags.`memmlp.sweep` = '{_quoted(facts.name)}'")
@@ -275,7 +275,7 @@ def _sweep_run(client: MlflowClient, experiment: str, facts: SweepFacts) -> str:
 
 
 def allowed(name: str) -> str:
-    """Return a name with the characters that MLflow allows; where that makes two alike, a digest differs."""
+    """Return a name with the characters that MLflow allows; if any were replaced, a digest is appended."""
     plain = re.sub(r"[^\w./ -]", "_", name)
     return plain if plain == name else f"{plain} {hashlib.sha256(name.encode()).hexdigest()[:4]}"
 

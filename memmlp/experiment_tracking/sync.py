@@ -1,4 +1,4 @@
-"""Fill in what a tracker missed, from the folders of runs and sweeps."""
+"""Fills in what a tracker missed, from the folders of runs and sweeps."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ Say = Callable[[str], None]
 
 
 def sync(tracker: Tracker, runs: Iterable[Run], outputs: Path, say: Say, full: bool = False) -> Counter[str]:
-    """Bring a tracker up to date with runs: afterwards it has of each exactly what its folder has.
+    """Update a tracker, so that it has exactly the content of each run's folder.
 
     Args:
         tracker: the tracker.
         runs: the runs.
         outputs: the outputs folder.
-        say: is told in a line of each run that could not be shown.
-        full: whether runs that the tracker has by our notes are shown anew, too.
+        say: gets a line about each run that could not be shown.
+        full: whether runs that the tracker has according to our notes are shown anew, too.
 
     Returns:
-        How many were "shown", were up to date ("same"), are being followed ("live") or "failed".
+        How many runs were "shown", were up to date ("same"), are being followed at present ("live"), or
+        "failed".
     """
     found: Counter[str] = Counter()
     for run in runs:
@@ -53,7 +54,7 @@ def _one(tracker: Tracker, run: Run, outputs: Path, full: bool) -> str:
 
 
 def sync_sweeps(tracker: Tracker, folders: Iterable[Path], say: Say) -> int:
-    """Show the sweeps that left a summary in these folders, and return how many are shown."""
+    """Show the sweeps whose folders have a summary, and return how many were shown."""
     shown = 0
     for folder in folders:
         facts = SweepFacts.read(folder)

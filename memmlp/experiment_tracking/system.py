@@ -1,4 +1,4 @@
-"""What a run's machine does meanwhile: processor, memory, disk, network, GPUs, by psutil and NVML."""
+"""What a run's machine does during the run: processor, memory, disk, network, GPUs, by psutil and NVML."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MB = 1e6
 
 
 class Machine:
-    """Measures the machine and a process on it; what is not installed or not there is left out.
+    """Measures the machine and a process on it; what is not installed or does not exist is left out.
 
     Args:
         pid: the process whose own memory and processor time are measured.
@@ -29,7 +29,7 @@ class Machine:
         self.gpus = _gpus()
 
     def measure(self) -> dict[str, float]:
-        """Return what was measured, in percent, megabytes and watts."""
+        """Return the measurements, in percent, megabytes and watts."""
         values: dict[str, float] = {}
         for part in (self._host, self._own, self._graphics):
             with contextlib.suppress(Exception):  # the process ended, a driver was unloaded, ...
@@ -62,7 +62,7 @@ class Machine:
 
 
 def _gpus() -> list[Any]:
-    """Return NVML's handles of the machine's GPUs; none where there is no NVML."""
+    """Return NVML's handles of the machine's GPUs; none without NVML."""
     with contextlib.suppress(Exception):
         import pynvml
 

@@ -1,4 +1,4 @@
-"""The tracker that writes TensorBoard's event files, without TensorBoard: by tensorboardX."""
+"""The tracker that writes TensorBoard's event files; it needs tensorboardX, not TensorBoard."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OWN = len(" · 01234567")  # of these, what tells a run from all others
 
 @dataclass(frozen=True)
 class TensorBoard:
-    """Shows runs as folders of event files below outputs/tensorboard, each written anew when it begins.
+    """Shows runs as folders of event files below outputs/tensorboard, each written anew when its run begins.
 
     Attributes:
         outputs: the outputs folder.
@@ -33,11 +33,11 @@ class TensorBoard:
         return str(self.outputs.absolute() / "tensorboard")
 
     def has(self, run_id: str) -> bool:
-        """Return whether there is a folder of that run."""
+        """Return whether there is a folder for that run."""
         return any(self._folders(run_id[:8]))
 
     def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> ShownInTensorBoard:
-        """Write a run's event file from its beginning; an earlier one is removed."""
+        """Write a run's event file from its beginning; an earlier file is removed."""
         for old in self._folders(facts.id[:8]):
             shutil.rmtree(old)
         shown = ShownInTensorBoard(EventFile(Path(self.place) / file_name(facts.title)))
@@ -63,19 +63,19 @@ class TensorBoard:
 
 
 class ShownInTensorBoard:
-    """A run whose event file is open."""
+    """A run with an open event file."""
 
     def __init__(self, writer: EventFile):
         self.writer = writer
 
     def log(self, points: Sequence[CurvePoint]) -> None:
-        """Write values to the disk."""
+        """Write values to disk."""
         for point in points:
             self.writer.scalar(point.key, point.value, point.step, point.time)
         self.writer.flush()
 
     def end(self, facts: RunFacts, results: Sequence[CurvePoint]) -> None:
-        """Write the results, and as text how the run ended, what people said of it, and its config."""
+        """Write the results, and as text the run's status, its tags and note, and its config."""
         self.log(results)
         config = "\n".join(f"| {key} | {value} |" for key, value in facts.config.items())
         texts = {"status": facts.status, "reason": facts.reason, "note": facts.note}
@@ -91,7 +91,7 @@ class ShownInTensorBoard:
 
 
 class EventFile:
-    """An event file that is written at once; tensorboardX's SummaryWriter leaves it to another thread."""
+    """An event file that is written immediately; tensorboardX's SummaryWriter uses another thread."""
 
     def __init__(self, folder: Path):
         from tensorboardX.event_file_writer import EventsWriter
@@ -112,7 +112,7 @@ class EventFile:
         self._add(summary(key, text), 0, 0.0)
 
     def flush(self) -> None:
-        """Bring what was added to the disk."""
+        """Write what was added to disk."""
         self.file.flush()
 
     def close(self) -> None:
@@ -126,6 +126,6 @@ class EventFile:
 
 
 def file_name(title: str) -> str:
-    """Return a title as the name of a folder, as TensorBoard shows it; of a long one the run's id is kept."""
+    """Return a title as the name of a folder, shown by TensorBoard; a long one is cut before the run's id."""
     name = re.sub(r"[^\w=.,·+() -]", "_", title)
     return name if len(name) <= LONGEST else name[: LONGEST - OWN] + name[-OWN:]

@@ -1,4 +1,4 @@
-"""The tracking slot: what a tracker is, and a run as one tracker is shown it."""
+"""The tracking slot: the interface of trackers, and a run as one tracker shows it."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from memmlp.runs.run import Run
 
 
 class Shown(Protocol):
-    """A run that a tracker shows at present."""
+    """A run that a tracker is showing."""
 
     def log(self, points: Sequence[CurvePoint]) -> None:
         """Show further values of the curves."""
 
     def end(self, facts: RunFacts, results: Sequence[CurvePoint]) -> None:
-        """Show the run's end or failure, its results and its files; nothing more comes."""
+        """Show the run's end or failure, its results and its files; nothing more follows."""
 
     def leave(self) -> None:
-        """Let go of the run, whether it ended or not."""
+        """Release the run, whether or not it ended."""
 
 
 class Tracker(Protocol):
-    """The slot's interface. All of it may block and may raise: no run ever waits for it.
+    """The slot's interface. Every method may block and may raise, since no run ever waits for a tracker.
 
-    An implementation can be pickled, for it works in a process of its own.
+    An implementation must be picklable, since it works in a separate process.
 
     Attributes:
         name: the option's name.
@@ -51,29 +51,29 @@ class Tracker(Protocol):
         """Where the tracker shows runs: an address or a folder."""
 
     def has(self, run_id: str) -> bool:
-        """Return whether the tracker shows a run of that id."""
+        """Return whether the tracker shows a run with that id."""
 
     def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> Shown:
-        """Show a run with these facts and points alone, in place of whatever the tracker had of it."""
+        """Show a run with exactly these facts and points, replacing whatever the tracker had of it."""
 
     def sweep(self, facts: SweepFacts) -> None:
-        """Show a sweep as the parent of its runs; a second call changes nothing."""
+        """Show a sweep as a group that contains its runs; a second call changes nothing."""
 
 
 class Busy(Exception):
-    """Raised when another process shows the run in that tracker at present."""
+    """Raised when another process is showing the run in that tracker."""
 
 
 class Session:
-    """A run as one tracker is shown it, from its beginning to its end.
+    """The work of showing one run in one tracker, from the run's beginning to its end.
 
     Args:
         tracker: the tracker.
         run: the run, which has begun.
-        ledgers: the folder in which is kept what trackers have.
+        ledgers: the folder of notes about what trackers have.
 
     Raises:
-        Busy: if another process shows the run in that tracker.
+        Busy: if another process is showing the run in that tracker.
     """
 
     def __init__(self, tracker: Tracker, run: Run, ledgers: Path):
@@ -88,7 +88,7 @@ class Session:
             raise Busy(f"run {run.id} is shown by another process") from None
 
     def step(self) -> None:
-        """Show what is new of a run that goes on."""
+        """Show what is new in a run that goes on."""
         if not self.run.manifest_path.exists():
             return  # it is about to begin
         with self._trying():
@@ -98,7 +98,7 @@ class Session:
                 self.shown.log(points)
 
     def end(self) -> None:
-        """Show the run as its folder says that it is now, and note that this tracker has it."""
+        """Show the run's final state from its folder, and note that this tracker has it."""
         if not self.run.manifest_path.exists():
             return  # it never began
         with self._trying():
@@ -113,12 +113,12 @@ class Session:
             write_json(self.ledger, {"shown": mark})
 
     def up_to_date(self) -> bool:
-        """Return whether the tracker has all of the run already."""
+        """Return whether the tracker has everything of the run already."""
         kept = read_json(self.ledger).get("shown")
         return kept == fingerprint(self.run, facts_of(self.run)) and self.tracker.has(self.run.id)
 
     def leave(self) -> None:
-        """Let go of the run."""
+        """Release the run."""
         try:
             if self.shown is not None:
                 shown, self.shown = self.shown, None
@@ -133,7 +133,7 @@ class Session:
 
     @contextlib.contextmanager
     def _trying(self) -> Iterator[None]:
-        """Begin anew after a failure, since nobody knows how much of it the tracker took."""
+        """Start anew after a failure, since it is unknown how much the tracker received."""
         try:
             yield
         except BaseException:

@@ -1,4 +1,4 @@
-"""The tracker that writes W&B's offline runs, by its own client; `wandb sync` uploads them."""
+"""The tracker that writes W&B's offline runs, with W&B's own client; `wandb sync` uploads them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ AXES = {"train/*": "step", "val/*": "step", "system/*": "system/time"}  # what c
 
 @dataclass(frozen=True)
 class WandB:
-    """Shows runs as W&B's offline runs below outputs/wandb, each written anew when it begins.
+    """Shows runs as W&B's offline runs below outputs/wandb, each written anew when its run begins.
 
     Attributes:
         project: the project to which `wandb sync` uploads them.
@@ -39,7 +39,7 @@ class WandB:
         return str(self.outputs.absolute() / "wandb")
 
     def has(self, run_id: str) -> bool:
-        """Return whether there is an offline run of that id."""
+        """Return whether there is an offline run for that id."""
         return any(self._folders(run_id))
 
     def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> ShownInWandB:
@@ -92,16 +92,16 @@ class WandB:
 class ShownInWandB:
     """A run that W&B's client has open.
 
-    Values of one training step, and of one of the machine's samples, are a row of W&B's history. Rows only go
-    forth there, and so their numbers are those of the steps until the machine's lie between; each row says
-    itself of which step or time it is (`AXES`).
+    The values of one training step, or of one sample of the machine, are a row of W&B's history. Row numbers
+    can only increase, so they equal the training steps until rows of the machine come between; each row
+    contains its own step or time (`AXES`).
     """
 
     def __init__(self, run: Any):
         self.run, self.row = run, -1
 
     def log(self, points: Sequence[CurvePoint]) -> None:
-        """Log values, those of training before those of the machine."""
+        """Log values, with those of training before those of the machine."""
         training = [point for point in points if not point.key.startswith("system/")]
         machine = [point for point in points if point.key.startswith("system/")]
         for step, group in groupby(sorted(training, key=lambda point: point.step), lambda point: point.step):
@@ -110,12 +110,12 @@ class ShownInWandB:
             self._log({point.key: point.value for point in group} | {"system/time": time_})
 
     def _log(self, values: dict[str, float], wanted: int = 0) -> None:
-        """Log a row, under a wanted number where that is free."""
+        """Log a row, under the wanted number if that is still free."""
         self.row = max(self.row + 1, wanted)
         self.run.log(values, step=self.row)
 
     def end(self, facts: RunFacts, results: Sequence[CurvePoint]) -> None:
-        """Give results to the run's summary, and end it as the run ended."""
+        """Write results into the run's summary, and end it with the run's own status."""
         self.run.summary.update({point.key: point.value for point in results})
         self.run.summary.update({"status": facts.status, "reason": facts.reason})
         for path in facts.files:
@@ -123,5 +123,5 @@ class ShownInWandB:
         self.run.finish(exit_code=0 if facts.status == "done" else 1)
 
     def leave(self) -> None:
-        """Close the run's file; one that did not end counts as crashed."""
+        """Close the run's file; a run that did not end counts as crashed."""
         self.run.finish(exit_code=1)

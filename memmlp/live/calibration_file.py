@@ -1,4 +1,4 @@
-"""What is known of a wearer, as a JSON file: offsets of the joints from the devices, body height, floor."""
+"""What a stream knows of its wearer, as a JSON file: the joints' offsets from the devices, height, floor."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ SAME = 5e-3  # metres by which two bodies of a height may differ
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a stream must know of a wearer; all but `body` are arguments of `Stream`.
+    """What a stream must know of a wearer; all fields except `body` are arguments of `Stream`.
 
     Attributes:
         space: the frame of reference, in whose axes the offsets are.
-        body: the body height of the network that they are of, metres (`memmlp.live.wearer.stature`).
+        body: the body height of the network for which the offsets were found, metres
+            (`memmlp.live.wearer.stature`).
         offsets: the offsets of the joints from the devices; None for none.
-        height: the body height, metres; None for that of the network's body.
+        height: the body height, metres; None for the height of the network's body.
         floor: the height of the floor, metres.
     """
 
@@ -39,7 +40,7 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
     """Write a calibration, atomically.
 
     Raises:
-        InputError: where it cannot be written there.
+        InputError: if the file cannot be written.
     """
     offsets = calibration.offsets and {
         "positions": calibration.offsets.positions.tolist(),
@@ -58,11 +59,12 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
 
 
 def read_calibration(path: Path, space: SpaceName, body: float) -> Calibration:
-    """Read a calibration of a space, for a network of a body height (metres).
+    """Read a calibration, for a frame of reference and a network with a given body height (metres).
 
     Raises:
-        InputError: where the file is none, of another space, or of a network with another body; the message
-            names the file. Height and floor are checked by who takes them.
+        InputError: if the file is no calibration, is for another frame of reference, or is for a network with
+            another body; the message names the file. Height and floor are not checked here, but where they
+            are used.
     """
     try:
         with open(path, "rb") as file:

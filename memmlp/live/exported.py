@@ -28,7 +28,7 @@ class ExportedNetwork(OnnxStream):
         branches: what the network learned to predict: rotations, and perhaps positions.
 
     Raises:
-        InputError: where the file is no such network, or lacks what must be known of it.
+        InputError: if the file is no such network, or lacks some of its metadata.
     """
 
     def __init__(self, path: Path):

@@ -3,13 +3,13 @@
 Inputs are one frame at 60 Hz: `tracker_positions` (1, 3, 3), metres, and `tracker_rotations` (1, 3, 3, 3),
 matrices, of head, left and right wrist; and the states `state.*`, all zeros for a fresh start.
 
-Outputs are `rotations` (1, 22, 3, 3), local matrices, or on demand (1, 22, 4), unit quaternions x, y, z, w
-whose w is not negative; the root's are global. `positions` (1, 22, 3), metres, by forward kinematics with the
-head on its tracker; `joints` (1, 22, 3), metres, the network's own positions; and the new states, under the
-same names with the suffix `.next`.
+Outputs are `rotations` (1, 22, 3, 3), local matrices, or, if asked for, (1, 22, 4), unit quaternions x, y, z,
+w whose w is not negative; the root's are global. `positions` (1, 22, 3), metres, by forward kinematics with
+the head on its tracker; `joints` (1, 22, 3), metres, the network's own positions; and the new states, under
+the same names with the suffix `.next`.
 
-All are in the frame of reference that was chosen (memmlp.live.spaces). Lost trackers, other rates and gaps
-(memmlp.live.tracker_frames) are left to the caller: NaN in is NaN out.
+All inputs and outputs are in the chosen frame of reference (memmlp.live.spaces). Lost trackers, other rates
+and gaps (memmlp.live.tracker_frames) are left to the caller: NaN in is NaN out.
 """
 
 from __future__ import annotations
@@ -52,19 +52,19 @@ INPUTS = ("tracker_positions", "tracker_rotations")
 OUTPUTS = ("rotations", "positions", "joints")
 UNIT = 1e-4  # how far a quaternion's norm may be from 1
 OWN = {"seen": (1, 1), "positions": (1, 3, 3), "rotations": (1, 3, 3, 3)}
-"""States beside the network's: whether there was a frame before, and its trackers in AMASS' world."""
+"""States besides the network's: whether there was an earlier frame, and its trackers in AMASS' world."""
 
 
 def as_they_are(rotations: Tensor) -> Tensor:
-    """Return matrices (..., 3, 3) as they are."""
+    """Return matrices (..., 3, 3) unchanged."""
     return rotations
 
 
 def quaternions(rotations: Tensor) -> Tensor:
     """Convert matrices (..., 3, 3) to unit quaternions (..., 4), xyzw, w not negative; accurate everywhere.
 
-    As `memmlp.motion.geometry.matrix_to_wxyz`, but of the four forms the well conditioned one is found
-    by comparing two at a time, which needs no computed index.
+    This computes the same as `memmlp.motion.geometry.matrix_to_wxyz`, but finds the well-conditioned one of
+    the four forms by comparing two at a time, which needs no computed index.
     """
     m = rotations.flatten(-2).split(1, -1)
     xx, yy, zz = m[0], m[4], m[8]
@@ -82,7 +82,7 @@ def quaternions(rotations: Tensor) -> Tensor:
 
 
 FORMATS: dict[str, Callable[[Tensor], Tensor]] = {"matrix": as_they_are, "quaternion": quaternions}
-"""How rotations come out, by name."""
+"""The formats of output rotations, by name."""
 
 
 class FullStep(nn.Module):
@@ -90,8 +90,8 @@ class FullStep(nn.Module):
 
     Args:
         model: the network, as it was trained or as its streaming graph.
-        space: the frame of reference of what goes in and comes out.
-        rotated: converts the rotation matrices to the format that comes out; one of FORMATS.
+        space: the frame of reference of inputs and outputs.
+        rotated: converts rotation matrices to the format of the outputs; one of FORMATS.
     """
 
     world: Tensor
@@ -135,7 +135,7 @@ class FullStep(nn.Module):
         return *self.posed(motion[:, -1], positions[:, 0]), seen.clamp_min(1), positions, rotations, *kept
 
     def posed(self, motion: Tensor, head: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return rotations, positions and joints in the space.
+        """Return rotations, positions and joints in the graph's frame of reference.
 
         Args:
             motion: world motion (1, 198).
@@ -152,7 +152,7 @@ class FullStep(nn.Module):
     def reached(self, local: Tensor) -> Tensor:
         """Return positions (1, 22, 3) relative to the root, by the products of `BodyTree.positions`.
 
-        They are few operations on large arrays, which are quicker in a graph than many small ones.
+        These products are few operations on large arrays, which run faster in a graph than many small ones.
         """
         bottom = torch.tensor([0.0, 0.0, 0.0, 1.0]).expand(1, N_JOINTS, 1, 4)
         transforms = torch.cat([torch.cat([local, self.offsets], -1), bottom], -2)
@@ -173,7 +173,8 @@ def export_full(
     """Write the whole step, on the CPU in float32, as one ONNX file with its metadata.
 
     Raises:
-        InputError: for an unknown space or format of rotations, or an opset that it cannot be brought to.
+        InputError: for an unknown space or format of rotations, or an opset to which the step can't be
+            converted.
     """
     if rotations not in FORMATS:
         raise InputError(f"rotations={rotations}: no such format; allowed: {', '.join(FORMATS)}")
@@ -194,7 +195,7 @@ def export_full(
 def trackers_of(frames: Tensor) -> tuple[Tensor, Tensor]:
     """Return the trackers of frames (N, 252 or 54): positions (N + 1, 3, 3) and rotations (N + 1, 3, 3, 3).
 
-    The first of them is the moment before the first frame, which follows from that frame's velocities.
+    The first entry is the time step before the first frame, reconstructed from that frame's velocities.
     """
     sixd = frames[:, SPARSE_ROTATION].unflatten(-1, (3, 6))
     turned = sixd_to_matrix(frames[:1, SPARSE_ANGULAR_VELOCITY].unflatten(-1, (3, 6)))
@@ -207,8 +208,8 @@ def trackers_of(frames: Tensor) -> tuple[Tensor, Tensor]:
 def full_parity(model: MotionModel, path: Path, clip: Tensor, space: str = "amass") -> float:
     """Return the largest difference between torch and the file over a clip (N, 252).
 
-    Each of them has its own history. Torch goes the way of evaluation: the features of the same trackers, the
-    network, and `Normalizer.pose`. Quaternions are compared as the matrices that they stand for.
+    Each of them has its own history. Torch computes what evaluation does: the features of the same trackers,
+    the network, and `Normalizer.pose`. Quaternions are converted to matrices for the comparison.
     """
     trackers, there = trackers_of(clip[:, :SPARSE_DIM].cpu()), space_of(space)
     found = _streamed(path, trackers, there)
@@ -216,12 +217,12 @@ def full_parity(model: MotionModel, path: Path, clip: Tensor, space: str = "amas
 
 
 def full_tolerated(model: MotionModel, path: Path, clip: Tensor, apart: float, space: str = "amass") -> bool:
-    """Return whether a difference between torch and the file over a clip (N, 252) is rounding.
+    """Return whether a difference between torch and the file over a clip (N, 252) is due to rounding.
 
-    Up to TOLERANCE it is. Up to ROUNDING it may be, where 6D columns are almost parallel, so that a matrix
-    magnifies what was rounded before: then the file has to be within TOLERANCE of torch in float64, or no
-    farther from it than twice as far as torch in float32 is. However large it is, it may be that rounding
-    chose another code-vector (`begins_at_ties`).
+    A difference of at most TOLERANCE always is. One of at most ROUNDING may be, where 6D columns are almost
+    parallel, so that earlier rounding errors are magnified: it is accepted if the file is within TOLERANCE of
+    torch in float64, or at most twice as far from it as torch in float32 is. A difference of any size is
+    accepted if rounding chose another code-vector (`begins_at_ties`).
     """
     if not apart > TOLERANCE:  # NaN is not
         return apart <= TOLERANCE
@@ -239,7 +240,7 @@ def full_tolerated(model: MotionModel, path: Path, clip: Tensor, apart: float, s
 
 
 def _streamed(path: Path, trackers: tuple[Tensor, Tensor], space: Space) -> list[np.ndarray] | None:
-    """Return rotations, positions and joints that the file makes of trackers; None for wrong quaternions."""
+    """Return the file's rotations, positions and joints for trackers; None for wrong quaternions."""
     stream, (positions, rotations) = OnnxStream(path), trackers
     given = [space.positions_out(positions.numpy()), space.rotations_out(rotations.numpy())]
     made = [stream.step(*(part[index : index + 1] for part in given)) for index in range(len(positions))]
@@ -252,7 +253,7 @@ def _streamed(path: Path, trackers: tuple[Tensor, Tensor], space: Space) -> list
 
 
 def _in_torch(model: MotionModel, trackers: tuple[Tensor, Tensor], space: Space) -> list[np.ndarray]:
-    """Return the rotations, positions and joints that the model makes of trackers, in a space."""
+    """Return the model's rotations, positions and joints for trackers, in a frame of reference."""
     positions, rotations = trackers
     sparse = sparse_features(rotations, positions)
     return _expected(model.normalizer, in_torch(model.cpu().eval(), sparse), sparse, space)
@@ -265,7 +266,7 @@ def _apart(some: list[np.ndarray], others: list[np.ndarray]) -> np.ndarray:
 
 
 def _expected(normalizer: Normalizer, motion: Tensor, sparse: Tensor, space: Space) -> list[np.ndarray]:
-    """Return rotations, positions and joints in a space, of world motion (N, 198) at inputs (N, 54)."""
+    """Return rotations, positions and joints in a space, from world motion (N, 198) and inputs (N, 54)."""
     local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6))).numpy()
     positions = [normalizer.pose(motion, sparse), motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))]
     return [space.pose_out(local), *(space.positions_out(part.numpy()) for part in positions)]

@@ -23,9 +23,9 @@ LEAST = 200  # samples that are timed, at least
 def measure_pose(path: Path, steps: int) -> dict[str, float]:
     """Time whole poses of an exported network on one thread: median and 95th percentile, in milliseconds.
 
-    A pose is a call of `Stream.step`: features, conversions and forward kinematics, with the network's step
-    among them. No yardstick runs between poses, as one does between the steps of `measure_step`, so that a
-    small network stays in the caches and its pose may take less than its step there.
+    A pose is a call of `Stream.step`: features, conversions, forward kinematics and the network's step.
+    Unlike in `measure_step`, no yardstick runs in between. So a small network stays in the caches, and its
+    whole pose may take less time than its step does there.
     """
     seconds = alternate(Stream(path), None, WARM_UP + max(steps, LEAST))[WARM_UP:, 1]
     return {
@@ -35,10 +35,10 @@ def measure_pose(path: Path, steps: int) -> dict[str, float]:
 
 
 def time_poses_in_turn(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, np.ndarray]:
-    """Time whole poses of exported networks on one thread, the files in turn in each round.
+    """Time whole poses of exported networks on one thread, with all files in turn in each round.
 
     Returns:
-        For each file the seconds of its poses (rounds, steps); the first ones of a round do not count.
+        For each file the seconds of its poses (rounds, steps); the first poses of a round are left out.
     """
     streams = {key: Stream(path) for key, path in paths.items()}
     seconds = {key: np.zeros((rounds, steps)) for key in paths}
@@ -49,12 +49,12 @@ def time_poses_in_turn(paths: Mapping[Key, Path], rounds: int, steps: int) -> di
 
 
 def alternate(stream: Stream, network: OnnxStream | None, frames: int) -> np.ndarray:
-    """Time the network's step alone and the stream's in turn, over random trackers.
+    """Time the network's step alone and the stream's step in alternation, on random trackers.
 
     Args:
         stream: the stream.
         network: the network; None to time the stream alone.
-        frames: how many samples the trackers give.
+        frames: number of samples.
 
     Returns:
         Seconds (frames, 2): of the network's step, and of the stream's.

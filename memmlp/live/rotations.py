@@ -1,6 +1,6 @@
 """Rotations and forward kinematics on NumPy arrays, one frame at a time. Quaternions are x, y, z, w.
 
-`memmlp.motion.geometry` has the same on torch tensors; this is what a live stream needs without torch.
+`memmlp.motion.geometry` has the same on torch tensors; a live stream does without torch.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def matrix_to_quaternion(matrix: np.ndarray) -> np.ndarray:
 
 
 def turned_by(matrix: np.ndarray, share: np.ndarray | float) -> np.ndarray:
-    """Return rotations (n, 3, 3) about the same axes by a share, (n,) or one, of their angles (0 to pi)."""
+    """Return rotations (n, 3, 3) about the same axes by a share, (n,) or one, of the angles (0 to pi)."""
     quaternion = matrix_to_quaternion(matrix)
     vector, w = quaternion[:, :3], quaternion[:, 3]
     sine = np.sqrt(np.einsum("ni,ni->n", vector, vector))
@@ -94,8 +94,8 @@ class BodyTree:
     Attributes:
         tracked: the indices of head, left and right wrist.
         offsets: (J, 3), metres, from the parent to the joint; 0 for the root.
-        ancestors: for 1, 2, 4, ... the index of the ancestor so far above, for each joint and for one more
-            above the root (J + 1), which stands for the identity.
+        ancestors: for 1, 2, 4, ... the index of the ancestor that many levels above each joint (J + 1); the
+            last entry is an extra joint above the root, which stands for the identity.
     """
 
     def __init__(self, joints: Sequence[str], parents: Sequence[int], rest: np.ndarray):
@@ -117,7 +117,7 @@ class BodyTree:
         """Return the positions (J, 3), metres, relative to the head.
 
         Args:
-            local: local rotations (J, 3, 3), the root's global.
+            local: local rotations (J, 3, 3), except for the root's, which is global.
         """
         transforms = self._transforms
         transforms[:-1, :3, :3] = local

@@ -1,4 +1,4 @@
-"""A long stream: whether it stays finite, as accurate as it was, and no larger in memory."""
+"""A test of a long stream: whether it stays finite, keeps its accuracy, and does not use more memory."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TENTHS = 10
 
 
 class TrackedMotion(NamedTuple):
-    """Trackers and truth of a motion, in AMASS' world.
+    """Trackers and true joints of a motion, in AMASS' world.
 
     Attributes:
         positions: of head, left and right wrist (N, 3, 3), metres.
@@ -31,13 +31,13 @@ class TrackedMotion(NamedTuple):
 
 
 class Soaked(NamedTuple):
-    """What a long stream showed.
+    """The result of a long stream.
 
     Attributes:
-        frames: how many there were.
+        frames: number of frames.
         finite: whether every number of every pose was finite.
         errors: the joints' mean distance from the truth in each tenth, cm.
-        growth: of the process's memory, from the end of the first tenth to the end, bytes.
+        growth: growth of the process's memory, from the end of the first tenth to the end, bytes.
     """
 
     frames: int
@@ -47,9 +47,9 @@ class Soaked(NamedTuple):
 
 
 def repetitions(length: int, least: int) -> int:
-    """Return how often to repeat a motion of `length` frames for at least `least` frames.
+    """Return how often to repeat a motion of `length` frames to get at least `least` frames.
 
-    It is a multiple of ten, so that every tenth has the same frames.
+    The number is a multiple of ten, so that every tenth of the stream has the same frames.
     """
     return TENTHS * -(-least // (TENTHS * length))
 
@@ -57,8 +57,8 @@ def repetitions(length: int, least: int) -> int:
 def soak(stream: Stream, motion: TrackedMotion, times: int) -> Soaked:
     """Stream a motion `times` times in a row, a multiple of ten, without a reset or a gap in between.
 
-    Each tenth holds the same frames. Only their beginnings differ: the first repetition begins fresh, every
-    later one with a jump from the motion's end.
+    Each tenth holds the same frames. Only their beginnings differ: the first repetition starts fresh, and
+    every later one starts with a jump from the motion's end.
     """
     length, finite, errors, size = len(motion.joints), True, np.zeros(TENTHS), 0
     total = length * times
@@ -75,7 +75,7 @@ def soak(stream: Stream, motion: TrackedMotion, times: int) -> Soaked:
 
 
 def memory() -> int:
-    """Return the bytes of memory that the process has; where the system doesn't tell, the most it had."""
+    """Return the process's memory in bytes; if the system does not tell it, the most that it has had."""
     statm = Path("/proc/self/statm")
     if statm.exists():
         return int(statm.read_text().split()[1]) * resource.getpagesize()

@@ -1,4 +1,4 @@
-"""Frames of reference by name, and the way from each to AMASS' world and back.
+"""Frames of reference by name, with the conversion from each to AMASS' world and back.
 
 | name   | axes of the world                        | body in its T-pose (its rotations are the identity) |
 |--------|------------------------------------------|-----------------------------------------------------|
@@ -30,9 +30,10 @@ class Space:
 
     Attributes:
         name: the name by which users call it.
-        world: orthogonal (3, 3), from its positions to AMASS' world; it mirrors where the space is
+        world: orthogonal (3, 3), from its positions to AMASS' world; it includes a mirroring if the space is
             left-handed.
-        body: signs (3,), from the axes of its T-pose to SMPL's body frame; they mirror where `world` does.
+        body: signs (3,), from the axes of its T-pose to SMPL's body frame; they include a mirroring if
+            `world` does.
     """
 
     name: str
@@ -40,33 +41,33 @@ class Space:
     body: np.ndarray
 
     def positions_in(self, positions: np.ndarray) -> np.ndarray:
-        """Bring positions (..., 3) from this space to AMASS' world."""
+        """Convert positions (..., 3) from this space to AMASS' world."""
         return positions @ self.world.T
 
     def positions_out(self, positions: np.ndarray) -> np.ndarray:
-        """Bring positions (..., 3) from AMASS' world to this space."""
+        """Convert positions (..., 3) from AMASS' world to this space."""
         return positions @ self.world.astype(positions.dtype)
 
     def rotations_in(self, rotations: np.ndarray) -> np.ndarray:
-        """Bring global rotations (..., 3, 3) from this space to AMASS' world."""
+        """Convert global rotations (..., 3, 3) from this space to AMASS' world."""
         return self.world @ rotations * self.body
 
     def rotations_out(self, rotations: np.ndarray) -> np.ndarray:
-        """Bring global rotations (..., 3, 3) from AMASS' world to this space."""
+        """Convert global rotations (..., 3, 3) from AMASS' world to this space."""
         return self.world.T.astype(rotations.dtype) @ rotations * self.body.astype(rotations.dtype)
 
     def pose_in(self, local: np.ndarray) -> np.ndarray:
-        """Bring local rotations (..., J, 3, 3), the root's global, from this space to AMASS' conventions."""
+        """Convert local rotations (..., J, 3, 3), the root's global, from this space to AMASS' convention."""
         return self._posed(local, self.rotations_in(local[..., 0, :, :]))
 
     def pose_out(self, local: np.ndarray) -> np.ndarray:
-        """Bring local rotations (..., J, 3, 3), the root's global, from AMASS' conventions to this space."""
+        """Convert local rotations (..., J, 3, 3), the root's global, from AMASS' convention to this space."""
         return self._posed(local, self.rotations_out(local[..., 0, :, :]))
 
     def _posed(self, local: np.ndarray, root: np.ndarray) -> np.ndarray:
-        """Put the other T-pose's axes on both sides of local rotations, and `root` in place of the root's.
+        """Convert local rotations to the other T-pose's axes, and put `root` in place of the root's rotation.
 
-        The signs are their own inverse, so that this serves both directions.
+        The signs are their own inverse, so this serves both directions.
         """
         turned = local * np.outer(self.body, self.body).astype(local.dtype)
         turned[..., 0, :, :] = root
@@ -84,7 +85,7 @@ SPACES = {
 
 
 def space_of(name: str) -> Space:
-    """Return the space of that name. Raises InputError for an unknown one."""
+    """Return the space with that name. Raises InputError if there is none."""
     if not isinstance(name, str) or name not in SPACES:
         raise InputError(f"space={name}: no such frame of reference; allowed: {', '.join(SPACES)}")
     return SPACES[name]

@@ -37,7 +37,7 @@ RotationFormat = Literal["matrix", "quaternion"]
 
 
 class Pose(NamedTuple):
-    """A person at a time, in the caller's frame of reference.
+    """A person's pose at a time, in the caller's frame of reference.
 
     Attributes:
         time: the frame's time, seconds of the caller's clock.
@@ -46,8 +46,8 @@ class Pose(NamedTuple):
         rotations: local rotations (22, 3, 3), or quaternions xyzw (22, 4); the root's is global.
         position_branch: the joints (22, 3), metres, from the network's position branch; where it has none,
             they follow from its rotations.
-        held: which of "head", "left", "right" are lost at this sample, and held.
-        fresh: whether this call made a frame; if not, the pose is the last frame's.
+        held: which of "head", "left", "right" are lost at this sample, and held at their last poses.
+        fresh: whether this call made a new frame; if not, the pose is the last frame's.
         restarted: whether the network began anew at this frame, as it does at the first one, and after
             `reset` or a gap.
     """
@@ -89,16 +89,16 @@ class Stream:
     """A trained network that is fed live.
 
     A tracker's rotation is that of SMPL's joint (head, wrists): the turn from a T-pose, see
-    `memmlp.live.spaces`. Devices that sit otherwise on the body differ from the joints by constant offsets,
-    which `calibrate` finds or `offsets` gives. `memmlp.live.tracker_frames` says what happens at other rates
-    than 60 Hz, to lost trackers and after gaps.
+    `memmlp.live.spaces`. Devices that are worn in other orientations or places differ from the joints by
+    constant offsets, which `calibrate` finds or `offsets` gives. `memmlp.live.tracker_frames` says what
+    happens at other rates than 60 Hz, to lost trackers and after gaps.
 
     Args:
         source: a finished run or its folder, or an ONNX file as `memmlp export` writes it (--scope step).
-        space: the frame of reference of what goes in and comes out: amass, openxr or unity.
-        rotations: what rotations come out as: matrix or quaternion (xyzw).
+        space: the frame of reference of inputs and outputs: amass, openxr or unity.
+        rotations: the format of the output rotations: matrix or quaternion (xyzw).
         offsets: the offsets of the joints from the devices; None for none.
-        height: the wearer's body height, metres; None for that of the network's body.
+        height: the wearer's body height, metres; None for the height of the network's body.
         floor: the height of the floor in the space, metres.
         ik: inverse kinematics towards the position branch (`memmlp.evaluation.ik.LBFGS()`), which needs
             torch; None for none.
@@ -108,7 +108,7 @@ class Stream:
         network_seconds: how long the network itself took in the last `step`.
 
     Raises:
-        InputError: where an argument is none of the above, in one line.
+        InputError: if an argument is not one of the above; its message is one line.
     """
 
     def __init__(
@@ -144,16 +144,16 @@ class Stream:
         return self.network.skeleton.rest / self.wearer.scale
 
     def fit(self, height: float | None = None, floor: float = 0.0) -> None:
-        """Take another body height (metres; None for the network's) and floor (metres), and begin anew.
+        """Set another body height (metres; None for the network's) and floor (metres), and begin anew.
 
         Raises:
-            InputError: for no height of a person, or no floor.
+            InputError: if the height is no person's, or the floor is no height.
         """
         self.wearer = wearer(self.network.skeleton, height, floor)
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew: the next sample is the first."""
+        """Begin anew: the next sample counts as the first."""
         self._trackers.reset()
         self._restart()
 
@@ -172,8 +172,8 @@ class Stream:
             The newest frame's pose.
 
         Raises:
-            InputError: for arrays of other shapes, a rotation that is none, or a time that is no number of
-                seconds.
+            InputError: for arrays of other shapes, for numbers that are no rotation, or for a time that is no
+                number of seconds.
         """
         _check_time(time)
         positions, rotations, lost = read_trackers((head, left, right))
@@ -203,20 +203,20 @@ class Stream:
     def calibrate(self, head: TrackerPose, left: TrackerPose, right: TrackerPose) -> Offsets:
         """Learn the offsets from a person who stands upright in T-pose, and use them from now on.
 
-        The line from the right to the left tracker tells which way the person looks, and so every joint's
-        rotation is known. The joints' positions are those of the network's body in that pose, at the wearer's
-        height, placed as near to the devices as possible (least squares). So a person of other proportions
+        The line from the right to the left tracker tells which way the person looks, and thereby every
+        joint's rotation. The joints' positions are those of the network's body in that pose, at the wearer's
+        height, placed as near to the devices as possible (least squares). So a person with other proportions
         moves a body with the network's proportions.
 
         Args:
             head, left, right: the devices' poses, as in `step`.
 
         Returns:
-            The offsets, which later streams can be given.
+            The offsets, which can be passed to later streams.
 
         Raises:
-            InputError: for a lost tracker, hands that are not apart, or a head that looks backwards as seen
-                from them.
+            InputError: for a lost tracker, hands that are not apart, or a head that looks backwards with
+                respect to the hands.
         """
         positions, rotations, lost = read_trackers((head, left, right))
         if any(lost):
@@ -241,11 +241,11 @@ class Stream:
         return self.offsets
 
     def _positions_in(self, positions: np.ndarray) -> np.ndarray:
-        """Bring the wearer's positions (..., 3) from the caller's space to the network's world."""
+        """Convert the wearer's positions (..., 3) from the caller's space to the network's world."""
         return self.wearer.positions_in(self.space.positions_in(positions))
 
     def _positions_out(self, positions: np.ndarray) -> np.ndarray:
-        """Bring positions (..., 3) from the network's world to the wearer's, in the caller's space."""
+        """Convert positions (..., 3) from the network's world to the wearer's size, in the caller's space."""
         return self.space.positions_out(self.wearer.positions_out(positions))
 
     def _restart(self) -> None:
@@ -254,7 +254,7 @@ class Stream:
         self._last = None
 
     def _again(self, lost: Lost) -> Pose:
-        """Return the last frame's pose, for a sample with which no frame is due."""
+        """Return the last frame's pose again, for a sample with which no frame is due."""
         assert self._last is not None  # the first sample always makes a frame
         return self._last._replace(held=_names(lost), fresh=False, restarted=False)
 
@@ -271,7 +271,7 @@ class Stream:
 
 
 class Solver:
-    """Inverse kinematics of one frame. It imports torch."""
+    """Inverse kinematics of one frame; this class imports torch."""
 
     def __init__(self, ik: LBFGS, rest: np.ndarray):
         import torch
@@ -282,9 +282,10 @@ class Solver:
         self.ik, self.normalizer = ik, Normalizer.raw(World(), torch.tensor(rest))
 
     def __call__(self, rotation6d: np.ndarray, position: np.ndarray, sparse: np.ndarray) -> np.ndarray:
-        """Return rotations (22, 6) whose joints are brought near to positions (22, 3).
+        """Return rotations (22, 6) whose joints are as near as possible to positions (22, 3).
 
-        It starts from the rotations (22, 6); `sparse` (54,) are the frame's inputs, for the head's position.
+        The search starts from the given rotations (22, 6); `sparse` (54,) are the frame's inputs, which have
+        the head's position.
         """
         import torch
 
@@ -293,9 +294,9 @@ class Solver:
 
 
 def read_trackers(trackers: Sequence[TrackerPose]) -> tuple[np.ndarray, np.ndarray, Lost]:
-    """Return positions (3, 3), rotations (3, 3, 3) and who is lost, of trackers as users give them.
+    """Return positions (3, 3), rotations (3, 3, 3) and which trackers are lost, from a user's trackers.
 
-    A lost tracker has the identity in place of its pose. Raises InputError where a tracker is malformed.
+    A lost tracker has the identity in place of its pose. Raises InputError if a tracker is malformed.
     """
     read, quaternions = NOTHING.copy(), {}
     for index, (name, tracker) in enumerate(zip(TRACKERS, trackers, strict=True)):
@@ -343,7 +344,7 @@ def _matrices(quaternions: dict[int, np.ndarray]) -> np.ndarray:
 
 
 def _check_rotations(names: Sequence[str], rotations: np.ndarray) -> None:
-    """Refuse matrices (3, 3, 3) that are no rotations: not orthonormal, or mirror images."""
+    """Raise InputError for matrices (3, 3, 3) that are no rotations: not orthonormal, or mirror images."""
     product = rotations @ rotations.swapaxes(1, 2)
     if np.abs(product - IDENTITY).max() <= UNIT and np.linalg.det(rotations).min() > 0:
         return
@@ -355,7 +356,7 @@ def _check_rotations(names: Sequence[str], rotations: np.ndarray) -> None:
 
 
 def _check_time(time: float | None) -> None:
-    """Refuse what is no time in seconds."""
+    """Raise InputError for anything but a time in seconds or None."""
     if time is None:
         return
     if not isinstance(time, (int, float, np.integer, np.floating)) or not abs(time) <= LATEST:
@@ -365,15 +366,16 @@ def _check_time(time: float | None) -> None:
 
 
 def _looks_back(head: np.ndarray, heading: float) -> bool:
-    """Return whether a head's device (3, 3) in AMASS' world looks away from a heading, radians, by over 90
-    degrees. One that is far from upright, and so no headset, is not asked.
+    """Return whether a head's device (3, 3), in AMASS' world, looks more than 90 degrees away from a heading.
+
+    The heading is in radians. The answer is False for a device far from upright, which is no headset.
     """
     upright = (head @ UPRIGHT.T)[2, 2] > np.cos(TILTED)
     return bool(upright and np.cos(heading_of(head) - heading) < 0)
 
 
 def checked_offsets(offsets: Offsets) -> Offsets:
-    """Return the offsets as float64 arrays. Raises InputError where they are malformed."""
+    """Return the offsets as float64 arrays. Raises InputError if they are malformed."""
     try:
         positions, rotations = (np.asarray(part, np.float64) for part in offsets)
     except (TypeError, ValueError):

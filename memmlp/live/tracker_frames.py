@@ -47,7 +47,7 @@ Lost = tuple[bool, ...]  # whether head, left and right wrist are lost
 
 
 class TrackerSample(NamedTuple):
-    """Head, left and right wrist at a time, in AMASS' world.
+    """Poses of head, left and right wrist at a time, in AMASS' world.
 
     Attributes:
         time: seconds.
@@ -63,8 +63,8 @@ class TrackerSample(NamedTuple):
 def between(a: TrackerSample, b: TrackerSample, time: float) -> TrackerSample:
     """Return the trackers at a time, interpolated between the samples before and after it.
 
-    A time a little after both is taken as of rounded times, but no further than `FURTHEST`: from two samples
-    that came together, speeds can't be told.
+    A time shortly after both samples is extrapolated, as it comes from rounded times, but no further than
+    `FURTHEST`: two samples that arrived almost together do not tell a speed.
     """
     weight = min((time - a.time) / (b.time - a.time), FURTHEST)
     positions = a.positions + weight * (b.positions - a.positions)
@@ -112,7 +112,7 @@ class Hold:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: no tracker was seen yet."""
+        """Forget everything, as if no tracker had been seen yet."""
         self.last: TrackerSample | None = None
         self.lost: Lost = NOBODY
         self.settled = -np.inf  # time from which all trackers that returned are at their true poses
@@ -120,7 +120,7 @@ class Hold:
         self.shift, self.turn = np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1))
 
     def __call__(self, sample: TrackerSample, lost: Lost) -> TrackerSample:
-        """Return the sample with lost trackers filled in, and with returning ones on their way."""
+        """Return the sample with lost trackers filled in, and returning ones on the way to true poses."""
         last = self.last or self._first(sample, lost)
         returning = [was and not is_lost for was, is_lost in zip(self.lost, lost, strict=True)]
         self.last, self.lost = sample, lost
@@ -133,9 +133,10 @@ class Hold:
         return self.last
 
     def _first(self, sample: TrackerSample, lost: Lost) -> TrackerSample:
-        """Return what stands in for the last sample when the first one comes: itself, if nothing is lost.
+        """Return a stand-in for the sample before the first: the first itself, if no tracker is lost.
 
-        Else it is the T-pose under the head; without a head, that of a person who stands at the origin.
+        Otherwise it is the T-pose under the head; without a head, the T-pose of a person standing at the
+        origin.
         """
         if not any(lost):
             return sample
@@ -145,20 +146,20 @@ class Hold:
         return t_pose(self.skeleton, sample.positions[0], heading_of(sample.rotations[0]))
 
     def _return(self, which: list[bool], last: TrackerSample, sample: TrackerSample) -> None:
-        """Remember how far the returning trackers are from where they were held."""
+        """Remember how far the returning trackers are from the poses at which they were held."""
         self.returned[which], self.settled = last.time, last.time + self.recovery
         self.shift[which] = (last.positions - sample.positions)[which]
         self.turn[which] = (last.rotations @ sample.rotations.swapaxes(1, 2))[which]
 
     def _on_their_way(self, sample: TrackerSample) -> TrackerSample:
-        """Return the sample with what is left of these differences added."""
+        """Return the sample with the remaining share of these differences added."""
         left = np.clip(1 - (sample.time - self.returned) / self.recovery, 0, 1)
         positions = sample.positions + left[:, None] * self.shift
         return TrackerSample(sample.time, positions, turned_by(self.turn, left) @ sample.rotations)
 
 
 def held(sample: TrackerSample, lost: Lost, last: TrackerSample) -> TrackerSample:
-    """Return the sample with the lost trackers where they last were, as seen from the head."""
+    """Return the sample with lost trackers at their last poses, as seen from the head."""
     positions, rotations = sample.positions.copy(), sample.rotations.copy()
     if lost[0]:
         positions[0], rotations[0] = last.positions[0], last.rotations[0]
@@ -170,7 +171,7 @@ def held(sample: TrackerSample, lost: Lost, last: TrackerSample) -> TrackerSampl
 
 
 class Taken(NamedTuple):
-    """What a sample brought: the frames that are due, and whether everything began anew with it."""
+    """The result of a sample: the frames that are due, and whether everything began anew with it."""
 
     frames: list[TrackerSample]
     restarted: bool
@@ -189,7 +190,7 @@ class Resampler:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: the next sample is the first."""
+        """Forget everything: the next sample counts as the first."""
         self.last: TrackerSample | None = None
         self.origin, self.count = 0.0, 0
 
@@ -199,11 +200,11 @@ class Resampler:
         return self.origin + self.count / self.fps
 
     def restarts(self, time: float) -> bool:
-        """Return whether frames begin anew with a sample at that time."""
+        """Return whether frames begin anew with a sample at the given time."""
         return self.last is None or abs(time - self.last.time) > self.gap
 
     def is_old(self, time: float) -> bool:
-        """Return whether a sample at that time is not newer than the last one."""
+        """Return whether a sample at the given time is not newer than the last one."""
         return self.last is not None and -self.gap <= time - self.last.time <= 0
 
     def take(self, sample: TrackerSample) -> list[TrackerSample]:
@@ -220,7 +221,7 @@ class Resampler:
 
 
 class TrackerFrames:
-    """Turns samples of three trackers into frames at the network's rate, by the rules of the module's text.
+    """Turns samples of three trackers into frames at the network's rate, by the rules at this file's top.
 
     Args:
         skeleton: the network's body.
@@ -242,7 +243,7 @@ class TrackerFrames:
             time: seconds; None for the time of the next frame, which is then exactly this sample.
             positions: (3, 3), metres, AMASS' world.
             rotations: (3, 3, 3), AMASS' world.
-            lost: which of the trackers do not count.
+            lost: which trackers are lost.
         """
         if time is None:
             time = self.grid.next
@@ -262,7 +263,7 @@ class Features:
         self.last: TrackerSample | None = None
 
     def reset(self) -> None:
-        """Forget the last frame: the next one has no velocity."""
+        """Forget the last frame: the next frame has zero velocities."""
         self.last = None
 
     def write(self, frame: TrackerSample, sparse: np.ndarray) -> None:

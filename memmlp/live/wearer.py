@@ -1,7 +1,8 @@
-"""The wearer beside the network's body: of another height, and on a floor at another height.
+"""The wearer, compared with the network's body: another height, and a floor at another height.
 
 A network knows bodies of one size, that of the rest pose in its file, on a floor at height zero. So positions
-go in scaled about the floor by the network's height over the wearer's, and come out scaled back. Angles stay.
+are scaled about the floor by the network's height divided by the wearer's on their way in, and scaled back on
+their way out. Angles stay the same.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from memmlp.common.errors import InputError
 from memmlp.live.rotations import BodyTree
 
 STATURE = 1.72 / 1.57
-"""Body height over the height of the head joint above the lowest joint, as the built-in adult has it."""
+"""The built-in adult's body height, divided by the height of the head joint above the lowest joint."""
 
 HEIGHTS = (0.5, 2.5)  # metres; from a small child to more than the tallest person
 DEEPEST = 100.0  # metres that a floor may be from the height zero
@@ -23,12 +24,12 @@ DEEPEST = 100.0  # metres that a floor may be from the height zero
 
 @dataclass(frozen=True)
 class Wearer:
-    """Who wears the trackers.
+    """The person who wears the trackers.
 
     Attributes:
-        height: the body height, metres.
+        height: the person's body height, metres.
         floor: the height of the floor, metres, in the trackers' frame of reference.
-        scale: the network's height over the wearer's.
+        scale: the network's body height divided by the wearer's.
     """
 
     height: float
@@ -36,11 +37,11 @@ class Wearer:
     scale: float
 
     def positions_in(self, positions: np.ndarray) -> np.ndarray:
-        """Bring the wearer's positions (..., 3), metres, AMASS' axes, to the network's size and floor."""
+        """Convert the wearer's positions (..., 3), metres, AMASS' axes, to the network's size and floor."""
         return (positions - self._up(positions)) * self.scale
 
     def positions_out(self, positions: np.ndarray) -> np.ndarray:
-        """Bring the network's positions (..., 3), metres, AMASS' axes, to the wearer's size and floor."""
+        """Convert the network's positions (..., 3), metres, AMASS' axes, to the wearer's size and floor."""
         return positions / self.scale + self._up(positions)
 
     def _up(self, positions: np.ndarray) -> np.ndarray:
@@ -48,21 +49,21 @@ class Wearer:
 
 
 def stature(skeleton: BodyTree) -> float:
-    """Return the body height, metres, of who has this rest pose."""
+    """Return the body height, metres, of a person with this rest pose."""
     heights = skeleton.rest[:, 1]
     return STATURE * float(heights[skeleton.tracked[0]] - heights.min())
 
 
 def wearer(skeleton: BodyTree, height: float | None = None, floor: float = 0.0) -> Wearer:
-    """Return a wearer beside a network's body.
+    """Return a wearer, given a network's body.
 
     Args:
         skeleton: the network's body.
-        height: the wearer's body height, metres; None for the network's body's.
+        height: the wearer's body height, metres; None for the height of the network's body.
         floor: the height of the floor, metres.
 
     Raises:
-        InputError: for no height of a person, or no floor.
+        InputError: if the height is no person's, or the floor is no height.
     """
     low, high = HEIGHTS
     if height is not None and not (_number(height) and low <= height <= high):

@@ -1,8 +1,8 @@
 """The body and every convention of the project, stated once: joints, tree, feature layout.
 
 Frames of reference: motion lives in AMASS' world (Z up, metres). A rest pose lives in SMPL's body frame (Y
-up, the person faces +Z, left is +X, T-pose), and the root's rotation carries the one to the other. A body
-joint's rotation is local, relative to its parent; the root's is global.
+up, the person faces +Z, left is +X, T-pose), and the root's rotation turns the rest pose into the world. A
+body joint's rotation is local, relative to its parent; the root's is global.
 """
 
 from __future__ import annotations

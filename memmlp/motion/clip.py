@@ -21,7 +21,7 @@ class Skipped:
     """A file that was skipped.
 
     Attributes:
-        file: its path below the folder.
+        file: the file's path below the folder.
         reason: why it was skipped, in one line.
     """
 
@@ -49,7 +49,7 @@ class Clip:
         return len(self.poses)
 
     def parts(self, frames: int = PART) -> Iterator[Clip]:
-        """Yield the clip in parts of at most so many frames, one after the other."""
+        """Yield the clip in successive parts of at most `frames` frames."""
         for start in range(0, len(self), frames):
             part = slice(start, start + frames)
             yield replace(self, poses=self.poses[part], trans=self.trans[part])
@@ -58,8 +58,8 @@ class Clip:
 def resample(clip: Clip, fps: float = FPS) -> tuple[Clip, str]:
     """Resample a clip to exactly `fps`, and say how: `kept`, `every k. frame`, or `interpolated`.
 
-    Where the rate divides, frames are taken by stride; otherwise rotations are interpolated by slerp and the
-    translation linearly, at the times k / fps that lie inside the clip.
+    If the clip's rate is a multiple of `fps`, every k-th frame is taken; otherwise rotations are interpolated
+    by slerp and the translation linearly, at the times k / fps that lie inside the clip.
 
     Raises:
         InputError: if a clip of one frame would have to be interpolated.

@@ -1,4 +1,4 @@
-"""The coordinates slot: how the network's space lies in the world."""
+"""The coordinates slot: the local coordinates in which a network sees the world."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from memmlp.motion.body import (
 
 
 class Coordinates:
-    """The slot's interface, with the world's own coordinates where it is not overridden.
+    """The slot's interface; methods that are not overridden use the world's own coordinates.
 
-    `origin` says, from a frame's inputs alone, where its local coordinates lie; `sparse_in`, `motion_in` and
-    `motion_out` convert inputs and motion to and from them.
+    `origin` says, from a frame's inputs alone, the origin of its local coordinates; `sparse_in`, `motion_in`
+    and `motion_out` convert inputs and motion to and from them.
     """
 
     def origin(self, sparse: Tensor) -> Tensor:
@@ -52,7 +52,7 @@ class World(Coordinates):
 
 
 class HeadRelative(Coordinates):
-    """Coordinates whose horizontal origin is the head of the same frame; heights stay (reading 20)."""
+    """Coordinates with the head of the same frame as horizontal origin and unchanged heights (reading 20)."""
 
     def origin(self, sparse: Tensor) -> Tensor:
         """Return the head's position on the floor (..., 3), metres, for inputs (..., 54)."""
@@ -101,7 +101,7 @@ class Heading(HeadRelative):
         return _turn(rotations, origin, 1)
 
     def _turned(self, motion: Tensor, origin: Tensor, way: int) -> Tensor:
-        """Turn the root's rotation and the positions; the other rotations are local anyway."""
+        """Turn the root's rotation and the positions; the other rotations are local, so they stay."""
         root, body = motion[..., :6], motion[..., 6 : ROTATION.stop]
         return torch.cat([_turn(root, origin, way), body, _turn(motion[..., POSITION], origin, way)], -1)
 

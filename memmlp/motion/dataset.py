@@ -28,7 +28,8 @@ class MotionDataset:
         starts: first frames of the clips (C,), int64, on the device of `frames`.
         lengths: numbers of frames of the clips (C,), int64, on the device of `frames`.
         names: names of the clips.
-        groups: group of each clip; clips that belong together share one. By default each clip is its own.
+        groups: group of each clip; clips that belong together share a group. By default each clip is a group
+            of its own.
         sources: source of each clip; None for clips of one folder.
     """
 
@@ -111,13 +112,13 @@ class WindowSampler:
 
     Args:
         dataset: the clips.
-        batch: number of windows a draw.
-        window: number of frames a window.
+        batch: number of windows per draw.
+        window: number of frames per window.
         seed: seed of the draws.
         weighting: "frames" if every window of the part is equally likely (reading 23), "clips" if every clip
-            is.
-        shares: how often a window is of each source, relative to the others; within a source `weighting`
-            says. None draws from all clips alike.
+            is equally likely.
+        shares: how often a window is drawn from each source, relative to the others; within a source,
+            `weighting` decides. None draws from all clips alike.
 
     Raises:
         InputError: for another weighting.
@@ -150,13 +151,13 @@ class WindowSampler:
         return torch.from_numpy(clip).to(self.device), torch.from_numpy(end).to(self.device)
 
     def draw_beginnings(self, step: int, stride: int) -> tuple[Tensor, Tensor]:
-        """Draw where streams begin that go through a clip to its end, `stride` frames a step.
+        """Draw where streams begin that run through a clip to its end, `stride` frames per step.
 
-        They begin at one of the clip's first windows, and a clip is the rarer the longer a stream stays in
-        it, so that streams see each window as often as `draw` draws it.
+        They begin at one of the clip's first windows. The longer a stream stays in a clip, the more rarely
+        the clip is drawn, so that streams see each window as often as `draw` draws it.
 
         Returns:
-            Clips (B,) and the last frames (B,) of the windows, as of `draw`, which they don't depend on.
+            Clips (B,) and the last frames (B,) of the windows, as from `draw`, but independent of its draws.
         """
         random = np.random.Generator(np.random.Philox(key=[self.seed, step], counter=[0, 0, 1, 0]))
         bounds = np.cumsum(self.weights / np.maximum(self.windows / stride, 1))
@@ -166,7 +167,7 @@ class WindowSampler:
 
 
 def _shared(weights: np.ndarray, sources: Sequence[str] | None, shares: Mapping[str, float]) -> np.ndarray:
-    """Return clips' weights (C,), int64: as they were within a source, and a source's sum up to its share."""
+    """Return clips' weights (C,), int64, scaled so that the weights of each source sum up to its share."""
     named, scaled = np.array(sources), weights.astype(float)
     for source, share in shares.items():
         scaled[named == source] *= share / weights[named == source].sum()

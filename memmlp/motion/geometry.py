@@ -1,7 +1,7 @@
 """Rotations and forward kinematics, on torch tensors of any leading shape and floating type.
 
-A rotation matrix acts on column vectors. "6D" is its first two columns, one after the other (Zhou et
-al. 2019, as every code base of the field has it). Angles are radians.
+A rotation matrix acts on column vectors. "6D" is its first two columns, one after the other (Zhou et al.
+2019, in the order that every code base of the field uses). Angles are radians.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def matrix_to_wxyz(matrix: Tensor) -> Tensor:
 def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
     """Convert matrices (..., 3, 3) to axis-angle (..., 3) of norm at most pi.
 
-    It goes by a quaternion, which is accurate at 0 and near pi.
+    The conversion goes through a quaternion, which is accurate at 0 and near pi.
     """
     quaternion = matrix_to_wxyz(matrix)
     vector = quaternion[..., 1:]
@@ -65,7 +65,10 @@ def matrix_to_sixd(matrix: Tensor) -> Tensor:
 
 
 def sixd_to_matrix(sixd: Tensor) -> Tensor:
-    """Convert 6D (..., 6) to matrices (..., 3, 3) by Gram-Schmidt; any 6 numbers give a rotation."""
+    """Convert 6D (..., 6) to matrices (..., 3, 3) by Gram-Schmidt.
+
+    Any two columns that are not zero and not parallel give a rotation.
+    """
     first = F.normalize(sixd[..., :3], dim=-1)
     second = sixd[..., 3:]
     second = F.normalize(second - (first * second).sum(-1, keepdim=True) * first, dim=-1)
@@ -93,9 +96,9 @@ def forward_kinematics(local: Tensor, root: Tensor, rest: Tensor) -> tuple[Tenso
     Joints that are equally far from the root are computed together, which takes the fewest operations.
 
     Args:
-        local: local rotations (..., 22, 3, 3), the root's global.
+        local: local rotations (..., 22, 3, 3), except for the root's, which is global.
         root: position of the root joint (..., 3), metres, world.
-        rest: rest positions (22, 3), metres; only the offsets between joint and parent count.
+        rest: rest positions (22, 3), metres; only the offsets between joint and parent matter.
     """
     offsets = (rest - rest[list(PARENTS)])[..., None]  # the root's is not used
     rotations, positions = [local[..., :1, :, :]], [root[..., None, :, None]]
@@ -107,7 +110,7 @@ def forward_kinematics(local: Tensor, root: Tensor, rest: Tensor) -> tuple[Tenso
 
 
 def bone_chains() -> Tensor:
-    """Return the matrix (22, 21) that adds turned bones up to joints as they are seen from the head.
+    """Return the matrix (22, 21) that adds turned bones up to joint positions relative to the head.
 
     A bone leads from a joint's parent to the joint; the root has none.
     """
@@ -119,11 +122,11 @@ def bone_chains() -> Tensor:
 
 
 def _levels() -> Iterator[tuple[slice, list[slice]]]:
-    """Yield the joints that are equally far from the root, which are numbered level by level.
+    """Yield the joints level by level; the joints of a level are equally far from the root.
 
     Yields:
-        The joints of a level behind the root's, and the runs of joints of the level before it, counted from
-        that level's first, that are their parents.
+        The joints of a level below the root's, and their parents: runs of joints of the level before it,
+        counted from that level's first joint.
     """
     starts = [0]
     for joint, parent in enumerate(PARENTS):

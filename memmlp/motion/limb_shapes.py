@@ -1,4 +1,4 @@
-"""The round limbs that joints are shown with: in pictures, on the live page, and in glTF files."""
+"""The round limbs that display joints: in pictures, on the live page, and in glTF files."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ RADII = tuple(_RADII[name.split("_")[-1]] for name in JOINTS)
 
 
 class Limb(NamedTuple):
-    """A round limb, from a joint to another, or from a joint to a tip that no joint marks.
+    """A round limb between two joints, or from a joint to a tip that is no joint.
 
     Attributes:
         start, end: the joints whose errors colour its two ends.
         radii: the radii at its ends, metres.
-        tip: 0 for a limb between the joints. Else the limb goes on from `end`, by this many metres, in the
-            direction from `start` to `end`.
+        tip: 0 for a limb between the two joints. Otherwise the limb begins at `end`, and goes this many
+            metres further in the direction from `start` to `end`.
     """
 
     start: int
@@ -46,7 +46,7 @@ LIMBS = (
 
 
 def ends(limb: Limb, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where a limb of joints (22, 3) begins and ends, each (3,), metres."""
+    """Return the two ends of a limb, each (3,), metres, given the joints (22, 3)."""
     start, end = joints[limb.start], joints[limb.end]
     if not limb.tip:
         return start, end

@@ -13,7 +13,7 @@ POINT_SIGNS = (-1.0, 1.0, 1.0)  # S p
 
 
 def _other_side(name: str) -> str:
-    """Return the name of the joint that a joint is in the mirror."""
+    """Return the name of the joint that takes a joint's place in the mirror."""
     side, _, rest = name.partition("_")
     return {"left": f"right_{rest}", "right": f"left_{rest}"}.get(side, name)
 
@@ -23,7 +23,7 @@ TRACKED_SWAPPED = tuple(TRACKED.index(SWAPPED[joint]) for joint in TRACKED)
 
 
 def _layout() -> tuple[Tensor, Tensor]:
-    """Return where each of a frame's features (252,) is taken from in the mirror, and with which sign."""
+    """Return the source (252,) of each of a frame's features in the mirror, and its sign."""
     sources, signs = torch.arange(FRAME_DIM), torch.ones(FRAME_DIM)
     start = 0
     for joints, of_each in (
@@ -44,15 +44,15 @@ SOURCES, SIGNS = _layout()
 def mirrored(frames: Tensor) -> Tensor:
     """Mirror world frames [X | Theta] (..., 252) at the plane X = 0, with left and right exchanged.
 
-    A body whose rest pose is not its own mirror image becomes its mirror image, too.
+    If the body's rest pose is not symmetric, the mirrored motion is that of the mirrored body.
     """
     return frames[..., SOURCES.to(frames.device)] * SIGNS.to(frames)
 
 
 class MirroredDataset(MotionDataset):
-    """Each clip of a dataset twice: as it is, and, after all of these, in the mirror.
+    """Each clip of a dataset twice: first all clips as they are, then all clips mirrored.
 
-    The frames are there once; what is drawn of a mirrored clip is mirrored when it is drawn.
+    The frames are stored once; frames of a mirrored clip are mirrored when they are read.
     """
 
     def __init__(self, plain: MotionDataset):

@@ -33,7 +33,7 @@ class Prepared(NamedTuple):
 
     @property
     def digest(self) -> str:
-        """The digest of the data, which stands for it in every identity."""
+        """The digest of the data, by which identities refer to it."""
         return self.manifest.digest
 
     def open(self, part: str) -> MotionDataset:
@@ -46,13 +46,13 @@ class Prepared(NamedTuple):
 
 @dataclass(frozen=True)
 class MotionSource:
-    """A folder of clips, which is generated if it is synthetic, and its cache.
+    """One or more folders of clips and their cache; synthetic clips are generated.
 
     Attributes:
         source: the folder of clips, or several, with its split and body.
         generate: makes a synthetic folder; None for the user's own.
         caches: folder of all caches.
-        partial: whether a part of what the split lists will do.
+        partial: whether it is allowed that only a part of the split's entries have clips.
     """
 
     source: ClipFolder
@@ -62,7 +62,7 @@ class MotionSource:
 
     @property
     def cache(self) -> Path:
-        """The folder of the cache, one for each source, split and body."""
+        """The folder of the cache; each combination of source, split and body has its own."""
         key = repr(replace(self.source, root=self.source.root.resolve())) + (self.groups_digest or "")
         return self.caches / f"{self.source.root.name}-{hashlib.sha256(key.encode()).hexdigest()[:8]}"
 
@@ -76,7 +76,7 @@ class MotionSource:
 
         Raises:
             InputError: if the cache can't be made, or if, without `partial`, an entry of the split's list has
-                no clip. A missing file is said before any is read.
+                no clip. A missing file is reported before any file is read.
         """
         if self.generate is not None:
             _make_once(Path(str(self.source.root)), self.generate)
@@ -88,7 +88,7 @@ class MotionSource:
         return found
 
     def _listed(self) -> Coverage:
-        """Return how many entries of the split have a file, whatever is in it."""
+        """Return how many entries of the split have a file, whatever the file contains."""
         split = self.source.split
         found = find_all(self.source.root) if split.listed else FoundFiles()
         names = [clip_name(file) for file in (*found.files, *found.links)]
@@ -101,9 +101,9 @@ class MotionSource:
 
 
 def _make_once(root: Path, generate: Callable[[Path], object]) -> None:
-    """Make the clips of a folder that is not there yet; concurrent callers wait for one another.
+    """Generate the clips of a folder that does not exist yet; concurrent callers wait for one another.
 
-    They are made in a temporary folder that is renamed, so that a kill leaves no incomplete one.
+    They are made in a temporary folder that is then renamed, so that a kill leaves no incomplete folder.
     """
     if root.exists():
         return

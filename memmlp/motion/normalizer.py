@@ -34,7 +34,7 @@ class Normalizer(nn.Module):
         coordinates: World(), HeadRelative() or Heading().
         rest: rest positions (22, 3), metres, for forward kinematics.
         mean: mean (252,) of frames [X | Theta] in the chosen coordinates.
-        std: their standard deviation (252,); values under 1e-3 are raised to that.
+        std: their standard deviation (252,); values under 1e-3 are replaced by 1e-3.
     """
 
     MIN_STD = 1e-3  # keeps a constant feature constant, where a division by 0 would make noise of it
@@ -100,7 +100,7 @@ class Normalizer(nn.Module):
     def pose(self, motion: Tensor, sparse: Tensor) -> Tensor:
         """Return joint positions (..., 22, 3), metres, world, from the rotations of world motion (..., 198).
 
-        They follow by forward kinematics, translated so that the head stands where its tracker says in the
+        They follow by forward kinematics, translated so that the head is at its tracker's position in the
         world inputs (..., 54) (reading 22).
         """
         rotations = motion[..., ROTATION].to(sparse.dtype).unflatten(-1, (N_JOINTS, 6))
@@ -111,9 +111,9 @@ class Normalizer(nn.Module):
         return positions + (head - positions[..., HEAD, :]).unsqueeze(-2)
 
     def posed(self, rotation: Tensor, sparse: Tensor) -> Tensor:
-        """Make world motion (..., 198) from rotations (..., 132) in network space at world inputs (..., 54).
+        """Make world motion (..., 198) from rotations (..., 132) in network space and world inputs (..., 54).
 
-        The positions follow from the rotations (`pose`), without gradient.
+        The positions follow from the rotations (`pose`), without gradients.
         """
         motion = F.pad(rotation, (0, MOTION_DIM - ROTATION.stop))
         world = self.decode_motion(motion, self.origin(sparse))
@@ -121,9 +121,9 @@ class Normalizer(nn.Module):
         return torch.cat([world[..., ROTATION], positions], -1)
 
     def posed_in_world(self, rotations: Tensor, sparse: Tensor, change: Change | None = None) -> Tensor:
-        """Make world motion (..., 198) from its global rotations (..., 132), 6D, at world inputs (..., 54).
+        """Make world motion (..., 198) from global rotations (..., 132), 6D, and world inputs (..., 54).
 
-        The positions are sums of turned bones, without gradient, the head on its tracker.
+        The positions are sums of turned bones, without gradients, with the head on its tracker.
         """
         matrices = sixd_to_matrix(rotations.unflatten(-1, (N_JOINTS, 6)))
         parents = matrices[..., list(PARENTS[1:]), :, :]

@@ -1,7 +1,7 @@
-"""Whether a clip can be a person's motion in radians, metres and with Z up, since no file says its units.
+"""Whether a clip can be a person's motion in radians, metres and with Z up, as files don't say their units.
 
 The limits leave room for what people do (jump, lie, crawl, climb, dance far from the origin, on a floor of
-any height): units that are wrong are wrong by factors of 39 to 1000, and a wrong axis by 90 degrees.
+any height): wrong units are off by factors of 39 to 1000, and a wrong axis by 90 degrees.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def implausible(clip: Clip) -> str | None:
 
 
 def unusual(clip: Clip) -> str | None:
-    """Return what a reader should know of a clip that may be sound all the same, or None."""
+    """Return what the user should know of a clip that is odd but may be sound, or None."""
     if _never_upright(_joints(clip, _spread(clip))):
         return "the head is never above the pelvis, so it lies throughout, or Z is not up"
     height = _height(clip)
@@ -53,7 +53,7 @@ def _degrees(clip: Clip) -> str | None:
 
 
 def _too_fast(clip: Clip) -> str | None:
-    """Judge by a quarter of the frames, since recordings have glitches."""
+    """Return why the pelvis is too fast in a quarter of the frames, or None; fewer may be glitches."""
     speeds = np.linalg.norm(np.diff(clip.trans, axis=0), axis=-1) * clip.fps
     if len(speeds) == 0 or np.quantile(speeds, 0.75) <= MOST_SPEED:
         return None
@@ -62,7 +62,11 @@ def _too_fast(clip: Clip) -> str | None:
 
 
 def _too_high(clip: Clip) -> str | None:
-    """Judge a great height by the feet: on a high floor one stands still while the pelvis moves on."""
+    """Return why the pelvis is too high, or None.
+
+    A great height is accepted if the feet hold: on a high floor, a foot stands still while the pelvis moves
+    on.
+    """
     height = _height(clip)
     if abs(height) <= MOST_HEIGHT or _feet_hold(clip):
         return None
@@ -71,10 +75,10 @@ def _too_high(clip: Clip) -> str | None:
 
 
 def _y_up(clip: Clip) -> str | None:
-    """Find a person who never stands along Z, but does along Y, and there on a floor.
+    """Return why the clip seems to have Y up, or None: a person stands along Y and never along Z, on a floor.
 
     Someone who lies throughout with the head towards +Y hardly has the feet at y = 0, and does not rise by a
-    metre while they keep to a plane.
+    metre while the feet stay in one plane.
     """
     joints = _joints(clip, _spread(clip))
     if _standing(joints, axis=2) > 0.02 or _standing(joints, axis=1) < 0.6:
@@ -90,7 +94,12 @@ def _height(clip: Clip) -> float:
 
 
 def _standing(joints: np.ndarray, axis: int) -> float:
-    """Return the share of frames with the head well above the pelvis, and that above an ankle, on an axis."""
+    """Return the share of frames with the head well above the pelvis, and the pelvis above an ankle.
+
+    Args:
+        joints: positions (n, 22, 3), metres.
+        axis: the axis along which heights are measured.
+    """
     heights = joints[:, :, axis] - joints[:, :1, axis]
     return float(((heights[:, HEAD] > 0.4) & (heights[:, ANKLES].min(1) < -0.5)).mean())
 

@@ -1,4 +1,4 @@
-"""Torch's threads while many short clips are worked on."""
+"""Torch's number of threads for work on many short clips."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Limit torch to one thread: on short clips more threads only spin, waiting for one another."""
+    """Limit torch to one thread: on short clips, more threads would only spin and wait for one another."""
     import torch
 
     before = torch.get_num_threads()

@@ -62,10 +62,11 @@ class Architecture:
 
         Args:
             normalizer: converts between the world and network space.
-            upstream: weights of the run that its own builds upon; None for none.
+            upstream: file of the weights of the run that this one builds upon; None where there is no such
+                run.
 
         Raises:
-            InputError: if their file is damaged.
+            InputError: if the file of weights is damaged.
         """
         return self.build(normalizer, self.load_vqvae(upstream) if upstream else None)
 
@@ -154,11 +155,11 @@ class PlainArchitecture(Architecture):
 
 @dataclass(frozen=True)
 class PartedArchitecture(PlainArchitecture):
-    """How a network is built whose parts are trained one after the other, before it is as a whole.
+    """The architecture of a network whose parts are trained one after the other, before the whole network is.
 
     Attributes:
-        finished: names of the parts that were trained and stay as they are, where others begin; empty where
-            the whole network goes on.
+        finished: names of the parts whose trained weights are loaded and frozen where the training of the
+            remaining parts begins; empty where the whole network is trained further.
     """
 
     finished: tuple[str, ...] = ()

@@ -43,7 +43,7 @@ def module_tensors(prefix: str, module: nn.Module) -> dict[str, Tensor]:
 
 
 def load_module(prefix: str, module: nn.Module, tensors: dict[str, Tensor]) -> None:
-    """Load those tensors into a module that `module_tensors` named with this prefix."""
+    """Load into a module those of the tensors that `module_tensors` named with this prefix."""
     own = {name.removeprefix(f"{prefix}."): t for name, t in tensors.items() if name.startswith(f"{prefix}.")}
     module.load_state_dict({_current(name): tensor for name, tensor in own.items()})
 

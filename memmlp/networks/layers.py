@@ -1,6 +1,6 @@
 """The MLP block of the backbone and the predictor, and its two forms that take in a memory feature.
 
-Also what a network's layers must be like for several processes to train it together.
+This file also says which layers several processes can't train together.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class PlainFusion(MLPBlock):
 
 
 class Dropout(nn.Dropout):
-    """Dropout that draws the same for a row of a batch, whether one process has it or several share it."""
+    """Dropout that draws the same values for a row of a batch, however many processes share the batch."""
 
     def forward(self, h: Tensor) -> Tensor:
         """Set random elements of features (B, ...) to 0 in training, and scale the others up."""

@@ -43,7 +43,7 @@ class MemMLP(MotionModel):
 
     @property
     def shift(self) -> int:
-        """How many frames before the newest one the memory's recall ends; 0 without a memory."""
+        """How many frames before the newest one the memory's recalled past ends; 0 without a memory."""
         return self.memory.shift
 
     @property
@@ -65,7 +65,7 @@ class MemMLP(MotionModel):
         return super().initial_state(batch) | {name: t.to(self.normalizer.mean) for name, t in kept.items()}
 
     def true_state(self, frames: Tensor) -> State:
-        """Return the state after world frames [X | Theta] (B, length, 252), the truth being its history."""
+        """Return the state after world frames [X | Theta] (B, length, 252), with the truth as its history."""
         encoded = self.normalizer.encode(frames)
         true = self.memory.true_state(encoded[..., :SPARSE_DIM], encoded[..., SPARSE_DIM:])
         return super().true_state(frames) | true
@@ -73,8 +73,8 @@ class MemMLP(MotionModel):
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         """Take in the newest frames; see MotionModel.
 
-        By default all T frames are returned; frames that are not wanted are not computed in the predictor's
-        last blocks.
+        By default all T frames are returned. If fewer are wanted, the predictor's last blocks skip the
+        others.
         """
         new = sparse.shape[1]
         inputs, kept = self.taken_in(sparse, state)
@@ -91,10 +91,10 @@ class MemMLP(MotionModel):
         return self.normalizer.decode_motion(motion[:, -wanted:], origin[:, -wanted:]), kept
 
     def rewound(self, state: State, frames: Tensor) -> State:
-        """Return the state with what the memory recalls as it was some frames ago; see MotionModel."""
+        """Return the state whose memory buffers are as they were some frames ago; see MotionModel."""
         return {**state, **self.memory.rewound(state, frames)}
 
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
-        """Make a training call. A memory whose VQ-VAE trains with the network brings losses of its own."""
+        """Make a training call; a memory whose VQ-VAE trains with the network adds losses of its own."""
         motion, kept = self.advance(sparse, state)
         return Learned(motion, kept, self.memory.auxiliary_losses(truth, self.normalizer))

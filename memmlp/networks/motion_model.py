@@ -13,13 +13,14 @@ from memmlp.networks.memory import State
 
 
 class Learned(NamedTuple):
-    """What a training call makes.
+    """What a training call returns.
 
     Attributes:
-        motion: (B, n, 198) in the world, that is to be the true one of the window's last n frames. A network
-            of members that each learn by themselves makes that of all, in turn: (members B, n, 198).
+        motion: (B, n, 198) in the world, to be compared with the true motion of the window's last n frames. A
+            network whose members each learn by themselves returns the motion of all members, one after the
+            other: (members B, n, 198).
         state: the new state.
-        losses: the network's own further losses, weighted, which are added to the motion's.
+        losses: the network's own further losses, weighted, which are added to the motion's losses.
     """
 
     motion: Tensor
@@ -28,7 +29,7 @@ class Learned(NamedTuple):
 
 
 class MotionModel(nn.Module):
-    """A network that `advance` moves in time; the interface of all networks.
+    """A network that takes in frames by calls of `advance`; the interface of all networks.
 
     Evaluation, export, timing and training know no more of a network than this. In this base class a
     network sees a window, the last T frames, and its state is only the buffer of past inputs (WindowlessModel
@@ -39,8 +40,8 @@ class MotionModel(nn.Module):
         frames: T, the window's length.
 
     Attributes:
-        branches: the parts of the motion that are learned, of "rotation" and "position"; positions that are
-            not learned follow from the rotations.
+        branches: the parts of the motion that are learned, out of "rotation" and "position"; positions that
+            are not learned follow from the rotations.
     """
 
     branches: frozenset[str] = frozenset({"rotation"})
@@ -62,7 +63,7 @@ class MotionModel(nn.Module):
 
     @property
     def windowless(self) -> bool:
-        """Whether it has no window and is a stream in both evaluation modes (see WindowlessModel)."""
+        """Whether the network has no window and is a stream in both evaluation modes; see WindowlessModel."""
         return False
 
     @property
@@ -72,7 +73,10 @@ class MotionModel(nn.Module):
 
     @property
     def joint(self) -> bool:
-        """Whether window mode makes all windows of a clip together, by `whole`, and they may overlap."""
+        """Whether window mode passes a whole clip to `whole`, which makes all its windows together.
+
+        Such windows may overlap.
+        """
         return False
 
     @property
@@ -82,7 +86,7 @@ class MotionModel(nn.Module):
 
     @property
     def stride(self) -> int:
-        """By how many frames a training step moves: the shift, or 1 for a network without a past."""
+        """By how many frames a training step moves on: the shift, or 1 for a network without a past."""
         return max(self.shift, 1)
 
     def initial_state(self, batch: int = 1) -> State:
@@ -99,11 +103,11 @@ class MotionModel(nn.Module):
         return fresh | {"sparse": sparse, "started": torch.ones_like(fresh["started"])}
 
     def true_state(self, frames: Tensor) -> State:
-        """Return the state after true world frames [X | Theta] (B, length, 252), its history being true."""
+        """Return the state after true world frames [X | Theta] (B, length, 252), the truth as its history."""
         return self.running_state(frames[..., :SPARSE_DIM])
 
     def taken_in(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
-        """Return the buffer's and the new inputs together (B, length + n, 54), and the buffers after them.
+        """Return past and new inputs together (B, length + n, 54), and the buffers after them.
 
         Args:
             sparse: new world inputs (B, n, 54).
@@ -119,7 +123,7 @@ class MotionModel(nn.Module):
         Args:
             sparse: world inputs (B, n, 54) of the n newest frames: n is 1 for a live stream, T for windows.
             state: what the last call returned, or `initial_state`.
-            newest: how many of the newest frames are wanted; by default all that the network makes.
+            newest: how many of the newest frames are wanted; by default all that the network predicts.
 
         Returns:
             Motion (B, newest, 198) in the world, of the frames that end with the newest one, and the new
@@ -128,14 +132,14 @@ class MotionModel(nn.Module):
         raise NotImplementedError
 
     def rewound(self, state: State, frames: Tensor) -> State:
-        """Return the state as it was some frames ago, for a window that takes in frames again.
+        """Return the state as it was some frames ago, for a window that takes in some frames a second time.
 
-        By default that is the state itself: T new frames are all that a network without a past sees.
-        Recurrent states can't be taken back, and stay.
+        By default this is the state itself, since a network without a past sees nothing but the T new frames.
+        Recurrent states can't be rewound, so they are kept.
 
         Args:
             state: what the last call returned.
-            frames: how many frames each of the batch goes back (B,), int64, fewer than T.
+            frames: how many frames each batch element goes back (B,), int64, fewer than T.
         """
         return state
 
@@ -154,7 +158,7 @@ class MotionModel(nn.Module):
         return Learned(*self.advance(sparse, state), {})
 
     def count_parameters(self) -> int:
-        """Count the trainable parameters, which tables show as parameters, in millions.
+        """Count the trainable parameters; tables show this number in millions.
 
         A frozen VQ-VAE is not counted; one that is trained with the network is, its decoder included.
         """

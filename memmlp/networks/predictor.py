@@ -101,7 +101,7 @@ class TwoBranchMemory(TwoBranch):
 
 
 class RotationOnly(nn.Module):
-    """One branch for the rotations; positions follow by forward kinematics, without gradient.
+    """One branch for the rotations; positions follow by forward kinematics, without gradients.
 
     Args:
         depth: number of blocks.
@@ -138,7 +138,7 @@ class RotationOnly(nn.Module):
 
 
 class RotationOnlyMemory(RotationOnly):
-    """One rotation branch of memory blocks: Table 8's question asked without a position branch."""
+    """One rotation branch of memory blocks: Table 8's comparison without a position branch."""
 
     kind = MemoryBranch
 

@@ -1,7 +1,7 @@
 """Arms that reach to the hands' trackers, in closed form.
 
-Two bones whose ends are known leave the elbow a circle (Tolani et al. 2000). Where on it the elbow is, a
-network predicts. What else it predicted of an arm gives way, as the tracker knows better.
+If shoulder and wrist are known, the elbow lies on a circle (Tolani et al. 2000). The network's prediction
+decides where on that circle; everything else it predicted of the arm is replaced to match the tracker.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SLACK = 1e-3  # the part of its reach by which an arm is never quite straight, n
 
 
 def tracked(rotations: Tensor, sparse: Tensor) -> Tensor:
-    """Turn head and wrists as their trackers are.
+    """Replace the rotations of head and wrists by those of their trackers.
 
     Args:
         rotations: global rotations (..., 132), 6D, world.
@@ -35,10 +35,10 @@ def tracked(rotations: Tensor, sparse: Tensor) -> Tensor:
 
 
 def reached(rotations: Tensor, joints: Tensor, sparse: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
-    """Bend the arms of a body so that its wrists come to their trackers, as far as the arms reach.
+    """Bend the arms of a body so that its wrists get to their trackers, as far as the arms reach.
 
-    The elbows stay on that side of the line from shoulder to hand on which they are; those of straight arms
-    go to the upper arm's back. The bones are turned the least way.
+    Each elbow stays on its side of the line from shoulder to hand; the elbow of a straight arm goes to the
+    back of the upper arm. The bones are turned by the smallest rotations.
 
     Args:
         rotations: global rotations (..., 22, 3, 3), world.
@@ -63,7 +63,7 @@ def reached(rotations: Tensor, joints: Tensor, sparse: Tensor, rest: Tensor) -> 
 
 
 def bent_to(goal: Tensor, side: Tensor, upper: Tensor, lower: Tensor) -> tuple[Tensor, Tensor]:
-    """Return where the elbows and wrists are of arms that reach to a goal, all seen from the shoulders.
+    """Return the positions of elbows and wrists of arms that reach to a goal, all relative to the shoulders.
 
     Args:
         goal: where the wrists should be (..., 2, 3), metres.

@@ -49,7 +49,7 @@ class RecurrentCell(nn.Module):
 
 
 def products(weights: Sequence[Tensor], x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what a layer's gates get from an input (B, n) and from the hidden state (B, d).
+    """Return the contributions of an input (B, n) and of the hidden state (B, d) to a layer's gates.
 
     Args:
         weights: the layer's weights and biases, in the order of `nn.RNNBase.all_weights`.
@@ -87,7 +87,7 @@ class GRUCell(RecurrentCell):
 
 
 class LSTMCell(RecurrentCell):
-    """A long short-term memory (Hochreiter & Schmidhuber 1997); its state: hidden, then cell."""
+    """A long short-term memory (Hochreiter & Schmidhuber 1997); its state is hidden state, then cell."""
 
     carried = 2
 
@@ -137,7 +137,7 @@ class LinearCell(RecurrentCell):
     """The base of cells whose units are linear in their own state, so that all frames are made at once."""
 
     def gates(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Map inputs (..., d) to the share of the state that is kept, and to what is added, both (..., d)."""
+        """Map inputs (..., d) to the share of the state that is kept and to what is added, both (..., d)."""
         raise NotImplementedError
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
@@ -160,7 +160,7 @@ class MinGRU(LinearCell):
         self.linear = nn.Linear(width, 2 * width)
 
     def gates(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Map inputs (..., d) to what is kept and what is added; see LinearCell."""
+        """Map inputs (..., d) to the share that is kept and to what is added; see LinearCell."""
         gate, new = self.linear(x).chunk(2, -1)
         update = torch.sigmoid(gate)
         return 1 - update, update * new
@@ -176,7 +176,7 @@ class LRU(LinearCell):
         self.decay = nn.Parameter(rate.expm1().log())  # softplus makes the rate of it
 
     def gates(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Map inputs (..., d) to what is kept and what is added; see LinearCell."""
+        """Map inputs (..., d) to the share that is kept and to what is added; see LinearCell."""
         forget, enter, new = self.linear(x).chunk(3, -1)
         keep = torch.exp(-F.softplus(self.decay) * torch.sigmoid(forget))
         room = (1 - keep.square()).clamp_min(1e-6).sqrt()  # keeps the state's variance that of its inputs

@@ -25,7 +25,7 @@ class RecurrentBlock(nn.Module):
     Args:
         cell: the recurrent cell of d inputs and outputs.
         width: d.
-        expansion: the MLP's hidden width, in d.
+        expansion: the MLP's hidden width, as a multiple of d.
     """
 
     def __init__(self, cell: RecurrentCell, width: int, expansion: int):
@@ -54,17 +54,17 @@ class RecurrentBlock(nn.Module):
 
 
 class RotationOutput(nn.Module):
-    """What a member's rotations (..., 132) stand for; the interface of the option `model.output`."""
+    """What a member's outputs (..., 132) mean as rotations; the interface of the option `model.output`."""
 
     def begin(self, head: nn.Linear, normalizer: Normalizer) -> None:
-        """Change the weights that a head begins with; by default they stay as they are."""
+        """Change the initial weights of a member's head; by default they stay as they are."""
 
     def posed(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        """Map rotations (..., 132), as they are made, to world motion (..., 198) at inputs (..., 54)."""
+        """Map a member's outputs (..., 132) to world motion (..., 198), given inputs (..., 54)."""
         raise NotImplementedError
 
     def learned(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        """Map rotations to the motion whose errors are learned from; by default as in `posed`."""
+        """Map a member's outputs to the motion that the losses compare; by default the same as `posed`."""
         return self.posed(made, sparse, normalizer)
 
 
@@ -72,7 +72,7 @@ class LocalRotations(RotationOutput):
     """Each joint's rotation in its parent's frame."""
 
     def posed(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        """Map rotations (..., 132), as they are made, to world motion (..., 198) at inputs (..., 54)."""
+        """Map a member's outputs (..., 132) to world motion (..., 198), given inputs (..., 54)."""
         return normalizer.posed(made, sparse)
 
 
@@ -83,35 +83,36 @@ class GlobalRotations(RotationOutput):
     """
 
     def begin(self, head: nn.Linear, normalizer: Normalizer) -> None:
-        """Begin near the mean pose: a training that begins at random ones leaves legs turned wrongly."""
+        """Begin near the mean pose: trainings that begin at random rotations leave legs turned wrongly."""
         with torch.no_grad():
             head.weight *= 0.3
             head.bias.copy_(mean_pose(normalizer))
 
     def posed(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        """Map rotations (..., 132), as they are made, to world motion (..., 198) at inputs (..., 54)."""
+        """Map a member's outputs (..., 132) to world motion (..., 198), given inputs (..., 54)."""
         with in_float32(made.device):
             return normalizer.posed_in_world(self.in_world(made, sparse, normalizer), sparse)
 
     def in_world(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        """Turn rotations (..., 132), as they are made at inputs (..., 54), to those of the world."""
+        """Map a member's outputs (..., 132) to global rotations in the world, given inputs (..., 54)."""
         return normalizer.rotations_out(made.to(sparse.dtype), normalizer.origin(sparse))
 
 
 class ReachingArms(GlobalRotations):
     """Global rotations, and arms that reach to the hands' trackers (`reached`).
 
-    What is learned is the arms before they reach: learned through, rotations and positions err more.
+    The losses compare the arms before they reach: with losses after it, rotations and positions had larger
+    errors.
     """
 
     def posed(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        """Map rotations (..., 132), as they are made, to world motion (..., 198) at inputs (..., 54)."""
+        """Map a member's outputs (..., 132) to world motion (..., 198), given inputs (..., 54)."""
         with in_float32(made.device):
             rotations = tracked(self.in_world(made, sparse, normalizer), sparse)
             return normalizer.posed_in_world(rotations, sparse, reached)
 
     def learned(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        """Map rotations (..., 132) to world motion whose arms are as they are made."""
+        """Map a member's outputs (..., 132) to world motion whose arms have not been made to reach."""
         return super().posed(made, sparse, normalizer)
 
 
@@ -126,7 +127,7 @@ OUTPUTS: dict[str, type[RotationOutput]] = {
 def mean_pose(normalizer: Normalizer) -> Tensor:
     """Return the global rotations (132,), 6D, of the mean pose in the network's coordinates.
 
-    They are zeros where the normalizer knows no mean (`frame.normalize=false`).
+    They are zeros where the normalizer has no mean (`frame.normalize=false`).
     """
     local = sixd_to_matrix(normalizer.mean[SPARSE_DIM:][ROTATION].unflatten(-1, (N_JOINTS, 6)))
     rotations, _ = forward_kinematics(local, torch.zeros_like(normalizer.rest[0]), normalizer.rest)
@@ -140,7 +141,7 @@ class Member(nn.Module):
         cells: makes a recurrent cell of d inputs and outputs.
         width: d, the width of the hidden state.
         depth: number of blocks.
-        expansion: the hidden width of the blocks' MLPs, in d.
+        expansion: the hidden width of the blocks' MLPs, as a multiple of d.
     """
 
     def __init__(self, cells: Callable[[int], RecurrentCell], width: int, depth: int, expansion: int):
@@ -176,12 +177,12 @@ class Member(nn.Module):
 
 
 class RecurrentPoser(WindowlessModel):
-    """A recurrent stream of rotations: those of several members, averaged.
+    """A recurrent stream of rotations, averaged over several members.
 
-    Each member learns by itself: in training its motion has its own loss. The positions follow from the
-    rotations by forward kinematics, the head on its tracker. What the network knows of the past is its cells'
-    state; it sees none of its own outputs. Training unrolls it over T frames from a zero state, as a live
-    stream starts.
+    Each member learns by itself: in training, losses are computed on the motion of each member. The positions
+    follow from the rotations by forward kinematics, the head on its tracker. All it knows of the past is the
+    state of its cells; it does not see its own outputs. Training unrolls it over T frames from a zero state,
+    as a live stream starts.
 
     Args:
         normalizer: converts between the world and network space.
@@ -189,7 +190,7 @@ class RecurrentPoser(WindowlessModel):
         width: d, the width of a member's hidden state.
         depth: number of a member's blocks.
         cell: the recurrent cell, by its name in CELLS.
-        expansion: the hidden width of the blocks' MLPs, in d.
+        expansion: the hidden width of the blocks' MLPs, as a multiple of d.
         output: what the rotations stand for, by its name in OUTPUTS.
         members: number of members.
     """
@@ -219,17 +220,17 @@ class RecurrentPoser(WindowlessModel):
         return cast(Iterator[tuple[str, Member]], self.members.items())
 
     def initial_state(self, batch: int = 1) -> State:
-        """Return the state of a fresh start: zeros (B, size) of each cell, by its member and block."""
+        """Return the state of a fresh start: zeros (B, size) for each cell, named by its member and block."""
         return _joined(
             {name: one.initial_state(self.normalizer.mean, batch) for name, one in self.named_members()}
         )
 
     def encoded(self, sparse: Tensor) -> Tensor:
-        """Map world inputs (..., 54) to what the members see of them (..., 54)."""
+        """Map world inputs (..., 54) to network space, as the members see them."""
         return self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
 
     def posed(self, made: Tensor, sparse: Tensor) -> Tensor:
-        """Map rotations (..., 132), as members make them, to world motion (..., 198) at inputs (..., 54)."""
+        """Map a member's rotations (..., 132) to world motion (..., 198), given inputs (..., 54)."""
         return self.output.posed(made, sparse, self.normalizer)
 
     def made(self, sparse: Tensor, state: State, newest: int) -> tuple[Tensor, State]:
@@ -247,7 +248,7 @@ class RecurrentPoser(WindowlessModel):
         return self.posed(made.mean(0), sparse[:, sparse.shape[1] - wanted :]), kept
 
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
-        """Make a training call; the motion is that of each member (members B, T, 198), in turn."""
+        """Make a training call; it returns the motion of each member (members B, T, 198), one by one."""
         made, kept = self.made(sparse, state, sparse.shape[1])
         motion = self.output.learned(made, sparse.expand(len(made), -1, -1, -1), self.normalizer)
         return Learned(motion.flatten(0, 1), kept, {})
@@ -266,11 +267,11 @@ class RecurrentPoser(WindowlessModel):
 
 
 def _joined(states: Mapping[str, State]) -> State:
-    """Return the states of several members as one."""
+    """Merge the states of several members into one."""
     return {f"{name}_{block}": value for name, state in states.items() for block, value in state.items()}
 
 
 def _of(state: State, member: str) -> State:
-    """Return a member's own state of that of all."""
+    """Return the state of one member, taken from the merged state of all."""
     own = f"{member}_"
     return {name.removeprefix(own): value for name, value in state.items() if name.startswith(own)}

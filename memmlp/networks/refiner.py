@@ -1,7 +1,8 @@
-"""The refiner slot: what corrects the stream of a network's poses, frame by frame.
+"""The refiner slot: a refiner corrects the stream of a network's poses, frame by frame.
 
-SAGE-Net's (Feng et al., CVPR 2024) is a recurrent network behind its decoder; here it may stand behind any
-network. It is trained on the poses that the finished network streams (memmlp.training.train_refiner).
+SAGE-Net's refiner (Feng et al., CVPR 2024) is a recurrent network behind its decoder; here it may stand
+behind any network. It is trained on the poses that the finished network streams
+(memmlp.training.train_refiner).
 """
 
 from __future__ import annotations
@@ -26,10 +27,11 @@ class SAGERefiner:
 
     Attributes:
         width: the width of its recurrent layers.
-        depth: how many there are.
-        frames: frames of a training piece, through which the network streams from a fresh start.
+        depth: number of recurrent layers.
+        frames: number of frames of a training piece, over which the network runs as a stream from a fresh
+            start.
         pieces: how many pieces are drawn from the training clips.
-        lr: learning rate at the start; None for the network's.
+        lr: learning rate at the start; None for the network's learning rate.
     """
 
     width: int
@@ -44,15 +46,15 @@ class SAGERefiner:
 
 
 class Refined(MotionModel):
-    """A network with recurrent layers behind it that correct its rotations; a stream in both modes.
+    """A network followed by recurrent layers that correct its rotations; a stream in both evaluation modes.
 
     With 2 layers of width 512 the refiner has 2,635,908 parameters. Rotations are corrected in the world.
     Learned positions stay as they are; others follow from the corrected rotations.
 
     Args:
-        network: the network; it is not trained any more.
+        network: the network; it is not trained further.
         width: the width of the recurrent layers (GRU).
-        depth: how many there are.
+        depth: number of recurrent layers.
     """
 
     def __init__(self, network: MotionModel, width: int, depth: int):
@@ -78,11 +80,11 @@ class Refined(MotionModel):
 
     @property
     def windowless(self) -> bool:
-        """Whether the network has no window: this one corrects a stream."""
+        """Whether the network has no window; true here, since the refiner corrects a stream."""
         return True
 
     def count_parameters(self) -> int:
-        """Return how many parameters the network uses, with those of the refiner."""
+        """Whether the network predicts each frame without later ones."""
         own = (p.numel() for part in (self.layers, self.head) for p in part.parameters())
         return self.network.count_parameters() + sum(own)
 
@@ -107,7 +109,7 @@ class Refined(MotionModel):
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         """Take in the newest frames, one after the other; see MotionModel.
 
-        By default the n new frames are returned, which are the most that it can make.
+        By default the n new frames are returned, which are the most that this network can make.
         """
         made, kept = [], {name: tensor for name, tensor in state.items() if name != HIDDEN}
         for frame in sparse.split(1, 1):

@@ -19,7 +19,7 @@ from memmlp.motion.normalizer import Normalizer
 
 
 class Quantised(NamedTuple):
-    """What a codebook makes of latents in training.
+    """What a codebook returns for latents in training.
 
     Attributes:
         codes: code-vectors (..., width).
@@ -33,12 +33,12 @@ class Quantised(NamedTuple):
 
 
 def straight_through(latent: Tensor, codes: Tensor) -> Tensor:
-    """Return the codes (..., width), through which gradients reach the latents (..., width) unchanged."""
+    """Return the codes (..., width); their gradient passes to the latents (..., width) unchanged."""
     return latent + (codes - latent).detach()
 
 
 class Codebook(nn.Module):
-    """K code-vectors, of which the nearest stands for a latent; subclasses say how they are learned."""
+    """K code-vectors, of which the nearest one replaces a latent; subclasses say how they are learned."""
 
     vectors: Tensor
 
@@ -47,10 +47,11 @@ class Codebook(nn.Module):
         return self._distances(latent).argmin(-1)
 
     def margins(self, latent: Tensor) -> Tensor:
-        """Return how far (...) each latent (..., width) is from having another code-vector for its nearest.
+        """Return how far (...) each latent (..., width) is from having another code-vector as its nearest.
 
-        It is the distance to the plane halfway between the two nearest, as a share of the latent's length. By
-        errors of more than that, as rounding makes them, another one may be found the nearest.
+        It is the distance to the plane halfway between the two nearest code-vectors, as a share of the
+        latent's length. An error larger than that, such as rounding, can make another code-vector the
+        nearest.
         """
         if len(self.vectors) < 2:
             return torch.full_like(latent[..., 0], float("inf"))
@@ -105,7 +106,7 @@ class EMACodebook(Codebook):
     def _follow(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         """Return the codes and indices of latents (B, width), then update the code-vectors.
 
-        The running means are those of the whole batch, where several processes share it.
+        Where several processes share a batch, the running means are those of the whole batch.
         """
         latent = distributed.whole(latent)
         if not self.started:
@@ -120,7 +121,7 @@ class EMACodebook(Codebook):
         return distributed.own_rows(codes), distributed.own_rows(index)
 
     def _restart(self, dead: Tensor, latent: Tensor) -> None:
-        """Put the codes that are `dead` (K,) onto random latents of the batch (B, width)."""
+        """Replace the codes that are `dead` (K,) by random latents of the batch (B, width)."""
         pick = torch.randint(len(latent), (len(dead),), device=latent.device)
         self.sums.copy_(torch.where(dead[:, None], latent[pick], self.sums))
         self.counts.copy_(torch.where(dead, torch.ones_like(self.counts), self.counts))

@@ -12,13 +12,13 @@ from memmlp.common.errors import InputError
 
 
 def device(name: str) -> torch.device:
-    """Return the torch device of a name: auto, cpu, cuda, cuda:INDEX or mps.
+    """Return the torch device with a given name: auto, cpu, cuda, cuda:INDEX or mps.
 
-    With auto it is a GPU of CUDA where there is one, else the CPU. Of several processes that train one run
-    together each has the GPU of its own number.
+    The name auto stands for a CUDA GPU where there is one, else for the CPU. If several processes train one
+    run together, each has the GPU whose index is the process's own number.
 
     Raises:
-        InputError: where there is no such device.
+        InputError: if there is no such device.
     """
     kind, _, index = name.partition(":")
     if kind == "mps" and not torch.backends.mps.is_available():
@@ -33,7 +33,11 @@ def device(name: str) -> torch.device:
 
 
 def _checked(name: str, index: int) -> int:
-    """Return the index of a GPU, checked to be there and, of several processes, to be this one's alone."""
+    """Return the index of a GPU, after checks that it exists and that no other process of the run uses it.
+
+    Raises:
+        InputError: if it does not exist, or if the run has several processes.
+    """
     count = torch.cuda.device_count()
     if index >= count:
         raise InputError(f"device={name}: allowed here is cuda:0{f' to cuda:{count - 1}' * (count > 1)}")
@@ -43,10 +47,10 @@ def _checked(name: str, index: int) -> int:
 
 
 def described(used: torch.device) -> dict[str, Any]:
-    """Return what a manifest says of a device: its kind, the GPU's name, and which GPU of the machine it is.
+    """Return what a manifest says of a device: its kind, the GPU's name, and the GPU's index.
 
-    The last one, `gpu_index`, is the GPU's name in CUDA_VISIBLE_DEVICES where that is set, for inside the
-    process the visible ones are numbered anew.
+    The index, `gpu_index`, is the GPU's entry in CUDA_VISIBLE_DEVICES where that is set, since inside the
+    process the visible GPUs are numbered anew.
     """
     if used.type != "cuda":
         return {"device": used.type, "gpu": None, "gpu_index": None}
@@ -57,7 +61,7 @@ def described(used: torch.device) -> dict[str, Any]:
 
 
 def missing_gpu() -> str | None:
-    """Return a line that says so where torch finds no GPU in a process that was to have one."""
+    """Return a line that says that torch finds no GPU in a process that should have one; None if it does."""
     if torch.cuda.is_available():
         return None
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")

@@ -1,4 +1,4 @@
-"""The experiment: its data, its network, how each stage is done, and the identities of all of them."""
+"""The experiment: its data, its network, how each stage is done, and the identities of the stages."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ class UpstreamTraining(Protocol):
 
     @property
     def kind(self) -> str:
-        """The kind of its run (see `Identity`)."""
+        """The kind of the run that the training makes (see `Identity`)."""
 
     @property
     def config(self) -> dict[str, Any]:
-        """The part of the resolved config that determines the result."""
+        """The part of the resolved config that determines the training's result."""
 
     @property
     def told(self) -> str:
-        """What is done, in words."""
+        """What the training does, in words."""
 
     def train(
         self,
@@ -43,7 +43,7 @@ class UpstreamTraining(Protocol):
         run: Run,
         device: torch.device,
     ) -> dict[str, float]:
-        """Train upon the weights `upstream`, from the run's checkpoint if there is one; return its errors."""
+        """Train upon the weights in `upstream`, from the run's checkpoint if there is one; return errors."""
 
 
 def unnamed(kind: str, config: Mapping[str, Any]) -> str:
@@ -60,16 +60,16 @@ class Experiment:
         outputs: folder of runs and caches.
         device: device of training and evaluation.
         force: whether a finished run is made again.
-        data: the motion.
+        data: the source of the motion.
         architecture: builds the networks.
-        upstream: how the runs are trained that the network builds upon, each upon the one before.
+        upstream: how to train the runs that the network builds upon; each builds upon the one before.
         training: how the network is trained.
-        evaluation: how it is evaluated.
-        deployment: how it is exported and timed; None where it is not to be.
-        predictions: folder for predictions of the test clips; None for no such files.
-        tracking: shows runs elsewhere.
-        called: makes a name that people can read, of the config of a run and the word for its kind.
-        unrefined: the experiment of the network that a refiner stands behind; None without a refiner.
+        evaluation: how the network is evaluated.
+        deployment: how the network is exported and timed; None where it is not deployed.
+        predictions: folder for predictions of the test clips; None to write none.
+        tracking: shows the runs in experiment trackers.
+        called: makes a readable name for a run from the word for its kind and its config.
+        unrefined: the experiment of the network that is refined; None without a refiner.
     """
 
     config: dict[str, Any]
@@ -89,14 +89,14 @@ class Experiment:
 
     @property
     def evaluations(self) -> dict[str, str]:
-        """The identity of the evaluation in each mode."""
+        """The identity of the evaluation, by mode."""
         return {
             mode: evaluation_id(self.config, mode, self.data.groups_digest) for mode in self.evaluation.modes
         }
 
     @property
     def deployments(self) -> dict[str, Deployment]:
-        """The deployment by its identity; empty where none is wanted."""
+        """The deployment by its identity; empty if none is wanted."""
         return {deployment_id(self.config): self.deployment} if self.deployment else {}
 
     @property
@@ -105,14 +105,14 @@ class Experiment:
         return (*self.evaluations.values(), *self.deployments)
 
     def upstream_identities(self, data: str) -> list[Identity]:
-        """Return the identities of the runs upstream, in order, on data of that digest."""
+        """Return the identities of the runs upstream, in order, given the digest of the data."""
         found: list[Identity] = []
         for training in self.upstream:
             found.append(Identity(training.kind, training.config, data, found[-1] if found else None))
         return found
 
     def identity(self, data: str) -> Identity:
-        """Return the identity of the network's run on data of that digest."""
+        """Return the identity of the network's run, given the digest of the data."""
         # The identity of a frozen VQ-VAE's run covers its config. A joint VQ-VAE is trained with the network,
         # so only the keys of its architecture act.
         own = {key: value for key, value in self.config.items() if key != "vqvae"}

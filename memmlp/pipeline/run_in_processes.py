@@ -1,4 +1,4 @@
-"""A run brought to its end in this process alone, or in those of torchrun, of which the first leads."""
+"""One run, trained by several processes that torchrun started: the first leads, the others train along."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from memmlp.runs.run import Run
 
 
 def run_in_processes(experiment: Experiment) -> Outcome | None:
-    """Bring the experiment's run to its end; without torchrun that is `run_experiment`.
+    """Bring the experiment's run to its end; without torchrun, this is `run_experiment`.
 
-    The first process holds the run's lock, prepares the data, writes, evaluates and deploys. It tells the
-    others which stage all of them train next.
+    The first process holds the run's lock, prepares the data, writes files, evaluates and deploys. It tells
+    the other processes which stage all of them train next.
 
     Returns:
-        None in the processes that trained along.
+        The outcome in the first process, None in the others.
     """
     if experiment.unrefined and distributed.size() > 1:
         raise InputError("refiner: several processes can't train it; allowed is one process, or refiner=null")
@@ -31,7 +31,7 @@ def run_in_processes(experiment: Experiment) -> Outcome | None:
 
 
 def _train_along(experiment: Experiment) -> None:
-    """Train the stages that the first process names, until it is at the end."""
+    """Train the stages that the first process names, until it says that it is at the end."""
     while (stage := distributed.of_first("")) != "end":
         data = experiment.data.prepare()  # the first process has prepared it
         chain = [*experiment.upstream_identities(data.digest), experiment.identity(data.digest)]

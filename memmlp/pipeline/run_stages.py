@@ -1,6 +1,7 @@
-"""Brings an experiment to its end: data, VQ-VAE's run, network's run, its evaluations, its deployment.
+"""Brings an experiment to its end: data, upstream runs, the network's run, its evaluations, its deployment.
 
-Each stage has an identity (memmlp.runs.identity): it is found if it was made before, and made if not.
+Each stage has an identity (memmlp.runs.identity). A stage whose identity exists already is reused; otherwise
+it is made.
 """
 
 from __future__ import annotations
@@ -44,13 +45,13 @@ from memmlp.training.loop import Watch, unwatched
 
 @dataclass(frozen=True)
 class Outcome:
-    """The run that an experiment ends in.
+    """The result of an experiment.
 
     Attributes:
         run: the network's run.
-        made: the stages that were made just now, of "training", "evaluation" and "deployment".
+        made: the stages that this call made, out of "training", "evaluation" and "deployment".
         results: mode -> branch -> metric, and "latency".
-        stages: the identities of the evaluations and the deployment that these are of.
+        stages: the identities of the evaluations and the deployment that the results come from.
     """
 
     run: Run
@@ -60,7 +61,7 @@ class Outcome:
 
 
 def of_tests(clips: Sequence[ClipRecord]) -> str:
-    """Say how many test clips in how many groups there are, and where that is too little to conclude from."""
+    """Say how many test clips and groups there are, and whether they are too few for conclusions."""
     tested = [clip.group for clip in clips if clip.split == "test"]
     counts = f"test clips: {len(tested)}, in groups: {len(set(tested))}"
     if len(set(tested)) > 1:
@@ -69,9 +70,9 @@ def of_tests(clips: Sequence[ClipRecord]) -> str:
 
 
 def of_subjects(config: Mapping[str, Any], clips: Sequence[ClipRecord]) -> str:
-    """Say that a seeded split of AMASS tests on people whom it trains on; empty where it doesn't.
+    """Say that a seeded split of AMASS has subjects in both training and test; empty if it has none.
 
-    Published lists do so, as they were published, and a mix names its sources before its clips.
+    It is also empty for published lists, which are used as they were published, and for mixes.
     """
     divided = divided_subjects((clip.name, clip.split) for clip in clips)
     if not divided or config.get("sources") or "folder" in config["split"]:
@@ -116,7 +117,7 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
 def complete_stages(
     experiment: Experiment, run: Run, data: Prepared, again: bool = False
 ) -> tuple[dict[str, Any], list[str]]:
-    """Make what is missing of a trained run's evaluations and deployment, and return its results.
+    """Make the missing evaluations and deployment of a trained run, and return its results.
 
     Args:
         experiment: says which evaluations and deployment.
@@ -135,7 +136,7 @@ def complete_stages(
 
 
 def make_missing_stages(experiment: Experiment, run: Run, data: Prepared) -> list[str]:
-    """Make what is missing of a trained run's evaluations and deployment.
+    """Make the missing evaluations and deployment of a trained run.
 
     Returns:
         The names of the stages that were made.
@@ -163,7 +164,7 @@ def results_of(experiment: Experiment, run: Run) -> dict[str, Any]:
 
 
 def clip_rows(experiment: Experiment, run: Run) -> list[dict[str, Any]]:
-    """Return for each test clip its name, frames, and the metrics by mode and branch that are asked for."""
+    """Return name, frames and the wanted metrics, by mode and branch, for each test clip."""
     rows: dict[str, dict[str, Any]] = {}
     for mode, name in experiment.evaluations.items():
         for clip in read_report(run.evaluation(name))["clips"]:
@@ -174,9 +175,9 @@ def clip_rows(experiment: Experiment, run: Run) -> list[dict[str, Any]]:
 
 
 def upstream_run(experiment: Experiment, data: Prepared, last: str | None = None) -> Run | None:
-    """Return the finished run that the experiment's own builds upon, made if necessary; None for none.
+    """Return the finished run that the experiment's run builds upon, made if necessary; None for none.
 
-    What is upstream of it is made before it, in turn.
+    The runs upstream of that run are made first, in order.
 
     Args:
         experiment: the experiment.
@@ -201,7 +202,7 @@ def find_or_train_upstream(
     data: Prepared,
     upstream: Run | None,
 ) -> Run:
-    """Return the finished run upstream of that identity, training it if necessary."""
+    """Return the finished upstream run with that identity, training it if necessary."""
     run = Run.of(experiment.outputs, identity.id)
     with run.lock():
         if run.done:
@@ -219,7 +220,7 @@ def train_upstream(
     run: Run,
     upstream: Run | None,
 ) -> None:
-    """Train a run that others build upon, and mark it as done."""
+    """Train a run that other runs build upon, and mark it as done."""
     begin(experiment, run, identity, training.config)
     run.write_manifest({"partial": partial_words(experiment, data)})
     tell(f"{training.told} (run {run.id})")
@@ -234,8 +235,8 @@ def train_upstream(
 def recording_outcome(experiment: Experiment, run: Run, again: bool = False) -> Iterator[None]:
     """Follow work on a run in the trackers, and record its failure in the run's folder.
 
-    Only failures of the work itself count: bad input, interruptions, a full disk, a reader of our output that
-    went away, and the loss of the run to another process leave it as it is.
+    Only failures of the work itself are recorded. Bad input, interruptions, a full disk, a closed output
+    pipe, and the loss of the run to another process are not.
     """
     missing = again or not run.done or not all(map(run.has, experiment.stages))
     tracking = experiment.tracking if missing else Tracking((), experiment.outputs)
@@ -272,7 +273,7 @@ def train_run(
 def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequence[str]) -> None:
     """Evaluate a trained run in the given modes.
 
-    Each evaluation is a file that is there whole or not at all.
+    Each evaluation is one file, which is written completely or not at all.
     """
     run.attempt("evaluation")
     tell(f"evaluation: measure the errors on the test clips, in {' and '.join(modes)} mode")
@@ -290,7 +291,7 @@ def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequen
 
 
 def deploy_run(experiment: Experiment, run: Run, data: Prepared, name: str) -> None:
-    """Make the deployment of that identity: export a trained run, check file against network, and time it."""
+    """Make the deployment with that identity: export a trained run, check the file against torch, time it."""
     run.attempt("deployment")
     tell("deployment: export to ONNX, compare with torch, and time a frame")
     with timed(run, "export"):
@@ -309,7 +310,7 @@ def deploy_run(experiment: Experiment, run: Run, data: Prepared, name: str) -> N
 
 
 def begin(experiment: Experiment, run: Run, identity: Identity, config: dict[str, Any]) -> None:
-    """Begin a training: write its config, and into its manifest its identity and what it runs on."""
+    """Begin a training: write its config, and record in the manifest its identity and the machine."""
     upstream = identity.upstream.id if identity.upstream else None
     facts = {"recipes": identity.recipes, "what": identity.what, **machine(experiment)}
     facts |= {"processes": distributed.size(), **own_code(experiment)}
@@ -319,26 +320,26 @@ def begin(experiment: Experiment, run: Run, identity: Identity, config: dict[str
 
 
 def user() -> str | None:
-    """Return the name of the user, where the system knows one."""
+    """Return the user's name, if the system knows it."""
     with contextlib.suppress(KeyError, OSError, ImportError):
         return getpass.getuser()
     return None
 
 
 def own_code(experiment: Experiment) -> dict[str, Any]:
-    """Return version and digest of the packages of one's own that the experiment uses; empty without any."""
+    """Return version and digest of the user's own packages in the experiment; empty if it uses none."""
     packages = experiment.config.get("plugins")
     return {"plugins": packages_of_ones_own(packages)} if packages else {}
 
 
 def of_data(experiment: Experiment, data: Prepared) -> dict[str, Any]:
-    """Return what tables have to flag of a run's data, each in words, None where there is nothing to say."""
+    """Return warnings about a run's data for tables to flag, in words; None for each that does not apply."""
     divided = of_subjects(experiment.config["data"], data.manifest.clips) or None
     return {"partial": partial_words(experiment, data), "divided": divided}
 
 
 def partial_words(experiment: Experiment, data: Prepared) -> str | None:
-    """Return in words which part of its list and its training clips the data is; None where it is all."""
+    """Return in words which part of its list or of its training clips the data is; None if it is complete."""
     config, coverage = experiment.config["data"], data.manifest.coverage
     fraction = config["split"].get("train_fraction", 1)
     parts = [] if coverage.whole else [str(coverage)]
@@ -347,7 +348,7 @@ def partial_words(experiment: Experiment, data: Prepared) -> str | None:
 
 
 def machine(experiment: Experiment) -> dict[str, Any]:
-    """Return what can change the last digits of a result: device, GPU, threads, precision."""
+    """Return the facts that can change the last digits of a result: device, GPU, threads, precision."""
     return {
         **described(experiment.device),
         "threads": torch.get_num_threads(),
@@ -357,7 +358,7 @@ def machine(experiment: Experiment) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def timed(run: Run, stage: str) -> Iterator[None]:
-    """Add the seconds that a stage takes to those that it took before, of other modes or precisions."""
+    """Add the seconds that a stage takes to those of earlier work on it, in other modes or precisions."""
     started = time.monotonic()
     yield
     before = run.manifest.get("seconds", {}).get(stage, 0.0)

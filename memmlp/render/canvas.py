@@ -1,4 +1,4 @@
-"""A sheet of panels with words and a colour bar, exact to the pixel; the colours of a GIF."""
+"""A sheet of panels with text and a colour bar, exact to the pixel, and the colours of a GIF."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ class Sheet:
         self.canvas = FigureCanvasAgg(self.figure)
 
     def panel(self, x: int, y: int, width: int, height: int) -> FigureImage:
-        """Add a panel for pictures (height, width, 3), uint8, which `set_data` puts into it."""
+        """Add a panel for pictures (height, width, 3), uint8, which are set by its `set_data`."""
         empty = np.full((height, width, 3), 255, np.uint8)
         return self.figure.figimage(empty, x, self.height - y - height)
 
     def text(self, x: float, y: float, text: str, size: float, **style: Any) -> Text:
-        """Add words, anchored at a position; `size` is in pixels."""
+        """Add a text, anchored at a position; `size` is in pixels."""
         width = self.figure.get_figwidth() * DPI
         style = {"color": INK, "va": "center", "ha": "center"} | style
         return self.figure.text(x / width, 1 - y / self.height, text, fontsize=0.72 * size, **style)
@@ -60,7 +60,7 @@ class Sheet:
 def palette() -> Image.Image:
     """Return the 256 colours of all GIF pictures: heat-map and truth in light and shadow, and greys.
 
-    A palette that is the same in all pictures does not flicker.
+    With the same palette in all pictures, the film does not flicker.
     """
     heats = shades(heat(np.linspace(0, 1, 28)), 7)
     colours = np.concatenate([heats, shades(np.array([NEUTRAL]), 36), shades(np.ones((1, 3)), 24)])

@@ -1,4 +1,4 @@
-"""What a picture or a film shows: a piece of a clip, and the camera that looks at it."""
+"""The content of a picture or a film: a piece of a clip, and the camera."""
 
 from __future__ import annotations
 
@@ -23,15 +23,16 @@ FOLLOW = 0.4  # seconds over which the camera's way is smoothed
 def span(
     length: int, title: str, begin: float, end: float | None, keys: tuple[str, str] = ("begin", "end")
 ) -> tuple[int, int]:
-    """The first frame of a piece of a clip, and the one after its last.
+    """Return the first frame of a piece of a clip, and the frame after its last one.
 
     Args:
-        length: of the clip, frames. title: its name.
-        begin, end: of the piece, seconds; None for the clip's end.
-        keys: what the two were given as.
+        length: the clip's number of frames.
+        title: the clip's name.
+        begin, end: beginning and end of the piece, seconds; None for the clip's end.
+        keys: the options or arguments that gave begin and end.
 
     Raises:
-        InputError: where no frame lies between.
+        InputError: if there is no frame between begin and end.
     """
     stop = length / FPS if end is None else min(end, length / FPS)
     if not 0 <= begin < stop or round(begin * FPS) == round(stop * FPS):  # NaN is neither
@@ -63,7 +64,7 @@ class Take:
 
     @cached_property
     def top(self) -> float:
-        """The top of the colour scale, cm, which all predictions share."""
+        """The top of the colour scale, cm, shared by all predictions."""
         return scale(np.stack(list(self.errors.values())))
 
     @cached_property
@@ -80,17 +81,17 @@ class Take:
         return [(self.truth[frame], None), *predicted]
 
     def camera(self, azimuth: float, place: np.ndarray, width: int, height: int) -> Camera:
-        """Return a camera that looks at a person who stands at a point (2,) of the floor, metres."""
+        """Return a camera that looks at a person standing at a point (2,) on the floor, metres."""
         point = np.array([*place, self.floor + MIDDLE])
         return Camera(point, azimuth, width, height, height / METRES)
 
     def azimuth(self, frame: int) -> float:
-        """Return the azimuth, radians, that shows the true person from the front, a little from the side."""
+        """Return the azimuth, radians, that shows the true person from the front, slightly from the side."""
         left = self.truth[frame, 1] - self.truth[frame, 2]  # from right to left hip
         return float(np.arctan2(left[1], left[0])) + SIDE
 
     def path(self) -> np.ndarray:
-        """Return where the camera is over time (N, 2): over the truth's root, smoothed."""
+        """Return the camera's place over time (N, 2), which follows the truth's root, smoothed."""
         width = round(FOLLOW * FPS)
         window = np.hanning(2 * width + 3)[1:-1]
         padded = np.pad(self.truth[:, ROOT, :2], ((width, width), (0, 0)), mode="edge")

@@ -1,4 +1,4 @@
-"""A sheet of motion clips, each at a few moments: what an import or a data set looks like at one glance."""
+"""A sheet of motion clips, each at a few moments: an overview of an import or a dataset."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ ASKEW = np.deg2rad(35)  # the camera stands beside the person's front
 def some_clips(
     source: Path, count: int, body: str = "builtin"
 ) -> tuple[list[tuple[str, np.ndarray]], list[Skipped], int]:
-    """Read a clip, or so many of a folder's npz files, evenly spread in the order of their names.
+    """Read a clip, or `count` of a folder's npz files, evenly spread in the order of their names.
 
     Returns:
-        Name and global joint positions (N, 22, 3), metres, world, of each clip; the files of these that hold
-        none; and how many files there are.
+        Name and global joint positions (N, 22, 3), metres, world, of each clip; those of the read files that
+        contain no clip; and the number of all files.
 
     Raises:
         InputError: if there are no npz files, or no clip in those that were read.

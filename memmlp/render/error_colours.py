@@ -22,7 +22,7 @@ def heat(parts: np.ndarray) -> np.ndarray:
 
 
 def scale(errors: np.ndarray) -> float:
-    """Return the top of a scale for errors in cm: a round number that 98 % of them stay below.
+    """Return the top of a scale for errors in cm: a round number below which 98 % of them are.
 
     Errors may be larger than the largest top.
     """

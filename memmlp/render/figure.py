@@ -20,8 +20,8 @@ TOP, LEFT, RIGHT, CAPTION = 84, 40, 110, 26
 def heatmap_png(path: Path, take: Take, poses: int = POSES) -> None:
     """Write a PNG: the truth's poses in a row, and below it a row for each prediction, coloured by error.
 
-    Each pose is seen from the person's front, by the same camera in all rows. Under a prediction stands the
-    mean error of its 22 joints.
+    Each pose is seen from the person's front, by the same camera in all rows. The mean error of its 22 joints
+    is written under a prediction.
     """
     rows = 1 + len(take.predictions)
     step = HEIGHT + CAPTION

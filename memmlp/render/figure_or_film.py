@@ -1,4 +1,4 @@
-"""A take as a file: a figure or a film, by the name's suffix."""
+"""Writes a take as a file: a figure or a film, depending on the name's suffix."""
 
 from __future__ import annotations
 
@@ -13,9 +13,12 @@ SUFFIXES = (".png", ".gif", ".mp4")
 
 
 def check_picture(path: Path, key: str = "path", suffixes: tuple[str, ...] = SUFFIXES) -> None:
-    """Raise InputError for what is wrong with a picture's file before any of it is made.
+    """Raise InputError for an invalid picture file, before any work is done.
 
-    key: what the path was given as. suffixes: of the kinds of picture that can be made.
+    Args:
+        path: the file to write.
+        key: the option or argument that gave the path.
+        suffixes: suffixes of the kinds of picture that can be made.
     """
     if path.suffix.lower() not in suffixes:
         raise InputError(f"{key} {path}: no such kind of picture; allowed are {', '.join(suffixes)}")
@@ -26,9 +29,9 @@ def check_picture(path: Path, key: str = "path", suffixes: tuple[str, ...] = SUF
 
 
 def write_picture(path: Path, take: Take, poses: int = POSES, key: str = "path") -> None:
-    """Write a PNG of so many poses in a row, or a GIF or MP4 of all frames, whole or not at all.
+    """Write a PNG of `poses` poses in a row, or a GIF or MP4 of all frames, completely or not at all.
 
-    Raises InputError where the system refuses the file.
+    Raises InputError if the file can't be written.
     """
     try:
         if path.suffix.lower() == ".png":

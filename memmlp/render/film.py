@@ -26,10 +26,10 @@ TICKS = (30, 30, 40)  # milliseconds of a GIF's pictures in turn, multiples of 1
 
 
 def film(path: Path, take: Take) -> None:
-    """Write a film at 30 pictures a second, as a whole or not at all: MP4 or GIF, by the path's suffix.
+    """Write a film at 30 pictures per second, completely or not at all: MP4 or GIF, by the path's suffix.
 
     Raises:
-        InputError: where MP4 is asked for and PyAV is not installed.
+        InputError: if MP4 is asked for and PyAV is not installed.
     """
     encode = {".mp4": mp4, ".gif": gif}[path.suffix.lower()]
     if path.suffix.lower() == ".mp4":
@@ -87,7 +87,7 @@ def mp4(pictures: Iterable[np.ndarray]) -> bytes:
 
 
 def pyav() -> Any:
-    """Import and return the module `av`. Raises InputError where it is not installed."""
+    """Import and return the module `av`. Raises InputError if it is not installed."""
     try:
         import av
     except ImportError:

@@ -1,7 +1,7 @@
 """Draw skeletons as shaded bodies on a floor, in NumPy.
 
 A limb is a row of spheres, a depth buffer decides what is in front, and the projection is parallel. For
-smooth edges the picture is drawn with SAMPLES x SAMPLES samples a pixel and averaged at the end.
+smooth edges the picture is drawn with SAMPLES x SAMPLES samples per pixel and averaged at the end.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Camera:
         centre: the point (3,) in the middle of the picture, metres.
         azimuth: radians about the vertical; at 0 the camera looks along +Y.
         width, height: the picture's size, pixels.
-        scale: pixels a metre.
+        scale: pixels per metre.
         elevation: radians by which the camera looks down.
     """
 
@@ -48,11 +48,11 @@ class Camera:
         return np.array([[c, s, 0], [-s * se, c * se, ce], [s * ce, -c * ce, se]])
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Project world points (..., 3) to metres (..., 3) right, up and towards the viewer of the centre."""
+        """Project world points (..., 3) to metres (..., 3) from the centre: right, up, towards the viewer."""
         return (points - self.centre) @ self.axes.T
 
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the metres to the right (1, W) and up (H, 1) of all samples, SAMPLES to a pixel's side."""
+        """Return the metres to the right (1, W) and up (H, 1) of all samples, SAMPLES per pixel and axis."""
         width, height, scale = SAMPLES * self.width, SAMPLES * self.height, SAMPLES * self.scale
         right = (np.arange(width, dtype=np.float32) + 0.5 - width / 2) / scale
         up = (height / 2 - np.arange(height, dtype=np.float32) - 0.5) / scale
@@ -81,7 +81,7 @@ def draw(camera: Camera, joints: np.ndarray, errors: np.ndarray | None, floor: f
 def ground(camera: Camera, joints: np.ndarray, floor: float) -> np.ndarray:
     """Draw the floor's grid and the skeleton's shadow on white: (H, W, 3) samples, 0 to 1.
 
-    They are smooth, so they are computed once for each pixel and repeated for its samples.
+    Both are smooth, so they are computed once for each pixel and repeated for its samples.
     """
     x, y = on_floor(camera, floor)
     # The floor has no horizon in a parallel projection: it fades out around the person instead.
@@ -112,7 +112,7 @@ def on_floor(camera: Camera, floor: float) -> tuple[np.ndarray, np.ndarray]:
 def grid_lines(along: np.ndarray, camera: Camera) -> np.ndarray:
     """Return how much (height, width), 0 to 1, of each pixel lies on the grid lines of a floor coordinate.
 
-    Lines are a pixel or two wide at any scale, since distances are divided by what a pixel covers.
+    Lines are a pixel or two wide at any scale, since distances are divided by the size that a pixel covers.
     """
     off = np.abs((along / GRID + 0.5) % 1 - 0.5) * GRID
     pixel = np.hypot(*np.gradient(along))  # metres of the floor that a pixel covers
@@ -131,7 +131,8 @@ def shade(
 ) -> None:
     """Draw a limb into a picture (H, W, 3), wherever it is nearer than the depth buffer (H, W).
 
-    Both are changed in place. Metres to the `right` (1, W) and `up` (H, 1) are those of `Camera.grid`.
+    The picture and the buffer are changed in place. Metres to the `right` (1, W) and `up` (H, 1) are those of
+    `Camera.grid`.
     """
     a, b = (camera.project(point).astype(np.float32) for point in ends(limb, joints))
     part = np.linspace(0, 1, SPHERES, dtype=np.float32)[:, None, None]
@@ -174,8 +175,8 @@ def box(
 def along_tube(normal: np.ndarray, axis: np.ndarray, side: np.ndarray) -> np.ndarray:
     """Return the normals (H, W, 3) of a row of spheres as those of a smooth tube along the axis (3,).
 
-    Bumps between the spheres would show in the light otherwise. The normals change on the tube's side alone
-    (H, W), where `side` is true, and stay those of spheres at its round ends.
+    Otherwise bumps between the spheres would be visible. Only the normals on the tube's side change, where
+    `side` (H, W) is true; at its round ends they stay those of spheres.
     """
     axis = axis / max(float(np.linalg.norm(axis)), 1e-6)
     flat = normal - (normal @ axis)[..., None] * axis

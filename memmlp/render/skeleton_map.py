@@ -1,4 +1,4 @@
-"""A skeleton's map as a picture: the stance from which a file is read with the mapped nodes, and the body."""
+"""A picture of a skeleton map: the stance from which a file is read, its mapped nodes, and the body."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ LEFT, RIGHT, MIDDLE, BARE = "#1f6fd0", "#d0561f", "#2a8c4a", "#b4bac1"
 
 
 def skeleton_png(path: Path, stance: FileStance, title: str) -> None:
-    """Write a PNG of a stance: the file's nodes from the front and from the right, and the body likewise.
+    """Write a PNG of a stance: the file's nodes from the front and from the right, and the body, too.
 
-    All nodes are grey; those that stand for a body joint are coloured and named `body joint = node`.
+    All nodes are grey; those mapped to a body joint are coloured, and named `body joint = node`.
     """
     sheet = Sheet(WIDTH, HEIGHT)
     sheet.text(24, 28, title, 20, ha="left", weight="bold")
@@ -48,14 +48,14 @@ def skeleton_png(path: Path, stance: FileStance, title: str) -> None:
 
 
 def _scale(positions: np.ndarray) -> float:
-    """Return the pixels a metre at which these points (n, 3) are in view."""
+    """Return the pixels per metre at which these points (n, 3) are in view."""
     size = np.ptp(positions, axis=0)
     room = HEIGHT - TOP - BOTTOM
     return float(min(room / max(size[1], TALL), FRONT / max(size[0], WIDE)))
 
 
 def _place(positions: np.ndarray, middle: float, axis: int, scale: float) -> np.ndarray:
-    """Return where points (nodes, 3) are in the picture (nodes, 2), the axis to the right."""
+    """Return the places (nodes, 2) of points (nodes, 3) in the picture, with the given axis to the right."""
     height = TOP + (HEIGHT - TOP - BOTTOM) / 2
     return np.stack([middle + scale * positions[:, axis], height - scale * positions[:, 1]], -1)
 
@@ -85,7 +85,7 @@ def _bones(sheet: Sheet, stance: FileStance, places: np.ndarray, near: np.ndarra
 
 
 def _names(sheet: Sheet, stance: FileStance, places: np.ndarray, side: str, x: float, align: str) -> None:
-    """Write the names of one side's joints below each other, each with a line to its node."""
+    """Write the names of one side's joints below each other, each joined to its node by a line."""
     joints = [joint for joint in stance.mapped if _colour(joint) == _colour(side or "pelvis")]
     joints.sort(key=lambda joint: places[stance.mapped[joint], 1])
     plain = without_namespace(stance.nodes)
@@ -102,9 +102,9 @@ def _short(name: str, most: int = 20) -> str:
 
 
 def spread(wanted: Sequence[float], least: float, low: float, high: float) -> list[float]:
-    """Return places near the wanted ones, which rise, at least so far apart and between two bounds.
+    """Return rising places near the wanted ones, at least `least` apart and between two bounds.
 
-    They are closer to each other only where there is no room.
+    They are closer to each other only if there is not enough room.
     """
     least = min(least, (high - low) / max(1, len(wanted) - 1))
     places: list[float] = []

@@ -1,4 +1,4 @@
-"""The figures of the page, as inline SVG that takes its colours from the page."""
+"""The figures of the page, as inline SVG that uses the page's colours."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ NAMED = 12  # the largest number of our points that are named in a figure
 
 
 class SpeedAndError(NamedTuple):
-    """A system's frames a second and its error."""
+    """A system's frames per second and its error."""
 
     label: str
     fps: float
@@ -58,7 +58,7 @@ class Curve(NamedTuple):
 def forest(table: Table) -> str | None:
     """Draw the differences from the control with their intervals, by arm and metric.
 
-    None where there are no differences.
+    Return None if there are no differences.
     """
     metrics = [metric for metric in table.metrics if metric not in COSTS]
     rows = [
@@ -112,10 +112,10 @@ def profiles(name: str, found: Mapping[str, Sequence[Distribution]]) -> str:
 
 @mpl.rc_context(STYLE)
 def accuracy(ours: Mapping[str, Sequence[SpeedAndError]], paper: Sequence[SpeedAndError], error: str) -> str:
-    """Draw errors against frames a second (Fig. 1).
+    """Draw errors against frames per second (Fig. 1).
 
     Args:
-        ours: our points by table; they are named where they are few.
+        ours: our points by table; they are named if there are few.
         paper: the points of the paper's systems.
         error: the metric.
     """
@@ -182,7 +182,7 @@ def _panels(count: int, height: float, sharey: bool = True) -> tuple[Figure, lis
 
 
 def _bar(axis: Axes, cell: Cell, place: float, number: int) -> None:
-    """Draw a difference with its interval; its mark is filled where the difference is significant."""
+    """Draw a difference with its interval; its mark is filled if the difference is significant."""
     effect = cell.effect
     if effect is None:
         return
@@ -216,7 +216,7 @@ def _short(label: str) -> str:
 def _svg(figure: Figure, name: str, description: str) -> str:
     """Return the figure as an SVG element for the page.
 
-    It has no ids that occur twice in the page, no metadata that changes from day to day, and the page's
+    Its ids are unique in the page, it has no metadata that changes from day to day, and it uses the page's
     colours.
     """
     figure.set_layout_engine("constrained")

@@ -41,7 +41,7 @@ class Chapter:
 
 
 class ReportedRun:
-    """A finished run, and the rows of tables in which it stands."""
+    """A finished run, and the table rows that use it."""
 
     def __init__(self, measured: Measured):
         self.measured = measured
@@ -49,7 +49,7 @@ class ReportedRun:
 
     @cached_property
     def config(self) -> dict[str, Any]:
-        """The keys of its config, dotted, that can change a result."""
+        """The config keys, dotted, that can change the run's result."""
         return trained_by(self.measured.run.config) if self.measured.run else {}
 
 
@@ -58,7 +58,7 @@ def page(chapters: Sequence[Chapter], published: Sequence[SpeedAndError], genera
 
     Args:
         chapters: the tables with their runs.
-        published: the paper's systems with frames a second and MPJRE.
+        published: the paper's systems with frames per second and MPJRE.
         generated: when the page is made, in words.
         commit: the commit of the code that makes it.
     """
@@ -78,7 +78,7 @@ def page(chapters: Sequence[Chapter], published: Sequence[SpeedAndError], genera
 def fragment(
     chapters: Sequence[Chapter], published: Sequence[SpeedAndError], generated: str, commit: str
 ) -> str:
-    """Return the report as part of a page that has a head and a style of its own."""
+    """Return the report as a part of a page that has its own head and style."""
     about = f"{generated}, code {commit}, {_counted(_entries(chapters))}"
     sections = _sections(chapters, published)
     contents = f"<details><summary>Contents</summary>\n{_contents(sections, chapters)}\n</details>"
@@ -103,9 +103,9 @@ def _sections(
 
 
 def published(accuracies: Sweep, latencies: Sweep) -> list[SpeedAndError]:
-    """Return the systems for which the paper gives both an error and frames a second.
+    """Return the systems for which the paper gives both an error and frames per second.
 
-    The two stand in different tables, whose names for a system agree in their beginnings alone.
+    The two are in different tables, in which only the beginnings of a system's names agree.
     """
     errors = {arm.label.casefold(): (arm.paper or {}).get(ERROR) for arm in accuracies.arms}
     points = []
@@ -118,7 +118,7 @@ def published(accuracies: Sweep, latencies: Sweep) -> list[SpeedAndError]:
 
 
 def _entries(chapters: Sequence[Chapter]) -> list[ReportedRun]:
-    """Return each finished run once for each of its deployments, with all rows in which it stands."""
+    """Return each finished run once per deployment, with all table rows that use it."""
     entries: dict[tuple[str, str], ReportedRun] = {}
     for chapter in chapters:
         for label, runs in chapter.runs.items():
@@ -130,7 +130,7 @@ def _entries(chapters: Sequence[Chapter]) -> list[ReportedRun]:
 
 
 def _counted(entries: Sequence[ReportedRun]) -> str:
-    """Say how many runs the tables have; other finished runs may lack an evaluation that these ask for."""
+    """Say how many runs are in the tables; other finished runs may lack an evaluation that a table needs."""
     return f"{len({entry.measured.id for entry in entries})} finished runs stand in these tables"
 
 
@@ -166,7 +166,7 @@ def _effects(chapters: Iterable[Chapter]) -> list[str]:
 
 
 def _but(table: Table, side: str) -> str:
-    """Say which of a table's metrics are better on the other side, where any are."""
+    """Say which of a table's metrics are better on the other side; empty if none is."""
     higher = [metric for metric in table.measured_metrics if better(metric) == "higher"]
     return f", of {', '.join(map(_text, higher))} {side}" if higher else ""
 
@@ -208,7 +208,7 @@ def _robust_words(one: Distribution) -> tuple[str, str]:
 
 
 def _accuracy(chapters: Iterable[Chapter], paper: Sequence[SpeedAndError]) -> list[str]:
-    """Return the paper's Fig. 1 with what was measured."""
+    """Return the paper's Fig. 1 with our measured points added."""
     ours = {chapter.title: _points(chapter) for chapter in chapters}
     ours = {title: points for title, points in ours.items() if points}
     if not ours:
@@ -224,7 +224,7 @@ def _accuracy(chapters: Iterable[Chapter], paper: Sequence[SpeedAndError]) -> li
 
 
 def _points(chapter: Chapter) -> list[SpeedAndError]:
-    """Return each arm's mean frames a second and mean error."""
+    """Return each arm's mean frames per second and mean error."""
     points = []
     for label, runs in chapter.runs.items():
         values = [(run.costs.get("FPS"), run.value("stream", "rotation", ERROR)) for run in runs.values()]
@@ -269,7 +269,7 @@ def _curves(chapter: Chapter) -> dict[str, dict[str, list[Curve]]]:
 
 
 def _curve(log: Sequence[Metrics], phase: str, name: str) -> Curve:
-    """Return the course of a value, thinned out evenly where it is long; the last point stays."""
+    """Return a value over the training steps, thinned out evenly if it is long; the last point is kept."""
     points = [
         (entry.step, entry.values[name]) for entry in log if entry.phase == phase and name in entry.values
     ]
@@ -318,7 +318,7 @@ def _number(values: Mapping[str, float], key: str, scale: float, form: str) -> s
 
 
 def _runs(entries: Sequence[ReportedRun]) -> str:
-    """Return a table of the runs, with the keys of their configs that differ from the commonest value."""
+    """Return a table of the runs, with the config keys whose values differ from the most common one."""
     if not entries:
         return ""
     common = _common([entry.config for entry in entries])
@@ -348,7 +348,7 @@ def _runs(entries: Sequence[ReportedRun]) -> str:
 
 
 def _common(configs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the commonest value of every key."""
+    """Return the most common value of every key."""
     common = {}
     for key in {key for config in configs for key in config}:
         values = Counter(repr(config.get(key)) for config in configs)

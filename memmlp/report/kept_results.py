@@ -1,7 +1,7 @@
 """A sweep's finished runs in compact form: per-clip errors, costs and origins, in one JSON file.
 
-Whoever has the file can compute every interval again without training. Its bytes depend on its content alone:
-runs stand in the order of their ids, and numbers have six digits.
+Every interval can be recomputed from the file, without training. Its bytes depend on its content alone: runs
+are in the order of their ids, and numbers have six digits.
 """
 
 from __future__ import annotations
@@ -36,17 +36,18 @@ OLDER_NAMES = {"vqvae": "upstream"}  # what the origins of older files call othe
 
 @dataclass(frozen=True)
 class Kept:
-    """What is kept of a sweep.
+    """The kept results of a sweep.
 
     Attributes:
         sweep: the sweep's name, as commands take it.
         overrides: the command line's overrides.
         runs: the finished runs by the arm's label and the seed.
-        arms: the overrides of each arm with which the runs were made.
-        rounds: the rounds in which seeds were spent, as JSON holds them; None where they were not.
-        flags: what a reader has to know of how the seeds came about.
-        predicted: the FLOPs of the control's training at the scale that the sweep predicts for, by the
-            overrides of that scale as one line.
+        arms: the overrides with which each arm's runs were made.
+        rounds: the rounds in which seeds were spent, in types for JSON; None if they were not spent in
+            rounds.
+        flags: what a reader has to know about how the seeds were chosen.
+        predicted: the FLOPs of the control's training at the scale for which the sweep predicts, by that
+            scale's overrides as one line.
     """
 
     sweep: str
@@ -69,7 +70,7 @@ class Kept:
 
     @property
     def every(self) -> list[Measured]:
-        """The runs, once for each evaluation and deployment that arms show, in the order of their names."""
+        """The runs, once for each evaluation and deployment that arms show, sorted by name."""
         return [run for _, run in sorted(self.named.items())]
 
     @property
@@ -81,9 +82,9 @@ class Kept:
     def named(self) -> dict[str, Measured]:
         """The runs by their names in the file.
 
-        That is the id; where arms show several evaluations of one run, such as inverse kinematics of two
-        kinds, it is the id and a digest of the errors; where they show several deployments, one of the costs
-        stands behind that.
+        A run's name is its id. If arms show several evaluations of one run, such as two kinds of inverse
+        kinematics, a digest of the errors is appended; if they show several deployments, a digest of the
+        costs follows.
         """
         found: dict[tuple[str, str, str], Measured] = {}
         for run in (run for runs in self.runs.values() for run in runs.values()):
@@ -101,7 +102,7 @@ class Kept:
 
     @staticmethod
     def _name(key: tuple[str, str, str], every: Iterable[tuple[str, str, str]]) -> str:
-        """Return the name of what has that id, errors and costs among all that are kept."""
+        """Return the name for an id and digests of errors and costs, unique among all that are kept."""
         run_id, errors, costs = key
         same = [one[1:] for one in every if one[0] == run_id]
         if len(same) == 1:
@@ -110,11 +111,11 @@ class Kept:
         return f"{run_id}/{errors}" if len(alike) == 1 else f"{run_id}/{errors}-{costs}"
 
     def merged(self, other: Kept) -> Kept:
-        """Return the results with another's runs added; where both have an arm and seed, the other's stands.
+        """Return the results with another's runs added; if both have an arm and seed, the other's is used.
 
         Raises:
-            InputError: where the two are not of one sweep with the same overrides, or a fixed number of seeds
-                would join seeds that were spent in rounds, so that no verdict would keep its level.
+            InputError: if the two are not from the same sweep with the same overrides, or if a fixed number
+                of seeds would join seeds that were spent in rounds, so that verdicts would lose their level.
         """
         if (self.sweep, self.overrides) != (other.sweep, other.overrides):
             raise InputError(f"holds the results of '{self.command}', not of '{other.command}'")
@@ -128,15 +129,15 @@ class Kept:
         return replace(self, runs=runs, arms=arms, rounds=other.rounds, flags=flags, predicted=predicted)
 
     def check_runs(self, wanted: Mapping[tuple[str, int], str]) -> None:
-        """Check that the arms and seeds have the runs that a sweep gives them today.
+        """Check that the arms and seeds have the same runs that the sweep gives them now.
 
-        The words of an arm may be the same while what they stand for has changed: a default or a recipe.
+        An arm's overrides may be unchanged although their meaning has changed, by a default or a recipe.
 
         Args:
-            wanted: the ids of the runs by the arm's label and the seed; others are not checked.
+            wanted: the runs' ids by the arm's label and the seed; other runs are not checked.
 
         Raises:
-            InputError: where one has another run.
+            InputError: if an arm and seed has another run.
         """
         others = {
             label: sorted(seed for seed, run in runs.items() if wanted.get((label, seed), run.id) != run.id)
@@ -153,7 +154,8 @@ class Kept:
         """Check that the arms have the overrides with which their runs were made.
 
         Raises:
-            InputError: where one has others, so that the runs are of another arm with the same label.
+            InputError: if an arm has other overrides, so that its runs belong to another arm with the same
+                label.
         """
         for label, words in arms.items():
             if self.runs.get(label) and self.arms.get(label, words) != words:
@@ -162,11 +164,11 @@ class Kept:
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """The names of the sources of the test clips; empty where there is one."""
+        """The names of the sources of the test clips; empty if there is only one source."""
         return tuple(sorted({source for run in self.every for source in run.sources.values()}))
 
     def of(self, sweep: Sweep) -> dict[str, RunsBySeed]:
-        """Return the runs of the arms and seeds that the sweep has today.
+        """Return the runs of the arms and seeds that the sweep has now.
 
         Raises:
             InputError: as `check` does.
@@ -183,18 +185,18 @@ class Kept:
 
 
 def overrides_of(sweep: Sweep) -> dict[str, tuple[str, ...]]:
-    """Return the overrides that a sweep's file gives each arm, the base's included."""
+    """Return the overrides that a sweep's file gives each arm, including those of the base."""
     bare = replace(sweep, command_line=())
     return {arm.label: without_paths(bare.overrides(arm)) for arm in sweep.runnable()}
 
 
 def without_paths(overrides: Iterable[str]) -> tuple[str, ...]:
-    """Return the overrides with absolute paths shortened to their last part, for they differ by machine."""
+    """Return the overrides with absolute paths shortened to their last part, as they differ by machine."""
     return tuple(re.sub(r"(?<==)/\S*", lambda found: f".../{PurePath(found[0]).name}", w) for w in overrides)
 
 
 def save(path: Path, kept: Kept) -> None:
-    """Write a file of results, as a whole or not at all. Raises InputError where that can't be done."""
+    """Write a file of results, completely or not at all. Raises InputError if it can't be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         atomic_write(path, dumps(kept))
@@ -232,7 +234,7 @@ def _on_one_line(found: re.Match[str]) -> str:
 
 
 def load_kept(path: Path) -> Kept:
-    """Read a file of results. Raises InputError where it holds none, or was edited since it was saved."""
+    """Read a file of results. Raises InputError if it is none, or was edited after it was saved."""
     try:
         content = json.loads(path.read_bytes())
         if content.pop("digest", None) not in (None, _digest(content)):  # None: an older file
@@ -258,7 +260,7 @@ def _digest(content: Mapping[str, Any]) -> str:
 
 
 def _errors(run: Measured) -> dict[str, Any]:
-    """Return each metric of every test clip by mode and branch, to six digits."""
+    """Return each metric of every test clip, by mode and branch, rounded to six digits."""
     names = list(run.clips)
     return {
         mode: {
@@ -273,7 +275,7 @@ def _errors(run: Measured) -> dict[str, Any]:
 
 
 def _key(run: Measured) -> tuple[str, str, str]:
-    """Return a run's id, and digests of the errors and the costs that are kept of it."""
+    """Return a run's id, and digests of its kept errors and costs."""
     parts = (json.dumps(part, sort_keys=True) for part in (_errors(run), _shortened_costs(run)))
     errors, costs = (hashlib.sha256(part.encode()).hexdigest()[:8] for part in parts)
     return run.id, errors, costs
@@ -284,7 +286,7 @@ def _shortened_costs(run: Measured) -> dict[str, Any]:
 
 
 def _record(run: Measured) -> dict[str, Any]:
-    """Return what is kept of a run."""
+    """Return the record of a run in the file."""
     costs = _shortened_costs(run)
     origin = plain(asdict(run.origin))
     for name in LATER_FACTS:
@@ -296,7 +298,7 @@ def _record(run: Measured) -> dict[str, Any]:
 
 
 def _clips(run: Measured) -> list[list[str]]:
-    """Return the names of the test clips, each with its group, and its source where there are several."""
+    """Return the names of the test clips, each with its group, and with its source if there are several."""
     sources = run.sources
     return [[name, run.group(name), *([sources[name]] if sources else [])] for name in run.clips]
 
@@ -306,7 +308,7 @@ def _clips_key(run: Measured) -> str:
 
 
 def _measured(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str]]) -> Measured:
-    """Return a run from what is kept of it."""
+    """Return a run from its record in the file."""
     names, errors = [clip for clip, *_ in clips], record["errors"]
     if any(len(values) != len(names) for values in _every(errors)):
         raise ValueError(f"run {name} has not as many errors as clips")

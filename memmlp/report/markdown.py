@@ -1,4 +1,4 @@
-"""Pages of results: one for each table, and templates that take numbers and verdicts from the tables."""
+"""Pages of results: one for each table, and pages from templates that take numbers from the tables."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ ORIGIN = {
 
 
 TURNED = {Verdict.HIGHER: Verdict.LOWER, Verdict.LOWER: Verdict.HIGHER}
-"""The verdicts that change when a difference is turned round."""
+"""The verdicts that change when a difference's sign is reversed."""
 
 
 class KeptTable(NamedTuple):
-    """What a page is made of: results that were kept, and the table that is computed of them today.
+    """The content of a page: kept results, and the table computed from them now.
 
-    `by_source` are the tables of each source's test clips alone, where the data has several; `trends` the
-    effects against the sweep's scale, where it has one.
+    `by_source` are the tables of each source's test clips alone, if the data has several sources; `trends`
+    are the effects against the sweep's scale, if it has one.
     """
 
     kept: Kept
@@ -73,7 +73,7 @@ def pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -> dic
 
 
 def check_claims(name: str, text: str) -> None:
-    """Refuse prose that claims effects by hand (see `memmlp.report.unbacked_claims`). Raises InputError."""
+    """Raise InputError for prose that claims effects by hand (see `memmlp.report.unbacked_claims`)."""
     for claim in claims(text):
         raise InputError(
             f"{name}, line {claim.line}: {claim.reason} in '{claim.sentence[:80]}'; allowed for effects are "
@@ -82,7 +82,7 @@ def check_claims(name: str, text: str) -> None:
 
 
 def _filled(name: str, text: str, words: Placeholders) -> str:
-    """Return a page: its template with the placeholders filled in. Raises InputError, naming the template."""
+    """Return a page: its template, filled in. Raises InputError, which names the template."""
     check_claims(name, text)
     environment = Environment(undefined=StrictUndefined, keep_trailing_newline=True, trim_blocks=True)
     environment.globals = words.functions()
@@ -131,13 +131,13 @@ def _recipes(runs: Iterable[Measured]) -> str:
 
 
 class Placeholders:
-    """The placeholders of templates. For a wrong name each raises InputError, which says what is allowed."""
+    """The placeholders of templates; each raises InputError for a wrong name, and says what is allowed."""
 
     def __init__(self, sources: Mapping[str, KeptTable]):
         self.sources = sources
 
     def functions(self) -> dict[str, object]:
-        """Return the placeholders by the names under which templates call them."""
+        """Return the placeholders by the names with which templates call them."""
         names = (
             "has",
             "effect",
@@ -155,7 +155,7 @@ class Placeholders:
         return {"names": sorted(self.sources), **{name: getattr(self, name) for name in names}}
 
     def has(self, name: str) -> bool:
-        """Return whether there are results of that name."""
+        """Return whether there are results with that name."""
         return name in self.sources
 
     def effect(self, name: str, arm: str, mode: str, metric: str) -> str:
@@ -166,7 +166,7 @@ class Placeholders:
         return f"{number}, {self.verdict(name, arm, mode, metric)}"
 
     def verdict(self, name: str, arm: str, mode: str, metric: str) -> str:
-        """Return the verdict on an arm's difference in a word."""
+        """Return the verdict on an arm's difference, in a word."""
         effect = self._cell(name, arm, mode, metric).effect
         return "not measured" if effect is None or effect.verdict is None else str(effect.verdict)
 
@@ -180,7 +180,7 @@ class Placeholders:
         return "not printed" if printed is None else f"{printed:+.2f}".replace("-", MINUS)
 
     def seen(self, name: str, mode: str, metric: str, arm: str | None = None) -> str:
-        """Return the smallest difference that 80 % power would detect, in an arm or in every one."""
+        """Return the smallest difference detectable with 80 % power, for one arm or for every arm."""
         if arm is None:
             least = self._table(name).detectable(mode, metric)
         else:
@@ -202,10 +202,10 @@ class Placeholders:
         return origin_words(self.sources[name].kept)
 
     def summary(self, name: str, mode: str = "stream") -> str:
-        """Return a table with a line for each arm: measured differences, their verdicts, and the paper's.
+        """Return a table with a line for each arm: measured and the paper's differences, and verdicts.
 
-        Of a sweep with a scale it is a list of what the lines through its cells say, of a table without
-        errors its costs beside the paper's.
+        For a sweep with a scale, return a list of what the lines through its cells show; for a table without
+        errors, its costs beside the paper's.
         """
         table = self._table(name)
         if (trends := self.sources[name].trends) is not None:
@@ -226,9 +226,10 @@ class Placeholders:
         return "\n".join(lines)
 
     def held(self, names: Sequence[str], mode: str = "stream") -> str:
-        """Return which of the paper's effects hold: verdicts, counted and in a line for each arm.
+        """Return which of the paper's effects hold: the counts of verdicts, and a line for each arm.
 
-        Effects whose sign the paper prints are counted, and shown with a verdict; the others as `-`.
+        Effects whose sign the paper prints are counted, and shown with a verdict; the others are shown as
+        `-`.
 
         Args:
             names: the names of the tables' results.
@@ -261,11 +262,11 @@ class Placeholders:
         return self.verdict(name, row.label, mode, metric) if printed else MISSING
 
     def way(self, name: str, mode: str = "stream") -> str:
-        """Return a table of how each step of a chain of arms changes each metric, with its share of the way.
+        """Return a table of how each step in a chain of arms changes each metric, and its share of the total.
 
-        In a chain each arm is the control of the one before it, and the table's control is its end; without a
-        chain the text is empty. Shares are of the difference between its two ends, and shown where that one's
-        interval does not contain 0.
+        In a chain, each arm is the control of the next, and the table's control is the last arm; without a
+        chain the text is empty. Shares are parts of the difference between the two ends of the chain, and are
+        shown if that difference's interval does not contain 0.
         """
         table = self._table(name)
         steps = _chain(table)
@@ -306,7 +307,7 @@ class Placeholders:
         return self.sources[name].table
 
     def _cell(self, name: str, arm: str, mode: str, metric: str) -> Cell:
-        """Return a cell of a table. Raises InputError where any of the names is wrong."""
+        """Return a cell of a table. Raises InputError if one of the names is wrong."""
         table = self._table(name)
         rows = {row.label: row for row in table.rows}
         _allowed(f"arm of {name}", arm, rows)
@@ -316,7 +317,7 @@ class Placeholders:
 
 
 def _chain(table: Table) -> list[Row]:
-    """Return the arms after the chain's first, to the table's control; each is the control of the next."""
+    """Return the arms after the chain's first, up to the table's control; each is the control of the next."""
     rows = {row.label: row for row in table.rows}
     found: list[Row] = []
     row = rows[table.control]
@@ -327,7 +328,7 @@ def _chain(table: Table) -> list[Row]:
 
 
 def _share(cell: Cell, way: Cell, metric: str) -> str:
-    """Return a step's difference, its share of the whole way, and its verdict."""
+    """Return a step's difference, its share of the chain's total, and its verdict."""
     if cell.effect is None:
         return MISSING
     words = [effect_words(cell, metric)[0].replace("*", "")]
@@ -337,7 +338,7 @@ def _share(cell: Cell, way: Cell, metric: str) -> str:
 
 
 def _whole(cell: Cell) -> str:
-    """Return the way from an arm to its control: the difference turned round, its verdict, the paper's."""
+    """Return the change from an arm to its control: the reversed difference, its verdict, and the paper's."""
     if cell.effect is None:
         return MISSING
     verdict = TURNED.get(cell.effect.verdict, cell.effect.verdict) if cell.effect.verdict else "no verdict"

@@ -1,4 +1,4 @@
-"""The figure of a sweep's effects against its scale: a row for each effect, a column for each metric."""
+"""The figure of a sweep's effects against its scale: rows are effects, columns are metrics."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ DATA = "Comment"  # the entry of the file that has the digest of what is drawn
 
 
 def figure_digest(found: Trends) -> str:
-    """Return a digest of the numbers that the figure shows, and of how it shows them."""
+    """Return a digest of the numbers in the figure, and of the way in which it shows them."""
 
     def short(number: float) -> str:
         return f"{number:.{DIGITS}g}"
@@ -56,7 +56,7 @@ def figure_digest(found: Trends) -> str:
 
 
 def figure_is_of(path: Path, found: Trends) -> bool:
-    """Return whether a file is the figure of these numbers."""
+    """Return whether a file is the figure for these numbers."""
     if not path.is_file():
         return False
     from PIL import Image, UnidentifiedImageError
@@ -70,7 +70,7 @@ def figure_is_of(path: Path, found: Trends) -> bool:
 
 @mpl.rc_context(STYLE)
 def scaling_figure(found: Trends) -> bytes:
-    """Draw the effects with their lines, as a PNG. Points that differ in more than the axis are hollow."""
+    """Draw the effects with their lines, as a PNG; points that differ in more than the axis are hollow."""
     series, metrics = found.series, found.metrics
     figure = Figure(figsize=(SIZE[0] * len(metrics), SIZE[1] * len(series) + 0.5), dpi=DOTS)
     axes = figure.subplots(len(series), len(metrics), squeeze=False, sharex=True)
@@ -88,7 +88,7 @@ def scaling_figure(found: Trends) -> bytes:
 
 
 def _label(found: Trends) -> str:
-    """Say what the figure's axis is, and what its marks are."""
+    """Describe the figure's axis and its marks."""
     name = found.against[0]
     words = ["training compute of the control, FLOP" if name == COMPUTE else name]
     if len(found.against) > 1:
@@ -99,7 +99,7 @@ def _label(found: Trends) -> str:
 
 
 def _ahead(found: Trends) -> float | None:
-    """Return the compute that effects are predicted for, where it fits on the figure's axis."""
+    """Return the compute for which effects are predicted, if it fits on the figure's axis."""
     ends = found.measured(COMPUTE)
     if found.against[0] != COMPUTE or found.compute is None or ends is None:
         return None

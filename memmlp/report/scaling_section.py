@@ -12,7 +12,7 @@ from memmlp.tables.table_text import places, signed, with_unit
 
 SIGNS = {1: "higher", -1: "lower", 0: "open", None: "no verdict"}
 NEAR = 0.5
-"""A prediction is near where it is beyond the measured range by at most this part of it, in decades."""
+"""A prediction is near if it exceeds the measured range by at most this fraction of the range, in decades."""
 
 
 def scaling_section(found: Trends) -> str:
@@ -29,30 +29,30 @@ def scaling_section(found: Trends) -> str:
 
 
 def scaling_summary(found: Trends) -> str:
-    """Return in Markdown what the lines say of each effect, a bullet each."""
+    """Return in Markdown what the lines show about each effect, one bullet each."""
     readings = _readings(found)
     return "\n".join(f"- {line}" for line in ([*_reach(found), *readings] if readings else ["no line yet"]))
 
 
 def picture_name(found: Trends) -> str:
-    """Return the name of the figure's file, beside the page."""
+    """Return the name of the figure's file, which lies in the page's folder."""
     return f"{found.name}.png"
 
 
 def amount(name: str, value: float) -> str:
-    """Return a value on the axis of effects against scale as text, FLOPs with their unit."""
+    """Return a value on the axis of the figure as text; FLOPs get their unit."""
     return f"{power(value)} FLOP" if name == COMPUTE else f"{value:g}"
 
 
 def power(value: float) -> str:
-    """Return a large number with two digits: 5.7 · 10¹²."""
+    """Return a large number with two digits, as in 5.7 · 10¹²."""
     digits, exponent = f"{value:.1e}".split("e")
     raised = str(int(exponent)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
     return f"{digits} · 10{raised}"
 
 
 def bounds_words(one: Bounds) -> str:
-    """Return a number with its interval: +0.42 (0.10 to 0.74)."""
+    """Return a number with its interval, as in +0.42 (0.10 to 0.74)."""
     if not math.isfinite(one.high - one.low):
         return signed(one.mean, "+.2f")
     digits = places(one.high - one.low)
@@ -65,7 +65,7 @@ def _has(found: Trends, name: str) -> bool:
 
 
 def _explained(found: Trends) -> list[str]:
-    """Say what the effects are, what was measured, and how the lines were made."""
+    """Explain what the effects are, what was measured, and how the lines were made."""
     controls = sorted({trend.control for trend in found.trends})
     seeds = sorted({point.seeds for trend in found.trends for point in trend.points})
     lines = [
@@ -113,7 +113,7 @@ def _numbers(seeds: Sequence[int]) -> str:
 
 
 def _table(found: Trends, name: str) -> str:
-    """Return the table of all slopes against one thing; that of the first has the effects' sizes, too."""
+    """Return the table of all slopes along one axis; that of the first axis has the effects' sizes, too."""
     first = name == found.against[0]
     ahead = found.compute if name == COMPUTE else None
     head = ["effect", "metric", "cells", f"tenfold {escaped(name)}", "verdict"]
@@ -145,7 +145,7 @@ def _verdict(slope: Slope) -> str:
 
 
 def _reach(found: Trends) -> list[str]:
-    """Say how far the prediction is from what was measured, and what that makes of it."""
+    """Say how far the prediction is from the measured cells, and what follows from that."""
     ends = found.measured(COMPUTE)
     if found.predict is None or ends is None:
         return []
@@ -175,14 +175,14 @@ def _reach(found: Trends) -> list[str]:
 
 
 def _held(found: Trends, where: str) -> list[str]:
-    """Say what else is held at its largest measured value in the prediction."""
+    """Say which other values are kept at their largest measured one in the prediction."""
     others = [name for name in found.against if name != COMPUTE and _has(found, name)]
     words = [f"`{name}={ends[1]:g}`" for name in others if (ends := found.measured(name)) is not None]
     return [f"the prediction for {where} has {_listed(words)}, the largest measured"] if words else []
 
 
 def _readings(found: Trends) -> list[str]:
-    """Say of each effect how it changes with compute, and what is predicted of it."""
+    """Say of each effect how it changes along the axes, and what is predicted about it."""
     lines = []
     for series in found.series:
         own = [trend for trend in found.trends if trend.series == series and trend.line is not None]
@@ -203,7 +203,7 @@ def _changes(own: Sequence[Trend], name: str) -> str:
 
 
 def _signs(found: Trends, own: Sequence[Trend]) -> list[str]:
-    """Group an effect's metrics by the sign that is predicted."""
+    """Group an effect's metrics by their predicted sign."""
     if found.compute is None or not _has(found, COMPUTE):
         return []
     signs = [(trend.predicted.sign, trend.metric) for trend in own if trend.predicted]

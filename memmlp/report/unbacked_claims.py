@@ -1,14 +1,14 @@
-"""Find claims of effects that prose makes by hand, which only the computation may make.
+"""Finds claims of effects in prose that were written by hand, which only computed text may make.
 
-The rules hold for each sentence (cells of tables and items of lists are sentences, too), once code, addresses
-and comments are taken out of it. A placeholder counts as a number.
+The rules apply to each sentence (cells of tables and items of lists are sentences, too), after code,
+addresses and comments are removed from it. A placeholder counts as a number.
 
 1. No number has a star or an interval: `1.47*`, `0.3 [0.1, 0.5]`.
 2. No sentence has a word of comparison or of verdict (`WORDS`) beside a number or the name of a metric.
    References such as "Table 4" or "Eq. 5" are no numbers.
 3. No sentence has one of the words `NEVER`, with or without a number.
 
-What is measured is written by a placeholder, which brings the verdict along.
+Measured effects are written with a placeholder, which adds the verdict.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ SENTENCE = re.compile(r"(?<=[.!?;])\s+|\n\s*\n|\n(?=\s*([-*]|\d+\.|#+|>)\s)|(?<!
 
 
 class UnbackedClaim(NamedTuple):
-    """A sentence that claims what it must not: its line, its words, and what is wrong with them."""
+    """A sentence with a claim that is not allowed: its line, its words, and what is wrong with them."""
 
     line: int
     sentence: str
@@ -68,7 +68,7 @@ def claims(text: str) -> list[UnbackedClaim]:
 
 
 def _blank(found: re.Match[str]) -> str:
-    """Return as many spaces as the match is long, with its line breaks kept."""
+    """Return spaces of the match's length, with its line breaks kept."""
     return re.sub(r"[^\n]", " ", found[0])
 
 
@@ -81,7 +81,7 @@ def _sentences(text: str) -> list[tuple[int, str]]:
 
 
 def _reason(sentence: str) -> str | None:
-    """Return what is wrong with a sentence; None where nothing is."""
+    """Return what is wrong with a sentence; None if nothing is."""
     for pattern, what in ((STAR, "a number with a star"), (INTERVAL, "an interval")):
         if pattern.search(sentence):
             return what

@@ -1,8 +1,8 @@
 """A run as one file: a zip of its own files, with an index of their sizes and digests.
 
-An archive may come from anybody. It is unpacked into a folder beside the runs, by names that a run's files
-have and no others, each no longer than the index says and with the digest that it says; nothing in it is
-executed or unpickled. Only a run that is whole takes its place among the runs.
+An archive may come from anybody. It is unpacked into a folder beside the runs. Only names of a run's files
+are accepted, and each file must have the size and the digest in the index; nothing is executed or unpickled.
+Only a complete run is then moved among the runs.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ ALLOWED = re.compile(
 def export_run(run: Run, out: Path) -> str:
     """Write a finished run to a file, and return the file's SHA-256.
 
-    Its checkpoint stays behind, since nothing is left to resume.
+    The checkpoint is left out, since a finished run is not resumed.
 
     Raises:
-        InputError: if the run is not finished, or files of it are missing or changed.
+        InputError: if the run is not finished, or some of its files are missing or changed.
     """
     if not run.done:
         raise InputError(f"run {run.id}: is {run.status}; allowed is a finished run")
@@ -91,21 +91,20 @@ def import_run(
     largest: int = LARGEST,
     tell: Callable[[str], None] = lambda line: None,
 ) -> tuple[Run, bool]:
-    """Take the run of an archive among the runs of an outputs folder.
+    """Add the run in an archive to the runs of an outputs folder.
 
     Args:
         path: the archive.
         outputs: the outputs folder.
         sha256: the digest that the archive must have; None for any.
-        largest: bytes of all files together at most.
-        tell: gets a line where the run is there already, without evaluations or deployments that the archive
-            has.
+        largest: the largest allowed size of all files together, bytes.
+        tell: gets a line if the run exists already, but lacks evaluations or deployments of the archive.
 
     Returns:
-        The run, and whether it is new; one that is there already with the same weights stays as it is.
+        The run, and whether it is new; an existing run with the same weights is left unchanged.
 
     Raises:
-        InputError: if the file is no archive of a run, is too large, or a digest does not hold.
+        InputError: if the file is no archive of a run, is too large, or a digest is wrong.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file")
@@ -131,7 +130,7 @@ def _missing(run: Run, files: Iterable[str]) -> list[str]:
 
 
 def _index(archive: zipfile.ZipFile, path: Path, largest: int) -> tuple[str, Mapping[str, Mapping[str, Any]]]:
-    """Return the run's id and the index' files, after a check of names and sizes."""
+    """Return the run's id and the files in the index, after a check of names and sizes."""
     names = archive.namelist()
     if len(names) > MOST_FILES or len(set(names)) != len(names) or INDEX not in names:
         raise InputError(f"{path}: not an archive of a run, which has an {INDEX} and each name once")
@@ -155,7 +154,7 @@ def _index(archive: zipfile.ZipFile, path: Path, largest: int) -> tuple[str, Map
 
 
 def _sound(files: Any) -> bool:
-    """Return whether the index has a size and a digest of each file."""
+    """Return whether the index has a valid size and digest for each file."""
     return isinstance(files, dict) and all(
         isinstance(one, dict)
         and isinstance(one.get("size"), int)
@@ -195,7 +194,7 @@ def _placed(
 
 
 def _copy(source: IO[bytes], file: IO[bytes], expected: Mapping[str, Any], what: str) -> None:
-    """Copy no more bytes than expected. Raises InputError where there are others, or have another digest."""
+    """Copy the expected number of bytes. Raises InputError if there are more, or if the digest is wrong."""
     digest, left = hashlib.sha256(), expected["size"]
     while piece := source.read(min(PIECE, left + 1)):
         left -= len(piece)
@@ -210,7 +209,7 @@ def _copy(source: IO[bytes], file: IO[bytes], expected: Mapping[str, Any], what:
 
 
 def _check(run: Run, path: Path) -> None:
-    """Raise InputError where the unpacked files are no finished run of that id, as it was made."""
+    """Raise InputError if the unpacked files are not an unchanged, finished run with that id."""
     if not run.done or run.manifest.get("id") != run.id or not run.config:
         raise InputError(f"{path}: holds no finished run {run.id}")
     run.metrics()
@@ -222,7 +221,7 @@ def _check(run: Run, path: Path) -> None:
 
 
 def _known(place: Run, files: Mapping[str, Mapping[str, Any]], path: Path) -> Run:
-    """Return the run that is there already. Raises InputError where it is not the archive's."""
+    """Return the run that exists already. Raises InputError if it is not the archive's run."""
     weights = files.get(place.model.name, {}).get("sha256")
     if not place.done or not place.model.is_file() or file_digest(place.model) != weights:
         raise InputError(f"{path}: run {place.id} is there already, {place.status}, and is another one")

@@ -1,4 +1,4 @@
-"""The folder of a deployment: a run's ONNX files and what was measured of them."""
+"""The folder of a deployment: a run's ONNX files and the measurements on them."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class DeploymentFolder:
     Attributes:
         folder: the folder.
         onnx: the float32 ONNX file.
-        int8: the int8 ONNX file, where there is one.
-        latency: the record of what was measured; it is written last.
+        int8: the int8 ONNX file, if there is one.
+        latency: the record of the measurements; it is written last.
     """
 
     def __init__(self, folder: Path):
@@ -43,28 +43,28 @@ class DeploymentFolder:
         self.latency = folder / LATENCY
 
     def file(self, precision: str) -> Path:
-        """Return the ONNX file of a precision, one of ONNX_FILES, whether it was made or not."""
+        """Return the ONNX file of a precision, one of ONNX_FILES, whether or not it was made."""
         return self.folder / ONNX_FILES[precision]
 
     @property
     def done(self) -> bool:
-        """Whether the deployment is complete, and belongs to the run in whose folder it lies."""
+        """Whether the deployment is complete, and belongs to the run in whose folder it is."""
         record = self.record
         whole = all((self.folder / name).is_file() for name in record.get("artifacts", {}))
         return bool(record) and whole and belongs(record.get("run"), self.folder.parent.parent)
 
     @property
     def current(self) -> bool:
-        """Whether the deployment was made by the present recipes."""
+        """Whether the deployment was made with the present recipe versions."""
         return self.folder.name == deployment_id_of(self.settings)
 
     @property
     def recipes(self) -> dict[str, int]:
-        """The recipe versions that it was made by; empty where these are not the present ones."""
+        """The recipe versions with which it was made; empty if these are not the present ones."""
         return deployment_recipes(self.settings) if self.current else {}
 
     def finish(self, record: Mapping[str, Any]) -> None:
-        """Write what was measured, with the files' digests; this marks the deployment as complete."""
+        """Write the measurements, with the files' digests; this marks the deployment as complete."""
         files = map(self.file, ONNX_FILES)
         artifacts = {path.name: file_digest(path) for path in files if path.exists()}
         made = {"made": now(), "made_by": environment(), "artifacts": artifacts}
@@ -72,7 +72,7 @@ class DeploymentFolder:
 
     @property
     def record(self) -> dict[str, Any]:
-        """What was measured: sizes, times, accuracy of less precision; empty if there is none."""
+        """The measurements: sizes, times, accuracy of lower precision; empty if there are none."""
         return _current(read_json(self.latency))
 
     @property
@@ -87,7 +87,7 @@ class DeploymentFolder:
 
     @property
     def accurate_int8(self) -> Path | None:
-        """The ONNX file in int8, if there is one that is accurate enough to stand for float32; else None."""
+        """The int8 ONNX file, if there is one that is accurate enough to replace float32; else None."""
         record = self.record
         accurate = [name for name in INT8_PRECISIONS if record.get(name, {}).get("default")]
         return next((self.file(name) for name in accurate if self.file(name).exists()), None)

@@ -63,7 +63,7 @@ def _version(package: str) -> str | None:
 
 @functools.cache
 def _git() -> dict[str, Any] | None:
-    """Return the commit of the package's checkout, and whether its files are changed; None outside of one."""
+    """Return the commit of the package's checkout, and whether files are changed; None outside a checkout."""
     try:
         _in_git("ls-files", "--error-unmatch", "__init__.py")
         commit = _in_git("rev-parse", "HEAD")
@@ -81,7 +81,7 @@ def _in_git(*args: str) -> str:
 def changes() -> str:
     """Return a patch from the package's commit to its present code, with the names of new files.
 
-    It is empty if nothing is changed or the package is not in a checkout.
+    It is empty if nothing was changed, or if the package is not in a checkout.
     """
     git = _git()
     if not git or not git["dirty"]:
@@ -94,9 +94,9 @@ def changes() -> str:
 
 
 def sources(packages: Iterable[str] = ()) -> dict[str, str]:
-    """Return a digest of the code of each file that a run's numbers come from.
+    """Return a digest of the code in each file on which a run's numbers depend.
 
-    Comments and docstrings do not count. Files of packages of one's own are named PACKAGE:FILE.
+    Comments and docstrings don't matter. Files of the user's own packages are named PACKAGE:FILE.
     """
     own = {f"{name}:{file}": digest for name in packages for file, digest in package_sources(name).items()}
     return _sources() | own
@@ -110,7 +110,7 @@ def _sources() -> dict[str, str]:
 
 
 def package_sources(name: str) -> dict[str, str]:
-    """Return a digest of each Python file of a package of one's own; empty where it is not here."""
+    """Return a digest of each Python file in a user's package; empty if the package is not imported."""
     module = sys.modules.get(name)  # what was imported is what computes
     if module is None:
         return {}
@@ -122,7 +122,7 @@ def package_sources(name: str) -> dict[str, str]:
 
 
 def _own_digest(path: Path) -> str:
-    """Return a digest of a file's code; of its bytes where it is no Python of this version."""
+    """Return a digest of a file's code, or of its bytes if it is not Python of this version."""
     try:
         return code_digest(path.read_text("utf-8"))
     except (SyntaxError, ValueError):
@@ -139,7 +139,7 @@ def packages_of_ones_own(names: Iterable[str]) -> dict[str, dict[str, str | None
 
 
 def _own_version(name: str) -> str | None:
-    """Return the version that a package tells of itself, or that of the distribution which it came with."""
+    """Return a package's own version, or that of the distribution that contains it."""
     if version := getattr(sys.modules.get(name), "__version__", None):
         return str(version)
     distributions = metadata.packages_distributions().get(name.split(".")[0], [])
@@ -147,13 +147,13 @@ def _own_version(name: str) -> str | None:
 
 
 def _counts(path: Path) -> bool:
-    """Return whether a run's numbers come from the file at this path below the package."""
+    """Return whether a run's numbers depend on the file at this path below the package."""
     room = path.parts[0]
     return path.as_posix() in WIRING or (not room.startswith("_") and room not in NOT_NUMBERS)
 
 
 def code_digest(text: str) -> str:
-    """Return 12 hex digits that stand for Python code, whatever its layout, comments and docstrings."""
+    """Return a digest of Python code, 12 hex digits, that ignores layout, comments and docstrings."""
     tree = ast.parse(text)
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):

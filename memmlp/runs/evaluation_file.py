@@ -1,4 +1,4 @@
-"""The files of evaluations, each of which holds a digest of itself."""
+"""The files of evaluations, each of which contains its own digest."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from memmlp.runs.identity import belongs, evaluation_id_of
 
 
 def write_report(path: Path, report: Mapping[str, Any]) -> None:
-    """Write the file of an evaluation: what was measured, when, with what environment, and a digest."""
+    """Write the file of an evaluation: results, time, environment, and a digest."""
     path.parent.mkdir(parents=True, exist_ok=True)
     content = plain({**report, "made": now(), "made_by": environment()})
     write_json(path, content | {"digest": _content_digest(content)})
 
 
 def read_report(path: Path) -> dict[str, Any]:
-    """Read the file of an evaluation. Raises InputError where it is damaged."""
+    """Read the file of an evaluation. Raises InputError if it is damaged."""
     found = read_json(path)
     if not {"mode", "mean", "clips"} <= found.keys():
         raise InputError(f"{path}: cannot be read; remove it, and the run's command makes it again")
@@ -30,7 +30,7 @@ def read_report(path: Path) -> dict[str, Any]:
 
 
 def intact(path: Path) -> bool:
-    """Return whether the file of an evaluation is as it was written, and lies where it was written."""
+    """Return whether an evaluation's file is unchanged, and is in the folder for which it was written."""
     content = read_json(path)
     same = content.pop("digest", None) == _content_digest(content)
     named = content.get("name", path.stem) == path.stem
@@ -38,7 +38,7 @@ def intact(path: Path) -> bool:
 
 
 def current(path: Path, report: Mapping[str, Any]) -> bool:
-    """Return whether an evaluation was made by the present recipes."""
+    """Return whether an evaluation was made with the present recipe versions."""
     settings = report.get("settings") or {}
     return {"mode", "ik"} <= settings.keys() and path.stem == evaluation_id_of(settings)
 

@@ -1,11 +1,11 @@
-"""Identities: a digest of all that can change a result, for each of the stages that results come from.
+"""Identities: digests of everything that can change a result, one for each stage that makes results.
 
 A **run** is a training (of a VQ-VAE or of a network): its identity is its config, its data, the run that it
 builds upon, and the recipe versions of the components it uses. An **evaluation** of it (one mode, with or
 without inverse kinematics) and a **deployment** (ONNX, int8, latency) have identities of their own, made only
-of what can change their own result. So a new mode, inverse kinematics or precision on a finished run takes
-that stage's work and no training. A component is known by its name in the config, never by where its class
-lies.
+from what can change their own result. So a new mode, inverse kinematics or precision on a finished run
+repeats only that stage, not the training. A component is identified by its name in the config, never by the
+path of its class.
 """
 
 from __future__ import annotations
@@ -73,11 +73,11 @@ class Identity:
     """The identity of a run.
 
     Attributes:
-        kind: NETWORK for every motion network, baselines too, or what it is upstream of one: "vqvae", or the
-            name of a part that is trained first; ids are digests of this word.
-        config: the resolved config; only the keys that can change a training's result count.
+        kind: NETWORK for every motion network, including baselines; for a run upstream of one, "vqvae" or the
+            name of the part that is trained. Ids are digests of this word.
+        config: the resolved config; only the keys that can change a training's result are used.
         data: digest of the prepared data.
-        upstream: the identity of the run whose artifact this one uses.
+        upstream: the identity of the run whose weights this one uses.
     """
 
     kind: str
@@ -92,29 +92,29 @@ class Identity:
 
     @property
     def id(self) -> str:
-        """A digest of all that can change the result, 16 hex digits."""
+        """A digest of everything that can change the result, 16 hex digits."""
         above = self.upstream.id if self.upstream else None
         return run_id(self.kind, self.config, data=self.data, upstream=above)
 
     @property
     def what(self) -> str:
-        """A digest of all that `id` is one of but the recipe versions.
+        """A digest of everything that is in `id` except the recipe versions.
 
-        It is equal in runs that differ by the age of their code alone.
+        It is equal for runs that differ only in the age of their code.
         """
         above = self.upstream.what if self.upstream else None
         return _digest(_training(self.kind, self.config, self.data, above))
 
 
 def run_id(kind: str, config: Mapping[str, Any], *, data: str, upstream: str | None) -> str:
-    """Return the identity of a training: 16 hex digits over all that can change its result.
+    """Return the identity of a training: a digest of everything that can change its result, 16 hex digits.
 
     Args:
         kind: see Identity.
-        config: the resolved config; keys that are neutral or of a later stage do not count, and 1 counts as
-            1.0.
+        config: the resolved config; keys that are neutral or belong to a later stage are ignored, and 1
+            equals 1.0.
         data: digest of the prepared data.
-        upstream: id of the run whose artifact this one uses.
+        upstream: id of the run whose weights this one uses.
     """
     what = _training(kind, config, data, upstream)
     return _digest(what | {"recipes": recipes(list(trained_components(kind, config)))})
@@ -126,7 +126,7 @@ def evaluation_id(config: Mapping[str, Any], mode: str, groups_digest: str | Non
 
 
 def evaluation_id_of(settings: Mapping[str, Any]) -> str:
-    """Return the identity that an evaluation with these settings has by the present recipes."""
+    """Return the identity of an evaluation with these settings, with the present recipe versions."""
     mode, ik = settings["mode"], settings["ik"]
     name = mode if ik == "off" else f"{mode}-{ik}"
     return f"{name}-{_digest({'settings': settings, 'recipes': evaluation_recipes(settings)})}"
@@ -142,9 +142,9 @@ def evaluation_recipes(settings: Mapping[str, Any]) -> dict[str, int]:
 def evaluation_settings(
     config: Mapping[str, Any], mode: str, groups_digest: str | None = None
 ) -> dict[str, Any]:
-    """Return the settings that an evaluation's result follows from, beside the run and its data.
+    """Return the settings that determine an evaluation's result, besides the run and its data.
 
-    `groups_digest` is a digest of the column file that says which clips belong together; None without one.
+    `groups_digest` is a digest of the column file that says which clips belong together; None without a file.
     """
     group = config.get("evaluation", {})
     ik = group.get("ik", "off")
@@ -156,12 +156,12 @@ def evaluation_settings(
 
 
 def _own_metrics(names: Iterable[str]) -> dict[str, str]:
-    """Return the paths of the functions of metrics of one's own, by name."""
+    """Return the paths of custom metrics' functions, by name."""
     return {name: METRICS[name].function if name in METRICS else "" for name in sorted(names)}
 
 
 def _groups(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the patterns of clips that belong together, as a report's rows say who does."""
+    """Return the patterns of clips that belong together, on which the groups in a report's rows depend."""
     patterns = (data.get("split") or {}).get("groups")
     sources = (data.get("sources") or {}).items()
     own = {name: groups for name, source in sources if (groups := source.get("groups"))}
@@ -174,7 +174,7 @@ def deployment_id(config: Mapping[str, Any]) -> str:
 
 
 def deployment_id_of(settings: Mapping[str, Any]) -> str:
-    """Return the identity that a deployment with these settings has by the present recipes."""
+    """Return the identity of a deployment with these settings, with the present recipe versions."""
     name = settings.get("precision", "fp32")
     return f"{name}-{_digest({'settings': settings, 'recipes': deployment_recipes(settings)})}"
 
@@ -187,14 +187,14 @@ def deployment_recipes(settings: Mapping[str, Any]) -> dict[str, int]:
 
 
 def deployment_settings(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings that a deployment's result follows from, beside the run and its data."""
+    """Return the settings that determine a deployment's result, besides the run and its data."""
     own = {key: _canonical(value) for key, value in config.get("export", {}).items()}
     counting = {key: value for key, value in own.items() if (key, value) not in UNNAMED_EXPORT}
     return counting | inference(config)
 
 
 def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
-    """Yield the names of the components that a training's numbers come from."""
+    """Yield the names of the components on which a training's numbers depend."""
     yield from ("features", "sampler", "training")
     if (config.get("data") or {}).get("mirror"):
         yield "mirror"
@@ -216,19 +216,19 @@ def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
 
 
 def training_settings(kind: str, config: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the group of a config that says for how many steps a run of that kind is trained."""
+    """Return the config group that has the number of training steps for a kind of run."""
     if kind == "vqvae":
         return config["vqvae"]
     return config["optim"] if kind == NETWORK else config["upstream"][kind]
 
 
 def chosen(config: Mapping[str, Any], slot: str) -> str | None:
-    """Return the name of the option in a slot; None for an empty slot, and for Mem-MLP in `model`."""
+    """Return the name of the option in a slot; None if the slot is empty, and for Mem-MLP in `model`."""
     return (config.get(slot) or {}).get("name", UNNAMED.get(slot))
 
 
 def trained_by(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return, by dotted key, the config values that can change a training's result; null counts as no key."""
+    """Return the config values that can change a training's result, by dotted key; null counts as no key."""
     later = (*EVALUATION, *DEPLOYMENT, *(() if _rolls_out(config) else INFERENCE))
     out = (*NEUTRAL, *FORMER, *later, *_unused(config))
     flat = {key: _canonical(value) for key, value in flatten(config).items() if value is not None}
@@ -237,7 +237,7 @@ def trained_by(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _draws(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return how windows are drawn, which the data's digest does not cover."""
+    """Return the settings with which windows are drawn, which the data's digest does not cover."""
     data = config.get("data")
     if not data:
         return {}
@@ -258,37 +258,37 @@ def trained_with(key: str, config: Mapping[str, Any]) -> bool:
 
 
 def is_data_path(key: str) -> bool:
-    """Return whether a dotted key says where data lies. One folder has many spellings, and one digest."""
+    """Return whether a dotted key is a path to data; data is identified by its digest, not by its path."""
     return DATA_PATH.fullmatch(key) is not None
 
 
 def belongs(run_id: str | None, folder: Path) -> bool:
-    """Return whether what was made of the run with that id lies in that run's folder.
+    """Return whether a file of the run with that id is in that run's folder.
 
-    A folder whose name is no id is a copy, to which everything in it belongs.
+    A folder whose name is no id is a copy of a run, to which everything in it belongs.
     """
     return run_id in (None, folder.name) or not ID.fullmatch(folder.name)
 
 
 def used_as_configured(settings: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
-    """Return whether a stage's settings use the network as the run's own config does."""
+    """Return whether a stage's settings use the network in the way that the run's own config does."""
     return all(settings.get(key) == value for key, value in inference(config).items())
 
 
 def inference(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the keys that act when the network is used, as far as the config has them."""
+    """Return the keys that matter when the network is used, as far as the config has them."""
     flat = flatten(config)
     return {key: _canonical(flat[key]) for key in INFERENCE if key in flat}
 
 
 def _rolls_out(config: Mapping[str, Any]) -> bool:
-    """Return whether training runs the network as live use does, so that inference keys act in it too."""
+    """Return whether training runs the network as live use does, so that inference keys matter in it too."""
     rollout = (config.get("rollout") or {}).get("name", "teacher_forcing")
     return bool(config.get("refiner") or config.get("upstream")) or rollout != "teacher_forcing"
 
 
 def _unused(config: Mapping[str, Any]) -> Iterable[str]:
-    """Yield the keys that nothing reads, given the others."""
+    """Yield the keys that have no effect, given the values of the others."""
     if config.get("optim", {}).get("schedule", "step") != "step":
         yield "optim.drop_at"
     if chosen(config, "optim") == UNNAMED["optim"]:
@@ -310,7 +310,7 @@ def _below(key: str, names: Iterable[str]) -> bool:
 
 
 def _is_path(key: str, value: Any) -> bool:
-    """Return whether a key says where a class of this package lies; a foreign class has no other name."""
+    """Return whether a key is the path of a class of this package; a foreign class has no other name."""
     return key.rsplit(".", 1)[-1] in PATHS and (value is True or str(value).startswith("memmlp."))
 
 
@@ -320,7 +320,7 @@ def _digest(what: Mapping[str, Any]) -> str:
 
 
 def _canonical(value: Any) -> Any:
-    """Return a value that is the same for the same number, however it was typed (1 or 1.0)."""
+    """Return a value in one form for equal numbers, however they were typed (1 or 1.0)."""
     if isinstance(value, list | tuple):
         return [_canonical(item) for item in value]
     if isinstance(value, float) and value.is_integer():
@@ -329,7 +329,7 @@ def _canonical(value: Any) -> Any:
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return a nested mapping as a flat one with dotted keys; lists stay values."""
+    """Return a nested mapping as a flat one with dotted keys; lists stay as they are."""
     flat: dict[str, Any] = {}
     for key, value in tree.items():
         if isinstance(value, Mapping) and value:

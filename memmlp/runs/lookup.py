@@ -41,17 +41,17 @@ def find_run(outputs: Path | str, name: str) -> Run:
 
 
 def is_trained(run: Run) -> bool:
-    """Whether it is a finished run of a motion network, not one of a VQ-VAE."""
+    """Return whether a run is a finished run of a motion network, not one of a VQ-VAE."""
     return run.done and run.manifest.get("kind") == "memmlp"
 
 
 def check_trained(run: Run) -> None:
-    """Raise InputError where it is no finished run of a motion network."""
+    """Raise InputError if a run is not a finished run of a motion network."""
     if not is_trained(run):
         raise InputError(f"run {run.id}: not a finished run of a motion network")
 
 
 def _enumerate(names: Iterable[str], most: int = 8) -> str:
-    """Join names with commas; of more than `most` only the first are shown."""
+    """Join names with commas; after the first `most` names the rest is left out."""
     every = list(names)
     return ", ".join(every[:most]) + (", ..." if len(every) > most else "")

@@ -32,7 +32,7 @@ class Metrics(NamedTuple):
 
 
 def parsed(line: bytes) -> Metrics:
-    """Return the record in a line. Raises ValueError, KeyError or TypeError where it holds none."""
+    """Return the record in a line. Raises ValueError, KeyError or TypeError if it has none."""
     entry = json.loads(line)
     values = {key: float(value) for key, value in entry["values"].items()}
     return Metrics(entry["step"], entry["phase"], values, entry["time"])
@@ -49,8 +49,8 @@ class MetricsLog:
         """Append one line, in one write: a kill damages at most that line.
 
         Raises:
-            LeaseLost: if the run has another owner by now.
-            OSError: if the disk is full; the log is as it was.
+            LeaseLost: if the run has another owner now.
+            OSError: if the disk is full; the log is then unchanged.
         """
         lease_fences.check_owner(self.path)
         if not self._whole:
@@ -67,9 +67,9 @@ class MetricsLog:
             self._whole = True
 
     def repair(self) -> None:
-        """Put in the log's place a copy of it, without a last line that was not written whole.
+        """Replace the log by a copy of it, without an incomplete last line.
 
-        What an earlier owner of the run writes, who had the log open, is then lost with that file.
+        If an earlier owner of the run has the old file open, what it writes there is lost.
         """
         if self.path.exists():
             content = self.path.read_bytes()
@@ -77,9 +77,9 @@ class MetricsLog:
         self._whole = True
 
     def read(self) -> list[Metrics]:
-        """Read all records, leaving out a last line that was not written whole.
+        """Read all records, leaving out an incomplete last line.
 
-        Of a step that a resumed run repeated, the last record counts.
+        If a resumed run repeated a step, its last record is used.
 
         Raises:
             InputError: if a line is damaged; the message names file and line.

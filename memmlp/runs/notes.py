@@ -1,4 +1,4 @@
-"""Tags and notes that people give a run: the file `notes.json` in its folder, no part of any identity."""
+"""Tags and notes that users give a run: the file `notes.json` in its folder, not part of any identity."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LONGEST = 10_000  # characters of a note
 
 @dataclass(frozen=True)
 class Notes:
-    """What people said of a run.
+    """A run's tags and note.
 
     Attributes:
         tags: short words, sorted.
@@ -34,7 +34,7 @@ def notes_path(run: Run) -> Path:
 
 
 def read_notes(run: Run) -> Notes:
-    """Return a run's tags and note; empty ones where nobody gave any or the file is damaged."""
+    """Return a run's tags and note; empty ones if there are none or the file is damaged."""
     found = read_json(notes_path(run))
     tags, note = found.get("tags"), found.get("note")
     words = [tag for tag in tags if isinstance(tag, str)] if isinstance(tags, list) else []
@@ -42,13 +42,13 @@ def read_notes(run: Run) -> Notes:
 
 
 def add_tags(run: Run, tags: Iterable[str]) -> Notes:
-    """Give a run tags. Raises InputError for one that is no short word."""
+    """Add tags to a run. Raises InputError for a tag that is no short word."""
     known = read_notes(run)
     return _write(run, Notes(tuple(sorted({*known.tags, *map(checked, tags)})), known.note))
 
 
 def remove_tags(run: Run, tags: Iterable[str]) -> Notes:
-    """Take tags from a run. Raises InputError for one that it does not have."""
+    """Remove tags from a run. Raises InputError for a tag that the run does not have."""
     known, gone = read_notes(run), set(tags)
     if missing := sorted(gone - set(known.tags)):
         has = ", ".join(known.tags) or "none"
@@ -64,7 +64,7 @@ def set_note(run: Run, note: str) -> Notes:
 
 
 def checked(tag: str) -> str:
-    """Return the tag. Raises InputError where it is no short word."""
+    """Return the tag. Raises InputError if it is no short word."""
     if not TAG.fullmatch(tag):
         raise InputError(f"tag '{tag}': allowed are up to 64 letters, digits and . _ + / : -")
     return tag

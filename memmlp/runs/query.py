@@ -1,6 +1,7 @@
-"""Conditions on runs, such as "memory=gru and stream.MPJPE<6.3", and the values that they are about.
+"""Conditions on runs, such as "memory=gru and stream.MPJPE<6.3", and the values that they can use.
 
-A condition is made of comparisons, `and`, `or`, `not` and parentheses. Nothing of it is ever executed.
+A condition is made of comparisons, `and`, `or`, `not` and parentheses. No part of it is ever executed as
+code.
 """
 
 from __future__ import annotations
@@ -36,9 +37,9 @@ def record(run: Run) -> dict[str, Any]:
     """Return the values that conditions can use for a run, by key.
 
     These are its id, kind, status, name, started, upstream, user, tag and note; its data by name (`data`) and
-    by digest (`data_digest`); the keys of its config, slots also by their name alone (`memory` for
-    `memory.name`); and its results, those of the rotation branch also without the branch (`stream.MPJPE` for
-    `stream.rotation.MPJPE`).
+    by digest (`data_digest`); the keys of its config, with slots also under their name alone (`memory` for
+    `memory.name`); and its results, with those of the rotation branch also without the branch (`stream.MPJPE`
+    for `stream.rotation.MPJPE`).
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
     results = {key: _measured(value) for key, value in flatten(run.results).items()}
@@ -54,14 +55,15 @@ def record(run: Run) -> dict[str, Any]:
 
 
 def _measured(value: Any) -> Any:
-    """Return what JSON holds for a measured number as that number, with NaN and infinities."""
+    """Return a measured number as JSON holds it, with NaN and infinities converted back to numbers."""
     return NUMBERS.get(value, value) if isinstance(value, str) else value
 
 
 def data_labels(records: Sequence[Record]) -> list[str]:
-    """Return for each record the name of its data, with a short digest where two data have that name.
+    """Return the name of each record's data, with a short digest if different data have the same name.
 
-    A record without a name of its data, as a VQ-VAE's, has the name that another one gives to the same data.
+    A record without a name for its data, such as a VQ-VAE's, gets the name that another record has for the
+    same data.
     """
     digests = [str(one.get("data_digest") or "") for one in records]
     named = {
@@ -78,9 +80,9 @@ def data_labels(records: Sequence[Record]) -> list[str]:
 def differing(configs: Sequence[Mapping[str, Any]], data: Sequence[str] = ()) -> list[str]:
     """Return the config keys that change a result and differ among these configs.
 
-    Where the option in a slot differs, its name stands for its keys that the others don't have, unless runs
-    with that option differ in them. Of the data the keys count in which two data of one name differ; data of
-    several names are told apart by these.
+    If the option in a slot differs, its name stands for the keys that only this option has, unless runs with
+    that option differ in them. Keys of the data are included only if data with the same name differ in them;
+    otherwise the names tell the data apart.
 
     Args:
         configs: the configs.
@@ -102,7 +104,7 @@ def differing(configs: Sequence[Mapping[str, Any]], data: Sequence[str] = ()) ->
 
 
 def _of_data(flats: Sequence[Mapping[str, Any]], digests: Sequence[str]) -> set[str]:
-    """The keys of the data that differ between data of one name."""
+    """Return the data's keys that differ between data with the same name."""
     named: dict[Any, dict[str, Mapping[str, Any]]] = {}
     for flat, digest in zip(flats, digests, strict=False):
         named.setdefault(flat.get("data.name"), {}).setdefault(digest, flat)
@@ -115,12 +117,12 @@ def _of_data(flats: Sequence[Mapping[str, Any]], digests: Sequence[str]) -> set[
 
 
 def _later(config: Mapping[str, Any]) -> list[str]:
-    """The keys of evaluation and export, which change what is made of a trained network."""
+    """Return the keys of evaluation and export, which change what is made from a trained network."""
     return [key for key in flatten(config) if key.startswith(("evaluation.ik", "export.precision"))]
 
 
 def as_typed(value: Any) -> str:
-    """Return a value as it is typed in a condition, and shown in a column."""
+    """Return a value as it is typed in a condition and shown in a column."""
     if isinstance(value, list | tuple):
         return f"[{','.join(map(as_typed, value))}]"
     if isinstance(value, bool):
@@ -131,7 +133,7 @@ def as_typed(value: Any) -> str:
 
 
 def check_key(key: str, records: Iterable[Record], option: str) -> None:
-    """Raise InputError where no run has the key."""
+    """Raise InputError if no run has the key."""
     keys = {name for one in records for name in one}
     if key not in keys:
         near = difflib.get_close_matches(key, keys, n=1)
@@ -149,19 +151,19 @@ class Query(NamedTuple):
     keys: tuple[str, ...]
 
     def of(self, records: Sequence[Record], option: str = "--where") -> list[bool]:
-        """Return for each record whether it fulfils the condition. Raises InputError for unknown keys."""
+        """Return for each record whether it satisfies the condition. Raises InputError for unknown keys."""
         for key in self.keys if records else ():
             check_key(key, records, option)
         return [self.condition(one) for one in records]
 
 
 def parse(text: str) -> Query:
-    """Parse a condition. Raises InputError, in one line, where it is none."""
+    """Parse a condition. Raises InputError, in one line, if it is not valid."""
     return _Parser(text).parsed()
 
 
 class _Parser:
-    """Recursive descent over the tokens of a condition."""
+    """A recursive-descent parser over the tokens of a condition."""
 
     def __init__(self, text: str):
         self.text, self.place, self.depth = text, 0, 0
@@ -252,8 +254,9 @@ class _Parser:
 
 
 def _holds(own: Any, sign: str, value: str) -> bool:
-    """Return whether a comparison holds. What a run does not have is neither smaller nor larger, nor is NaN,
-    which fulfils != alone.
+    """Return whether a comparison holds.
+
+    A missing value is neither smaller nor larger than anything, and neither is NaN, which satisfies only !=.
     """
     if sign in ORDER:
         if isinstance(own, str):
@@ -265,7 +268,7 @@ def _holds(own: Any, sign: str, value: str) -> bool:
 
 
 def _equal(own: Any, value: str) -> bool:
-    """Return whether a run's value is one that was typed in; a number may be typed as it is shown."""
+    """Return whether a run's value equals a typed one; a number may also be typed as it is shown."""
     if isinstance(own, tuple):  # tags: it has the tag
         return value in own
     if isinstance(own, int | float) and not isinstance(own, bool):

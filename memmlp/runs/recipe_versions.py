@@ -1,9 +1,9 @@
-"""Recipe numbers: one for every component that numbers come from.
+"""Recipe versions: one for every component on which a result's numbers depend.
 
-A run's identity holds the numbers of the components that it uses. Whoever changes what a component computes
-raises its number in the same commit: the runs that used it then have an outdated recipe and are made again,
-and no others. `tests/test_golden.py` computes a few steps of every component and fails until that is done.
-Moving or renaming code changes no number. Packages of one's own add numbers for their components
+A run's identity contains the numbers of the components that it uses. Whoever changes what a component
+computes raises its number in the same commit: then exactly the runs that used it have an outdated recipe and
+are made again. `tests/test_golden.py` computes a few steps of every component and fails until that is done.
+Moving or renaming code changes no number. Users' packages add numbers for their components
 (memmlp.config.plugins).
 """
 
@@ -90,11 +90,11 @@ RECIPES: dict[str, int] = {
 
 
 def outdated(known: Mapping[str, int]) -> list[str]:
-    """Return in words which of the known numbers, by component, are different now: "name old -> new"."""
+    """Describe which of the known recipe versions, by component, are different now: "name old -> new"."""
     now = recipes(list(known))
     return [f"{name} {number} -> {now[name]}" for name, number in known.items() if now[name] != number]
 
 
 def recipes(components: list[str]) -> dict[str, int]:
-    """Return the numbers of the components by name; 0 for one that is not of this package."""
+    """Return the recipe versions of components by name; 0 for a component that is not in this package."""
     return {name: RECIPES.get(name, 0) for name in sorted(components)}

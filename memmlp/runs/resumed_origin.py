@@ -1,4 +1,4 @@
-"""The origin of a training that was resumed: every machine and code that had a share in it."""
+"""The origin of a resumed training: every machine and code version that had a part in it."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ MACHINE = ("device", "gpu", "gpu_index", "threads", "processes", "precision", "c
 
 
 def joined(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
-    """Join the origins of a training before and after it was resumed: where they differ, both are kept.
+    """Join the origins of a training before and after it was resumed; if they differ, both are kept.
 
-    A file whose code changed in between gets the digest "mixed", which no code has.
+    A file whose code changed in between gets "mixed" in place of a digest.
 
     Args:
         before: the manifest so far, empty for a training from the start.
-        after: what the training goes on with.
+        after: the origin of the resumed training.
     """
     found = dict(after)
     for key in MACHINE:

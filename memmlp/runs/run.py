@@ -1,7 +1,7 @@
 """Run folders: lock, manifest, metrics log, completion. The folder is the only record of a run.
 
-A run is done when it is trained. Its evaluations and deployments lie below its folder, each in a file or
-folder that is named by its identity and is there whole or not at all.
+A run is done when it is trained. Its evaluations and deployments are below its folder, each in a file or
+folder that is named by its identity and is either complete or absent.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Run:
         folder: the folder; its name is the run's `id`.
         id: 16 hex digits.
         config_path: the resolved config; `config` is its content.
-        manifest_path: what is known of the run; `manifest` is its content.
+        manifest_path: the facts about the run; `manifest` is its content.
         metrics_path: the metrics log; `metrics()` is its content.
         checkpoint: the last checkpoint.
         model: the trained weights.
@@ -88,32 +88,32 @@ class Run:
 
     @classmethod
     def of(cls, outputs: Path | str, run_id: str) -> Run:
-        """Return the run of that id below an outputs folder, whether it exists or not."""
+        """Return the run with that id below an outputs folder, whether or not it exists."""
         return cls(Path(outputs) / "runs" / run_id)
 
     def evaluation(self, identity: str) -> Path:
-        """Return the file of an evaluation, whether it was made or not."""
+        """Return the file of an evaluation, whether or not it was made."""
         return self.evaluations / f"{identity}.json"
 
     def deployment(self, identity: str) -> DeploymentFolder:
-        """Return the folder of a deployment, whether it was made or not."""
+        """Return the folder of a deployment, whether or not it was made."""
         return DeploymentFolder(self.deployments / identity)
 
     def has(self, stage: str) -> bool:
-        """Return whether the evaluation or deployment of that identity was made."""
+        """Return whether the evaluation or deployment with that identity was made."""
         return self.evaluation(stage).is_file() or self.deployment(stage).done
 
     @property
     def preferred_deployment(self) -> DeploymentFolder:
         """The deployment to use, among those with the run's own settings.
 
-        One of the present recipes comes first, then one whose int8 file is accurate enough, then the last one
-        made.
+        One with the present recipe versions is preferred, then one whose int8 file is accurate enough, then
+        the one that was made last.
         """
         return self.deployment_used(self.config)
 
     def deployment_used(self, config: Mapping[str, Any]) -> DeploymentFolder:
-        """Return the preferred deployment, given the run's config as it was read already."""
+        """Return the preferred deployment, given the run's config if that was read already."""
         made = [DeploymentFolder(path.parent) for path in self.deployments.glob("*/latency.json")]
         own = [one for one in made if one.done and used_as_configured(one.settings, config)]
         best = max(own, key=lambda one: (one.current, bool(one.accurate_int8), one.made), default=None)
@@ -121,10 +121,10 @@ class Run:
 
     @property
     def preferred_onnx(self) -> Path:
-        """The ONNX file to use: that in int8 if it is accurate enough (`export.precision`), else in float32.
+        """The ONNX file to use: int8 if that is accurate enough (`export.precision`), else float32.
 
         Raises:
-            InputError: if the run is finished and has none (`export.graph=off`).
+            InputError: if the run is finished and has no ONNX file (`export.graph=off`).
         """
         deployment = self.preferred_deployment
         if self.done and not self.deployments.is_dir():
@@ -143,24 +143,24 @@ class Run:
     def lock(
         self, say: Callable[[str], None] | None = None, wait: bool = True
     ) -> AbstractContextManager[Lease | None]:
-        """Hold the run for this process, which may hold it already; yields the lease.
+        """Hold the run's lock for this process, which may hold it already; yields the lease.
 
-        Once another process took the run over, whatever this one would write to it raises LeaseLost.
+        Once another process has taken over the run, any attempt of this one to write to it raises LeaseLost.
 
         Args:
-            say: told in one line whom this process waits for; by default the line goes to stderr.
+            say: gets a line about the process for which this one waits; by default the line goes to stderr.
             wait: whether to wait while another process holds the run; otherwise None is yielded.
         """
         return self._lock.hold(say, wait)
 
     @property
     def status(self) -> str:
-        """One of STATUSES: what a process is doing with the run, or else how far it is."""
+        """The run's status, one of STATUSES: what a process is doing with it, or else its progress."""
         return self.doing or self.state(self.done and not self.failure)
 
     @property
     def doing(self) -> str | None:
-        """What a process is doing with the run, one of STAGE_WORDS; None if none is at it."""
+        """What a process is doing with the run, one of STAGE_WORDS; None if no process works on it."""
         if not self._lock.held:
             return None
         attempts = self.manifest.get("attempts") or [{}]
@@ -168,10 +168,10 @@ class Run:
         return None if self.done and word == "training" else word
 
     def state(self, complete: bool) -> str:
-        """Return how far work on the run is, given whether that work is complete.
+        """Return the state of the work on the run, given whether that work is complete.
 
-        One of: done, running (a process is at it), lost (its process died), failed, trained (an evaluation or
-        a deployment that is wanted was not made yet), stopped, new.
+        One of: done, running (a process works on it), lost (its process died), failed, trained (a wanted
+        evaluation or deployment was not made yet), stopped, new.
         """
         if complete:
             return "done"
@@ -189,7 +189,7 @@ class Run:
         return read_json(self.folder / "FAILED").get("reason")
 
     def fail(self, reason: str, details: str = "") -> None:
-        """Record why the run ended before it was done."""
+        """Record why the run failed."""
         write_json(
             self.folder / "FAILED", {"reason": " ".join(reason.split()), "when": now(), "details": details}
         )
@@ -207,15 +207,15 @@ class Run:
     ) -> None:
         """Write config.yaml and the manifest of a run that starts or resumes.
 
-        If the code was changed since its commit, the patch is written beside them.
+        If the code was changed since its commit, a patch is written beside them.
 
         Args:
             kind: what is trained (see `Identity`).
             config: the resolved config.
             data: digest of the prepared data.
-            upstream: id of the run whose artifact this one uses.
-            facts: further entries of the manifest, such as recipes, device and threads, and the packages of
-                one's own that it uses (`plugins`).
+            upstream: id of the run whose weights this one uses.
+            facts: further entries of the manifest, such as recipes, device and threads, and the user's
+                packages that it uses (`plugins`).
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         atomic_write(self.config_path, yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
@@ -229,7 +229,7 @@ class Run:
         self.write_manifest(identity | times | made)
 
     def took(self, stage: str, seconds: float) -> None:
-        """Record in the manifest how long a stage took, all processes that worked on it in turn together."""
+        """Record in the manifest how long a stage took, summed over all processes that worked on it."""
         known = self.manifest.get("seconds", {})
         self.write_manifest({"seconds": {**known, stage: round(seconds, 3)}})
 
@@ -245,7 +245,7 @@ class Run:
 
     @property
     def manifest(self) -> dict[str, Any]:
-        """What is known of the run; empty before it began."""
+        """The facts about the run; empty before it began."""
         return read_json(self.manifest_path)
 
     @property
@@ -265,10 +265,11 @@ class Run:
 
     @property
     def results(self) -> dict[str, Any]:
-        """What was measured with the run's own settings: mode -> branch -> metric, and "latency".
+        """The results with the run's own settings: mode -> branch -> metric, and "latency".
 
         A VQ-VAE's run has its own results instead. Where a branch was evaluated by inverse kinematics with
-        several numbers of iterations, the last evaluation counts; tables ask for theirs by its identity.
+        several numbers of iterations, the last evaluation is used; tables ask for an evaluation by its
+        identity.
 
         Raises:
             InputError: if the file of an evaluation is damaged.
@@ -283,9 +284,7 @@ class Run:
 
     @property
     def own_evaluations(self) -> list[Path]:
-        """The evaluations that use the network as the run's config does: older recipes first, then by
-        time.
-        """
+        """The evaluations with the settings of the run's config: older recipes first, then by time."""
         config, paths = self.config, sorted(self.evaluations.glob("*.json"))
         every = {path: read_json(path) for path in paths}
         own = [path for path, made in every.items() if used_as_configured(made.get("settings", {}), config)]
@@ -293,8 +292,9 @@ class Run:
 
     @property
     def changed_sources(self) -> list[str]:
-        """The files whose code differs from what made the run, those of one's own packages that are in use
-        too; empty if that is not known.
+        """The files whose code has changed since the run was made; empty if that is not known.
+
+        Files of the user's packages that are in use are included.
         """
         before, packages = self.manifest.get("sources", {}), self.manifest.get("plugins", ())
         now_here = sources(packages).items() if before else ()
@@ -306,7 +306,7 @@ class Run:
 
     @property
     def step(self) -> int:
-        """The last training step that is logged; 0 before the first."""
+        """The last logged training step; 0 before the first."""
         return max((entry.step for entry in self.metrics()), default=0)
 
     def metrics(self) -> list[Metrics]:
@@ -322,7 +322,7 @@ class Run:
 
     @property
     def done(self) -> bool:
-        """Whether the run was finished, and the folder is not another run's under this id."""
+        """Whether the run is finished, and the folder does not belong to another run's id."""
         marker = read_json(self.marker)
         return "artifacts" in marker and belongs(marker.get("id"), self.folder)
 
@@ -330,7 +330,7 @@ class Run:
         """Return the file of the trained weights.
 
         Raises:
-            InputError: if the file is not the one that was trained.
+            InputError: if the file was changed since the training.
         """
         digest = read_json(self.marker).get("artifacts", {}).get(self.model.name)
         if digest and not self._same(self.model.name, digest):
@@ -355,7 +355,7 @@ class Run:
         return path.is_file() and file_digest(path) == digest
 
     def reset(self) -> None:
-        """Remove the run's own files, the marker first, and nothing else."""
+        """Remove the run's own files, with the marker first, and nothing else."""
         if not self.folder.exists():
             return
         lease_fences.check_owner(self.folder)
@@ -364,7 +364,7 @@ class Run:
         self._remove((*self.FILES, self.marker.name))
 
     def clear_stages(self) -> None:
-        """Remove the evaluations and deployments, which were made from earlier weights."""
+        """Remove the evaluations and deployments, which belong to earlier weights."""
         self._remove(self.STAGES)
 
     def _remove(self, names: Iterable[str]) -> None:

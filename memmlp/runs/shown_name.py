@@ -1,4 +1,4 @@
-"""A run's name for people, the same in lists, on the page and in trackers."""
+"""A run's readable name, which is the same in lists, on the page and in trackers."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ USUAL = {"model": "mem_mlp", "predictor": "two_branch"}
 
 
 def kind_words(kind: str) -> str:
-    """Return what people call a kind of run that networks build upon, such as "lower codes"."""
+    """Return the readable name of an upstream run's kind, such as "lower codes"."""
     return "VQ-VAE" if kind == "vqvae" else kind.replace("_", " ")
 
 
 def run_name(manifest: Mapping[str, Any], config: Mapping[str, Any]) -> str:
-    """Return the name that a run was given when it began: what its config has that a default one has not.
+    """Return the name that a run got when it began, which tells how its config differs from the default.
 
-    A run from before there were such names has its model, memory and predictor in place of it.
+    An older run without such a name is named by its model, memory and predictor.
 
     Args:
         manifest: the run's manifest.
-        config: its config by dotted key.
+        config: the run's config, by dotted key.
     """
     if manifest.get("name"):
         return str(manifest["name"])

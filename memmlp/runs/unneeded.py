@@ -1,4 +1,4 @@
-"""Runs that nobody needs any more: failed, of an old recipe, or orphaned."""
+"""Runs that are no longer needed: failed ones, ones with an old recipe, and orphans."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ REASONS = ("failed", "old", "orphaned")
 
 
 class Garbage(NamedTuple):
-    """A run that may go.
+    """A run that may be deleted.
 
     Attributes:
         run: the run.
         kind: one of REASONS.
-        reason: why, in words.
+        reason: why it may be deleted, in words.
         size: bytes in its folder.
     """
 
@@ -36,14 +36,14 @@ class Garbage(NamedTuple):
 
 
 def garbage(outputs: Path, kinds: Iterable[str] = REASONS) -> list[Garbage]:
-    """Find the runs that may go.
+    """Find the runs that may be deleted.
 
-    Never among them are runs that somebody is at, that people gave a tag or a note, or that a run builds upon
-    that stays.
+    Runs on which a process works, runs with a tag or a note, and runs upon which a remaining run builds are
+    never among them.
 
     Args:
         outputs: the outputs folder.
-        kinds: which of REASONS count.
+        kinds: which of REASONS to look for.
     """
     runs = list_runs(outputs)
     orphans, wanted = _orphans(outputs, runs), set(kinds)
@@ -58,7 +58,7 @@ def garbage(outputs: Path, kinds: Iterable[str] = REASONS) -> list[Garbage]:
 
 
 def delete(one: Garbage) -> bool:
-    """Delete a run's folder, its marker first. Returns False where somebody is at the run or marked it."""
+    """Delete a run's folder, its marker first. Returns False if the run is in use, or has tags or a note."""
     with one.run.lock(wait=False) as mine:
         if not mine or _marked(one.run):
             return False
@@ -76,10 +76,10 @@ def _reason(run: Run, orphans: Mapping[str, str]) -> tuple[str, str]:
 
 
 def _orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
-    """Return by id why a run is an orphan.
+    """Return the orphans' ids, each with the reason why it is an orphan.
 
-    Orphans are runs of earlier versions of a sweep that no plan has now, VQ-VAEs and parts that no run uses
-    and no plan wants, and folders in which nothing began.
+    Orphans are runs of earlier versions of a sweep that are in no plan now, VQ-VAEs and parts that no run
+    uses and no plan wants, and folders of runs that never began.
     """
     planned = {task["id"] for path in _plans(outputs) for task in _listed(path, "tasks")}
     before = {
@@ -97,7 +97,7 @@ def _orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
 
 
 def _plans(outputs: Path) -> Iterator[Path]:
-    """Yield the files of sweeps' plans, and of those that a living process, such as a search, works on."""
+    """Yield the plan files of sweeps, and those on which a living process, such as a search, works."""
     yield from outputs.glob("sweeps/*/plan.json")
     for path in outputs.glob("*/*/controllers/*.process"):
         if (process := read_json(path)) and lives(process) is not False:
@@ -105,9 +105,10 @@ def _plans(outputs: Path) -> Iterator[Path]:
 
 
 def _left(folder: Path) -> Iterator[str]:
-    """Yield the ids of runs that a sweep had and has no more: their arm is gone, or has another run now.
+    """Yield the ids of runs that a sweep no longer has: their arm is gone, or has another run now.
 
-    A plan that lacks an entry says nothing of its run: it may be for fewer seeds, or its data not be there.
+    A missing entry in a plan proves nothing about its run: the plan may have fewer seeds, or its data may be
+    absent.
     """
     now = {(one.get("label"), one.get("seed")): one["id"] for one in _listed(folder / "plan.json", "entries")}
     arms = read_json(folder / "sweep.json").get("arms")
@@ -124,7 +125,7 @@ def _listed(path: Path, key: str) -> Iterator[Mapping[str, Any]]:
 
 
 def _marked(run: Run) -> bool:
-    """Return whether people gave the run a tag or a note."""
+    """Return whether the run has a tag or a note."""
     notes = read_notes(run)
     return bool(notes.tags or notes.note)
 

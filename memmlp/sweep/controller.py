@@ -1,4 +1,4 @@
-"""The controller of a sweep: it keeps workers going while there is work, and shows how far it is."""
+"""The controller of a sweep: it keeps workers going while there is work, and shows the progress."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ PATIENCE = 5  # how many in a row, times the fleet's size, may fail to start
 
 
 class Fleet:
-    """The workers of a controller: as many as there is work for, those that died replaced.
+    """The workers of a controller: as many as there is work for; workers that died are replaced.
 
     Args:
         executor: starts workers.
         work: what a worker does.
         size: the largest number of workers.
         logs: the folder of the workers' logs, for error messages.
-        presence: tells the workers that the controller lives, for as long as the fleet exists.
+        presence: tells the workers that the controller is alive, for as long as the fleet exists.
     """
 
     def __init__(
@@ -43,10 +43,10 @@ class Fleet:
         self.complaint: str | None = None
 
     def keep(self, wanted: int) -> None:
-        """Start workers until `wanted` are alive, or as many as the fleet's size.
+        """Start workers until `wanted` of them are alive, but no more than the fleet's size.
 
         Raises:
-            InputError: when workers one after another end as soon as they are started.
+            InputError: if workers, one after another, end as soon as they are started.
         """
         now = time.monotonic()
         self._count_stillborn(now)
@@ -57,7 +57,7 @@ class Fleet:
             self.handles += [(handle, now) for handle in self.executor.submit(self.work, missing)]
 
     def _count_stillborn(self, now: float) -> None:
-        """Part with the workers that ended, and count those in a row that ended as soon as they began."""
+        """Remove workers that ended, and count how many in a row ended right after their start."""
         dead = [not handle.alive() for handle, _ in self.handles]
         ended = list(itertools.compress(self.handles, dead))
         self.handles = [worker for worker in self.handles if worker not in ended]
@@ -75,10 +75,10 @@ class Fleet:
 
 
 def oversee(plan: Plan, fleet: Fleet, board: Board) -> None:
-    """Keep the fleet at the plan until nothing is left.
+    """Keep the fleet working on the plan until nothing is left.
 
-    Runs that the workers of other sweeps are at are waited for. When the plan is stopped by a failure, or
-    this process is interrupted, the workers are ended.
+    It waits for runs on which workers of other sweeps are working. If a failure stops the plan, or this
+    process is interrupted, the workers are ended.
     """
     try:
         with board:

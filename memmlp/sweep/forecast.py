@@ -1,4 +1,4 @@
-"""How long a plan's remaining runs may take, judged by its finished ones."""
+"""How long a plan's remaining runs may take, estimated from its finished runs."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from memmlp.sweep.plan import Plan, RunTask
 
 
 class Forecast(NamedTuple):
-    """What one worker would need for the runs that are left.
+    """The time that one worker would need for the remaining runs.
 
     Attributes:
-        seconds: its time.
-        finished: how many finished runs say so.
-        unlike: how many runs are left of arms that have no finished run, and are judged by other arms.
+        seconds: the time, seconds.
+        finished: how many finished runs the estimate comes from.
+        unlike: how many remaining runs belong to arms without a finished run, and are estimated from other
+            arms.
     """
 
     seconds: float
@@ -25,10 +26,10 @@ class Forecast(NamedTuple):
 
 
 def forecast(plan: Plan) -> Forecast | None:
-    """Judge each run that is left by the finished runs of its arm, else by those of its kind.
+    """Estimate each remaining run from the finished runs of its arm, else from those of its kind.
 
     Returns:
-        None where nothing is left, or no run of a kind that is left has finished.
+        None if nothing is left, or if no run of the kinds that are left has finished.
     """
     left, times = plan.left(), {task.id: seconds(plan.run_of(task)) for task in plan.tasks}
     took = {name: time for name, time in times.items() if time is not None}
@@ -48,12 +49,12 @@ def forecast(plan: Plan) -> Forecast | None:
 
 
 def seconds(run: Run) -> float | None:
-    """Return how long a finished run took, all stages together; None for one that has not finished."""
+    """Return how long a finished run took, all stages together; None if it has not finished."""
     found = run.manifest.get("seconds") if run.done else None
     return sum(found.values()) if isinstance(found, dict) else found
 
 
 def _arm(plan: Plan, task: RunTask) -> set[str]:
-    """Return the ids of all runs, of every seed, of the arms that use a task's run; none if upstream."""
+    """Return the ids of all seeds' runs of the arms that use a task's run; none for an upstream run."""
     labels = {entry.label for entry in plan.entries if entry.id == task.id}
     return {entry.id for entry in plan.entries if entry.label in labels}

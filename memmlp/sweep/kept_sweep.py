@@ -15,7 +15,7 @@ NAME = "sweep.json"
 
 
 def keep(sweep: Sweep, folder: Path) -> None:
-    """Write the sweep into its folder, where it is not there as it is."""
+    """Write the sweep into its folder, unless the folder has the same content already."""
     content = plain(asdict(sweep))
     if read_json(folder / NAME) != content:
         folder.mkdir(parents=True, exist_ok=True)
@@ -23,7 +23,7 @@ def keep(sweep: Sweep, folder: Path) -> None:
 
 
 def kept(folder: Path) -> Sweep | None:
-    """Return the sweep of a folder; None where none was kept. Raises InputError where it is damaged."""
+    """Return the sweep kept in a folder; None if there is none. Raises InputError if it is damaged."""
     path = folder / NAME
     if not path.exists():
         return None
@@ -42,5 +42,5 @@ def kept(folder: Path) -> Sweep | None:
 
 
 def _with_tuples(fields: dict[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
-    """Return the fields with some of them as tuples, which JSON turned into lists."""
+    """Return the fields, some of them turned back from lists, as JSON has them, into tuples."""
     return {**fields, **{name: tuple(fields[name]) for name in names if fields.get(name) is not None}}

@@ -1,4 +1,4 @@
-"""Sweep files: arms (each a label and its overrides of the base), seeds, and the paper's values.
+"""Sweep files: arms (each with a label and overrides of the base), seeds, and the paper's values.
 
 title: Placement of memory blocks in the backbone
 table: 14                          # the number in the paper; left out in sweeps of your own
@@ -45,7 +45,7 @@ BASE = "base"  # the arm of a sweep that has only seeds
 
 
 class UniqueKeys(yaml.SafeLoader):
-    """Safe YAML that refuses a mapping with a key twice, where plain YAML silently takes the last one."""
+    """A safe YAML loader that rejects duplicate keys; plain YAML silently takes the last one."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Return the mapping. Raises ConstructorError for a key that occurs twice."""
@@ -62,10 +62,10 @@ def load_sweep(path: Path, prepare: Callable[[list[str]], None] = lambda base: N
 
     Args:
         path: the file.
-        prepare: told the base before the rest is checked, which may name metrics of one's own.
+        prepare: gets the base before the rest is checked, since the rest may name custom metrics.
 
     Raises:
-        InputError: naming file and key, where it is wrong.
+        InputError: if something is wrong; the message names file and key.
     """
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), UniqueKeys)
@@ -82,7 +82,7 @@ def load_sweep(path: Path, prepare: Callable[[list[str]], None] = lambda base: N
 
 
 def parse_sweep(name: str, content: Any) -> Sweep:
-    """Return the sweep that a file's content describes. Raises InputError, naming the key."""
+    """Return the sweep that a file's content describes. Raises InputError, which names the key."""
     content = _mapping(content, "the file", KEYS)
     branch = parse_branch(content.get("branch", BRANCHES[0]), "branch")
     arms = [_arm(label, value, branch) for label, value in _labelled(content.get("arms", {})).items()]
@@ -133,7 +133,7 @@ def _arm(label: str, value: Any, branch: str) -> Arm:
 
 
 def _check_controls(arms: Sequence[Arm], runnable: Sequence[str]) -> None:
-    """Refuse an arm that is compared with itself, or with an arm that is not run."""
+    """Raise InputError for an arm that is compared with itself, or with an arm that is not run."""
     for arm in arms:
         others = [label for label in runnable if label != arm.label]
         if arm.against is not None and arm.against not in others:
@@ -144,7 +144,7 @@ def _check_controls(arms: Sequence[Arm], runnable: Sequence[str]) -> None:
 
 
 def _axes(content: Mapping[str, Any]) -> tuple[list[dict[str, list[Any]]], tuple[int, ...]]:
-    """Return the grids of the axes by key, none of them empty, and the sweep's seeds.
+    """Return the grids of the axes, none of them empty, and the sweep's seeds.
 
     Seeds may be an axis of a single grid.
     """
@@ -162,7 +162,7 @@ def _axes(content: Mapping[str, Any]) -> tuple[list[dict[str, list[Any]]], tuple
 
 
 def _check_grid(grid: Mapping[str, Any], name: str, several: bool) -> None:
-    """Refuse a grid that gives no cells; several grids have no seeds of their own."""
+    """Raise InputError for a grid without cells, or for seeds in one of several grids."""
     if several and not grid:
         raise InputError(f"{name}: empty; allowed is a mapping of at least one key")
     for key, values in grid.items():
@@ -173,7 +173,7 @@ def _check_grid(grid: Mapping[str, Any], name: str, several: bool) -> None:
 
 
 def _cells(grids: Sequence[Mapping[str, Sequence[Any]]]) -> list[tuple[str, ...]]:
-    """Return the cells of all grids as overrides, each cell once, in whatever order it names its keys."""
+    """Return the cells of all grids as overrides, each cell once, whatever the order of its keys."""
     found: dict[frozenset[str], tuple[str, ...]] = {}
     for grid in grids:
         for values in itertools.product(*grid.values()):
@@ -185,8 +185,8 @@ def _cells(grids: Sequence[Mapping[str, Sequence[Any]]]) -> list[tuple[str, ...]
 def _over_cells(arms: Sequence[Arm], cells: Sequence[tuple[str, ...]]) -> Iterable[Arm]:
     """Yield every arm in every cell.
 
-    The paper's own arms stay as they are. An arm without a label gets that of its cell. An arm with a control
-    of its own is compared with that control in the same cell.
+    The paper's own arms stay as they are. An arm without a label gets its cell's overrides as label. An arm
+    with a control of its own is compared with that control in the same cell.
     """
     for arm in arms:
         if arm.overrides is None:
@@ -202,7 +202,7 @@ def _over_cells(arms: Sequence[Arm], cells: Sequence[tuple[str, ...]]) -> Iterab
 
 
 def _scale(value: Any, grids: Sequence[Mapping[str, Any]], arms: Sequence[Arm]) -> Scale:
-    """Return what the effects are shown against, checked to be there and to have numbers."""
+    """Return the axes against which effects are shown, checked to exist and to have numbers."""
     value = _mapping(value or {}, "scale", SCALE_KEYS)
     if not any(arm.cell and arm.against for arm in arms):
         raise InputError("scale: allowed with axes, and arms that name their control with against")
@@ -219,7 +219,7 @@ def _scale(value: Any, grids: Sequence[Mapping[str, Any]], arms: Sequence[Arm]) 
 
 
 def _check_numbers(name: str, grids: Sequence[Mapping[str, Any]]) -> None:
-    """Refuse an axis that effects can't be shown against: every cell needs a number above 0."""
+    """Raise InputError for an axis against which effects can't be shown: each cell needs a number above 0."""
     for place, grid in enumerate(grids) if name != COMPUTE else ():
         if name not in grid:
             raise InputError(f"scale.against: axes[{place}] has no {name}; allowed is a key of every grid")
@@ -229,12 +229,12 @@ def _check_numbers(name: str, grids: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _positive(number: Any) -> bool:
-    """Return whether a value of a file is a finite number above 0."""
+    """Return whether a value is a finite number above 0."""
     return isinstance(number, int | float) and not isinstance(number, bool) and 0 < number < math.inf
 
 
 def _word(value: Any) -> str:
-    """Return a value as text in an override."""
+    """Return a value as the text that an override has for it."""
     if value is None:
         return "null"
     if isinstance(value, bool):
@@ -245,7 +245,7 @@ def _word(value: Any) -> str:
 
 
 def _mapping(value: Any, name: str, keys: Sequence[str] = ()) -> Mapping[str, Any]:
-    """Return the value, checked to be a mapping with known keys only."""
+    """Return the value, after a check that it is a mapping with known keys only."""
     if not isinstance(value, Mapping):
         raise InputError(f"{name}: {_kind(value)}; allowed is a mapping")
     for key in value:
@@ -258,7 +258,7 @@ def _mapping(value: Any, name: str, keys: Sequence[str] = ()) -> Mapping[str, An
 
 
 def _labelled(value: Any) -> dict[str, Any]:
-    """Return the arms by label; a label that YAML takes for a number becomes text."""
+    """Return the arms by label; a label that YAML reads as a number becomes text."""
     arms = {str(label): arm for label, arm in _mapping(value, "arms").items()}
     if len(arms) < len(value):
         raise InputError("arms: two have the same label")
@@ -269,7 +269,7 @@ def _labelled(value: Any) -> dict[str, Any]:
 
 
 def _overrides(value: Any, name: str) -> list[str]:
-    """Return a list of Hydra overrides, checked for their form only; composing them shows what they mean."""
+    """Return a list of Hydra overrides, checked for their form only; composing them checks their meaning."""
     words = _texts(value, name)
     for word in words:
         if not re.match(r"[+~]*[\w./@]+(=|$)", word):
@@ -298,7 +298,7 @@ def _table(value: Any) -> int | None:
 
 
 def _metrics(value: Any) -> tuple[str, ...]:
-    """Return the names of the columns, checked to be metrics or costs."""
+    """Return the names of the columns, after a check that they are metrics or costs."""
     names = _texts(value, "metrics")
     if not names:
         raise InputError("metrics: empty; allowed is at least one")

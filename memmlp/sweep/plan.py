@@ -1,6 +1,6 @@
-"""A plan: the runs that a sweep's arms and seeds need, and how far they are.
+"""A plan: the runs that a sweep's arms and seeds need, and their progress.
 
-Only the runs' identities are kept in a plan; how far they are is read from the run folders.
+A plan holds only the runs' identities; their progress is read from the run folders.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class RunTask:
         id: the run's id.
         kind: the kind of run (see `Identity`).
         config: the resolved config of an experiment that needs the run.
-        upstream: the id of the run that must be done before; None for none.
-        stages: identities of the evaluations and the deployment that are wanted of the run.
+        upstream: the id of the run that must be done first; None for none.
+        stages: identities of the evaluations and the deployment that the run must have.
         what: what the run has in common with runs of other recipe versions (`Identity.what`).
     """
 
@@ -40,7 +40,7 @@ class RunTask:
 
     @property
     def key(self) -> str:
-        """What tells the task from others: the run's id and the stages that are wanted of it."""
+        """The task's key, which no other task has: the run's id, and the stages that are wanted."""
         return " ".join((self.id, *self.stages))
 
 
@@ -61,15 +61,15 @@ class Entry:
 
 @dataclass(frozen=True)
 class Plan:
-    """The entries of a sweep, and the tasks that they need, each once and after those that it needs.
+    """The entries of a sweep, and the tasks that they need: each task once, after the tasks that it needs.
 
     Attributes:
         name: the sweep's name.
         outputs: the folder of runs and caches.
         entries: the runs of the sweep's arms and seeds.
         tasks: the runs to be made.
-        open: whether more tasks may come (a search), so that workers stay. A sweep's plan is closed.
-        cancelled: ids of runs that no worker is to go on with.
+        open: whether tasks may be added, so that workers stay (a search); a sweep's plan is closed.
+        cancelled: ids of runs that workers must not go on with.
         fail_fast: whether the first failed run ends the sweep.
     """
 
@@ -82,7 +82,7 @@ class Plan:
     fail_fast: bool = False
 
     def run(self, label: str, seed: int) -> Run | None:
-        """Return the run of an arm with a seed, finished or not; None where its identity is not known."""
+        """Return the run of an arm with a seed, finished or not; None if its identity is not known."""
         found = self._by_entry.get((label, seed))
         return Run.of(self.outputs, found) if found else None
 
@@ -95,17 +95,17 @@ class Plan:
         return Run.of(self.outputs, task.id)
 
     def complete(self, task: RunTask | Entry) -> bool:
-        """Return whether the run is trained and all wanted stages of it were made."""
+        """Return whether the run is trained and has all wanted stages."""
         run = self.run_of(task)
         return run.done and all(map(run.has, task.stages))
 
     def states(self) -> dict[str, str]:
-        """Return every task's state by its key: its run's, or "blocked" where what is upstream failed."""
+        """Return the state of every task by its key: its run's, or "blocked" if an upstream run failed."""
         own = {task.key: self.run_of(task).state(self.complete(task)) for task in self.tasks}
         return self.with_blocked(own)
 
     def with_blocked(self, states: Mapping[str, str]) -> dict[str, str]:
-        """Return states by the tasks' keys with "blocked" for those that a failed run is upstream of."""
+        """Return the states with "blocked" for tasks that have a failed run upstream of them."""
         found = dict(states)
         for task in self.tasks:  # those upstream come first
             if found[task.key] != "done" and found.get(task.upstream or "") in ("failed", "blocked"):
@@ -113,7 +113,10 @@ class Plan:
         return found
 
     def left(self) -> list[RunTask]:
-        """Return the tasks to be done: not done, failed, blocked or cancelled. A stopped plan has none."""
+        """Return the tasks that are still to be done; none if the plan is stopped.
+
+        Tasks that are done, failed, blocked or cancelled are left out.
+        """
         if self.stopped:
             return []
         states = self.states()
@@ -122,7 +125,7 @@ class Plan:
 
     @property
     def stopped(self) -> bool:
-        """Whether a run failed in a plan that the first failure ends."""
+        """Whether a run failed in a plan that ends with the first failure."""
         return self.fail_fast and "failed" in self.states().values()
 
     def counts(self) -> Counter[str]:
@@ -130,13 +133,13 @@ class Plan:
         return Counter(self.states().values())
 
     def save(self, path: Path) -> None:
-        """Write the plan to a file, as a whole or not at all."""
+        """Write the plan to a file, completely or not at all."""
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, {**asdict(self), "outputs": str(self.outputs)})
 
     @classmethod
     def load(cls, path: Path) -> Plan:
-        """Read a saved plan. Raises InputError where the file holds none."""
+        """Read a saved plan. Raises InputError if the file is no plan."""
         try:
             content = json.loads(path.read_bytes())
             content["entries"] = tuple(Entry(**_stages(entry)) for entry in content["entries"])
@@ -153,7 +156,7 @@ def _stages(fields: dict[str, Any]) -> dict[str, Any]:
 
 
 def unique(tasks: Iterable[RunTask]) -> tuple[RunTask, ...]:
-    """Return each task once, in the order given, an upstream run right before the first that needs it."""
+    """Return each task once, in the given order, and upstream runs right before the first that needs them."""
     known = {task.key: task for task in tasks}
     order = (key for task in known.values() for key in (task.upstream, task.key) if key in known)
     return tuple(known[key] for key in dict.fromkeys(order))

@@ -33,7 +33,7 @@ ARM_WIDTH = 20  # columns that an arm's name has at least, or as many as it need
 
 
 class Screen:
-    """Shows something that changes: in place on a terminal, elsewhere with a line for every change."""
+    """Shows content that changes: in place on a terminal, elsewhere as one line for every change."""
 
     def __init__(self, console: Console | None = None):
         self.console = console or Console(highlight=False, stderr=True)
@@ -49,9 +49,9 @@ class Screen:
             self.live.stop()
 
     def show(self, whole: Callable[[], RenderableType], changes: Iterable[str]) -> None:
-        """Show the whole on a terminal; elsewhere print the lines about what changed.
+        """Show the whole content on a terminal; elsewhere print the lines about what changed.
 
-        `whole` is called only where it is shown.
+        `whole` is called only if its result is shown.
         """
         if self.console.is_terminal:
             self.live.update(whole())
@@ -81,7 +81,7 @@ class Board(Screen):
 
 
 def _change(plan: Plan, task: RunTask, state: str) -> str:
-    """Say what became of a task, and why."""
+    """Describe a task's new state, and the reason if it failed."""
     run = plan.run_of(task)
     reason = run.failure if state == "failed" else None
     where = f" on {device_name(run)}" if state == "done" else ""
@@ -89,7 +89,7 @@ def _change(plan: Plan, task: RunTask, state: str) -> str:
 
 
 def name(plan: Plan, task: RunTask) -> str:
-    """Return the task's name for people: arm and seed, or what it is and the seeds whose runs need it."""
+    """Return the task's readable name: arm and seed, or the kind of run and the seeds whose runs need it."""
     names = [f"{entry.label} seed {entry.seed}" for entry in plan.entries if entry.key == task.key]
     return names[0] if names else f"{kind_words(task.kind)} {task.id}{_seeds(plan, task)}"
 
@@ -104,7 +104,7 @@ def _seeds(plan: Plan, upstream: RunTask) -> str:
 
 
 def render(plan: Plan, states: Mapping[str, str]) -> Group:
-    """Draw arms by seeds, the runs upstream of them, the counts of states, and the reasons of what failed."""
+    """Draw arms by seeds, the runs upstream of them, the counts of states, and the reasons of failures."""
     tasks = {task.key: task for task in plan.tasks}
     seeds = sorted({entry.seed for entry in plan.entries})
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=f"sweep {plan.name}", title_justify="left")
@@ -156,7 +156,7 @@ def total_steps(task: RunTask) -> int:
 
 
 def progress_text(run: Run, total: int) -> str:
-    """Describe a run that somebody is at: of its training the steps, the time left and the loss."""
+    """Describe a run that a process is working on: steps of its training, time left and loss."""
     if (doing := run.doing) in ("evaluating", "exporting"):
         return doing
     log = [entry for entry in run.metrics() if entry.phase == "train"]
@@ -169,16 +169,16 @@ def progress_text(run: Run, total: int) -> str:
 
 
 def _words(seconds: float | None) -> str:
-    """Return a time left as text, in minutes where it is long; empty for None."""
+    """Return a remaining time as text, in minutes if it is long; empty for None."""
     if seconds is None:
         return ""
     return f" {seconds / 60:.0f} min" if seconds >= 90 else f" {seconds:.0f} s"
 
 
 def time_left(log: list[Metrics], total: int) -> float | None:
-    """Return the seconds to the end of training, at the rate of the last five entries of the log.
+    """Return the seconds to the end of training, at the rate of the log's last five entries.
 
-    None where there is no rate yet.
+    Return None if there is no rate yet.
     """
     recent = log[-5:]
     steps, seconds = recent[-1].step - recent[0].step, recent[-1].time - recent[0].time
@@ -188,13 +188,13 @@ def time_left(log: list[Metrics], total: int) -> float | None:
 
 
 def devices(running: Iterable[Run]) -> list[str]:
-    """Say, in a line if anything runs, how many of the runs at work each device has."""
+    """Return a line with the number of running runs on each device; no line if nothing runs."""
     names = Counter(name for run in running if (name := device_name(run)))
     return [f"running on {', '.join(f'{name}: {count}' for name, count in names.items())}"] if names else []
 
 
 def device_name(run: Run) -> str:
-    """Return the device that a run was last worked on with, as text; empty where it is not known."""
+    """Return the device on which a run was last worked on, as text; empty if it is not known."""
     manifest = run.manifest
     if not manifest.get("gpu"):
         return str(manifest.get("device") or "")
@@ -202,6 +202,6 @@ def device_name(run: Run) -> str:
 
 
 def _counts(states: Mapping[str, str]) -> str:
-    """Say how many runs are in which state."""
+    """Say how many runs are in each state."""
     counts = Counter(WORDS.get(state, state).partition(",")[0] for state in states.values())
     return ", ".join(f"{count} {word}" for word, count in counts.items())

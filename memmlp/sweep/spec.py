@@ -1,4 +1,4 @@
-"""Sweeps: arms, seeds, and the overrides that each is trained with (memmlp.sweep.parsing reads files)."""
+"""Sweeps: arms, seeds, and the overrides that train each arm (memmlp.sweep.parsing reads the files)."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ BRANCHES = ("rotation", "position", "combined")
 SIZES = ("FLOPs", "MACs", "parameters", "size")
 """The costs that a network has before it is trained, on any machine."""
 COSTS = (*SIZES, "ms", "network ms", "pose ms", "ratio", "FPS")
-"""Metrics that are costs and no errors.
+"""Metrics that are costs, not errors.
 
-Their units: GFLOP, GMAC, millions, MB, ms, multiples of the yardstick's time, and frames a second.
+Their units: GFLOP, GMAC, millions, MB, ms, multiples of the yardstick's time, and frames per second.
 """
 
 COMPUTE = "compute"
-"""The FLOPs of a cell's training, its control's, as something that effects are shown against."""
+"""The name of the axis of compute: the FLOPs of training a cell's control."""
 
 
 @dataclass(frozen=True)
@@ -29,17 +29,17 @@ class Arm:
     """A row of a table.
 
     Attributes:
-        label: its name in the table.
-        overrides: its overrides of the base; None where the row is the paper's alone (a system not built).
+        label: the arm's name in the table.
+        overrides: the arm's overrides of the base; None if the row has only the paper's values (a system that
+            is not built here).
         branch: whose errors the row shows: rotation, position, or combined (after inverse kinematics).
         paper: the paper's values by metric, as printed.
         note: a remark shown under the table.
         against: the label of the arm that this one is compared with; None for the sweep's control.
         fixed: whether the file gives the arm a branch of its own.
-        seeds: its seeds in place of the sweep's, where seeds are spent on open verdicts alone; None for the
-            sweep's.
-        series: its label in the file, which it shares with the same arm in other cells of the axes.
-        cell: the overrides that the axes give it, one a key; empty without axes.
+        seeds: the arm's own seeds, if seeds are added only to arms with open verdicts; None for the sweep's.
+        series: the arm's label in the file, which is the same in all cells of the axes.
+        cell: the overrides that the axes add, one per key; empty without axes.
     """
 
     label: str
@@ -55,18 +55,18 @@ class Arm:
 
     @property
     def own_overrides(self) -> tuple[str, ...]:
-        """Its overrides without those of its cell."""
+        """The arm's overrides without those of its cell."""
         return tuple(word for word in self.overrides or () if word not in self.cell)
 
 
 @dataclass(frozen=True)
 class Scale:
-    """What the effects of a sweep with axes are shown against, as lines through its cells.
+    """The axes against which a sweep's effects are shown, as lines through its cells.
 
     Attributes:
-        against: COMPUTE or keys of the axes, whose values are numbers above 0; the first is the figure's
-            axis, and the others are what the cells differ in beside it.
-        predict: overrides in place of the cells', at whose compute the effects are predicted; empty for no
+        against: COMPUTE, or keys of the axes, whose values are numbers above 0. The first one is the figure's
+            axis; the others distinguish cells beside it.
+        predict: overrides that replace the cells', at whose compute the effects are predicted; empty for no
             prediction.
     """
 
@@ -90,19 +90,17 @@ class Sweep:
     Attributes:
         name: the file's stem.
         title: the table's title.
-        table: the table's number in the paper; None for a sweep of one's own.
+        table: the table's number in the paper; None for a custom sweep.
         notes: remarks shown under the table.
         base: overrides that all arms share.
         seeds: the seeds of each arm.
         arms: the rows in order.
-        control: the label of the arm that the others are compared with.
+        control: the label of the arm with which the others are compared.
         metrics: the columns.
-        command_line: overrides of the command line.
-        branch_source: how we know which branch the paper's values belong to; None where the file does not
-            say.
+        command_line: overrides given on the command line.
+        branch_source: how we know which branch the paper's values belong to; None if the file does not say.
         smallest: the smallest effect of interest by metric, in its unit; every metric but costs has one.
-        scale: what the effects are shown against, as lines through the cells of its axes; None for tables
-            alone.
+        scale: the axes against which effects are shown, as lines through the cells; None for tables alone.
     """
 
     name: str
@@ -122,8 +120,8 @@ class Sweep:
     def with_branch(self, branch: str) -> Sweep:
         """Return the same sweep with its arms showing another branch.
 
-        An arm whose file gives it a branch of its own keeps that. The paper's values belong to the branch
-        that they were printed for, so arms that change theirs lose them.
+        An arm with a branch of its own in the file keeps it. The paper's values belong to the branch for
+        which they were printed, so arms whose branch changes lose them.
 
         Raises:
             InputError: for an unknown branch.
@@ -136,24 +134,24 @@ class Sweep:
         return self if arms == self.arms else replace(self, arms=arms, branch_source=None)
 
     def control_of(self, arm: Arm) -> str | None:
-        """Return the label of the arm that an arm is compared with; None for the sweep's control itself.
+        """Return the label of an arm's control arm: the arm's own `against`, or else the sweep's control.
 
-        The sweep's control may still name another arm with `against`.
+        It is None for the sweep's control itself, unless that arm has an `against`, too.
         """
         return arm.against or (self.control if arm.label != self.control else None)
 
     def seeds_of(self, arm: Arm) -> tuple[int, ...]:
-        """Return the seeds of an arm: its own where it has some, else the sweep's."""
+        """Return the seeds of an arm: its own if it has any, else the sweep's."""
         return self.seeds if arm.seeds is None else arm.seeds
 
     def with_overrides(self, overrides: Sequence[str]) -> Sweep:
-        """Return the same sweep with further overrides, after its base and before the arms' own.
+        """Return the same sweep with further overrides, applied after its base and before the arms' own.
 
         `seed=0,1` or `seed=0` sets the seeds.
 
         Raises:
             InputError: for an override of the outputs folder, which an option of the command sets, and for a
-                key that an arm sets itself, since the arm's value would stand.
+                key that an arm sets itself, since the arm's value would win.
         """
         if any(_key(word) == "paths.outputs" for word in overrides):
             raise InputError("paths.outputs: allowed here is --outputs FOLDER, or MEMMLP_OUTPUTS")
@@ -174,12 +172,12 @@ class Sweep:
                 )
 
     def overrides(self, arm: Arm) -> tuple[str, ...]:
-        """Return an arm's overrides: the base's, the command line's, its own; the last one for a key wins."""
+        """Return an arm's overrides: the base's, the command line's, its own; the last one of a key wins."""
         words = (*self.base, *self.command_line, *(arm.overrides or ()))
         return tuple({_key(word): word for word in words}.values())
 
     def runnable(self) -> tuple[Arm, ...]:
-        """Return the arms that can be run, which are all but the paper's alone."""
+        """Return the arms that can be run: all except those with only the paper's values."""
         return tuple(arm for arm in self.arms if arm.overrides is not None)
 
     def arm_seeds(self) -> list[ArmSeed]:
@@ -204,7 +202,7 @@ def parse_branch(value: Any, name: str) -> str:
 
 
 def parse_seeds(value: Any, name: str) -> tuple[int, ...]:
-    """Return the seeds, checked to be whole numbers, each once."""
+    """Return the seeds, after a check that they are different whole numbers."""
     items = value if isinstance(value, list) else [value]
     words = [str(item).strip() for item in items]
     if not words or not all(re.fullmatch(r"\d+", word) for word in words) or len(set(words)) < len(words):

@@ -1,8 +1,8 @@
 """A worker takes a plan's tasks, one after another, each under its run's lease, until none is left.
 
 Any number of workers, on any machines that share the outputs folder, may work on the same runs. A run is
-brought to its end by one of them. When a worker is killed, or stands still for longer than its lease, another
-takes its run over from the last checkpoint.
+finished by one of them. When a worker is killed, or stands still for longer than its lease, another worker
+takes over its run from the last checkpoint.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ Perform = Callable[[Plan, RunTask], None]
 
 
 class Cancelled(Exception):
-    """Raised when the plan no longer wants the run. Its folder stays as it is, and can be resumed."""
+    """Raised when the plan no longer wants the run; its folder stays as it is, and can be resumed."""
 
 
 def work_off(path: Path, perform: Perform, wanted: Callable[[], bool] = lambda: True) -> None:
-    """Work on the plan of that file while `wanted` returns true and tasks are left.
+    """Work on the plan in a file while `wanted` returns true and tasks are left.
 
-    The file is read again before each task, for the plan may have changed. An open plan (a search's) may get
-    more tasks, so its workers stay.
+    The file is read again before each task, since the plan may have changed. An open plan (a search's) may
+    get more tasks, so its workers stay.
 
     Args:
         path: the plan's file.
@@ -53,10 +53,10 @@ def work_off(path: Path, perform: Perform, wanted: Callable[[], bool] = lambda: 
 
 
 def directed(path: Path) -> bool:
-    """Return whether the plan of that file is closed, or open with a controller that lives.
+    """Return whether the plan in a file is closed, or is open and has a living controller.
 
-    A living controller touches the file all the time. What counts is how long this process has seen it
-    untouched, for the controller's machine may have another time.
+    A living controller touches the file repeatedly. The time for which this process has seen the file
+    untouched decides, since the controller's machine may have another clock.
     """
     if not Plan.load(path).open:
         return True
@@ -64,10 +64,10 @@ def directed(path: Path) -> bool:
 
 
 def attempt(plan: Plan, task: RunTask, perform: Perform) -> bool:
-    """Bring a task's run to its end, if its upstream run is done and nobody else is at it.
+    """Finish a task's run, if its upstream run is done and no other process works on it.
 
     Returns:
-        False where the task has to wait for its upstream run or for another worker; else True.
+        False if the task has to wait for its upstream run or for another worker; else True.
     """
     run = plan.run_of(task)
     if task.upstream and not Run.of(plan.outputs, task.upstream).done:
@@ -83,7 +83,7 @@ def attempt(plan: Plan, task: RunTask, perform: Perform) -> bool:
 
 
 def _attempt_locked(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
-    """Perform the task, unless somebody else ended it since the plan was looked at."""
+    """Perform the task, unless another process ended it since the plan was read."""
     if plan.complete(task) or run.failure:
         return
     if deaths(run) >= DEATHS:
@@ -93,11 +93,11 @@ def _attempt_locked(plan: Plan, task: RunTask, run: Run, perform: Perform) -> No
 
 
 def _perform(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
-    """Perform the task. A failure is recorded with the run, for it does not concern the other tasks.
+    """Perform the task. A failure is recorded with the run, and does not affect the other tasks.
 
     Raises:
-        LeaseLost: when another worker took the run over.
-        OSError: when the disk is full or read-only, which concerns every task.
+        LeaseLost: if another worker took over the run.
+        OSError: if the disk is full or read-only, which affects every task.
     """
     try:
         perform(plan, task)
@@ -114,7 +114,7 @@ def _perform(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
 
 
 def deaths(run: Run) -> int:
-    """Count the last processes that, one after another, began the run at the step where it still is.
+    """Count how many processes, one after another, most recently began the run at its present step.
 
     Processes from before the last --retry don't count.
     """
@@ -127,7 +127,7 @@ def deaths(run: Run) -> int:
 
 
 class Presence:
-    """A sign that the process that made it lives: a file that says which process of this machine it is."""
+    """A sign that the process which made it is alive: a file that names the process and its machine."""
 
     def __init__(self, path: Path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -136,6 +136,6 @@ class Presence:
 
     @staticmethod
     def of(path: Path) -> bool:
-        """Return whether the process that made that file lives, or may live on another machine."""
+        """Return whether the process that made the file is alive, or may be alive on another machine."""
         process = read_json(path)
         return bool(process) and lives(process) is not False

@@ -1,1 +1,1 @@
-"""Tables of a sweep's arms: measured values beside those that the paper prints."""
+"""Tables of a sweep's arms, with measured values beside those that the paper prints."""

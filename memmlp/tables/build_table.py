@@ -1,4 +1,4 @@
-"""From a sweep and its finished runs to the numbers of a table."""
+"""Makes the numbers of a table from a sweep and its finished runs."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def make_table(
     """Make the table of a sweep.
 
     Args:
-        sweep: the sweep; where seeds were spent in rounds, `rounds.spent(sweep)`.
+        sweep: the sweep; if seeds were spent in rounds, `rounds.spent(sweep)`.
         runs: the finished runs of every runnable arm, by seed (`finished_runs`).
-        modes: the modes of evaluation to show ("stream", "window"); one that no run has is left out where
-            another has one.
+        modes: the modes of evaluation to show ("stream", "window"); a mode that no run has is left out, if
+            runs have another one.
         command: the command that makes missing runs; `memmlp sweep` with the sweep's name by default.
-        state: says in a word how far the unfinished run of an arm and seed is; None for nothing to say.
-        older: names the run of an earlier recipe that there is in place of a missing one; None for none.
-        rounds: the rounds whose verdicts stand; None for verdicts of a fixed number of seeds.
+        state: describes in a word the state of an arm's and seed's unfinished run, or returns None.
+        older: names the run with an earlier recipe that exists in place of a missing one, or returns None.
+        rounds: the rounds that decided the verdicts; None for verdicts from a fixed number of seeds.
     """
     shown = _shown(modes, runs) if set(sweep.metrics) - set(COSTS) else tuple(modes)[:1]
     seen = with_existing_branches(sweep, runs)
@@ -74,7 +74,7 @@ def make_table(
 
 
 def _shown(modes: Sequence[str], runs: Mapping[str, RunsBySeed]) -> tuple[str, ...]:
-    """Return those of the modes in which runs were evaluated; all where there are none."""
+    """Return those of the modes in which runs were evaluated; all modes if there are no evaluations."""
     measured = {mode for found in runs.values() for run in found.values() for mode in run.means}
     return tuple(mode for mode in modes if mode in measured) or tuple(modes)
 
@@ -83,9 +83,9 @@ class OnSource(NamedTuple):
     """A sweep and its finished runs on the test clips of one source of motion.
 
     Attributes:
-        sweep: the sweep without the arms whose runs have no test clip of the source.
-        runs: the runs of the arms that are left, by seed, on these clips alone.
-        flags: a line that names the arms that were left out.
+        sweep: the sweep without the arms whose runs have no test clip from the source.
+        runs: the runs of the remaining arms, by seed, evaluated on these clips alone.
+        flags: a line that names the arms left out.
     """
 
     sweep: Sweep
@@ -96,10 +96,10 @@ class OnSource(NamedTuple):
 def on_source(sweep: Sweep, runs: Mapping[str, RunsBySeed], source: str) -> OnSource:
     """Restrict a sweep and its finished runs to one source's test clips.
 
-    Where the control has none of them, the first arm that has some stands in its place.
+    If the control has no such clips, the first arm that has some becomes the control.
 
     Raises:
-        InputError: if no run has a test clip of the source.
+        InputError: if no run has a test clip from the source.
     """
     own: dict[str, RunsBySeed] = {
         label: {seed: parts[source] for seed, run in seeds.items() if source in (parts := run.by_source())}
@@ -124,19 +124,19 @@ def on_source(sweep: Sweep, runs: Mapping[str, RunsBySeed], source: str) -> OnSo
 
 
 def titled(table: Table, source: str) -> Table:
-    """Return a table of one source's test clips with a title that says so."""
+    """Return a table of one source's test clips with a title that names the source."""
     return replace(table, title=f"{table.title} (test clips of {source} alone)")
 
 
 def without_runs(sweep: Sweep, modes: Sequence[str], reason: str) -> Table:
-    """Make the table of a sweep whose runs can't be known: the paper's values, and the reason."""
+    """Make the table of a sweep whose runs can't be identified: the paper's values, and the reason."""
     return replace(make_table(sweep, {arm.label: {} for arm in sweep.runnable()}, modes), flags=(reason,))
 
 
 def _row(
     sweep: Sweep, arm: Arm, runs: RunsBySeed | None, modes: Sequence[str], found: Mapping[Key, Effect]
 ) -> Row:
-    """Return an arm's row; `runs` is None for a row that is the paper's alone."""
+    """Return an arm's row; `runs` is None for a row with only the paper's values."""
 
     def cell(mode: str, metric: str) -> Cell:
         numbers = {seed: run.value(mode, arm.branch, metric) for seed, run in (runs or {}).items()}

@@ -18,11 +18,11 @@ class Distribution(NamedTuple):
 
     Attributes:
         label: the arm's label.
-        errors: the errors (S, C) by seed and clip; empty where there are none.
-        middle: their interquartile mean; None where there are none.
+        errors: the errors (S, C) by seed and clip; empty if there are none.
+        middle: the errors' interquartile mean; None if there are none.
         improvement: the probability that a run of the arm has a better value than one of its control on the
-            same clip: a smaller error, or a larger value of a metric of which more is better; None without a
-            control or a shared clip.
+            same clip: a smaller error, or a larger value of a metric for which higher is better; None without
+            a control or a shared clip.
     """
 
     label: str
@@ -54,15 +54,15 @@ def _of_metric(
 
 
 def _errors(runs: RunsBySeed, clips: list[str], mode: str, arm: Arm, metric: str) -> np.ndarray:
-    """Return errors (S, C), with NaN for a clip of which a run has none."""
+    """Return errors (S, C), with NaN for clips for which a run has no error."""
     return np.array([run.by_clip(clips, mode, arm.branch, metric) for run in runs.values()])
 
 
 def _distribution(label: str, errors: Mapping[str, np.ndarray], other: Arm | None, sign: int) -> Distribution:
     """Return an arm's distribution, over the clips for which all its runs have a number.
 
-    The comparison with the control is over the clips for which the control's runs have one, too. `sign` is -1
-    where larger values are better.
+    The comparison with the control is over those of these clips for which the control's runs have numbers,
+    too. `sign` is -1 if larger values are better.
     """
     every, theirs = errors[label], errors.get(other.label) if other else None
     known = np.isfinite(every).all(0)

@@ -21,12 +21,12 @@ RunsBySeed = Mapping[int, Measured]  # an arm's finished runs by seed
 
 
 class SharedClips(NamedTuple):
-    """What an arm's runs share with those of its control.
+    """The seeds and clips that an arm's runs share with those of its control.
 
     Attributes:
-        seeds: those that both have (S).
+        seeds: the seeds that both arms have (S).
         clips: the names of the clips that all runs have (C).
-        names: the names of their groups (C).
+        names: the names of the clips' groups (C).
         groups: the groups' numbers (C,).
     """
 
@@ -40,7 +40,7 @@ class Paired(NamedTuple):
     """An arm's differences from its control.
 
     Attributes:
-        matrix: the arm's errors less the control's (S, C), by seed and clip.
+        matrix: the arm's errors minus the control's (S, C), by seed and clip.
         groups: the number of each clip's group (C,).
         clips: the names of these clips (C).
         takes: the names of their groups (C).
@@ -53,13 +53,13 @@ class Paired(NamedTuple):
 
 
 def control_arm(sweep: Sweep, arm: Arm) -> Arm | None:
-    """Return the arm that an arm is compared with; None for the sweep's control and the paper's own rows."""
+    """Return an arm's control arm; None for the sweep's control and for rows with only the paper's values."""
     label = sweep.control_of(arm) if arm.overrides is not None else None
     return next((other for other in sweep.arms if other.label == label), None)
 
 
 def paper_effect(sweep: Sweep, arm: Arm, metric: str) -> float | None:
-    """Return the paper's difference from the control, of printed values; None where one is not printed."""
+    """Return the paper's difference from the control, from printed values; None if one is not printed."""
     other = control_arm(sweep, arm)
     ours = (arm.paper or {}).get(metric)
     theirs = (other.paper or {}).get(metric) if other else None
@@ -69,7 +69,7 @@ def paper_effect(sweep: Sweep, arm: Arm, metric: str) -> float | None:
 def paired(
     sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str], labels: Container[str] | None = None
 ) -> dict[Key, Paired]:
-    """Return the differences of all arms, or of those with these labels, in all known error metrics."""
+    """Return the differences in all known error metrics for all arms, or for those with the given labels."""
     found = {}
     for arm, other in _compared(sweep):
         if labels is not None and arm.label not in labels:
@@ -88,7 +88,7 @@ def paired(
 def effects(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -> dict[Key, Effect]:
     """Return the effects of all arms, with p-values corrected over all of them.
 
-    Of costs it has the bare differences, without p-values.
+    For costs there are only the differences, without p-values.
     """
     printed = {
         Key(arm.label, mode, metric): paper_effect(sweep, arm, metric)
@@ -102,7 +102,7 @@ def effects(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) 
 def one_and_the_same(arm: Arm, other: Arm, ours: RunsBySeed, theirs: RunsBySeed) -> bool:
     """Return whether two arms show the same errors of the same run, so that there is nothing to compare.
 
-    One run may have several, such as those after inverse kinematics of two kinds.
+    One run may have several kinds of errors, such as those after two kinds of inverse kinematics.
     """
 
     def same(one: Measured, two: Measured) -> bool:
@@ -128,7 +128,7 @@ def _paired(
     mode: str,
     metric: str,
 ) -> Paired:
-    """Return ours less theirs, over the shared seeds and those clips that all runs have a number for."""
+    """Return ours minus theirs, over the shared seeds and the clips for which all runs have a number."""
     seeds, clips, names, groups = shared
     sides = [
         np.array([runs[seed].by_clip(clips, mode, branch, metric) for seed in seeds])
@@ -141,7 +141,7 @@ def _paired(
 
 
 def _shared(ours: RunsBySeed, theirs: RunsBySeed) -> SharedClips:
-    """Return what an arm and its control share."""
+    """Return the seeds and clips that an arm and its control share."""
     seeds = [seed for seed in ours if seed in theirs]
     known = [runs[seed].clips for runs in (ours, theirs) for seed in seeds]
     clips = [name for name in known[0] if all(name in other for other in known)] if known else []
@@ -150,10 +150,10 @@ def _shared(ours: RunsBySeed, theirs: RunsBySeed) -> SharedClips:
 
 
 def alike(pairs: Mapping[Key, Paired]) -> Iterator[tuple[list[Key], np.ndarray, np.ndarray]]:
-    """Group the comparisons that have the same seeds and groups of clips, to be computed at once.
+    """Group comparisons with the same number of seeds and the same groups of clips, to be computed at once.
 
     Yields:
-        Keys (K), differences (K, S, C), and the clips' groups (C,), which they share.
+        Keys (K), differences (K, S, C), and the clips' groups (C,), which the comparisons share.
     """
     batches: dict[tuple[int, bytes], list[Key]] = defaultdict(list)
     for key, pair in pairs.items():
@@ -163,7 +163,7 @@ def alike(pairs: Mapping[Key, Paired]) -> Iterator[tuple[list[Key], np.ndarray, 
 
 
 def tested(pairs: Mapping[Key, Paired], smallest: Mapping[str, float]) -> dict[Key, Effect]:
-    """Return the effects with p-values of their own, not corrected yet, in the order of the pairs."""
+    """Return the effects with their own p-values, not corrected yet, in the order of the pairs."""
     found: dict[Key, Effect] = {}
     for keys, differences, groups in alike(pairs):
         size = {"seeds": differences.shape[1], "clips": differences.shape[2], "groups": len(set(groups))}
@@ -184,7 +184,8 @@ def _judged(
 ) -> dict[Key, Effect]:
     """Return the effects with verdicts and corrected p-values.
 
-    Differences are corrected by Holm over all comparisons, and so are equivalences, as a family of their own.
+    P-values of differences are corrected by Holm over all comparisons; those of equivalences are, too, as a
+    separate family.
     """
     keys = list(tested)
     different = holm(np.array([or_nan(tested[key].p) for key in keys]))
@@ -197,7 +198,7 @@ def _judged(
 
 
 def _costs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -> dict[Key, Effect]:
-    """Return the differences of mean costs. They have no interval, for they are exact or this machine's."""
+    """Return the differences of mean costs, without intervals: costs are exact, or hold for this machine."""
     found = {}
     for arm, other in _compared(sweep):
         for mode, metric in itertools.product(modes, set(sweep.metrics) & set(COSTS)):

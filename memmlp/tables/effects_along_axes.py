@@ -1,4 +1,4 @@
-"""The effects of a sweep with axes as lines through its cells, against compute and what else differs."""
+"""The effects of a sweep with axes, as lines through its cells, against compute and the other axes."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ MODE = "stream"
 
 
 class TrendVerdict(StrEnum):
-    """What may be claimed of how an effect changes along the axes.
+    """What may be claimed about how an effect changes along the axes.
 
-    RISES and FALLS are changes whose size is known, but not that of the effect at either end.
+    RISES and FALLS are changes with a certain sign, while the sign of the effect is uncertain at both ends.
     """
 
     GROWS = "grows"
@@ -44,19 +44,19 @@ class Bounds:
 
     @property
     def sign(self) -> int:
-        """1 or -1 where the interval leaves 0 out, else 0."""
+        """1 or -1 if the interval excludes 0, else 0."""
         return (self.low > 0) - (self.high < 0)
 
 
 @dataclass(frozen=True)
 class EffectOfCell:
-    """The effect in one cell.
+    """The effect measured in one cell.
 
     Attributes:
         cell: the overrides of the cell.
-        values: what the effects are shown against, by name.
-        effect: the mean difference, with its own interval over clips, and over seeds where there are several.
-        seeds: how many seeds it is of.
+        values: the cell's values on the axes, by name.
+        effect: the mean difference, with an interval over clips, and over seeds if there are several.
+        seeds: the number of seeds.
     """
 
     cell: tuple[str, ...]
@@ -67,12 +67,12 @@ class EffectOfCell:
 
 @dataclass(frozen=True)
 class Slope:
-    """How an effect changes with a tenfold value of what it is shown against.
+    """How an effect changes when the value on an axis grows tenfold.
 
     Attributes:
         change: the change, with its interval.
-        p: its p-value, corrected over all slopes of the sweep; None where there is none.
-        verdict: what may be claimed of it; None where there is no p-value.
+        p: its p-value, corrected over all slopes of the sweep; None if there is none.
+        verdict: what may be claimed about it; None without a p-value.
     """
 
     change: Bounds
@@ -82,12 +82,12 @@ class Slope:
 
 @dataclass(frozen=True)
 class EffectPrediction:
-    """The effect that one more cell would show elsewhere, if the line goes on straight.
+    """The effect that one more cell would show elsewhere, if the line continues straight.
 
     Attributes:
         effect: the effect, with its interval.
         sign: 1 or -1 where it is above or below 0 after a correction over all predictions of the sweep, else
-            0; None where nothing can be said of it.
+            0; None if nothing can be said about it.
     """
 
     effect: Bounds
@@ -100,17 +100,17 @@ class Trend:
 
     Attributes:
         series: the arm's label in the file.
-        control: its control's.
+        control: the label of the arm's control.
         metric: the metric.
         points: the measured cells.
-        clips: how many test clips all of its cells share.
-        lost: how many more clips only some of its cells have.
-        varied: what differs between the cells, the names of the line's slopes.
-        line: the line; None where `reason` says why there is none.
-        slopes: its slopes by name.
-        reason: why there is no line; empty where there is one.
-        predicted: the effect at the compute that the sweep predicts for; None without one, or without a line
-            against compute.
+        clips: how many test clips all cells share.
+        lost: how many more clips only some of the cells have.
+        varied: the axes on which the cells differ, which are the names of the line's slopes.
+        line: the line; None if there is none, and `reason` says why.
+        slopes: the line's slopes by name.
+        reason: why there is no line; empty if there is one.
+        predicted: the effect predicted at the sweep's compute for predictions; None without such a compute,
+            or without a line against compute.
     """
 
     series: str
@@ -127,15 +127,15 @@ class Trend:
 
     @property
     def most(self) -> dict[str, float]:
-        """The largest measured value of what differs between the cells, by name."""
+        """The largest measured value of each axis on which the cells differ, by name."""
         return {name: max(point.values[name] for point in self.points) for name in self.varied}
 
     def at(self, values: Mapping[str, float] | None = None, another: bool = False) -> Bounds:
-        """Return the line at values by name, at the largest measured ones where they are not given.
+        """Return the line at values by name; values that are not given are the largest measured ones.
 
         Args:
-            values: the values.
-            another: whether the interval is for one more cell there (see `FittedLine.at`).
+            values: the values on the axes.
+            another: whether the interval is for one more cell at these values (see `FittedLine.at`).
         """
         return _bounds(self.curve([values or {}], another))[0]
 
@@ -149,17 +149,17 @@ class Trend:
 
 @dataclass(frozen=True)
 class Trends:
-    """All effects of a sweep against its scale.
+    """All effects of a sweep against the axes of its scale.
 
     Attributes:
-        name, title: the sweep's.
-        against: what they are shown against; the first is a figure's axis.
-        trends: the effects, series by series, each metric.
-        cells: how many cells were measured, each an arm's.
-        wanted: how many the sweep has.
+        name, title: the sweep's name and title.
+        against: the axes against which they are shown; the first is a figure's axis.
+        trends: the effects, series by series and metric by metric.
+        cells: how many cells were measured, counted for each arm.
+        wanted: how many cells the sweep has.
         predict: the overrides whose compute the effects are predicted for; None for none.
-        compute: that compute, FLOPs; None where it is not known.
-        seconds: how long the trainings took together.
+        compute: that compute, FLOPs; None if it is not known.
+        seconds: the total duration of the trainings.
     """
 
     name: str
@@ -183,7 +183,7 @@ class Trends:
         return tuple(dict.fromkeys(trend.metric for trend in self.trends))
 
     def measured(self, name: str) -> tuple[float, float] | None:
-        """Return the least and the largest measured value of one of `against`; None for none."""
+        """Return the least and the largest measured value of one of `against`; None if there are none."""
         every = [
             point.values[name] for trend in self.trends for point in trend.points if name in point.values
         ]
@@ -198,7 +198,7 @@ def trends(
     Args:
         sweep: the sweep, which has a `scale`.
         runs: the finished runs of every runnable arm, by seed.
-        predicted: FLOPs by the overrides that a prediction is for, as one line.
+        predicted: the FLOPs at which a prediction is made, by its overrides as one line.
     """
     assert sweep.scale is not None
     pairs = paired(sweep, runs, (MODE,))
@@ -230,7 +230,7 @@ def in_cells(sweep: Sweep) -> list[tuple[Arm, Arm]]:
 def _trend(
     sweep: Sweep, runs: Mapping[str, RunsBySeed], pairs: Mapping[Key, Paired], series: str, metric: str
 ) -> Trend:
-    """Return an effect in a metric, whose slopes have no verdicts yet."""
+    """Return the trend of an arm's effect in a metric, whose slopes have no verdicts yet."""
     assert sweep.scale is not None
     own = [(arm, other) for arm, other in in_cells(sweep) if arm.series == series]
     cells = _cells(sweep, runs, {arm.label: pairs.get(Key(arm.label, MODE, metric)) for arm, _ in own}, own)
@@ -258,7 +258,7 @@ def _trend(
 
 
 class _Cell(NamedTuple):
-    """A measured cell: an arm, what effects are shown against, and its differences from its control."""
+    """A measured cell: an arm, its values on the axes, and its differences from its control."""
 
     arm: Arm
     values: Mapping[str, float]
@@ -271,7 +271,7 @@ def _cells(
     pairs: Mapping[str, Paired | None],
     own: Sequence[tuple[Arm, Arm]],
 ) -> list[_Cell]:
-    """Return the measured cells of a series; cells of the same runs are one."""
+    """Return the measured cells of a series; cells with the same runs are merged."""
     found: dict[tuple[frozenset[str], frozenset[str]], _Cell] = {}
     for arm, other in own:
         pair = pairs[arm.label]
@@ -282,7 +282,7 @@ def _cells(
 
 
 def _slopes(line: FittedLine, varied: Sequence[str]) -> dict[str, Slope]:
-    """Return a line's slopes by name, with p-values of their own."""
+    """Return a line's slopes by name, with uncorrected p-values."""
     estimates = {name: line.slope(number) for number, name in enumerate(varied, 1)}
     return {name: Slope(_bounds(one)[0], float(one.p[0]), None) for name, one in estimates.items()}
 
@@ -292,7 +292,7 @@ def _ids(runs: RunsBySeed) -> frozenset[str]:
 
 
 def _values(sweep: Sweep, arm: Arm, control: RunsBySeed) -> dict[str, float]:
-    """Return the values of the scale's keys in a cell: numbers of its overrides, and its compute."""
+    """Return a cell's values for the scale's keys: numbers in its overrides, and its compute."""
     assert sweep.scale is not None
     words = dict(word.split("=", 1) for word in arm.cell)
     found = {name: float(words[name]) for name in sweep.scale.against if name in words}
@@ -306,7 +306,7 @@ def _reason(
     varied: Sequence[str],
     differences: np.ndarray,
 ) -> str:
-    """Say why there can be no line; empty where there may be one."""
+    """Say why there can be no line; empty if there may be one."""
     if not values:
         return "no cell is measured"
     if any(name not in one for one in values for name in against):
@@ -323,10 +323,10 @@ def _point(cell: _Cell) -> EffectOfCell:
 
 
 def _shared(pairs: Sequence[Paired]) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return the means over seeds of all cells on the clips that they share.
+    """Return all cells' means over seeds on the clips that the cells share.
 
     Returns:
-        Differences (K, C), the clips' groups (C,), and how many clips some cells have beside these.
+        Differences (K, C), the clips' groups (C,), and how many further clips only some cells have.
     """
     takes = {clip: take for pair in pairs for clip, take in zip(pair.clips, pair.takes, strict=True)}
     rows = [dict(zip(pair.clips, pair.matrix.mean(0), strict=True)) for pair in pairs]
@@ -372,7 +372,7 @@ def _signed(sure: int | None, mean: float) -> int | None:
 
 
 def _verdict(trend: Trend, name: str, p: float) -> TrendVerdict:
-    """Return what may be claimed of a slope, from the signs that the line has at both ends for certain."""
+    """Return what may be claimed about a slope, from the line's signs that are certain at both ends."""
     if p > LEVEL:
         return TrendVerdict.NONE
     every = [point.values[name] for point in trend.points]

@@ -1,4 +1,4 @@
-"""Flags: what a reader has to know of the runs behind a table, a line each."""
+"""Flags: what a reader has to know about the runs behind a table, one line each."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ORIGIN = {
 
 
 def silent(arm: Arm, seed: int) -> None:
-    """Have nothing to say about a run: the default where a `Say` is wanted."""
+    """Return None, as there is nothing to say about a run: the default for a `Say`."""
 
 
 def flags(
@@ -36,11 +36,11 @@ def flags(
 
     Args:
         sweep: the sweep as it is shown.
-        asked: the sweep before arms without the wanted branch fell back to another.
+        asked: the sweep before arms without the wanted branch fell back to another branch.
         runs: the finished runs of every runnable arm, by seed.
         command: the command that makes missing runs.
-        state: says in a word how far the unfinished run of an arm and seed is.
-        older: names the run of an earlier recipe that there is in place of a missing one.
+        state: describes in a word the state of an arm's and seed's unfinished run.
+        older: names the run with an earlier recipe that exists in place of a missing one.
     """
     every = [(arm.label, run) for arm in sweep.runnable() for run in runs[arm.label].values()]
     yield from _other_data(sweep)
@@ -74,14 +74,14 @@ def flags(
 
 
 def _less_precise(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Flag arms whose size and times are those of another file than the network that errors are of."""
+    """Flag arms whose size and times come from another file than the network that was evaluated."""
     found = [label for label, run in every if run.origin.deployed != "fp32"]
     if found:
         yield f"size and times are of a file of less precision, errors of float32: {_quoted(found)}"
 
 
 def _other_data(sweep: Sweep) -> Iterable[str]:
-    """Flag a table of the paper that names its data (a protocol on AMASS) and is shown for other data."""
+    """Flag a table of the paper that names its data (a protocol on AMASS) but is shown for other data."""
     own, chosen = (
         next((word for word in reversed(words) if word.startswith("data=")), None)
         for words in (sweep.base, sweep.command_line)
@@ -91,7 +91,7 @@ def _other_data(sweep: Sweep) -> Iterable[str]:
 
 
 def _missing(sweep: Sweep, runs: Mapping[str, RunsBySeed], command: str, state: Say) -> Iterable[str]:
-    """Flag the runs that are missing, how far they are, and the command that makes them."""
+    """Flag the missing runs, with their states, and the command that makes them."""
     gaps = []
     for arm in sweep.runnable():
         seeds = _gaps(sweep, arm, runs)
@@ -104,7 +104,7 @@ def _missing(sweep: Sweep, runs: Mapping[str, RunsBySeed], command: str, state: 
 
 
 def _older(sweep: Sweep, runs: Mapping[str, RunsBySeed], older: Say) -> Iterable[str]:
-    """Flag missing runs for which there is a run of an earlier recipe."""
+    """Flag missing runs for which a run with an earlier recipe exists."""
     found = [
         f"'{arm.label}' seed {seed} ({run})"
         for arm in sweep.runnable()
@@ -120,7 +120,7 @@ def _gaps(sweep: Sweep, arm: Arm, runs: Mapping[str, RunsBySeed]) -> list[int]:
 
 
 def _branches(sweep: Sweep, asked: Sweep, runs: Mapping[str, RunsBySeed], command: str) -> Iterable[str]:
-    """Flag rows that show another branch than the table's, and rows not evaluated in the one they show."""
+    """Flag rows that show another branch than the table, and rows that were not evaluated in their branch."""
     wanted = {arm.label: arm.branch for arm in asked.arms}
     fallen = [arm for arm in sweep.runnable() if arm.branch != wanted[arm.label]]
     if fallen:
@@ -133,14 +133,14 @@ def _branches(sweep: Sweep, asked: Sweep, runs: Mapping[str, RunsBySeed], comman
 
 
 def _offline(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Flag networks that are no streams."""
+    """Flag networks that can't run as a stream."""
     found = [label for label, run in every if run.origin.offline]
     if found:
         yield f"offline, no stream, for frames are made with later ones: {_quoted(found)}"
 
 
 def _unequal_clips(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
-    """Flag arms that don't have the same test clips as their controls."""
+    """Flag arms whose test clips differ from those of their controls."""
     for arm in sweep.runnable():
         other = control_arm(sweep, arm)
         if other is None:
@@ -156,7 +156,7 @@ def _unequal_clips(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str
 
 
 def _unequal_groups(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Flag clips that belong to one group in some runs and to another in others."""
+    """Flag clips that belong to different groups in different runs."""
     groups: dict[str, set[str]] = defaultdict(set)
     for _, run in every:
         for clip in run.clips:
@@ -202,7 +202,7 @@ def _lacking(run: Measured, mode: str, branch: str, metric: str) -> set[str]:
 
 
 def _calmer_than_truth(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
-    """Flag arms whose motion is calmer than the true one, as it is where a network hardly follows at all."""
+    """Flag arms whose motion has less jitter than the true one, as when a network hardly follows at all."""
     calmer: dict[str, list[str]] = defaultdict(list)
     truths: dict[str, float] = {}
     for arm in sweep.runnable():
@@ -221,7 +221,7 @@ def _calmer_than_truth(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable
 
 
 def _differing(what: str, found: Iterable[tuple[str, str]]) -> Iterable[str]:
-    """Flag that arms differ in something, and name the arms that have each value.
+    """Flag a property in which arms differ, and name the arms that have each value.
 
     `found` has pairs of a value and an arm's label.
     """
@@ -234,7 +234,7 @@ def _differing(what: str, found: Iterable[tuple[str, str]]) -> Iterable[str]:
 
 
 def _seen(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
-    """Flag arms that saw more or fewer frames in training than their controls, whatever the reason."""
+    """Flag arms that saw more or fewer frames in training than their controls, for whatever reason."""
     every = [(label, run.training.get("frames")) for label, found in runs.items() for run in found.values()]
     frames = {label: number for label, number in every if number}
     unequal = []
@@ -249,7 +249,7 @@ def _seen(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
 
 
 def _busy(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
-    """Flag arms that were timed beside other work, which shows in their times."""
+    """Flag arms whose times were measured while other work ran on the machine."""
     found = []
     for arm in sweep.runnable():
         costs = [run.costs for run in runs[arm.label].values()]
@@ -264,19 +264,19 @@ def _busy(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
 
 
 def _partial(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Flag runs on a part of their protocol's list."""
+    """Flag runs whose data is only a part of their protocol's list."""
     for part in _unique(run.origin.partial for _, run in every if run.origin.partial):
         yield f"{part}, and no more: {_quoted(label for label, run in every if run.origin.partial == part)}"
 
 
 def _divided_subjects(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Flag runs that were tested on people on whom they were trained."""
+    """Flag runs that were tested on subjects on whom they were trained."""
     for said in _unique(run.origin.divided for _, run in every if run.origin.divided):
         yield f"{said}: {_quoted(label for label, run in every if run.origin.divided == said)}"
 
 
 def _recipes(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Flag components that several arms have, but in different recipes."""
+    """Flag components that several arms use, but with different recipe versions."""
     for name in sorted({name for _, run in every for name in run.origin.recipes}):
         having = [(run, label) for label, run in every if name in run.origin.recipes]
         yield from _differing(
@@ -285,14 +285,14 @@ def _recipes(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
 
 
 def _own_code(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Flag packages of one's own of which several arms use other versions or code."""
+    """Flag users' packages of which arms use different versions or code."""
     for name in sorted({name for _, run in every for name in run.origin.plugins}):
         having = [(run.origin.plugins[name], label) for label, run in every if name in run.origin.plugins]
         yield from _differing(f"code of {name}", having)
 
 
 def _replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
-    """Flag what the intervals don't speak of: seeds, groups of clips or VQ-VAEs, if there is only one."""
+    """Flag that intervals don't cover seeds, groups of clips or VQ-VAEs, if there is only one of them."""
     measured = {label: list(found.values()) for label, found in runs.items() if found}
     if len(measured) < 2:
         return
@@ -311,7 +311,7 @@ def _replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
 
 
 def _same(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
-    """Flag arms that are one run, because under these overrides nothing tells them apart."""
+    """Flag arms that are the same run, because nothing distinguishes them under these overrides."""
     for arm in sweep.runnable():
         other = control_arm(sweep, arm)
         if other and one_and_the_same(arm, other, runs[arm.label], runs[other.label]):
@@ -320,14 +320,14 @@ def _same(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
 
 
 def _apart(ours: RunsBySeed, theirs: RunsBySeed) -> str:
-    """Say what the difference between two arms of the same runs and errors has an effect on."""
+    """Say what the difference between two arms with the same runs and errors affects."""
     if any(ours[seed].costs != theirs[seed].costs for seed in ours.keys() & theirs.keys()):
         return "they differ in how it is deployed, and in nothing but costs"
     return "what tells them apart has no effect here"
 
 
 def _single(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
-    """Flag comparisons that have one seed where others have more."""
+    """Flag comparisons with one seed if others have more."""
     pairs = [(arm.label, other.label) for arm in sweep.runnable() if (other := control_arm(sweep, arm))]
     shared = {one: len(runs[one].keys() & runs[two].keys()) for one, two in pairs}
     few = [label for label, number in shared.items() if number == 1]
@@ -356,5 +356,5 @@ def _quoted(labels: Iterable[str]) -> str:
 
 
 def _listed(words: Sequence[str], most: int = 12) -> str:
-    """Return words with commas between; of many only the first ones and the number of the others."""
+    """Join words with commas; of many words, only the first ones and the number of the others."""
     return ", ".join(words[:most]) + (f", and {len(words) - most} more" if len(words) > most else "")

@@ -1,4 +1,4 @@
-"""A table in a format: Markdown, LaTeX, HTML, JSON, or lines on a terminal."""
+"""A table's output formats: Markdown, LaTeX, HTML, JSON, or lines on a terminal."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def markdown(table: Table) -> str:
 
 
 def escaped(text: str) -> str:
-    """Return the text with everything escaped that Markdown would interpret."""
+    """Return the text with all characters escaped that Markdown would interpret."""
     return re.sub(r"([\\`*_|<>\[\]#])", r"\\\1", text)
 
 
@@ -63,7 +63,7 @@ def latex(table: Table) -> str:
 
 
 def as_json(table: Table) -> str:
-    """Return everything that the table holds as JSON, with the values of each seed."""
+    """Return the table's whole content as JSON, including the values of each seed."""
     return json.dumps(plain(_with_summaries(table)), indent=2, ensure_ascii=False) + "\n"
 
 
@@ -80,7 +80,7 @@ def as_html(table: Table) -> str:
 
 
 def show(table: Table, console: Console) -> None:
-    """Print the table on a terminal; columns that do not fit stand in further blocks below."""
+    """Print the table on a terminal; columns that do not fit are put into further blocks below."""
     console.print(caption(table), style="bold", soft_wrap=True)
     for grid in grids(table):
         if grid.mode:
@@ -102,7 +102,7 @@ def _all(grid: Grid) -> Iterator[ArmLine]:
 
 
 def _remarks(table: Table) -> list[str]:
-    """Return the lines that stand below a table."""
+    """Return the lines below a table."""
     return [*legend(table), *table.flags, *table.notes]
 
 
@@ -144,7 +144,7 @@ def _html_line(line: ArmLine) -> str:
 def _html_mark(text: str) -> str:
     """Return the HTML of a part of a cell.
 
-    A verdict gets a class of its own name; the signs of agreement and significance get one each.
+    A verdict gets a class with its name; the signs of agreement and significance get one class each.
     """
     word = text.partition(" ")[0]
     if word in set(Verdict):
@@ -157,9 +157,9 @@ def _html_mark(text: str) -> str:
 
 
 def _fitting(grid: Grid, width: int) -> list[list[int]]:
-    """Divide the metrics' columns into the fewest groups of nearly equal size that fit the width.
+    """Divide the metrics' columns into as few groups of nearly equal size as fit the width.
 
-    The arms' two columns stand before each group.
+    The arms' two columns are repeated before each group.
     """
     columns = range(2, len(grid.header))
     widths = [
@@ -199,7 +199,7 @@ def _blocks(grid: Grid) -> list[list[Sequence[str]]]:
 
 
 def _block(group: Sequence[ArmLine]) -> list[Sequence[str]]:
-    """Return an arm's columns as lines, with its label folded beside them."""
+    """Return an arm's columns as lines, with its label wrapped beside them."""
     columns: list[list[str]] = [[] for _ in (0, *group[0].cells)]
     for line in group:
         height = max(map(len, line.cells))

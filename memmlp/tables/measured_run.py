@@ -24,28 +24,28 @@ SAME = 1e-4  # relative difference up to which two errors count as those of the 
 
 @dataclass(frozen=True)
 class Origin:
-    """What a run was made from, and on which machine. The runs of one table should agree in it.
+    """What a run was made from, and on which machine. All runs of a table should have the same origin.
 
     Attributes:
-        code: the commit; the package's version where there is no checkout.
+        code: the commit; the package's version outside a checkout.
         changed: whether the checkout had uncommitted changes.
         data: the digest of the prepared data.
         hardware: the processor.
         device: "cpu", "cuda" or "mps".
         gpu: the GPU's name.
         threads: torch's threads on the processor.
-        processes: how many trained it together.
+        processes: how many processes trained it together.
         torch: torch's version.
         precision: the precision of training.
         body: whose rest joints the motion is on: "builtin" or the file of a body model.
         recipes: the recipe version of each component.
-        upstream: the id of the run upstream: a VQ-VAE's, a part's, or that of the network before a refiner;
-            None where there is none.
-        partial: which part of its protocol's list the data is, in words; None where it is all of it.
-        plugins: version and digest of the code of each package of one's own that it uses.
-        offline: whether its frames are made with later ones, so that it is no stream.
-        deployed: the precision of the exported file that its size and times are of.
-        divided: in words, that people of whom clips are in training are also in test; None where none are.
+        upstream: the id of the upstream run: a VQ-VAE's, a part's, or that of the network before a refiner;
+            None if there is none.
+        partial: which part of its protocol's list the data is, in words; None if it is complete.
+        plugins: version and code digest of each user's package that it uses.
+        offline: whether frames are made with later ones, so that it can't run as a stream.
+        deployed: the precision of the exported file that was measured for size and times.
+        divided: a warning, in words, if subjects have clips in both training and test; None otherwise.
     """
 
     code: str
@@ -76,17 +76,17 @@ class Measured:
         id: the run's id.
         means: the metrics' means over the test clips.
         clips: the metrics of each clip, by its name.
-        groups: the group (take, subject) of each clip; a clip that is not named is a group of its own.
+        groups: the group (take, subject) of each clip; a clip that is not listed is a group of its own.
         costs: GFLOP and GMAC of the network as it was trained, for one frame; ms of a step of the exported
-            graph, its time over the yardstick's in the same minute,
-            millions of parameters, MB of the ONNX file, frames a second, and how much of the time that was
-            measured the thread had a core.
+            graph, the ratio of its time to the yardstick's in the same minute, millions of parameters, MB of
+            the ONNX file, frames per second, and the share of the measured time in which the thread had a
+            core.
         origin: what the run was made from.
-        latency: everything that was measured of its streaming step.
-        sources: the source of each clip, where the data has several.
-        run: the run's folder; None where the results were kept without one.
-        training: what its training took, where that is known: `seconds`; `frames`, those that it saw, each as
-            often as a window with it was drawn; and `flops` where results are kept.
+        latency: all measurements of its streaming step.
+        sources: the source of each clip, if the data has several sources.
+        run: the run's folder; None for results that were kept without it.
+        training: what its training took, as far as known: `seconds`; `frames`, the frames seen, each counted
+            as often as it was drawn in a window; and `flops` for kept results.
     """
 
     id: str
@@ -101,13 +101,13 @@ class Measured:
     training: Mapping[str, float] = field(default_factory=dict)
 
     def value(self, mode: str, branch: str, metric: str) -> float | None:
-        """Return a metric's mean over clips, or a cost; None where the run has none."""
+        """Return a metric's mean over clips, or a cost; None if the run has none."""
         if metric in self.costs:
             return self.costs[metric]
         return _number(self.means, mode, branch, metric)
 
     def by_clip(self, names: Sequence[str], mode: str, branch: str, metric: str) -> np.ndarray:
-        """Return a metric for each of these clips (C,); NaN where the run has none."""
+        """Return a metric for each of these clips (C,); NaN for clips for which the run has none."""
         found = [self.clips[name].get(mode, {}).get(branch, {}).get(metric) for name in names]
         return np.array([np.nan if value is None else float(value) for value in found])
 
@@ -116,14 +116,14 @@ class Measured:
         return self.groups.get(clip, clip)
 
     def by_source(self) -> dict[str, Measured]:
-        """Return the results on each source's clips alone, by its name; empty where there is one source."""
+        """Return the results on each source's clips alone, by source; empty if there is only one source."""
         own: dict[str, list[str]] = {name: [] for name in sorted(set(self.sources.values()))}
         for clip in self.clips if own else ():
             own[self.sources[clip]].append(clip)
         return {name: self.over(clips) for name, clips in own.items()}
 
     def over(self, clips: Sequence[str]) -> Measured:
-        """Return the same of some of the clips alone, with the means over these."""
+        """Return the same results restricted to some clips, with the means over these."""
         means = {
             mode: {
                 branch: _means({metric: self.by_clip(clips, mode, branch, metric) for metric in metrics})
@@ -134,18 +134,18 @@ class Measured:
         return replace(self, clips={clip: self.clips[clip] for clip in clips}, means=means)
 
     def has(self, branch: str) -> bool:
-        """Return whether the run was evaluated in that branch."""
+        """Return whether the run was evaluated in the given branch."""
         return any(branch in branches for branches in self.means.values())
 
     def shown(self, branch: str) -> dict[str, Any]:
-        """Return the means of that branch by mode."""
+        """Return the means in the given branch, by mode."""
         return {mode: branches.get(branch) for mode, branches in self.means.items()}
 
     @property
     def one_head(self) -> bool:
         """Whether the network predicts rotations alone.
 
-        Its positions are then those of the rotations by forward kinematics, so both branches have the same
+        Its positions then follow from the rotations by forward kinematics, so both branches have the same
         errors.
         """
         pairs = [
@@ -159,15 +159,16 @@ class Measured:
 def _means(values: Mapping[str, np.ndarray]) -> dict[str, float]:
     """Return the means over clips (C,) of a branch's metrics, as the evaluation does (`modes.evaluate`).
 
-    A clip too short for a metric does not count in it. One on which the network's numbers are none counts:
-    all means are NaN then. It is told by the metric that has a number on the shortest clip.
+    A clip that is too short for a metric is left out of its mean. A clip for which the network returned NaN
+    is not: all means are then NaN. Such a clip is recognised by the metric that has a number even for the
+    shortest clip.
     """
     diverged = SHARED in values and bool(np.isnan(values[SHARED]).any())
     return {metric: math.nan if diverged else _known_mean(each) for metric, each in values.items()}
 
 
 def _known_mean(values: np.ndarray) -> float:
-    """Return the mean over the clips that have a number; NaN where none has."""
+    """Return the mean over the clips that have a number; NaN if no clip has one."""
     known = values[~np.isnan(values)]
     return float(known.mean()) if len(known) else math.nan
 
@@ -177,12 +178,12 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
 
     Args:
         folder: the run's folder.
-        stages: identities of the evaluations and the deployment to read. By default, or where there are none
-            of these, all evaluations that use the network as the run's own config does, and the deployment
-            that the run prefers (`Run.preferred_deployment`).
+        stages: identities of the evaluations and the deployment to read. By default, or if none of these
+            exist, all evaluations that use the network as the run's own config does, and the deployment that
+            the run prefers (`Run.preferred_deployment`).
 
     Raises:
-        InputError: naming the file that is damaged.
+        InputError: if a file is damaged; the message names it.
     """
     run = Run(folder)
     manifest = _read(run.manifest_path)
@@ -213,7 +214,7 @@ def of_untrained(
 
     Args:
         overrides: what the network was made with.
-        record: its sizes and times, as a deployment records them.
+        record: the network's sizes and times, as a deployment records them.
         environment: the code, the packages and the hardware, as a run's manifest has them.
     """
     digest = hashlib.sha256("\n".join(["untrained", *overrides]).encode()).hexdigest()[:16]
@@ -228,9 +229,10 @@ def _training(run: Run, manifest: Mapping[str, Any]) -> dict[str, float]:
 
 
 def frames_seen(run: Run) -> float:
-    """Return how many frames a run's network saw in training, each as often as it did; 0 if that is unknown.
+    """Return how many frames a run's network saw in training, with repetitions; 0 if that is unknown.
 
-    A refiner sees those that the network before it saw, and the pieces of its own training.
+    For a refiner, this includes the frames that the network before it saw, and the pieces of its own
+    training.
     """
     config = run.config
     refiner, optim, model = (config.get(name) or {} for name in ("refiner", "optim", "model"))
@@ -243,7 +245,7 @@ def frames_seen(run: Run) -> float:
 
 
 def _join(known: dict[str, Any], more: Mapping[str, Any]) -> None:
-    """Add what a report has: facts, and the errors of each branch, of which another may have others."""
+    """Merge a report into known ones: its facts, and the errors of its branches, which others may lack."""
     for name, value in more.items():
         known[name] = {**known.get(name, {}), **value} if isinstance(value, Mapping) else value
 
@@ -251,7 +253,8 @@ def _join(known: dict[str, Any], more: Mapping[str, Any]) -> None:
 def _evaluations(run: Run, stages: Sequence[str] | None) -> list[Path]:
     """Return the files of some evaluations.
 
-    Without any of these stages, the files of all that use the network as the run's own config does.
+    If none of these stages exist, return the files of all evaluations that use the network as the run's own
+    config does.
     """
     if wanted := [path for name in stages or () if (path := run.evaluation(name)).is_file()]:
         return wanted
@@ -266,21 +269,21 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def deployed_precision(latency: Mapping[str, Any]) -> str:
-    """Return the precision of the file that a deployment was asked for, where it has it; else fp32."""
+    """Return the precision that was asked for in a deployment, if it has that file; else fp32."""
     precision = str((latency.get("settings") or {}).get("precision", "fp32"))
     return precision if precision in latency else "fp32"
 
 
 def as_deployed(latency: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what was measured of a streaming step, with size and times of the file that was asked for."""
+    """Return the measurements of a streaming step, with size and times of the file that was asked for."""
     return {**latency, **latency.get(deployed_precision(latency), {})}
 
 
 def _costs(latency: Mapping[str, Any]) -> dict[str, float]:
     """Return the costs that were measured, in the units of the tables.
 
-    Size and times are those of the file in the precision that was asked for; the network alone has no other
-    than that in float32, whose time it is.
+    Size and times are those of the file in the precision that was asked for; the network alone is timed in
+    float32 only.
     """
     measured = as_deployed(latency)
 
@@ -303,7 +306,7 @@ def _costs(latency: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _origin(manifest: Mapping[str, Any]) -> Origin:
-    """Return the origin that a run's manifest tells."""
+    """Return the origin that a run's manifest records."""
 
     def of(key: str) -> str:
         return str(manifest.get(key) or UNKNOWN)
@@ -335,7 +338,7 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
 
 
 def _evaluated(origin: Origin, reports: Sequence[Mapping[str, Any]]) -> Origin:
-    """Return the origin of a run together with that of its evaluations, where these differ from it."""
+    """Return the origin of a run, joined with the origins of its evaluations where these differ."""
     others = [_origin({**report.get("made_by", {}), **report}) for report in reports]
     found: dict[str, Any] = {"changed": origin.changed or any(other.changed for other in others)}
     found["offline"] = any(report.get("offline") for report in reports)
@@ -349,12 +352,12 @@ def _evaluated(origin: Origin, reports: Sequence[Mapping[str, Any]]) -> Origin:
 
 
 def _both(known: Mapping[str, str], more: Mapping[str, str]) -> dict[str, str]:
-    """Return the code of packages by name; where two differ, both."""
+    """Return the code of packages by name; if two versions differ, both."""
     words = {name: dict.fromkeys([*([known[name]] if name in known else []), more[name]]) for name in more}
     return {**known, **{name: ", ".join(each) for name, each in words.items()}}
 
 
 def _number(errors: Errors, mode: str, branch: str, metric: str) -> float | None:
-    """Return a value of nested errors as a number; None where there is none. (Files hold NaN as a word.)"""
+    """Return a value of nested errors as a number; None if it is missing. (Files hold NaN as a word.)"""
     value = errors.get(mode, {}).get(branch, {}).get(metric)
     return None if value is None else float(value)

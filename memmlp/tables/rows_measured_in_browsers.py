@@ -1,4 +1,4 @@
-"""Rows of Table 17 that a browser measured: what the bench of `memmlp web` copies, read and checked."""
+"""Rows of Table 17 that were measured in a browser: the output of `memmlp web`'s bench, read and checked."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NUMBER = 17  # the table's, in the paper
 LARGEST = 1_000_000  # bytes of a file
 GRAPHS = {"naive": "as published", "streaming": "stream"}
 BASE = ("AvatarPoser", "naive", "fp32")
-"""What ratios on the page are to: AvatarPoser as published."""
+"""The network to which ratios on the page refer: AvatarPoser as published."""
 
 Check = Callable[[Any], bool]
 
@@ -59,7 +59,7 @@ class BrowserBench:
 
     @property
     def name(self) -> str:
-        """Device and browser in words."""
+        """The device and the browser, in words."""
         return f"{self.about['device']}, {self.about['browser']}"
 
 
@@ -67,7 +67,7 @@ def read(path: Path) -> BrowserBench:
     """Read a file of the bench.
 
     Raises:
-        InputError: where it can't be read, or is none.
+        InputError: if the file can't be read, or is no file of the bench.
     """
     try:
         text = path.read_text(encoding="utf-8") if path.stat().st_size <= LARGEST else ""
@@ -102,18 +102,18 @@ def _check(path: Path, where: str, found: Mapping[str, Any], fields: Mapping[str
 
 
 def _shown(value: Any) -> Any:
-    """Return a value as a terminal may show it."""
+    """Return a value with texts made safe to print on a terminal."""
     return one_line(value) if isinstance(value, str) else value
 
 
 def with_rows(table: Table, measured: BrowserBench) -> Table:
     """Return Table 17 with a browser's rows below its own.
 
-    Their differences and ratios are to AvatarPoser as published, in the same browser on the same backend.
-    The column `ratio` is to the same fixed network as in the other rows.
+    Their differences and ratios compare with AvatarPoser as published, in the same browser on the same
+    backend. The column `ratio` compares with the same fixed yardstick as in the other rows.
 
     Raises:
-        InputError: for another table.
+        InputError: for a table other than Table 17.
     """
     if table.number != NUMBER:
         raise InputError(f"--add: {table.name} is not Table {NUMBER}; allowed is memmlp table {NUMBER}")
@@ -127,7 +127,7 @@ def _kind(row: Mapping[str, Any]) -> tuple[str, str, str]:
 
 
 def _label(measured: BrowserBench, row: Mapping[str, Any]) -> str:
-    """Name a row, its network's size too: a site's networks need not have the sizes of the table's own."""
+    """Name a row, with its network's size, as a site's networks may differ in size from the table's own."""
     graph, size = GRAPHS.get(row["graph"], row["graph"]), row["parameters"] / 1e6
     how = f"{graph}, {row['precision']}, {row['backend']}"
     return f"{row['network']} of {size:.3g} M parameters, {how}: {measured.name}"
@@ -164,7 +164,7 @@ def _costs(row: Mapping[str, Any]) -> dict[str, float | None]:
 
 
 def _told(measured: BrowserBench) -> list[str]:
-    """Say how the rows were measured."""
+    """Return notes that say how the rows were measured."""
     about, clock = measured.about, f"a clock of {measured.about['clock_ms']:.2g} ms"
     threads, steps = (_values(measured, key) for key in ("threads", "steps"))
     how = f"{threads} thread{'s' * (threads != '1')}, the median of {steps} steps, {clock}"
@@ -175,5 +175,5 @@ def _told(measured: BrowserBench) -> list[str]:
 
 
 def _values(measured: BrowserBench, key: str) -> str:
-    """Return the counts that the rows have under a key: one number, or all of them where rows differ."""
+    """Return a key's counts in the rows: one number, or all of them if rows differ."""
     return " or ".join(map(str, sorted({int(row[key]) for row in measured.rows})))

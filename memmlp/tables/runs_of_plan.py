@@ -1,4 +1,4 @@
-"""What the runs of a planned sweep tell a table: results, how far they are, and older ones."""
+"""What a table gets from the runs of a planned sweep: results, states, and older runs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Read = Callable[[Path, tuple[str, ...]], Measured]
 
 
 def finder(plan: Plan, read: Read) -> Find:
-    """Return a function that finds the results of a finished run of the plan by arm and seed."""
+    """Return a function that finds the results of the plan's finished run for an arm and a seed."""
 
     entries = {(entry.label, entry.seed): entry for entry in plan.entries}
 
@@ -32,7 +32,7 @@ def finder(plan: Plan, read: Read) -> Find:
 
 
 def states(plan: Plan) -> Say:
-    """Return a function that says how far an unfinished run of the plan is, once it began."""
+    """Return a function that describes the state of an unfinished run of the plan, once it has begun."""
 
     entries = {(entry.label, entry.seed): entry for entry in plan.entries}
 
@@ -50,7 +50,7 @@ def states(plan: Plan) -> Say:
 
 
 def older(plan: Plan) -> Say:
-    """Return a function that names a finished run that only recipe versions tell from a planned one."""
+    """Return a function that names a finished run that differs from a planned one only in recipe versions."""
     whats = {task.key: task.what for task in plan.tasks}
     entries = {(entry.label, entry.seed): entry for entry in plan.entries}
 

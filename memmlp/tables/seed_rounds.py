@@ -1,10 +1,11 @@
-"""Rounds of seeds for arms with open verdicts: looks that are fixed beforehand, and what they decided.
+"""Rounds of seeds for arms with open verdicts: looks that are fixed in advance, and what they decided.
 
 Every arm goes through the same looks, each at a number of seeds that was fixed at the start. An arm whose
-comparisons are all decided goes no further. A look uses the first seeds of an arm and of its control,
-whatever other seeds there are, and what it decides is final. It spends its level over all comparisons of the
-sweep that nobody has claimed, including those of arms that are at another look. So the levels add up to 5 %
-for either family of claims, also where an arm is late because its runs failed (docs/statistics.md).
+comparisons are all decided gets no further looks. A look uses the first seeds of an arm and of its control,
+whatever other seeds exist, and what it decides is final. It spends its level over all comparisons of the
+sweep about which nothing has been claimed, including those of arms that are at another look. So the levels
+add up to 5 % for either family of claims, even if an arm is late because its runs failed
+(docs/statistics.md).
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ MOST = 13  # the largest number of seeds of an arm by default
 
 @dataclass(frozen=True)
 class Finding:
-    """What a look found of a comparison.
+    """The finding of a look on one comparison.
 
     Attributes:
         label, mode, metric: which comparison it is.
@@ -74,8 +75,8 @@ class Look:
     Attributes:
         seeds: how many seeds of each arm were looked at.
         level: the level that the look spent.
-        runs: by the label of each arm that was looked at, a digest of its runs and its control's.
-        found: what was found of the comparisons that were open before.
+        runs: by the label of each arm that was looked at, a digest of the arm's runs and its control's.
+        found: the findings on the comparisons that were open before.
     """
 
     seeds: int
@@ -89,7 +90,7 @@ class Rounds:
     """The rounds of a sweep.
 
     Attributes:
-        subject: what the verdicts are about (`subject`).
+        subject: what the verdicts depend on (`subject`).
         seeds: all seeds that may be spent, in order.
         looks: the number of seeds at each look.
         levels: the level that each look spends.
@@ -103,17 +104,17 @@ class Rounds:
     taken: tuple[Look, ...] = ()
 
     def position(self, label: str) -> int:
-        """Return how many looks an arm went through."""
+        """Return how many looks an arm has been through."""
         return sum(label in look.runs for look in self.taken)
 
     def latest(self) -> dict[Key, tuple[Finding, Look]]:
-        """Return the last finding of each comparison, with its look; a decided one was decided there."""
+        """Return the last finding on each comparison, with its look; decided ones were decided there."""
         return {finding.key: (finding, look) for look in self.taken for finding in look.found}
 
     def next_looks(self, sweep: Sweep) -> dict[str, int]:
         """Return, by label, the number (from 0) of the next look of each arm that has one.
 
-        An arm has one while looks are left and it has an open comparison, or had no look yet.
+        An arm has a next look while looks are left, and it has an open comparison or had no look yet.
         """
         going = {finding.label for finding, _ in self.latest().values() if finding.open}
         found = {arm.label: self.position(arm.label) for arm, _ in _compared(sweep)}
@@ -126,8 +127,8 @@ class Rounds:
     def counts(self, sweep: Sweep) -> dict[str, int]:
         """Return how many seeds each arm is to be trained with.
 
-        They are those of its latest or next look, or of such a look of an arm that is compared with it,
-        whichever are more.
+        This is the number of its latest or next look, or of such a look of an arm that is compared with it,
+        whichever is larger.
         """
         ahead = self.next_looks(sweep)
         found = {arm.label: self.looks[0] for arm in sweep.runnable()}
@@ -147,12 +148,12 @@ class Rounds:
         return replace(sweep, arms=arms, seeds=self.seeds[: max(counts.values())])
 
     def family(self, sweep: Sweep) -> list[Key]:
-        """Return all comparisons: those that were found and, for arms without a look, all possible ones."""
+        """Return all comparisons: those with findings and, for arms without a look, all possible ones."""
         new = [arm for arm, _ in _compared(sweep) if not self.position(arm.label)]
         return list(dict.fromkeys([*self.latest(), *(key for arm in new for key in _keys(sweep, arm))]))
 
     def unseen(self, sweep: Sweep) -> list[Key]:
-        """Return the comparisons of arms that were looked at for which there was nothing to find.
+        """Return the comparisons without findings, for arms that were looked at.
 
         Their runs have no numbers, or are one and the same.
         """
@@ -160,7 +161,7 @@ class Rounds:
         return [key for arm in looked for key in _keys(sweep, arm) if key not in self.latest()]
 
     def judged(self, effects: Mapping[Key, Effect]) -> dict[Key, Effect]:
-        """Return the effects with the verdicts of the looks in place of those of a fixed number of seeds."""
+        """Return the effects with the looks' verdicts in place of verdicts from a fixed number of seeds."""
         latest = self.latest()
         return {
             key: _as_found(effect, *latest.get(key, (None, None))) if effect.verdict else effect
@@ -169,7 +170,7 @@ class Rounds:
 
 
 def subject(sweep: Sweep) -> dict[str, Any]:
-    """Return what the verdicts are about, in types that JSON holds. It must not change between two looks."""
+    """Return what the verdicts depend on, in types for JSON; it must not change between two looks."""
     return {
         "arms": {
             arm.label: {
@@ -185,7 +186,10 @@ def subject(sweep: Sweep) -> dict[str, Any]:
 
 
 def begin(sweep: Sweep, most: int = MOST) -> Rounds:
-    """Return new rounds of a sweep with up to so many seeds: its own first, then the numbers that follow."""
+    """Return new rounds of a sweep with at most `most` seeds.
+
+    The sweep's own seeds come first, then the whole numbers that follow the largest of them.
+    """
     following = itertools.count(max(sweep.seeds) + 1)
     seeds = tuple(itertools.islice(itertools.chain(sweep.seeds, following), most))
     schedule = looks(most)
@@ -195,14 +199,14 @@ def begin(sweep: Sweep, most: int = MOST) -> Rounds:
 def advanced(
     rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed], named: Mapping[str, str]
 ) -> Rounds:
-    """Return the rounds after the next look that can be taken; the same rounds where none can.
+    """Return the rounds after the next look that can be taken; the same rounds if none can be.
 
-    A look at an arm can be taken when the arm and its control have all seeds of its next look. Where runs
-    failed, arms may be at different looks; then those that are behind come first.
+    A look at an arm can be taken when the arm and its control have all seeds of its next look. If runs
+    failed, arms may be at different looks; arms at an earlier look then come first.
 
     Args:
         rounds: the rounds so far.
-        sweep: the sweep as it was begun with.
+        sweep: the sweep with which the rounds began.
         runs: the finished runs by label and seed.
         named: by label, a digest of the runs of an arm and its control up to its next look.
     """
@@ -220,8 +224,8 @@ def advanced(
 def outlook(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> dict[Key, int | None]:
     """Return how many seeds would decide each open comparison of arms that have no next look.
 
-    The numbers are for 80 % power if the effect is as measured, at a single look, corrected over what nobody
-    has claimed. None where no number of seeds would do with these clips.
+    The numbers are for 80 % power, if the effect is as measured, at a single look, with a correction over all
+    comparisons without a claim. None means that no number of seeds would be enough with these clips.
     """
     latest, ahead = rounds.latest(), rounds.next_looks(sweep)
     still = [key for key, (finding, _) in latest.items() if finding.open and key.label not in ahead]
@@ -239,13 +243,13 @@ def outlook(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> dic
 
 @dataclass(frozen=True)
 class Standing:
-    """How far an arm is in the rounds.
+    """An arm's progress through the rounds.
 
     Attributes:
-        label: the arm's.
-        decided, open: how many of its comparisons are.
-        seeds: those that it has spent, or needs for a next look.
-        next: the number of seeds of its next look; None where it has none.
+        label: the arm's label.
+        decided, open: how many of its comparisons are decided and open.
+        seeds: the number of seeds spent on it, or needed for its next look.
+        next: the number of seeds of its next look; None if it has none.
     """
 
     label: str
@@ -256,7 +260,7 @@ class Standing:
 
 
 def standings(rounds: Rounds, sweep: Sweep) -> list[Standing]:
-    """Return how far each arm is."""
+    """Return each arm's progress through the rounds."""
     ahead = rounds.next_looks(sweep)
     found: dict[str, list[Verdict]] = {}
     for finding, _ in rounds.latest().values():
@@ -271,12 +275,12 @@ def standings(rounds: Rounds, sweep: Sweep) -> list[Standing]:
 
 
 def as_json(rounds: Rounds) -> dict[str, Any]:
-    """Return the rounds in types that JSON holds."""
+    """Return the rounds in types for JSON."""
     return asdict(rounds)
 
 
 def of_json(content: Mapping[str, Any]) -> Rounds:
-    """Return the rounds of a file's content. Raises KeyError, TypeError or ValueError if it holds none."""
+    """Return the rounds in a file's content. Raises KeyError, TypeError or ValueError if there are none."""
     taken = [
         Look(
             **{
@@ -316,7 +320,7 @@ def pair_of(sweep: Sweep, label: str) -> tuple[str, str]:
 
 
 def _found(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed], look: Look) -> list[Finding]:
-    """Return what a look finds of the comparisons of its arms that are not decided yet."""
+    """Return a look's findings on those comparisons of its arms that are not decided yet."""
     before = {key: finding.verdict for key, (finding, _) in rounds.latest().items()}
     seen = _seen(rounds, sweep, runs, look)
     fresh = {key: e for key, e in seen.items() if before.get(key, Verdict.OPEN) is Verdict.OPEN}
@@ -345,12 +349,13 @@ def _seen(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed], look: Lo
 def _corrected(
     fresh: Sequence[Effect], elsewhere: Sequence[Verdict], level: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Correct p-values of differences and of equivalences (K,), over the fresh comparisons and all others.
+    """Correct p-values of differences and of equivalences (K,), over fresh and all other comparisons.
 
     Args:
-        fresh: the comparisons (K) that the look decides on.
-        elsewhere: the verdicts of the others, decided before, or open where their arms are at another look.
-        level: what the look spends.
+        fresh: the comparisons (K) that the look can decide.
+        elsewhere: the verdicts of the other comparisons: decided before, or open because their arms are at
+            another look.
+        level: the level that the look spends.
     """
     none = [Verdict.OPEN] * len(fresh)
     same = np.array([said is Verdict.EQUIVALENT for said in [*none, *elsewhere]], bool)
@@ -366,7 +371,7 @@ def _corrected(
 
 
 def _as_found(effect: Effect, finding: Finding | None, look: Look | None) -> Effect:
-    """Return the effect with what its last look found; open where there was no look."""
+    """Return the effect with the finding of its last look; open if there was no look."""
     if finding is None or look is None:
         return replace(effect, holm=None, equal=None, verdict=Verdict.OPEN)
     decided = None if finding.verdict is Verdict.OPEN else look.seeds

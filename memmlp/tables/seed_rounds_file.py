@@ -1,4 +1,4 @@
-"""The file of a sweep's rounds: what it holds, and whether that is about the runs that there are."""
+"""The file of a sweep's rounds: its content, and the check that it is about the present runs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NAME = "rounds.json"
 
 
 def read(path: Path) -> Rounds | None:
-    """Read the rounds of a file; None where there is no file. Raises InputError where it is damaged."""
+    """Read the rounds in a file; None if there is no file. Raises InputError if it is damaged."""
     try:
         return of_json(json.loads(path.read_bytes()))
     except FileNotFoundError:
@@ -25,9 +25,9 @@ def read(path: Path) -> Rounds | None:
 
 
 def name_of(rounds: Rounds, sweep: Sweep, plan: Plan, label: str, seeds: int) -> str:
-    """Digest the identities of the first runs, that many seeds, of an arm and its control.
+    """Return a digest of the identities of an arm's and its control's runs with the first `seeds` seeds.
 
-    The identities include the evaluations that the sweep shows of them.
+    The identities include the evaluations that the sweep shows.
     """
     keys = {(entry.label, entry.seed): entry.key for entry in plan.entries}
     cells = [keys.get((one, seed)) for one in pair_of(sweep, label) for seed in rounds.seeds[:seeds]]
@@ -35,10 +35,10 @@ def name_of(rounds: Rounds, sweep: Sweep, plan: Plan, label: str, seeds: int) ->
 
 
 def same_runs(rounds: Rounds, sweep: Sweep, plan: Plan, path: Path) -> None:
-    """Check that past looks compared the very runs that the sweep's arms have now.
+    """Check that past looks compared the same runs that the sweep's arms have now.
 
     Raises:
-        InputError: where a look was of other runs, because data, configs or recipes changed since.
+        InputError: if a look compared other runs, because data, configs or recipes have changed since.
     """
     for taken in rounds.taken:
         for label, name in taken.runs.items():

@@ -1,4 +1,4 @@
-"""How many seeds the paper's printed effects would need here, judged by the runs that there are."""
+"""How many seeds the paper's printed effects would need here, estimated from the present runs."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class Need(NamedTuple):
         label, mode, metric: which comparison it is.
         paper: the paper's difference.
         measured: the measured mean difference.
-        have: how many seeds there are.
-        seeds: how many are needed; None where no number of seeds would do with these clips.
+        have: the number of seeds so far.
+        seeds: the number of seeds needed; None if no number of seeds would be enough with these clips.
     """
 
     label: str
@@ -31,10 +31,10 @@ class Need(NamedTuple):
 
 
 def needs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str] = MODES) -> list[Need]:
-    """Return the needs of every arm and metric whose effect the paper prints, in the table's order.
+    """Return the needs of all arms and metrics whose effects the paper prints, in the table's order.
 
     The correction is over the comparisons that the runs allow today. With fewer than two seeds or two groups
-    of clips there is nothing to learn the spread from, and the comparison is left out.
+    of clips the spread can't be estimated, and the comparison is left out.
     """
     seen = with_existing_branches(sweep, runs)
     pairs, arms = paired(seen, runs, modes), {arm.label: arm for arm in seen.arms}

@@ -1,4 +1,4 @@
-"""What a sweep leaves in its folder for those who look at it later: its table, aggregates and verdicts."""
+"""The summary that a sweep leaves in its folder for later readers: its table, aggregates and verdicts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def write_summary(plan: Plan, table: Table, folder: Path) -> None:
 
 
 def summary(plan: Plan, table: Table) -> dict[str, Any]:
-    """Return a sweep's status, its runs' labels, and by LABEL/MODE/METRIC means over seeds and verdicts."""
+    """Return a sweep's status and runs' labels, and means over seeds and verdicts by LABEL/MODE/METRIC."""
     cells = {
         f"{row.label}/{mode}/{metric}": cell
         for row in table.rows

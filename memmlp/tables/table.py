@@ -1,4 +1,4 @@
-"""What a table holds: rows of arms, cells of metrics, effects with verdicts."""
+"""The content of a table: rows of arms, cells of metrics, effects with verdicts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LEVEL = 0.05
 
 
 class Key(NamedTuple):
-    """Which cell of a table: its arm, mode of evaluation and metric."""
+    """The key of a table's cell: its arm, mode of evaluation and metric."""
 
     label: str
     mode: str
@@ -26,7 +26,7 @@ class Key(NamedTuple):
 class Effect:
     """An arm's difference from its control, over the seeds and clips that both have.
 
-    What a comparison does not have is None; costs have the mean alone.
+    Fields that a comparison does not have are None; costs have only the mean.
 
     Attributes:
         mean: the mean difference.
@@ -34,11 +34,11 @@ class Effect:
         p: its p-value, not corrected.
         holm: its p-value, corrected over the table's comparisons.
         equal: the corrected p-value of equivalence (see `memmlp.tables.statistics`).
-        verdict: what follows from these.
+        verdict: the verdict that follows from these.
         detectable: the smallest difference that this comparison would have found with 80 % power.
-        seeds, clips, groups: how many were paired.
-        level: what the corrected p-values are compared with.
-        decided: the number of seeds of the look that decided the verdict for good; None without such a look.
+        seeds, clips, groups: how many of each were paired.
+        level: the level with which the corrected p-values are compared.
+        decided: the number of seeds of the look that decided the verdict; None without such a look.
     """
 
     mean: float
@@ -85,9 +85,9 @@ class Cell:
 
     @property
     def agrees(self) -> bool | None:
-        """True where the paper's effect holds, False where its opposite does; None where neither is known.
+        """True if the paper's effect holds, False if its opposite does; None if neither is known.
 
-        The verdict tells it; a cost has no verdict, so that its sign tells it.
+        The verdict decides; for a cost, which has no verdict, the sign does.
         """
         if self.effect is None or not self.paper_effect or not self.effect.mean:
             return None
@@ -103,12 +103,14 @@ class Row:
     Attributes:
         label: the arm's label.
         branch: whose errors are shown.
-        against: the label of its control; None for the sweep's control and the paper's own rows.
+        against: the label of its control; None for the sweep's control and for rows with only the paper's
+            values.
         note: a remark; None for none.
         found: the seeds of its finished runs.
-        wanted: the seeds that it should have; none for a row that is the paper's alone.
+        wanted: the seeds that it should have; empty for a row with only the paper's values.
         cells: its cells by mode and metric.
-        pairing: in words, which arm is its control in every cell of the axes; empty where it has one alone.
+        pairing: in words, which arm is its control in every cell of the axes; empty if it has a single
+            control.
     """
 
     label: str
@@ -134,16 +136,16 @@ class Table:
         name: the sweep's name.
         title: the sweep's title.
         number: the table's number in the paper; None if it is not the paper's.
-        modes: the modes of evaluation; a single one where only costs are shown.
+        modes: the modes of evaluation; a single one if only costs are shown.
         metrics: the columns.
-        control: the label of the arm that the others are compared with, where they name no other.
-        branch_source: how we know which branch the paper's values belong to; None where it prints none.
+        control: the label of the arm with which arms are compared that name no other control.
+        branch_source: how we know which branch the paper's values belong to; None if it prints none.
         smallest: the smallest effect of interest by metric.
-        comparisons: how many p-values the correction is over.
+        comparisons: the number of p-values in the correction.
         rows: the arms.
         notes: remarks on the paper's values.
-        flags: what a reader has to know of these runs.
-        looks: pairs of the seeds and the level of each look; empty for a fixed number of seeds.
+        flags: what a reader has to know about these runs.
+        looks: pairs of the number of seeds and the level of each look; empty for a fixed number of seeds.
     """
 
     name: str
@@ -173,14 +175,14 @@ class Table:
                     yield row, metric, cell, cell.effect
 
     def verdicts(self, mode: str) -> Counter[Verdict]:
-        """Count by verdict the effects of a mode for which the paper has one, too."""
+        """Count, by verdict, the effects of a mode for which the paper prints one, too."""
         found = (effect.verdict for _, _, cell, effect in self.effects(mode) if cell.paper_effect)
         return Counter(verdict for verdict in found if verdict is not None)
 
     def detectable(self, mode: str, metric: str) -> float | None:
         """Return the smallest difference that every comparison would have found with 80 % power.
 
-        Those in which nothing would have been found, as of one seed, are passed over (`blind`).
+        Comparisons that could not have found anything, such as those with one seed, are left out (`blind`).
         """
         known = [
             effect.detectable
@@ -190,7 +192,7 @@ class Table:
         return max(known, default=None)
 
     def blind(self, mode: str, metric: str) -> list[str]:
-        """Return the labels of the arms in whose comparison no difference at all would have been found."""
+        """Return the labels of the arms whose comparison could not have found any difference."""
         return [
             row.label
             for row in self.rows

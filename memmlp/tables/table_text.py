@@ -1,4 +1,4 @@
-"""The words of a table in rows and columns, which are the same for every format."""
+"""The words of a table in rows and columns, shared by all formats."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class ArmLine:
 
     Attributes:
         kind: "measured", "difference" (from the control) or "paper".
-        head: the words of its first two columns, arm and seeds.
-        cells: one for each metric, each of one to three parts.
+        head: the words of the line's first two columns, arm and seeds.
+        cells: one cell for each metric, each with one to three parts.
     """
 
     kind: str
@@ -44,7 +44,7 @@ class ArmLine:
 
 @dataclass(frozen=True)
 class Grid:
-    """The lines of one mode of evaluation, arm by arm; `mode` is None where it makes no difference."""
+    """The lines of one mode of evaluation, arm by arm; `mode` is None if it makes no difference."""
 
     mode: str | None
     header: tuple[str, ...]
@@ -54,8 +54,7 @@ class Grid:
 def grids(table: Table) -> list[Grid]:
     """Return a grid for each mode.
 
-    There is a single grid without a mode where all modes would show the same: costs alone, or nothing
-    measured.
+    There is a single grid without a mode if all modes would show the same: costs alone, or nothing measured.
     """
     timeless = set(table.metrics) <= set(COSTS) or not any(row.found for row in table.rows)
     header = ("arm", "seeds", *map(heading, table.metrics))
@@ -75,14 +74,14 @@ def heading(metric: str) -> str:
 
 
 def with_unit(metric: str) -> str:
-    """Return a metric's name with its unit in brackets; the name alone where it has none."""
+    """Return a metric's name with its unit in brackets; the name alone if it has no unit."""
     return f"{metric} [{unit(metric)}]" if unit(metric) else metric
 
 
 def better(metric: str) -> str:
-    """Return what is better of a metric, "lower" or "higher"; empty where nobody knows here.
+    """Return whether "lower" or "higher" values of a metric are better; empty if that is unknown.
 
-    That is so of a metric of one's own whose package is not in use.
+    It is unknown for a custom metric whose package is not in use.
     """
     if metric not in UNITS and metric not in COST_UNITS:
         return ""
@@ -90,7 +89,7 @@ def better(metric: str) -> str:
 
 
 def unit(metric: str) -> str:
-    """Return a metric's unit; empty where it has none."""
+    """Return a metric's unit; empty if it has none."""
     return UNITS.get(metric, COST_UNITS.get(metric, "")).replace("10^2", "10²").replace("s^3", "s³")
 
 
@@ -100,7 +99,7 @@ def caption(table: Table) -> str:
 
 
 def legend(table: Table) -> list[str]:
-    """Return the lines that explain the table: whose errors it shows, and how to read what was measured."""
+    """Return the lines that explain the table: whose errors it shows, and how to read the measured values."""
     lines = [_branch(table)] if table.measured_metrics else []
     if not any(row.found for row in table.rows):
         return lines
@@ -161,7 +160,7 @@ def _meanings(table: Table) -> str:
 
 
 def _looks(table: Table) -> list[str]:
-    """Say at how many seeds there were looks, and which part of the 5 % each one spent."""
+    """Say at how many seeds looks were taken, and which part of the 5 % each of them spent."""
     words = [f"{seeds} ({100 * level:.2g} %)" for seeds, level in sorted(set(table.looks))]
     if not words:
         return []
@@ -172,7 +171,7 @@ def _looks(table: Table) -> list[str]:
 
 
 def _power(table: Table) -> list[str]:
-    """Say what this table could have seen, a line for each metric."""
+    """Say which differences this table could have found, one line for each metric."""
     lines = []
     for metric in table.measured_metrics:
         seen = {mode: least for mode in table.modes if (least := table.detectable(mode, metric)) is not None}
@@ -207,9 +206,9 @@ def _agreement(table: Table) -> str:
 
 
 def _lines(table: Table, row: Row, mode: str) -> Iterable[ArmLine]:
-    """Yield an arm's lines: what was measured, its difference from the control, and the paper's values.
+    """Yield an arm's lines: measured values, their difference from the control, and the paper's values.
 
-    A row that is the paper's alone has only the last one.
+    A row with only the paper's values has just the last line.
     """
     cells = [(row.cells[mode][metric], metric) for metric in table.metrics]
     paper = tuple((paper_words(cell, metric),) for cell, metric in cells)
@@ -228,7 +227,7 @@ def _lines(table: Table, row: Row, mode: str) -> Iterable[ArmLine]:
 
 
 def value_words(cell: Cell, metric: str) -> str:
-    """Return mean ± standard deviation over seeds; of costs but milliseconds the mean alone."""
+    """Return mean ± standard deviation over seeds; for costs other than milliseconds only the mean."""
     if cell.mean is None:
         return MISSING
     if metric in COSTS and (metric != "ms" or cell.sd is None):
@@ -241,7 +240,8 @@ def value_words(cell: Cell, metric: str) -> str:
 def effect_words(cell: Cell, metric: str) -> tuple[str, ...]:
     """Return the parts of a difference's cell: the difference, its interval and its verdict.
 
-    A significant difference has a star. A cost has the difference and the ratio to the control instead.
+    A significant difference has a star. For a cost, the parts are the difference and the ratio to the
+    control.
     """
     effect = cell.effect
     if effect is None:
@@ -265,7 +265,7 @@ def number_words(value: float) -> str:
 
 
 def _ratio(value: float | None, difference: float) -> tuple[str, ...]:
-    """Return how many times the control's cost this cost is, given its difference from it."""
+    """Return the ratio of a cost to the control's, given their difference."""
     if value is None or value == difference:
         return ()
     return (f"(x {value / (value - difference):.3g})",)
@@ -277,12 +277,12 @@ def signed(number: float, form: str) -> str:
 
 
 def decimals(value: float) -> int:
-    """Return the decimals of an error: 2, or as many as show two digits of one below 0.1."""
+    """Return the decimals of an error: 2, or enough to show two digits of an error below 0.1."""
     return max(1 - math.floor(math.log10(abs(value))), 2) if value and math.isfinite(value) else 2
 
 
 def places(width: float, least: int = 2) -> int:
-    """Return the decimals, `least` or one more, that show two digits of an interval's half width."""
+    """Return the decimals, `least` or one more, that show two digits of half an interval's width."""
     return min(max(1 - math.floor(math.log10(width / 2)), least), least + 1) if width > 0 else least
 
 

@@ -1,7 +1,7 @@
-"""Which weights of a module count while it is trained: those of the last step, or an average over the steps.
+"""Which weights a training validates and keeps: those of the last step, or an average over the steps.
 
-The weights that count are validated, and kept at the end. A checkpoint has the last step's and the average,
-so that a resumed training goes on as if it had never stopped. Averaged are parameters; buffers, such as a
+These are called the weights that count. A checkpoint has the last step's weights as well as the average, so
+that a resumed training goes on as if it had never stopped. Only parameters are averaged; buffers, such as a
 codebook's statistics, are the last step's.
 """
 
@@ -17,7 +17,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 
 class Average(ABC):
-    """The weights of a module that count.
+    """The weights of a module that count: they are validated, and kept at the end.
 
     Args:
         module: the module that is trained.
@@ -28,7 +28,7 @@ class Average(ABC):
 
     @abstractmethod
     def update(self, steps: int) -> None:
-        """Take in the weights after `steps` steps."""
+        """Update the average with the module's weights after `steps` steps."""
 
     @abstractmethod
     def put_in_place(self) -> None:
@@ -36,15 +36,15 @@ class Average(ABC):
 
     @abstractmethod
     def tensors(self) -> dict[str, Tensor]:
-        """Return what a checkpoint must hold, names preceded by "average."."""
+        """Return the tensors that a checkpoint must hold, their names preceded by "average."."""
 
     @abstractmethod
     def load(self, tensors: dict[str, Tensor]) -> None:
-        """Load what `tensors` returned, from among a checkpoint's tensors."""
+        """Load from a checkpoint's tensors those that `tensors` returned."""
 
     @contextlib.contextmanager
     def in_place(self) -> Iterator[None]:
-        """Give the module the weights that count within the context; then the last step's, to the bit."""
+        """Give the module the weights that count within the context, then the last step's, bit for bit."""
         before = {name: one.detach().clone() for name, one in self.parameters.items()}
         self.put_in_place()
         try:
@@ -66,10 +66,10 @@ class LastWeights(Average):
         """Do nothing."""
 
     def put_in_place(self) -> None:
-        """Do nothing: they are in the module."""
+        """Do nothing: the weights that count are in the module."""
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return nothing."""
+        """Return no tensors."""
         return {}
 
     def load(self, tensors: dict[str, Tensor]) -> None:
@@ -84,7 +84,7 @@ class EMA(Average):
 
     Args:
         module: the module that is trained.
-        decay: what is kept of the average in a step, in (0, 1).
+        decay: the share of the old average that is kept at each step, in (0, 1).
     """
 
     def __init__(self, module: nn.Module, decay: float):
@@ -93,7 +93,7 @@ class EMA(Average):
         self.averages = {name: one.detach().clone() for name, one in self.parameters.items()}
 
     def update(self, steps: int) -> None:
-        """Take in the weights after `steps` steps."""
+        """Update the average with the module's weights after `steps` steps."""
         decay = min(self.decay, (1 + steps) / (10 + steps))
         weights = [one.detach() for one in self.parameters.values()]
         get_ema_multi_avg_fn(decay)(list(self.averages.values()), weights, steps)
@@ -103,7 +103,7 @@ class EMA(Average):
         self._put(self.averages)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the average, by parameter."""
+        """Return the average of each parameter."""
         return {f"average.{name}": value for name, value in self.averages.items()}
 
     def load(self, tensors: dict[str, Tensor]) -> None:
@@ -113,11 +113,11 @@ class EMA(Average):
 
 
 class ScheduleFreeAverage(Average):
-    """The average that a schedule-free optimiser makes itself, which it has in its mode of evaluation.
+    """The average that a schedule-free optimiser maintains itself, and shows in its evaluation mode.
 
     Args:
         module: the module that is trained.
-        optimiser: an optimiser of the package schedulefree, in its mode of training.
+        optimiser: an optimiser of the package schedulefree, in its training mode.
     """
 
     COUNTERS = ("k", "weight_sum", "lr_max")
@@ -128,7 +128,7 @@ class ScheduleFreeAverage(Average):
         self.optimiser = optimiser
 
     def update(self, steps: int) -> None:
-        """Do nothing: the optimiser's step has."""
+        """Do nothing: the optimiser's step has updated the average."""
 
     def put_in_place(self) -> None:
         """Put the average into the module."""
@@ -136,9 +136,9 @@ class ScheduleFreeAverage(Average):
 
     @contextlib.contextmanager
     def in_place(self) -> Iterator[None]:
-        """Give the module the average within the context; then the last step's weights, to the bit.
+        """Give the module the average within the context, then back the last step's weights, bit for bit.
 
-        The optimiser can go back to them by itself, but not to the bit.
+        The optimiser can restore the last step's weights by itself, but not bit for bit.
         """
         with super().in_place():
             yield

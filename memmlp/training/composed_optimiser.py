@@ -22,7 +22,7 @@ class ComposedOptimiser(Optimizer):
         self._share()
 
     def _share(self) -> None:
-        """Let the parts have the groups and the state of the whole, not copies."""
+        """Make the parts use the whole's groups and state themselves, not copies."""
         start = 0
         for part in self.parts:
             end = start + len(part.param_groups)
@@ -31,11 +31,11 @@ class ComposedOptimiser(Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> None:  # type: ignore[override]
-        """Take a step of each part. There is no closure."""
+        """Take a step of each part; a closure is not supported."""
         for part in self.parts:
             part.step()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Load groups and state of all parts."""
+        """Load the groups and the state of all parts."""
         super().load_state_dict(state_dict)
         self._share()

@@ -33,7 +33,7 @@ class StepResult:
 
     Attributes:
         loss: the loss, a scalar.
-        terms: its unweighted terms by name.
+        terms: the loss's unweighted terms by name.
         clips: indices of the clips (B,) that the batch came from.
     """
 
@@ -43,15 +43,15 @@ class StepResult:
 
 
 class TrainingTask(Protocol):
-    """What the loop trains: a module with its loss and data."""
+    """What the loop trains: a module with a loss and data."""
 
     @property
     def module(self) -> nn.Module:
-        """All parameters and buffers that a checkpoint must hold."""
+        """The module whose parameters and buffers a checkpoint must hold."""
 
     @property
     def dataset(self) -> MotionDataset:
-        """The training part."""
+        """The training part of the dataset."""
 
     def parameter_groups(self) -> list[dict]:
         """Return the optimiser's parameter groups."""
@@ -60,7 +60,7 @@ class TrainingTask(Protocol):
         """Compute the loss of a training step."""
 
     def report(self) -> dict[str, float]:
-        """Return values to log beside the loss terms."""
+        """Return values to log besides the loss terms."""
 
     def validate(self) -> dict[str, float]:
         """Compute the metrics on the validation part."""
@@ -75,7 +75,7 @@ Watch = Callable[[int, dict[str, float]], None]
 
 
 def unwatched(step: int, values: dict[str, float]) -> None:
-    """Do nothing, so that the training runs to its end."""
+    """Do nothing after a validation, so that the training runs to its end."""
 
 
 def train(
@@ -96,7 +96,7 @@ def train(
 
     Raises:
         TrainingDiverged: if the loss is NaN or infinite.
-        InputError: if several processes can't train the task as one would.
+        InputError: if several processes can't train the task with the same result as one.
     """
     check_divisible(task, optim, description)
     optimiser = optim.build(task.parameter_groups())
@@ -121,7 +121,7 @@ def train(
 
 
 def check_divisible(task: TrainingTask, optim: Optim, description: str) -> None:
-    """Raise InputError if shares of a batch, one for each process, don't add up to what one process does."""
+    """Raise InputError if a batch shared by several processes does not give the same step as on one."""
     count = distributed.size()
     if optim.batch % count:
         raise InputError(
@@ -157,7 +157,7 @@ def train_step(task: TrainingTask, optim: Optim, optimiser: torch.optim.Optimize
 
 
 def of_whole_batch(result: StepResult) -> StepResult:
-    """Return the loss, terms and clips of the whole batch, of which this process may have a share."""
+    """Return the loss, terms and clips of the whole batch, which several processes may share."""
     if not distributed.shared():
         return result
     terms = torch.stack([result.loss, *result.terms.values()])
@@ -186,14 +186,19 @@ def record(
     result: StepResult,
     count: Count,
 ) -> dict[str, float]:
-    """Log and show a finished step, and validate if it is time.
+    """Log and show a finished step, and validate if a validation is due.
 
     Args:
+        task: what is trained.
+        optim: the intervals.
+        average: says which weights count.
+        run: the run whose log takes the values.
         step: how many steps are finished.
+        result: what the step computed.
         count: shows how far the training is.
 
     Returns:
-        The validation's values, empty where there was none.
+        The validation's values, empty where there was no validation.
     """
     last = step == optim.steps
     if step % optim.log_every == 0 or last:
@@ -210,7 +215,7 @@ def record(
 
 
 def validate(task: TrainingTask, average: Average) -> dict[str, float]:
-    """Return the task's validation of the weights that count."""
+    """Validate the weights that count, and return the task's values."""
     task.module.eval()
     with average.in_place(), during("validation"):
         return task.validate()
@@ -224,10 +229,10 @@ def save(
     step: int,
     seconds: float,
 ) -> None:
-    """Write a checkpoint with all that a later process needs to go on after `step` steps.
+    """Write a checkpoint with everything that a later process needs to go on after `step` steps.
 
-    Of several processes the first one writes, and the others go on with its weights. `seconds` is how long
-    the steps took.
+    Of several processes the first one writes, and the others go on with its weights. `seconds` is the time
+    that all steps took.
     """
     distributed.align(task.module)
     if not distributed.first():
@@ -242,7 +247,7 @@ def save(
 def resume(
     task: TrainingTask, optimiser: torch.optim.Optimizer, average: Average, run: Run
 ) -> tuple[int, float]:
-    """Load the run's checkpoint, if there is one; return how many steps are finished, and their seconds."""
+    """Load the run's checkpoint, if any; return the number of finished steps, and the seconds they took."""
     found = checkpoint.read(run.checkpoint) if distributed.first() and run.checkpoint.exists() else None
     found = distributed.of_first(found)
     if found is None:

@@ -1,6 +1,6 @@
 """How a module is optimised: optimiser, steps, batches, learning rates, precision, averaged weights.
 
-Slot `optim`: Optim (AdamW), Muon, ScheduleFree.
+The classes of the slot `optim` are Optim (AdamW), Muon and ScheduleFree.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ class Optim:
 
     Attributes:
         steps: number of training steps.
-        batch: windows (of a VQ-VAE: frames) a step.
+        batch: windows per step; for a VQ-VAE, frames per step.
         lr: learning rate at the start.
         final_lr: learning rate at the end of the schedules "step" and "cosine".
         schedule: "step" (falls to `final_lr` at the fraction `drop_at` of the steps), "cosine", or
             "milestones" (times 0.2 at 20, 50 and 70 % of the steps, App. A).
         drop_at: see `schedule`.
-        warmup: over how many steps the learning rate first grows, in equal parts; 0 for none.
+        warmup: over how many first steps the learning rate grows, in equal parts; 0 for no warm-up.
         ema: decay of an exponential moving average of the weights, which is what is validated and kept; None
             for the weights of the last step.
         weight_decay: weight decay.
@@ -71,20 +71,24 @@ class Optim:
     log_every: int = 50
 
     def at(self, lr: float | None) -> Self:
-        """Return the same at another first learning rate, the last one in proportion; None for the same."""
+        """Return this optimisation with another learning rate at the start, and the final one in proportion.
+
+        Args:
+            lr: learning rate at the start; None to change nothing.
+        """
         return self if lr is None else replace(self, lr=lr, final_lr=self.final_lr * lr / self.lr)
 
     def factor(self, step: int) -> float:
-        """Return the learning rate at a step as a fraction of the first one."""
+        """Return the learning rate at a step as a fraction of the learning rate at the start."""
         course = SCHEDULES[self.schedule](step / self.steps, self.final_lr / self.lr, self.drop_at)
         return self.warm(step) * course
 
     def warm(self, step: int) -> float:
-        """Return the part of its learning rate that a step has: less than 1 in the warm-up."""
+        """Return the fraction of its learning rate that a step gets: less than 1 during the warm-up."""
         return min(1.0, (step + 1) / self.warmup) if self.warmup else 1.0
 
     def check_installed(self) -> None:
-        """Raise InputError where the optimiser's library is not there."""
+        """Raise InputError if the optimiser's library is not installed."""
 
     def build(self, groups: list[dict]) -> torch.optim.Optimizer:
         """Make the optimiser over parameter groups; a group's own `lr` and `weight_decay` take precedence."""
@@ -92,7 +96,7 @@ class Optim:
         return kind(groups, lr=self.lr, weight_decay=self.weight_decay, betas=self.betas, fused=True)
 
     def average(self, module: nn.Module, optimiser: torch.optim.Optimizer) -> Average:
-        """Make what says which weights of the module count."""
+        """Make the object that says which weights of the module count."""
         return EMA(module, self.ema) if self.ema else LastWeights(module)
 
 
@@ -100,24 +104,26 @@ class Optim:
 class Muon(Optim):
     """Optimised by Muon for matrices, and by AdamW for all other parameters (Jordan et al. 2024).
 
-    Muon's steps have the length that AdamW's typically have (Liu et al. 2025), so that AdamW's learning rates
-    and weight decay fit both. It is torch.optim.Muon, which multiplies matrices in bfloat16.
+    Muon's steps are scaled to the typical length of AdamW's steps (Liu et al. 2025), so that AdamW's learning
+    rates and weight decay fit both. The implementation is torch.optim.Muon, which multiplies matrices in
+    bfloat16.
 
     Attributes:
-        momentum: Muon's momentum, of Nesterov's kind.
-        rest_lr: learning rate at the start of what is no matrix; None for `lr`. It has the same schedule.
+        momentum: Muon's momentum, which is Nesterov momentum.
+        rest_lr: learning rate at the start for parameters that are not matrices, with the same schedule; None
+            for `lr`.
     """
 
     momentum: float = 0.95
     rest_lr: float | None = None
 
     def check_installed(self) -> None:
-        """Raise InputError where torch has no Muon."""
+        """Raise InputError if torch has no Muon."""
         if not hasattr(torch.optim, "Muon"):
             raise InputError(f"optim=muon: torch {torch.__version__} has no Muon; allowed is 2.9 or newer")
 
     def build(self, groups: list[dict]) -> torch.optim.Optimizer:
-        """Make both optimisers as one; a group's own `lr` and `weight_decay` take precedence."""
+        """Make both optimisers as one; a parameter group's own `lr` and `weight_decay` take precedence."""
         self.check_installed()
         matrices, rest = _split(groups)
         parts: list[torch.optim.Optimizer] = []
@@ -137,10 +143,10 @@ class Muon(Optim):
 
 @dataclass(frozen=True)
 class ScheduleFree(Optim):
-    """Optimised by schedule-free AdamW (Defazio et al. 2024), of the package schedulefree.
+    """Optimised by schedule-free AdamW (Defazio et al. 2024) of the package schedulefree.
 
     It averages the weights itself and has no schedule but the warm-up: `schedule`, `final_lr`, `drop_at` and
-    `ema` do nothing.
+    `ema` have no effect.
     """
 
     def factor(self, step: int) -> float:
@@ -148,7 +154,7 @@ class ScheduleFree(Optim):
         return self.warm(step)
 
     def check_installed(self) -> None:
-        """Raise InputError where the package is not there."""
+        """Raise InputError if the package is not installed."""
         if find_spec("schedulefree") is None:
             raise InputError(
                 "optim=schedule_free: needs the package schedulefree; pip install 'memmlp[schedulefree]'"
@@ -164,12 +170,12 @@ class ScheduleFree(Optim):
         return optimiser
 
     def average(self, module: nn.Module, optimiser: torch.optim.Optimizer) -> Average:
-        """Make what shows the optimiser's own average."""
+        """Make the object that says which weights count: the optimiser's own average."""
         return ScheduleFreeAverage(module, optimiser)
 
 
 def _split(groups: list[dict]) -> tuple[list[dict], list[dict]]:
-    """Divide parameter groups into those of matrices and those of all else; none is empty."""
+    """Divide parameter groups into groups of matrices and groups of all other parameters; none is empty."""
     parts: tuple[list[dict], list[dict]] = ([], [])
     for group in groups:
         for chosen, matrices in zip(parts, (True, False), strict=True):
@@ -186,7 +192,7 @@ def vqvae_optim(
     checkpoint_every: int = Optim.checkpoint_every,
     log_every: int = Optim.log_every,
 ) -> Optim:
-    """Return how a VQ-VAE is optimised: Adam, its rate times 0.2 at 20, 50 and 70 % of the steps (App. A).
+    """Return a VQ-VAE's optimisation: Adam, its rate times 0.2 at 20, 50 and 70 % of the steps (App. A).
 
     Validation is done once, at the end.
     """

@@ -1,7 +1,7 @@
 """The rollout slot: how the history that a training step sees is made.
 
-A network trained on true history alone relies on what is not there at run time (exposure bias), so the
-history may be made by the network itself, as it will be live.
+A network that is trained on true history alone comes to rely on it, but has none at run time (exposure bias).
+So the history may be made by the network itself, as it will be in a live stream.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ class Call(NamedTuple):
 
     Attributes:
         sparse: world inputs (B, n, 54) of the new frames.
-        state: the state before them.
+        state: the state before the new frames.
         truth: world frames [X | Theta] (B, T, 252) of the window.
-        clips: indices of the clips (B,) that they are from.
+        clips: indices of the clips (B,) that the frames are from.
     """
 
     sparse: Tensor
@@ -37,25 +37,25 @@ class Call(NamedTuple):
 class Rollout(nn.Module):
     """The rollout slot's interface.
 
-    Where several processes share a batch, each draws the call of its own rows (memmlp.common.distributed).
+    Where several processes share a batch, each draws the call for its own rows (memmlp.common.distributed).
     """
 
     def begin(self, model: MotionModel) -> None:
-        """Make room for what is kept between the training steps of a network; here nothing is kept."""
+        """Make room for what is kept between a network's training steps; by default nothing is kept."""
 
     def draw(self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
-        """Draw the call of a training step."""
+        """Draw the training call of a step."""
         raise NotImplementedError
 
     def keep(self, state: State) -> None:
-        """Keep what is needed of the state after the trained call; here nothing is kept."""
+        """Keep what is needed of the state after the training call; by default nothing is kept."""
 
 
 class TeacherForcing(Rollout):
-    """The true motion as history: the paper's training (Sec. 3.2.1)."""
+    """A rollout with the true motion as history: the paper's training (Sec. 3.2.1)."""
 
     def draw(self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
-        """Draw the call of a training step."""
+        """Draw the training call of a step."""
         clips, end = map(distributed.own_rows, sampler.draw(step))
         past, stride = model.length, model.stride
         segment = dataset.segments(clips, end, past + stride)
@@ -64,7 +64,7 @@ class TeacherForcing(Rollout):
 
 
 class OwnPredictions(Rollout):
-    """The network's own history, made by 0 to `max_passes` calls without gradient before the trained one.
+    """A rollout with the network's own history, made by 0 to `max_passes` calls without gradients beforehand.
 
     The first of these calls sees an empty history. All samples of a step take the same number of calls.
     """
@@ -74,7 +74,7 @@ class OwnPredictions(Rollout):
         self.max_passes = max_passes
 
     def draw(self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
-        """Draw the call of a training step, after the calls that make its history."""
+        """Draw the training call of a step, after the calls that make its history."""
         clips, end = map(distributed.own_rows, sampler.draw(step))
         past, stride = model.length, model.stride
         passes = int(torch.randint(self.max_passes + 1, ())) if model.shift else 0
@@ -94,17 +94,17 @@ class OwnPredictions(Rollout):
 class PersistentStreams(Rollout):
     """Many streams that run through the clips during the whole training, each on its own history.
 
-    Every step takes the next `batch` of the streams one stride further. A stream begins somewhere in a clip;
-    when it reaches the clip's end it starts afresh at the beginning of another, so that every window is seen
-    as often as the sampler says. The streams' states are part of the checkpoint.
+    Every step moves the next `batch` streams on by one stride. A stream begins somewhere in a clip; when it
+    reaches the clip's end, it starts afresh at the beginning of another clip, so that every window is seen as
+    often as the sampler says. The streams' states are part of the checkpoint.
 
     Args:
         streams: number of streams.
 
     Attributes:
         clip: index of each stream's clip (streams,).
-        end: its newest frame in that clip (streams,).
-        lives: whether it has started (streams,).
+        end: index of each stream's newest frame in that clip (streams,).
+        lives: whether each stream has started (streams,).
     """
 
     clip: Tensor
@@ -124,7 +124,7 @@ class PersistentStreams(Rollout):
             self.register_buffer(f"state_{name}", tensor.repeat(self.streams, *[1] * (tensor.dim() - 1)))
 
     def draw(self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
-        """Draw the call of a training step: the next streams, each one stride further."""
+        """Draw the training call of a step: the next streams, each moved on by one stride."""
         clips, end = sampler.draw(step)
         who = (step * len(clips) + torch.arange(len(clips), device=clips.device)) % self.streams
         again = sampler.draw_beginnings(step, model.stride)
@@ -144,6 +144,6 @@ class PersistentStreams(Rollout):
         return Call(segment[:, past:, :SPARSE_DIM], state, segment[:, -model.frames :], self.clip[mine])
 
     def keep(self, state: State) -> None:
-        """Keep the streams' states after the trained call."""
+        """Keep the streams' states after the training call."""
         for name, tensor in state.items():
             self.get_buffer(f"state_{name}")[self.who] = distributed.whole(tensor.detach())

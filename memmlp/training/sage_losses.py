@@ -1,6 +1,6 @@
 """The losses of SAGE-Net's VQ-VAEs and diffusion models (Feng et al., CVPR 2024), as released.
 
-Each is of world windows (B, T, 252), and says what is hidden of them in training.
+Each loss is computed on world windows (B, T, 252), and hides some of their joints in training.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ Objective = Callable[[Tensor, bool], dict[str, Tensor]]
 
 
 def objective(kind: str, halves: nn.ModuleDict) -> Objective:
-    """Return what a part is trained by.
+    """Return the objective that trains a part.
 
     Args:
-        kind: one of PARTS, but the decoder.
+        kind: one of PARTS, except "decoder".
         halves: the network ("net"), and the VQ-VAE of each half ("upper", "lower").
     """
     half, of = kind.split("_")
@@ -42,10 +42,10 @@ def objective(kind: str, halves: nn.ModuleDict) -> Objective:
 
 
 def code_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool) -> dict[str, Tensor]:
-    """Return the losses of a VQ-VAE: of its last frame's rotations and joints, and of its codebooks.
+    """Return the losses of a VQ-VAE: of the last frame's rotations and joints, and of its codebooks.
 
-    In training it has to guess joints of its half other than the first. The half with the hands has a loss of
-    theirs, too.
+    In training, random joints of its half except the first are hidden, so that the VQ-VAE has to guess them.
+    The half with the hands has a loss of the hands' positions, too.
 
     Args:
         net: the network, whose space the VQ-VAE works in.
@@ -69,12 +69,12 @@ def half_errors(
 ) -> dict[str, Tensor]:
     """Return errors of a half's rotations and of its joints by forward kinematics (smooth L1).
 
-    A half has all that its joints hang on, so that the other joints' rotations don't matter.
+    A half contains all ancestors of its joints, so the other joints' rotations do not matter.
 
     Args:
         net: the network, whose space the rotations are in.
         joints: the half's joints.
-        made: its predicted rotations (B, J, 6).
+        made: the half's predicted rotations (B, J, 6).
         frame: world frames (B, 252).
         true: the true rotations (B, 22, 6) of all joints.
     """
@@ -98,7 +98,7 @@ def half_errors(
 
 
 def upper_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool) -> dict[str, Tensor]:
-    """Return the error of the upper half's latents (smooth L1); for the arguments see `code_losses`."""
+    """Return the error of the upper half's latents (smooth L1); see `code_losses` for the arguments."""
     rotation, encoded = seen(net, frames)
     clean = latents(codes, rotation, encoded)
     if not training:
@@ -108,7 +108,7 @@ def upper_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool)
 
 
 def lower_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool) -> dict[str, Tensor]:
-    """Return the error of the lower half's latents (smooth L1), given the upper ones as they are sampled."""
+    """Return the error of the lower half's latents (smooth L1), given sampled latents of the upper half."""
     rotation, encoded = seen(net, frames)
     clean = latents(codes, rotation, encoded)
     with torch.no_grad():
@@ -131,13 +131,13 @@ def seen(net: SAGENet, frames: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def latents(codes: HalfVQVAE, rotation: Tensor, encoded: Tensor) -> Tensor:
-    """Return a finished VQ-VAE's latents (B, T // 2, 384) of rotations (B, T, 132) and inputs (B, T, 54)."""
+    """Return a trained VQ-VAE's latents (B, T // 2, 384) of rotations (B, T, 132) and inputs (B, T, 54)."""
     assert not codes.training
     return codes.encode(rotation, encoded)[0]
 
 
 def noised(net: SAGENet, clean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return noisy latents (B, T // 2, 384) of times (B,) drawn for each, and hidden joints (B, 22)."""
+    """Return noisy latents (B, T // 2, 384), their random times (B,), and random hidden joints (B, 22)."""
     time = distributed.drawn(net.diffusion.random_times, clean)
     noisy = net.diffusion.noised(clean, time, distributed.drawn(torch.randn_like, clean))
     drawn = distributed.drawn(lambda like: torch.rand_like(like[:, 0, :HIDDEN_COUNT]), clean) * N_JOINTS

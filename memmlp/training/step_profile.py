@@ -1,4 +1,4 @@
-"""Where the time of a training step goes on a CPU, by torch's profiler."""
+"""Where the time of a training step goes on a CPU, measured by torch's profiler."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ torch.compile made.
 
 
 def step_parts(take: Callable[[int], None], steps: int) -> dict[str, float]:
-    """Return how long each of PARTS takes of a step, milliseconds; together they are a profiled step.
+    """Return how long each of PARTS takes in a step, in milliseconds; they add up to a profiled step.
 
-    The profiler itself takes time for each operation, so that a step is longer than without it; matrix
-    products, which are few and long, have the least of that.
+    The profiler itself takes time for each operation, so a profiled step is longer than another one. Matrix
+    products, which are few and long, are affected least.
 
     Args:
-        take: takes so many training steps.
-        steps: how many to profile.
+        take: takes the given number of training steps.
+        steps: how many steps to profile.
     """
     with profile(activities=[ProfilerActivity.CPU]) as profiled, record_function("steps"):
         take(steps)
@@ -48,7 +48,7 @@ def step_parts(take: Callable[[int], None], steps: int) -> dict[str, float]:
 
 
 def _part(event: Any) -> str:
-    """Return the part that an event's own time belongs to."""
+    """Return the part to which an event's own time belongs."""
     inside, above = [event.name], event.cpu_parent
     while above is not None:
         inside.append(above.name)

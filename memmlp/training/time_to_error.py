@@ -1,4 +1,4 @@
-"""How soon trainings reach an error: several of them in turn, so that a busy machine is fair to all."""
+"""How soon trainings reach an error: several trainings take turns, so that a busy machine slows all alike."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from memmlp.training.optim import Optim
 
 
 class Validation(NamedTuple):
-    """What was known at a validation.
+    """The state of a training at a validation.
 
     Attributes:
-        steps: how many steps were taken.
-        seconds: the processor's time that these steps took, seconds; validations don't count.
+        steps: how many steps had been taken.
+        seconds: processor time of these steps, in seconds, without validations.
         error: the validation's error.
     """
 
@@ -25,11 +25,11 @@ class Validation(NamedTuple):
 
 
 class Learner:
-    """A training in memory that goes on piece by piece. Its steps are those of `memmlp.training.loop.train`.
+    """A training in memory that runs piece by piece, with the same steps as `memmlp.training.loop.train`.
 
     Args:
         task: what to train.
-        optim: steps and learning rates; its intervals do nothing.
+        optim: steps and learning rates; its intervals have no effect.
         seed: the seed of all steps.
         error: the name of the error among the task's validation values.
     """
@@ -43,11 +43,11 @@ class Learner:
 
     @property
     def done(self) -> bool:
-        """Whether all steps were taken."""
+        """Whether all steps have been taken."""
         return self.steps >= self.optim.steps
 
     def take(self, steps: int) -> None:
-        """Take so many steps, no more than are left."""
+        """Take the given number of steps, or as many as are left."""
         start = time.process_time()
         for step in range(self.steps, min(self.steps + steps, self.optim.steps)):
             seed_step(self.seed, step)
@@ -57,16 +57,16 @@ class Learner:
         self.seconds += time.process_time() - start
 
     def advance(self, steps: int) -> None:
-        """Take so many steps, no more than are left, and validate."""
+        """Take the given number of steps, or as many as are left, and validate."""
         self.take(steps)
         error = validate(self.task, self.average)[self.error]
         self.validations.append(Validation(self.steps, self.seconds, error))
 
 
 def in_turn(learners: Sequence[Learner], every: int) -> Iterator[int]:
-    """Train all to their ends in pieces of `every` steps, each after the other, and yield a piece's steps.
+    """Train all learners to their ends, in turn, in pieces of `every` steps; yield each piece's steps.
 
-    The order is turned round after each turn, so that none is always the first.
+    The order is reversed after each round, so that no learner is always the first.
     """
     order = list(learners)
     while unfinished := [one for one in order if not one.done]:

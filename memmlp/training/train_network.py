@@ -35,13 +35,13 @@ class NetworkTraining:
     """How a motion network is trained.
 
     Attributes:
-        seed: seed of its weights, batches and rollouts.
+        seed: seed of the weights, batches and rollouts.
         loss: makes the loss, given the network's branches.
         rollout: makes the history that the network is trained on.
         optim: steps, learning rates and intervals.
         weighting: how training windows are drawn, "frames" or "clips" (see WindowSampler).
-        shares: how often a window is of each source (see WindowSampler).
-        metrics: metrics of one's own, measured at validations.
+        shares: the share of windows drawn from each source (see WindowSampler).
+        metrics: custom metrics, measured at validations.
         mirror: whether half of the training windows are mirrored (see MirroredDataset).
     """
 
@@ -63,12 +63,13 @@ class NetworkTraining:
         device: torch.device,
         watch: Watch = unwatched,
     ) -> MotionModel:
-        """Train a network, from the run's checkpoint if there is one, and write its weights.
+        """Train a network, from the run's checkpoint if there is one, and write the network's weights.
 
         Args:
             architecture: builds the network.
             data: the prepared motion.
-            upstream: weights that it builds upon, of a frozen VQ-VAE for one; None for none.
+            upstream: file of the weights that the network builds upon, such as a frozen VQ-VAE's; None for
+                none.
             run: the run whose folder takes checkpoints, log and weights.
             device: the device to train on.
             watch: called after each validation; see `memmlp.training.loop.train`.
@@ -106,7 +107,7 @@ class NetworkTraining:
 
 
 class MotionTask:
-    """The training task of a motion network: its loss, over a history that the rollout makes."""
+    """The training task of a motion network: its loss, on the history that the rollout makes."""
 
     def __init__(
         self,
@@ -127,7 +128,7 @@ class MotionTask:
         self._validate = validate
 
     def parameter_groups(self) -> list[dict]:
-        """Return the model's trainable parameters and the loss weighting's own."""
+        """Return the model's trainable parameters and those of the loss weighting."""
         trained = [p for p in self.model.parameters() if p.requires_grad]
         return [{"params": trained}, *self.loss.weighting.parameter_groups()]
 

@@ -1,4 +1,4 @@
-"""The stage that trains a refiner, on what a finished network streams."""
+"""The stage that trains a refiner, on the motion that a finished network streams."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ TOGETHER = 64  # pieces that the network streams through side by side
 
 
 def sage_loss() -> Loss:
-    """Return the loss that SAGE-Net's refiner is trained with, of the library's terms."""
+    """Return the loss that SAGE-Net's refiner is trained with, made from the library's terms."""
     return TermsLoss(
         "smooth",
         orientation=0.01,
@@ -47,13 +47,13 @@ class RefinerTraining:
     """How a refiner is trained.
 
     Attributes:
-        seed: seed of its weights, pieces and batches.
-        refiner: says which pieces.
-        optim: steps, learning rates and intervals; a batch is of pieces.
+        seed: seed of the weights, pieces and batches.
+        refiner: says how many pieces are drawn, and how long they are.
+        optim: steps, learning rates and intervals; a batch consists of pieces.
         weighting: how pieces are drawn, "frames" or "clips" (see WindowSampler).
-        shares: how often a piece is of each source (see WindowSampler).
+        shares: the share of pieces drawn from each source (see WindowSampler).
         mirror: whether half of the pieces are mirrored (see MirroredDataset).
-        metrics: metrics of one's own, measured at validations.
+        metrics: custom metrics, measured at validations.
     """
 
     seed: int
@@ -73,12 +73,12 @@ class RefinerTraining:
         device: torch.device,
         watch: Watch = unwatched,
     ) -> MotionModel:
-        """Train a refiner, from the run's checkpoint if there is one, and write the weights of both.
+        """Train a refiner, from the run's checkpoint if there is one, and write it together with its network.
 
         Args:
             architecture: builds the network with its refiner.
             data: the prepared motion.
-            upstream: weights of the finished network.
+            upstream: file of the weights of the finished network.
             run: the run whose folder takes checkpoints, log and weights.
             device: the device to train on.
             watch: called after each validation; see `memmlp.training.loop.train`.
@@ -108,7 +108,7 @@ class RefinerTraining:
         return model.eval()
 
     def drawn(self, dataset: MotionDataset) -> tuple[Tensor, Tensor]:
-        """Draw the pieces: frames (P, n, 252), and the indices (P,) of the clips that they are from."""
+        """Draw the pieces: frames (P, n, 252), and the indices (P,) of the clips that they come from."""
         pieces = WindowSampler(
             dataset, self.refiner.pieces, self.refiner.frames, self.seed, self.weighting, self.shares
         )
@@ -117,7 +117,7 @@ class RefinerTraining:
 
 
 class RefinerTask:
-    """The training task of a refiner: its loss on pieces that the network streamed through."""
+    """The training task of a refiner: its loss on pieces for which the network's stream is known."""
 
     def __init__(
         self,
@@ -149,10 +149,10 @@ class RefinerTask:
         return StepResult(loss, terms, self.clips[drawn])
 
     def report(self) -> dict[str, float]:
-        """Return nothing to log beside the loss terms."""
+        """Return nothing: no values are logged besides the loss terms."""
         return {}
 
 
 def streamed(network: MotionModel, pieces: Tensor) -> list[Tensor]:
-    """Return the motion (n, 198) that a network streams of each piece (P, n, 252)."""
+    """Return the motion (n, 198) that a network streams for each piece (P, n, 252)."""
     return modes.predict(network, list(pieces), "stream", TOGETHER)

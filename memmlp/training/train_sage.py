@@ -1,8 +1,8 @@
-"""What is trained before SAGE-Net as a whole, as its authors do (Feng et al., CVPR 2024): its parts, in turn.
+"""How SAGE-Net's parts are trained, one after the other, before the whole network (Feng et al., CVPR 2024).
 
-A VQ-VAE of each half of the body, the diffusion model of the upper half's latents, that of the lower half's
-given the upper ones that the first predicts, and the decoder of what both predict. Each is a run of its own,
-whose file holds what was trained so far. Parts that are finished stay as they are.
+The parts are a VQ-VAE for each half of the body, the diffusion model of the upper half's latents, that of the
+lower half's latents given the upper latents that the first model predicts, and the decoder of what both
+predict. Each part is a run of its own, whose file holds all parts trained so far. Finished parts stay frozen.
 """
 
 from __future__ import annotations
@@ -50,24 +50,24 @@ ACTING: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class DroppingOptim(Optim):
-    """AdamW whose learning rate falls at some steps.
+    """AdamW with a learning rate that falls at some steps.
 
     Attributes:
-        drops: fractions of the steps at which it falls.
-        drop: by which it is multiplied there.
+        drops: fractions of the steps at which the learning rate falls.
+        drop: factor by which it is multiplied at each of them.
     """
 
     drops: Sequence[float] = ()
     drop: float = 1.0
 
     def factor(self, step: int) -> float:
-        """Return the learning rate at a step as a fraction of the first one."""
+        """Return the learning rate at a step as a fraction of the learning rate at the start."""
         return self.drop ** sum(step >= at * self.steps for at in self.drops)
 
 
 @dataclass(frozen=True)
 class SAGEUpstream:
-    """How long, and at which learning rates, each part is trained: steps, batch, lr, drops and drop."""
+    """The steps, batch, lr, drops and drop with which each part is trained."""
 
     upper_codes: Mapping[str, Any]
     lower_codes: Mapping[str, Any]
@@ -76,11 +76,11 @@ class SAGEUpstream:
     decoder: Mapping[str, Any]
 
     def trainings(self, config: Mapping[str, Any], network: NetworkTraining) -> Iterator[PartTraining]:
-        """Yield how each part is trained, in order.
+        """Yield the training of each part, in order.
 
         Args:
             config: the resolved config of the whole network.
-            network: how that is trained; windows are drawn alike for its parts.
+            network: how the whole network is trained; windows are drawn in the same way for its parts.
         """
         same = ("checkpoint_every", "log_every", "precision")
         often = {name: getattr(network.optim, name) for name in same}
@@ -93,7 +93,7 @@ class SAGEUpstream:
 
 
 def acting(kind: str, config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the part of a network's config that determines the result of training a part of it."""
+    """Return those keys of a network's config that determine the result of training one of its parts."""
     upstream = {key: config["upstream"][key] for key in ("name", "_target_", kind)}
     own = {key: config[key] for key in ("profile", "data", "frame", "seed")}
     own |= {"loss": config["loss"]} if kind == "decoder" else {}
@@ -121,7 +121,7 @@ class PartTraining:
 
     @property
     def told(self) -> str:
-        """What is done, in words."""
+        """What the training does, in words."""
         return f"{self.kind.replace('_', ' ')}: train it for {self.network.optim.steps} steps"
 
     def train(
@@ -132,17 +132,17 @@ class PartTraining:
         run: Run,
         device: torch.device,
     ) -> dict[str, float]:
-        """Train the part, from the run's checkpoint if there is one, and write it beside those before it.
+        """Train the part, from the run's checkpoint if there is one, and write it with the parts before it.
 
         Args:
             architecture: builds the whole network.
             data: the prepared motion.
-            upstream: weights of the parts that were trained before; None for the first one.
+            upstream: file of the parts that were trained before; None for the first part.
             run: the run whose folder takes checkpoints, log and weights.
             device: the device to train on.
 
         Returns:
-            Its errors on windows of the validation part.
+            The part's errors on windows of the validation part.
         """
         before, dataset = checkpoint.read(upstream)[0] if upstream else {}, data.open("train").to(device)
         torch.manual_seed(self.network.seed)
@@ -165,7 +165,7 @@ class PartTraining:
 
 @dataclass(frozen=True)
 class DecoderTraining(PartTraining):
-    """How the decoder is trained, on what the finished diffusion models predict: as the whole network is."""
+    """How the decoder is trained: like the whole network, on what the finished diffusion models predict."""
 
     def train(
         self,
@@ -175,7 +175,7 @@ class DecoderTraining(PartTraining):
         run: Run,
         device: torch.device,
     ) -> dict[str, float]:
-        """Train the decoder and write it with the diffusion models; see PartTraining."""
+        """Train the decoder and write it together with the diffusion models; see PartTraining."""
         assert isinstance(architecture, PartedArchitecture)
         fixed = replace(architecture, finished=("upper", "lower"))
         self.network.train(fixed, data, upstream, run, device)
@@ -183,13 +183,13 @@ class DecoderTraining(PartTraining):
 
 
 def last_errors(run: Run) -> dict[str, float]:
-    """Return the errors of a run's last validation; empty where another process does that."""
+    """Return the errors of a run's last validation; empty in a process that does not validate."""
     found = [entry.values for entry in run.metrics() if entry.phase == "val"]
     return dict(found[-1]) if found else {}
 
 
 class Windows:
-    """Draws the training windows of a part, and those that it is validated on."""
+    """Draws the windows with which a part is trained, and those on which it is validated."""
 
     def __init__(
         self, network: NetworkTraining, dataset: MotionDataset, validation: MotionDataset, frames: int
@@ -201,7 +201,7 @@ class Windows:
         self.validation = validation.segments(*drawn, frames)
 
     def draw(self, step: int) -> tuple[Tensor, Tensor]:
-        """Return the world frames (B, T, 252) of a step's windows, and their clips (B,)."""
+        """Return the world frames (B, T, 252) of a step's windows, and the indices (B,) of their clips."""
         clips, end = map(distributed.own_rows, self.sampler.draw(step))
         return self.dataset.segments(clips, end, self.frames), clips
 
@@ -224,10 +224,10 @@ class PartTask:
         return StepResult(torch.stack(list(terms.values())).sum(), terms, clips)
 
     def report(self) -> dict[str, float]:
-        """Return nothing to log beside the loss terms."""
+        """Return nothing: no values are logged besides the loss terms."""
         return {}
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
-        """Compute the losses on the validation windows, where nothing is hidden and latents are sampled."""
+        """Compute the losses on the validation windows, with no joints hidden and with sampled latents."""
         return {name: float(term) for name, term in self.objective(self.windows.validation, False).items()}

@@ -29,8 +29,8 @@ class VQVAETraining:
 
     Attributes:
         config: the part of the resolved config that determines the result.
-        seed: seed of its weights and batches.
-        optim: returns the optimisation, given the number of training frames.
+        seed: seed of the weights and batches.
+        optim: makes the optimisation, given the number of training frames.
         mirror: whether half of the training frames are mirrored (see MirroredDataset).
     """
 
@@ -51,11 +51,11 @@ class VQVAETraining:
     ) -> dict[str, float]:
         """Train the architecture's VQ-VAE, from the run's checkpoint if there is one, and write its weights.
 
-        It builds upon no run, so that `upstream` is None. For the other arguments see
+        A VQ-VAE builds upon no other run, so `upstream` is None. For the other arguments see
         `NetworkTraining.train`.
 
         Returns:
-            Its errors on the validation frames.
+            The VQ-VAE's errors on the validation frames.
         """
         dataset, validation = (data.open(split).to(device) for split in ("train", "val"))
         torch.manual_seed(self.seed)
@@ -71,8 +71,9 @@ class VQVAETraining:
 
 
 class VQVAETask:
-    """The training task of a VQ-VAE (App. A): Eq. 1 on the reconstructed rotations plus the codebook's
-    loss.
+    """The training task of a VQ-VAE (App.
+
+    A): Eq. 1 on the reconstructed rotations, and the codebook's loss.
     """
 
     def __init__(
@@ -102,7 +103,7 @@ class VQVAETask:
         return StepResult(torch.stack(list(terms.values())).sum(), terms, clips)
 
     def report(self) -> dict[str, float]:
-        """Return the perplexity of the step's codes: how many are in use, by the entropy of their counts."""
+        """Return the perplexity of the step's codes, the exponential of the entropy of their counts."""
         return {"perplexity": perplexity(self.used)}
 
     @torch.no_grad()
@@ -116,6 +117,6 @@ class VQVAETask:
 
 
 def perplexity(counts: Tensor) -> float:
-    """Return the exponential of the entropy of counts (K,): K if all are equal, 1 if only one is not 0."""
+    """Return the exponential of the entropy of counts (K,): K if all are equal, 1 if just one is not 0."""
     share = counts / counts.sum().clamp_min(1)
     return float(torch.special.entr(share).sum().exp())

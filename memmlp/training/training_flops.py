@@ -1,11 +1,11 @@
 """How many operations a training takes.
 
-Counted are the FLOPs of the matrix products of the trained calls, forward and backward, as torch's own
-counter sees them (torch.utils.flop_counter): a multiplication and an addition are two. Of a network whose
-weights are all trained that is close to 3 x 2 x MACs of the forward pass (Kaplan et al. 2020, "Scaling laws
-for neural language models", Sec. 2.1), less the gradients that nobody needs: those of the inputs, and of a
-frozen VQ-VAE. Not counted are the optimiser, what is done element by element, calls without a gradient by
-which a rollout or the network itself makes its history, validations, and runs upstream.
+The count covers the FLOPs of matrix products in training calls, forward and backward, as torch's own counter
+sees them (torch.utils.flop_counter); a multiplication and an addition are two FLOPs. For a network whose
+weights are all trained, this is close to 3 x 2 x MACs of the forward pass (Kaplan et al. 2020, "Scaling laws
+for neural language models", Sec. 2.1), minus the gradients that are not needed: those of the inputs, and of a
+frozen VQ-VAE. It does not cover the optimiser, element-wise operations, calls without gradients by which a
+rollout or the network itself makes its history, validations, or the runs upstream.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ def training_flops(model: MotionModel, loss: Loss, optim: Optim) -> int:
     """Count the FLOPs of a whole training of a network.
 
     Args:
-        model: the network, with any weights, on the CPU; it is not to be used afterwards.
-        loss: its loss, for the branches that it has.
-        optim: how many steps it is trained for, and of how many windows.
+        model: the network, with any weights, on the CPU; do not use it afterwards.
+        loss: the loss for the branches that the network has.
+        optim: says how many steps are taken, and how many windows each has.
     """
     few, more = (step_flops(model, loss, replace(optim, batch=batch, compile=False)) for batch in COUNTED)
     each = (more - few) // (COUNTED[1] - COUNTED[0])
@@ -57,7 +57,7 @@ def step_flops(model: MotionModel, loss: Loss, optim: Optim) -> int:
 
 
 def _with_gradient(count: Callable[..., int]) -> Callable[..., int]:
-    """Return what counts an operation's FLOPs, but none of a call without a gradient."""
+    """Return a function that counts an operation's FLOPs, but not in calls without gradients."""
 
     def counted(*args: Any, **kwargs: Any) -> int:
         return count(*args, **kwargs) if torch.is_grad_enabled() else 0
@@ -70,7 +70,7 @@ _WITH_GRADIENT = {operation: _with_gradient(count) for operation, count in flop_
 
 
 def _frames(model: MotionModel) -> MotionDataset:
-    """Return a clip of random frames that is as long as a training call sees."""
+    """Return a dataset of one clip of random frames, as long as a training call needs."""
     length = model.length + model.stride
     draw = torch.Generator().manual_seed(0)
     frames = torch.randn(length, FRAME_DIM, generator=draw)

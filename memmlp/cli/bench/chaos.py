@@ -1,6 +1,6 @@
 """`memmlp bench chaos` and `chaos-tune`: sweeps and searches whose processes are killed at random.
 
-They must end as undisturbed ones do.
+They must end with the same results as undisturbed ones.
 """
 
 from __future__ import annotations
@@ -129,9 +129,10 @@ def chaos_tune(trials: int, kills: int, seed: int, overrides: tuple[str, ...]) -
 def search_storm(
     trials: int, kills: int, controllers: int, dice: random.Random, overrides: Sequence[str]
 ) -> list[str]:
-    """Run a search under kills, and list what is not as it should be.
+    """Run a search under kills, and list what is wrong afterwards.
 
-    Of several controllers one directs the search; the others are refused, and started again until they can.
+    One of several controllers directs the search; the others are refused, and started again until they
+    succeed.
     """
     with tempfile.TemporaryDirectory() as folder:
         outputs = Path(folder) / "outputs"
@@ -144,7 +145,7 @@ def search_storm(
 
 
 def judge(problems: Sequence[str], what: str) -> None:
-    """Print the problems and a verdict; exit with 1 where there is a problem."""
+    """Print the problems and a verdict; exit with 1 if there are problems."""
     for problem in problems:
         click.echo(problem)
     click.echo(f"{'' if not problems else 'NOT '}{what}: {len(problems)} differences")
@@ -162,7 +163,7 @@ def start(words: Sequence[str], outputs: Path, workers: int) -> subprocess.Popen
 def storm(
     launches: Sequence[Launch], outputs: Path, kills: int, pauses: tuple[float, float], dice: random.Random
 ) -> int:
-    """Keep the processes at work until all have ended well, and kill at random on the way.
+    """Keep the processes running until all have ended well, and kill random ones meanwhile.
 
     A process that was killed, or that ended before all kills were made, is started again.
 
@@ -185,14 +186,14 @@ def storm(
 
 
 def await_release(outputs: Path) -> None:
-    """Wait until workers whose controllers have ended let go of their runs, but not for ever."""
+    """Wait, for a limited time, until workers whose controllers have ended have released their runs."""
     end = time.monotonic() + PATIENCE
     while any(Lock(folder).held for folder in outputs.glob("runs/*/")) and time.monotonic() < end:
         time.sleep(0.1)
 
 
 def choose(processes: Sequence[subprocess.Popen[bytes]], outputs: Path, dice: random.Random) -> int | None:
-    """Choose a process to kill: a controller, or a worker that holds a run. None where there is none."""
+    """Choose a process to kill: a controller, or a worker that holds a run; None if there is none."""
     owners = [Lock(folder).owner for folder in sorted(outputs.glob("runs/*/"))]
     workers = [int(owner["pid"]) for owner in owners if owner and lives(owner)]
     victims = [*(process.pid for process in processes if process.poll() is None), *workers]
@@ -200,7 +201,7 @@ def choose(processes: Sequence[subprocess.Popen[bytes]], outputs: Path, dice: ra
 
 
 def compare(calm: Path, stormy: Path) -> list[str]:
-    """List what is not as it should be in the disturbed sweep's outputs."""
+    """List what is wrong in the disturbed sweep's outputs."""
     expected, found = ({run.id: run for run in list_runs(outputs)} for outputs in (calm, stormy))
     problems = [f"run {name} is missing" for name in expected.keys() - found.keys()]
     problems += [f"run {name} should not be" for name in found.keys() - expected.keys()]
@@ -228,7 +229,7 @@ def check(folder: Path) -> list[str]:
 
 
 def examine(outputs: Path, trials: int) -> list[str]:
-    """List what is not as it should be with a search's trials and runs."""
+    """List what is wrong with a search's trials and runs."""
     (folder,) = (outputs / "tune").iterdir()
     with open(folder / "trials.csv", encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))

@@ -1,4 +1,4 @@
-"""`memmlp bench latency`: each network alone, its step as it was trained, as its stream, in fp16 and int8."""
+"""`memmlp bench latency`: each network alone, and its step as trained and as a stream, fp32, fp16, int8."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     import numpy as np
 
 Timed = tuple[str, str]
-"""A network of MODELS and a graph of VARIANTS."""
+"""A network in MODELS, and a variant in VARIANTS."""
 BASE = ("avatar_poser", "network")
-"""What all steps are compared with: AvatarPoser's network alone, a window of features in, rotations out."""
+"""The step with which all others are compared: AvatarPoser's network alone, from features to rotations."""
 POSE_BASE = ("avatar_poser", "naive")
-"""What all whole poses are compared with: AvatarPoser's."""
+"""The whole pose with which all others are compared: AvatarPoser's."""
 CHECK = ("avatar_poser", "torch")
 """The same layers, written and exported without this project."""
 
@@ -41,7 +41,7 @@ MODELS: dict[str, tuple[str, ...]] = {
     "recurrent_poser": ("model=recurrent_poser",),
 }
 SLOW = ("bodiffusion", "avatar_jlm", "manikin_l", "sage")
-"""Seconds a step, or gigabytes of files: timed where they are asked for."""
+"""Networks with seconds per step, or gigabytes of files, which are timed only if asked for."""
 LOWER = ("fp16", "int8", "int8_blocks")
 DEPLOYED = ("naive", "streaming", *LOWER)
 VARIANTS = ("network", *DEPLOYED)
@@ -142,7 +142,7 @@ def export_all(models: list[str], overrides: tuple[str, ...], folder: Path) -> I
 
 
 def export_independently(overrides: tuple[str, ...], path: Path) -> Path:
-    """Export AvatarPoser of torch's own layers in the config's sizes, and return the file."""
+    """Export an AvatarPoser made of torch's own layers, in the config's sizes, and return the file."""
     from memmlp.cli.bench.stock_avatar_poser import TorchAvatarPoser, export_plainly
     from memmlp.config.compose import composed
 
@@ -153,7 +153,7 @@ def export_independently(overrides: tuple[str, ...], path: Path) -> Path:
 
 
 def calibration_clips() -> list[Any]:
-    """Return one short clip (60, 252) of random frames to calibrate int8 with."""
+    """Return one short clip (60, 252) of random frames, to calibrate int8."""
     import torch
 
     from memmlp.motion.body import FRAME_DIM
@@ -162,7 +162,7 @@ def calibration_clips() -> list[Any]:
 
 
 def timed(paths: dict[Timed, Path], rounds: int, steps: int) -> list[dict[str, Any]]:
-    """Time all files in turn, their steps and then the whole poses of those that make any; see `summary`."""
+    """Time all files in turn: their steps, then the whole poses of those that make any; see `summary`."""
     from memmlp.deploy.latency import time_in_turn
     from memmlp.live.latency import time_poses_in_turn
 
@@ -181,13 +181,13 @@ def summary(prefix: str, seconds: np.ndarray, base: np.ndarray) -> dict[str, flo
     """Summarise a file's times.
 
     Args:
-        prefix: what the keys begin with.
+        prefix: the beginning of the keys.
         seconds: the time of each step (rounds, steps).
-        base: the time of each step of what it is compared with (rounds, steps).
+        base: the time of each step of the file with which it is compared (rounds, steps).
 
     Returns:
-        Median and 95th percentile in milliseconds; the median, least and most over the rounds of the ratio of
-        both medians.
+        Median and 95th percentile in milliseconds; and the median, minimum and maximum, over the rounds, of
+        the ratio of both medians.
     """
     import numpy as np
 
@@ -202,7 +202,7 @@ def summary(prefix: str, seconds: np.ndarray, base: np.ndarray) -> dict[str, flo
 
 
 def show(rows: list[dict[str, Any]], rounds: int) -> None:
-    """Print the rows as a table of 80 columns, a line each."""
+    """Print the rows as a table of 80 columns, one line each."""
     from rich.console import Console
     from rich.table import Table
 
@@ -225,12 +225,12 @@ def show(rows: list[dict[str, Any]], rounds: int) -> None:
 
 
 def short(number: float) -> str:
-    """Return a number in at most four characters, so that a row is a line of 80."""
+    """Return a number in at most four characters, so that a row fits a line of 80."""
     return f"{number:.2f}" if number < 10 else f"{number:.1f}" if number < 100 else f"{number:.0f}"
 
 
 def show_breakdown(path: Path) -> None:
-    """Print where a step's time goes, by the kind of operation and its shape."""
+    """Print where a step's time goes, by kind and shape of operation."""
     from rich.console import Console
     from rich.table import Table
 

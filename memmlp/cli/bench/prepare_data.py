@@ -43,7 +43,7 @@ def prepare(minutes: float, clips: int) -> None:
 
 
 def _pieces(root: Path, count: int) -> None:
-    """Write pieces of two seconds, each from another second of a walk and with its own noise in the place."""
+    """Write clips of two seconds, each from another second of a walk, with its own noise in the positions."""
     import numpy as np
 
     from memmlp.motion.clip import Clip

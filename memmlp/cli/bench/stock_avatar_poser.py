@@ -1,4 +1,4 @@
-"""AvatarPoser of torch's own layers, with which `bench latency` checks the time of its network."""
+"""An AvatarPoser of torch's own layers, with which `bench latency` checks the time of our network."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from memmlp.motion.body import N_JOINTS, SPARSE_DIM
 
 
 class TorchAvatarPoser(nn.Module):
-    """The layers of AvatarPoser, none of them this project's.
+    """The layers of AvatarPoser, none of which are this project's own.
 
     Args:
         frames: T, the window's length.
-        width, depth, heads, feedforward: the sizes of its encoder.
+        width, depth, heads, feedforward: the sizes of the encoder.
     """
 
     def __init__(self, frames: int, width: int, depth: int, heads: int, feedforward: int):
@@ -37,9 +37,10 @@ class TorchAvatarPoser(nn.Module):
 
 
 def export_plainly(network: TorchAvatarPoser, path: Path) -> None:
-    """Write a network by `torch.onnx.export` and nothing else, each layer with random weights of its own.
+    """Write a network with `torch.onnx.export` and nothing else, each layer with its own random weights.
 
-    Layers with the same weights would share them in the file, and be quicker than any trained network's.
+    Layers with equal weights would share them in the file, and would be faster than those of a trained
+    network.
     """
     for parameter in network.parameters():
         nn.init.normal_(parameter, std=0.03)

@@ -1,4 +1,4 @@
-"""`memmlp bench train`: how fast a changed recipe reaches the final validation error of today's."""
+"""`memmlp bench train`: how fast a changed recipe reaches the present recipe's final validation error."""
 
 from __future__ import annotations
 
@@ -102,10 +102,10 @@ def train(
 
 
 def known_rows(file: Path | None, subject: dict[str, Any]) -> dict[int, dict[str, Any]]:
-    """Return by seed what a file has already; empty where there is none.
+    """Return the rows that a file has already, by seed; empty if there is no file.
 
     Raises:
-        InputError: where the file is of another comparison, or can't be written.
+        InputError: if the file is from another comparison, or can't be written.
     """
     from memmlp.common.errors import InputError
     from memmlp.common.files import read_json
@@ -125,7 +125,7 @@ def known_rows(file: Path | None, subject: dict[str, Any]) -> dict[int, dict[str
 
 
 def compose_experiment(words: Sequence[str]) -> Experiment:
-    """Build the experiment of overrides, and let torch have its number of threads.
+    """Build the experiment for overrides, and set torch's number of threads to its.
 
     Raises:
         InputError: for bad overrides, and for a device other than the CPU.
@@ -150,17 +150,17 @@ def compose_experiment(words: Sequence[str]) -> Experiment:
 def measure_seed(
     experiments: dict[str, Experiment], seed: int, error: str, every: int, known: dict[str, Any] | None
 ) -> dict[str, Any]:
-    """Return the row of a seed: the error, when each arm had it, and the runs that they are.
+    """Return the row of a seed: the error, when each arm reached it, and the ids of the arms' runs.
 
     Args:
-        experiments: of both arms.
+        experiments: the experiments of both arms.
         seed: their seed.
         error: the error's name.
         every: steps between validations.
-        known: the row that there is already.
+        known: the row that exists already.
 
     Raises:
-        InputError: where the arms differ in what is not timed, or the known row is of other runs.
+        InputError: if the arms differ in something that is not timed, or the known row belongs to other runs.
     """
     from memmlp.common.errors import InputError
 
@@ -184,7 +184,7 @@ def measure_seed(
 
 
 def learner(experiment: Experiment, data: Any, error: str = "MPJPE") -> Learner:
-    """Return a training of an experiment that can go on piece by piece; its VQ-VAE is found or trained."""
+    """Return an experiment's training, which can run piece by piece; its VQ-VAE is found or trained first."""
     from memmlp.pipeline.run_stages import upstream_run
     from memmlp.training.time_to_error import Learner
     from memmlp.training.train_network import NetworkTraining
@@ -200,7 +200,11 @@ def learner(experiment: Experiment, data: Any, error: str = "MPJPE") -> Learner:
 def race(
     learners: dict[str, Learner], every: int, description: str
 ) -> tuple[dict[str, Validation | None], float]:
-    """Train both in turn; return when each first had the error that today's ends with, and that error."""
+    """Train both learners in turn, and compare how soon they reach the present recipe's final error.
+
+    Returns:
+        The validation at which each learner first had at most that error, or None, and that error.
+    """
     import math
     from collections import deque
 
@@ -217,7 +221,8 @@ def race(
 def summary(rows: Sequence[dict[str, Any]], times: float) -> dict[str, Any]:
     """Return the ratio of today's seconds to the recipe's, with a 95 % interval over seeds and a verdict.
 
-    Ratios are averaged as logarithms. A seed that never had the error leaves no number, and an open verdict.
+    Ratios are averaged as logarithms. If the recipe never reached the error for a seed, there are no numbers,
+    and the verdict is open.
     """
     import numpy as np
 
@@ -232,7 +237,7 @@ def summary(rows: Sequence[dict[str, Any]], times: float) -> dict[str, Any]:
 
 
 def write(file: Path, subject: dict[str, Any], rows: dict[int, dict[str, Any]], times: float) -> None:
-    """Write what was measured, with the number of threads and the summary so far."""
+    """Write the measurements, with the number of threads and the summary so far."""
     import torch
 
     from memmlp.common.files import write_json
@@ -243,7 +248,7 @@ def write(file: Path, subject: dict[str, Any], rows: dict[int, dict[str, Any]], 
 
 
 def seed_line(row: dict[str, Any], error: str) -> str:
-    """Return a seed's line."""
+    """Return the line for a seed."""
     parts = [f"seed {row['seed']}: {error} {row['target']:.3f} {UNITS[error]}"]
     for arm in ARMS:
         mark = row[arm]
@@ -262,7 +267,7 @@ def conclusion(found: dict[str, Any]) -> str:
 
 
 def show_breakdown(arm: str, words: Sequence[str], steps: int) -> None:
-    """Print how long a step takes, and each part of it."""
+    """Print how long a step takes, and each of its parts."""
     from memmlp.training.step_profile import PARTS, step_parts
 
     experiment = compose_experiment((*words, f"optim.steps={WARM_UP + 2 * steps}"))

@@ -1,4 +1,4 @@
-"""`memmlp bench tracking`: what it costs a training to be shown in trackers."""
+"""`memmlp bench tracking`: how much slower a training is while trackers show it."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def tracking(blocks: int, steps: int, uri: str | None, overrides: tuple[str, ...
 
 
 class PiecewiseRun(Run):
-    """A run that times its training between lines of its log, and stops a process in every other piece.
+    """A run that times its training between lines of its log, and pauses a process in every other piece.
 
     Args:
         folder: the run's folder.
@@ -70,7 +70,7 @@ class PiecewiseRun(Run):
         self.since = time.perf_counter()
 
     def log(self, step: int, values: Mapping[str, float], phase: str = "train") -> None:
-        """Log the values; after those of a training step note its time, and pause or resume the follower."""
+        """Log the values; after those of a training step, note its time, and pause or resume the follower."""
         super().log(step, values, phase)
         if phase == "train":
             self.seconds.append(time.perf_counter() - self.since)
@@ -78,7 +78,7 @@ class PiecewiseRun(Run):
             self.since = time.perf_counter()
 
     def finish(self, artifacts: Sequence[str]) -> None:
-        """Finish, with the process going on."""
+        """Finish the run, after resuming the process."""
         super().finish(artifacts)
         self._signal(signal.SIGCONT)
 

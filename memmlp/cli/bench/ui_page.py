@@ -1,4 +1,4 @@
-"""`memmlp bench ui`: how long the page of many runs takes to open, and to filter them."""
+"""`memmlp bench ui`: how long the page with many runs takes to open, and to filter them."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def first_answer(outputs: Path) -> float:
 
 
 def in_browser(outputs: Path, browser: str) -> tuple[float, float]:
-    """Return the seconds until a browser shows the table, and those of a filter that few runs pass."""
+    """Return the seconds until a browser shows the table, and those of a filter that matches few runs."""
     from memmlp.report.ui.answers import Answers
     from memmlp.report.ui.server import RunsServer
 
@@ -97,13 +97,13 @@ def in_browser(outputs: Path, browser: str) -> tuple[float, float]:
 
 
 class Timed:
-    """Answers that hear how long a page took, as it asks for "timing" when its address has `time`."""
+    """Answers that receive a page's timing: with `time` in its address, the page asks for "timing"."""
 
     def __init__(self, answers: Any, told: dict[str, float], heard: threading.Event):
         self.answers, self.told, self.heard = answers, told, heard
 
     def of(self, name: str, query: Mapping[str, str]) -> Mapping[str, Any]:
-        """Return the answer to a question, or keep the page's milliseconds."""
+        """Return the answer to a question, or store the page's milliseconds."""
         if name != "timing":
             return self.answers.of(name, query)
         self.told.update({key: float(value) for key, value in query.items()})
@@ -115,7 +115,7 @@ class Timed:
 
 
 def make(outputs: Path, runs: int, lines: int) -> None:
-    """Write run folders whose files look like those of trained runs; their numbers are made up."""
+    """Write run folders whose files look like those of trained runs, with made-up numbers."""
     import yaml
     from omegaconf import OmegaConf
 

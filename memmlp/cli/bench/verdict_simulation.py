@@ -67,7 +67,7 @@ def remarks(rows: Sequence[dict[str, Any]], seed: int) -> list[str]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> Table:
-    """Return the rows as a table for the terminal."""
+    """Return the rows as a table for a terminal."""
     from rich import box
     from rich.table import Table
 

@@ -1,4 +1,4 @@
-"""`memmlp data inspect`: what a cache or a folder of clips holds."""
+"""`memmlp data inspect`: the content of a cache or of a folder of clips."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`memmlp data show`: clips as a sheet of pictures."""
+"""`memmlp data show`: a sheet of pictures of clips."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`memmlp data skeleton`: a map for a skeleton that no shipped one fits, proposed and looked at."""
+"""`memmlp data skeleton`: a map for a skeleton that no shipped map fits, proposed and shown."""
 
 from __future__ import annotations
 

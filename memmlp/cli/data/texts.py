@@ -1,4 +1,4 @@
-"""Clips, frame rates and skipped files as people read them."""
+"""Prints clips, frame rates and skipped files for users."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def show_rates(clips: tuple[ClipRecord, ...]) -> None:
 def show_files(
     ignored: int, passed_over: Mapping[str, int], links: Mapping[str, str], unusual: Mapping[str, str]
 ) -> None:
-    """Print what else there was in a folder: files that are no clips, links, and clips to look at."""
+    """Print what else is in a folder: files that are no clips, links, and clips that look odd."""
     others = {"npz without poses": ignored, **dict(sorted(passed_over.items()))}
     counts = [f"{count} {kind}" for kind, count in others.items() if count]
     if counts:
@@ -89,7 +89,7 @@ def show_skipped(lines: list[str]) -> None:
 
 
 def show_some(lines: list[str], what: str) -> None:
-    """Print the first few lines, and how many more of them there are."""
+    """Print the first few lines, and the number of further ones."""
     for line in lines[:MOST_NAMED]:
         click.echo(line)
     if len(lines) > MOST_NAMED:

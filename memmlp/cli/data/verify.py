@@ -1,4 +1,4 @@
-"""`memmlp data verify`: imports beside their files."""
+"""`memmlp data verify`: compares imports with their files."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def diff(a: str, b: str, outputs: Path) -> None:
 
 
 def origin_rows(first: Run, second: Run) -> list[tuple[str, ...]]:
-    """Return a row for all in code and machine that differs, and may change numbers beside the config."""
+    """Return a row for every difference in code and machine that may change numbers despite equal configs."""
     from memmlp.runs.identity import flatten
 
     a, b = (flatten({key: run.manifest.get(key) for key in ORIGIN}) for run in (first, second))
@@ -76,7 +76,7 @@ def origin_rows(first: Run, second: Run) -> list[tuple[str, ...]]:
 
 
 def config_rows(first: Run, second: Run) -> list[tuple[str, ...]]:
-    """Return a row for each key of the config, or the data, that changes a result and differs."""
+    """Return a row for each differing key of the config, or the data, that changes a result."""
     from memmlp.runs.query import data_labels, differing
 
     pair = [recorded(run) for run in (first, second)]

@@ -89,12 +89,12 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
 
 
 def is_finished_upstream(run: Run) -> bool:
-    """Whether it is a finished VQ-VAE or part of a network, which has none of the results that are listed."""
+    """Return whether a run is a finished VQ-VAE or part of a network, which has no results to list."""
     return run.manifest.get("kind") not in (None, NETWORK) and run.done
 
 
 def sorted_by(listed: Sequence[Run], records: Mapping[str, Record], sort: str) -> list[Run]:
-    """Return the runs sorted by a key; those that have no such value, or NaN, come last."""
+    """Return the runs sorted by a key; those without such a value, or with NaN, come last."""
     from memmlp.runs.query import check_key
 
     key, down = sort.removeprefix("-"), sort.startswith("-")
@@ -107,12 +107,12 @@ def sorted_by(listed: Sequence[Run], records: Mapping[str, Record], sort: str) -
 
 
 def _is_missing(value: object) -> bool:
-    """Whether a value has no place in an order: there is none, or NaN."""
+    """Return whether a value can't be sorted: it is missing, or NaN."""
     return value in (None, "", ()) or (isinstance(value, float) and math.isnan(value))
 
 
 def wanted(columns: str | None, records: Mapping[str, Record], listed: Sequence[Run]) -> list[str]:
-    """Return the keys to show: those asked for, or those of the config that differ among finished runs."""
+    """Return the keys to show: those asked for, or those of the config that differ between finished runs."""
     from memmlp.runs.query import check_key, differing
 
     if columns is not None:
@@ -129,9 +129,9 @@ class Column(NamedTuple):
     """A column of the list.
 
     Attributes:
-        name: its head, or the key that it shows.
+        name: the column's head, or the key that it shows.
         cells: its text for each run.
-        number: whether these are numbers.
+        number: whether the cells are numbers.
     """
 
     name: str
@@ -140,12 +140,12 @@ class Column(NamedTuple):
 
 
 def show_runs(records: Sequence[Record], keys: Sequence[str], asked: bool) -> list[str]:
-    """Print the runs as a table, and return the keys for which there was no room.
+    """Print the runs as a table, and return the keys that did not fit.
 
     Args:
-        records: what may be asked of each run, and its `age`.
+        records: the values that can be shown of each run, and its `age`.
         keys: the keys whose values are shown.
-        asked: whether these were asked for, so that they are shown whatever room there is, without results.
+        asked: whether the user asked for these keys, so that all of them are shown, without results.
     """
     columns = list(_columns(records, keys, {} if asked else SHOWN))
     spare = [name for name in SPARED if name not in keys]
@@ -159,7 +159,7 @@ def show_runs(records: Sequence[Record], keys: Sequence[str], asked: bool) -> li
 
 
 def _columns(records: Sequence[Record], keys: Sequence[str], numbers: Mapping[str, str]) -> Iterator[Column]:
-    """Yield all columns, with the values of some keys, and with some numbers under heads of ours."""
+    """Yield all columns: the values of some keys, and some numbers under heads of our own."""
     from memmlp.runs.query import data_labels
 
     yield Column("run", [one["id"] for one in records])
@@ -181,7 +181,7 @@ def _columns(records: Sequence[Record], keys: Sequence[str], numbers: Mapping[st
 
 
 def _lines(columns: Sequence[Column]) -> Table:
-    """Make the table of some columns, whose texts are folded already."""
+    """Make the table of some columns, whose texts are wrapped already."""
     table = plain_table()
     table.padding, table.show_edge = (0, 0), False
     table.caption_justify, table.caption_style = "left", ""
@@ -194,19 +194,19 @@ def _lines(columns: Sequence[Column]) -> Table:
 
 
 def _legend(names: Sequence[str]) -> str | None:
-    """Return what the numbers of some columns are, None where there is none."""
+    """Return an explanation of the numbers in some columns; None if there are none."""
     words = [said for head, said in LEGEND.items() if any(name.startswith(head) for name in names)]
     return "; ".join(words) or None
 
 
 def _width(columns: Sequence[Column]) -> int:
-    """Return how wide the table of some columns is."""
+    """Return the width of the table of some columns."""
     console = Console(width=10_000)
     return console.measure(_lines(columns)).maximum
 
 
 def _folded(text: str, width: int = FOLD) -> str:
-    """Break a text into lines of some characters, between the words of a key and the items of a list."""
+    """Break a text into lines of up to `width` characters, between words of a key and items of a list."""
     lines = [""]
     for part in re.findall(r"[^.,_/ ]*[.,_/ ]*", text):
         if lines[-1] and len(lines[-1]) + len(part.rstrip()) > width:

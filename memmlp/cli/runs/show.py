@@ -44,7 +44,7 @@ def show(run: str, config: bool, outputs: Path) -> None:
 
 
 def _summary(run: Run) -> dict[str, Any]:
-    """Return what a run is and how it went, in words."""
+    """Return in words what a run is, and its progress."""
     one, manifest = recorded(run), run.manifest
     facts = {"run": run.id, "name": one.get("name"), "folder": run.folder, "status": run.status}
     if why := run.failure:
@@ -62,12 +62,12 @@ def _summary(run: Run) -> dict[str, Any]:
 
 
 def _attempts(manifest: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Return the stages that processes began, of those records that tell all about it."""
+    """Return the stages that processes began, from those records that are complete."""
     return [one for one in manifest.get("attempts", []) if {"stage", "step", "started"} <= one.keys()]
 
 
 def _origin(run: Run) -> dict[str, Any]:
-    """Return of what code and on which machine a run was made, the versions of recipes last."""
+    """Return the code and the machine with which a run was made, with recipe versions last."""
     from memmlp.runs.identity import flatten
 
     facts = {key: value for key, value in run.manifest.items() if key not in LEFT_OUT}

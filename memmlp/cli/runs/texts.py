@@ -1,4 +1,4 @@
-"""What the commands of runs have in common: a run's record, tables, and values as text."""
+"""Functions that the commands of runs share: a run's record, tables, and values as text."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LONGEST = 36  # characters of a value that nobody asked for
 
 
 def recorded(run: Run) -> Record:
-    """Return what may be asked of a run; of one with a damaged file, its id and status alone."""
+    """Return a run's record of values; of a run with a damaged file, only its id and status."""
     from memmlp.runs.query import record
 
     try:
@@ -32,7 +32,7 @@ def recorded(run: Run) -> Record:
 
 
 def value_text(record: Record, key: str, whole: bool) -> str:
-    """Return a record's value as text, of a long one its beginning unless the whole is wanted."""
+    """Return a record's value as text; a long one is shortened unless the whole is wanted."""
     from memmlp.runs.query import as_typed
 
     text = as_typed(record[key]) if key in record else "-"
@@ -40,7 +40,7 @@ def value_text(record: Record, key: str, whole: bool) -> str:
 
 
 def measured_numbers(results: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the numbers among results by dotted key, which may hold settings and digests, too."""
+    """Return the numbers in results by dotted key; results may also hold settings and digests."""
     from memmlp.runs.identity import flatten
 
     numbers = {key: value for key, value in flatten(results).items() if isinstance(value, int | float)}
@@ -52,12 +52,12 @@ def measured_numbers(results: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def console() -> Console:
-    """Make a console that takes texts as they are."""
+    """Make a console that prints texts unchanged."""
     return Console(highlight=False, markup=False)
 
 
 def plain_table(*columns: str, title: str | None = None) -> Table:
-    """Make a table without a border; long values fold, and no word is cut."""
+    """Make a table without a border; long values are wrapped, and no word is cut."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=title, title_justify="left")
     for column in columns:
         table.add_column(column, overflow="fold")
@@ -74,14 +74,14 @@ def pairs(facts: Mapping[str, Any], title: str | None = None) -> Table:
 
 
 def text_of(value: Any) -> str:
-    """Return a value in few characters."""
+    """Return a value as a short text."""
     if isinstance(value, float):
         return f"{value:.4g}"
     return "-" if value is None else str(value)
 
 
 def number_text(value: Any) -> str:
-    """Return a number as text; "-" where there is none."""
+    """Return a number as text; "-" if there is none."""
     return f"{value:.2f}" if isinstance(value, int | float) else "-"
 
 

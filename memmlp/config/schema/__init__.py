@@ -1,8 +1,8 @@
 """The schema of the config: the type of every key is declared here.
 
-The values and where they come from stand in conf/, the limits are enforced by `check`. Each dataclass is one
-option of a config group. Hydra's ConfigStore holds it as schema/<group>_<option>, and the YAML file of the
-same name starts from it, so that unknown keys and wrong types are refused when the config is composed.
+The values and their sources are in conf/, the limits are enforced by `check`. Each dataclass is one option of
+a config group. Hydra's ConfigStore holds it as schema/<group>_<option>, and the YAML file of the same name
+starts from it, so that unknown keys and wrong types are refused when the config is composed.
 """
 
 from memmlp.config.schema.checks import check, unknown_key

@@ -1,4 +1,4 @@
-"""Checks of a composed config before anything runs; each complaint is one line that names the key."""
+"""Checks of a composed config before anything runs; each error is one line that names the key."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def check(cfg: DictConfig) -> None:
     """Check a composed config.
 
     Raises:
-        InputError: naming the key, for a missing or unknown key, a value that its rule refuses, or values
-            that don't go together.
+        InputError: for a missing or unknown key, a value that its rule refuses, or values that don't go
+            together; the message names the key.
     """
     if OmegaConf.get_type(cfg) is not Config:
         raise InputError(
@@ -89,7 +89,7 @@ def unknown_key(name: str, keys: Sequence[str]) -> str:
 
 
 def _value(node: DictConfig, own: str, name: str) -> Any:
-    """Return a key's value. Raises InputError where it is missing or can't be resolved."""
+    """Return a key's value. Raises InputError if it is missing or can't be resolved."""
     if OmegaConf.is_missing(node, own):
         raise InputError(f"{name}: has no value; give one with {name}=...")
     try:
@@ -100,12 +100,12 @@ def _value(node: DictConfig, own: str, name: str) -> Any:
 
 
 def _show(value: Any) -> str:
-    """Return a value as a person would type it."""
+    """Return a value as a user would type it."""
     return str(list(value)) if OmegaConf.is_list(value) else str(value)
 
 
 def _check_names(cfg: DictConfig) -> None:
-    """Refuse a component from outside this package that uses the name of one of this package's options."""
+    """Raise InputError for a foreign component that uses the name of one of this package's options."""
     for slot in SLOTS:
         node = cfg[slot]
         path = node.get("_target_") if node is not None else None
@@ -119,7 +119,7 @@ def _check_names(cfg: DictConfig) -> None:
 
 
 def _check_combinations(cfg: DictConfig) -> None:
-    """Check what no key alone can tell: whether the values go together."""
+    """Check what concerns several keys: whether their values go together."""
     _check_names(cfg)
     if "final_lr" in cfg.optim and cfg.optim.final_lr > cfg.optim.lr:
         raise InputError(f"optim.final_lr={cfg.optim.final_lr}: allowed is at most optim.lr={cfg.optim.lr}")
@@ -166,7 +166,7 @@ def _check_sources(data: DictConfig) -> None:
 
 
 def _check_export(cfg: DictConfig) -> None:
-    """Check that a file of less precision has the streaming graph that it is made of."""
+    """Check that a file with lower precision has the streaming graph from which it is made."""
     precision = f"export.precision={cfg.export.precision}: is made of the streaming graph, and"
     if cfg.export.precision != "fp32" and cfg.export.graph in WITHOUT_STREAM:
         raise InputError(
@@ -177,7 +177,7 @@ def _check_export(cfg: DictConfig) -> None:
 
 
 def _is(node: DictConfig, schema: type) -> bool:
-    """Return whether a group's option is of this schema."""
+    """Return whether a group's option has this schema."""
     kind = OmegaConf.get_type(node)
     return kind is not None and issubclass(kind, schema)
 
@@ -185,7 +185,7 @@ def _is(node: DictConfig, schema: type) -> bool:
 def _check_baseline(cfg: DictConfig) -> None:
     """Check the config of a baseline, which has no slots, no history of its own and no positions.
 
-    Nothing may be set that concerns these, and its sizes must fit each other.
+    No key for these may be set, and the network's sizes must fit each other.
     """
     name = cfg.model._target_.rsplit(".", 1)[-1]
     for group in ("memory", "predictor", "hand", "term"):
@@ -234,7 +234,7 @@ def _check_baseline(cfg: DictConfig) -> None:
 
 
 def _check_foreign_loss(cfg: DictConfig, predictor: str) -> None:
-    """Refuse the loss of a baseline for Mem-MLP, with two exceptions.
+    """Raise InputError for the loss of a baseline with Mem-MLP, with two exceptions.
 
     AGRoL's loss and the library's terms score rotations alone, so a Mem-MLP that predicts nothing else may be
     trained with them.

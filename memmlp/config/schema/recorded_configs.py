@@ -1,4 +1,4 @@
-"""Recorded configs as typed ones: runs of earlier versions keep their meaning."""
+"""Turns recorded configs into typed ones, such that runs of earlier versions keep their meaning."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from memmlp.config.schema.data import SynthDataConfig
 from memmlp.runs.identity import chosen
 
 RENAMED = {"tracker": "tracking"}
-"""The names of today for groups that runs of version 0.1 recorded under other names."""
+"""The present names of groups that runs of version 0.1 recorded under other names."""
 
 
 def restored(config: Mapping[str, Any]) -> DictConfig:
     """Turn the config that a run recorded back into a typed one, with the classes of this version.
 
     Raises:
-        OmegaConfBaseException, KeyError: where the record does not fit this version's schema. (A value of the
+        OmegaConfBaseException, KeyError: if the record does not fit this version's schema. (A value of the
             wrong kind may also raise TypeError or ValueError.)
     """
     cfg = OmegaConf.structured(Config)
@@ -47,7 +47,7 @@ def _restored(group: str, content: Mapping[str, Any]) -> Any:
 
 
 def _trackers(content: Mapping[str, Any]) -> Any:
-    """Return the trackers as typed configs. Up to version 0.2 there was a single one, itself the group."""
+    """Return the trackers as typed configs. Up to version 0.2 the group was itself the single tracker."""
     every = {str(content["name"]): content} if "name" in content else content
     return {name: _restored_tracker(name, node) for name, node in every.items() if name != "none"}
 
@@ -58,9 +58,9 @@ def _restored_tracker(name: str, content: Mapping[str, Any]) -> Any:
 
 
 def _content(option: type | None, content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a typed config is filled with.
+    """Return the content for a typed config.
 
-    The classes of memmlp's options may lie elsewhere by now; others are checked to be those of the option.
+    The classes of memmlp's options may have moved; those of other packages are checked to be the option's.
     """
     return _bare(content) if option and option.__module__.startswith("memmlp.") else dict(content)
 

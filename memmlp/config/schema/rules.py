@@ -1,4 +1,4 @@
-"""The rules for what a key of the config may hold, and the helpers that declare a key with its rule."""
+"""The rules for the values of config keys, and the helpers that declare a key with its rule."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class OneOf:
 
 @dataclass(frozen=True)
 class Registered:
-    """The rule that a value is the name of a component that a package of one's own has registered."""
+    """The rule that a value is the name of a component that a user's package has registered."""
 
     names: Mapping[str, Any]
 
@@ -43,7 +43,7 @@ class Registered:
 
 @dataclass(frozen=True)
 class OneOfOrPath:
-    """The rule that a value is one of a few words, or the dotted path of a class of one's own."""
+    """The rule that a value is one of a few words, or the dotted path of a custom class."""
 
     words: tuple[str, ...]
 
@@ -117,7 +117,7 @@ class Text:
 
 @dataclass(frozen=True)
 class Matching:
-    """The rule that a value is text of a pattern, which `said` tells in words."""
+    """The rule that a value is text that matches a pattern, which `said` describes in words."""
 
     pattern: re.Pattern[str]
     said: str
@@ -135,7 +135,7 @@ class FolderPaths:
     """The rule that a value is the path of an existing folder, or a list of several."""
 
     def allows(self, value: Any) -> bool:
-        """Return whether every folder exists and none is there twice."""
+        """Return whether every folder exists and none occurs twice."""
         paths = [value] if isinstance(value, str) else list(value) if isinstance(value, Iterable) else []
         known = all(isinstance(path, str) and Path(path).is_dir() for path in paths)
         return bool(paths) and known and len(set(map(Path, paths))) == len(paths)
@@ -172,27 +172,27 @@ DEVICE = Matching(re.compile(r"auto|cpu|mps|cuda(:\d+)?"), "auto or cpu or cuda 
 
 
 def optional(rule: object = None) -> Any:
-    """Declare a key that may be null, as it counts for runs that were recorded before the key existed."""
+    """Declare a key that may be null, which is its value for runs recorded before the key existed."""
     return field(default=None, metadata={"rule": rule})
 
 
 def standing(value: object, rule: object = None) -> Any:
-    """Declare a key with a default, which counts for runs that were recorded before the key existed."""
+    """Declare a key with a default, which is its value for runs recorded before the key existed."""
     return field(default=value, metadata={"rule": rule})
 
 
 def empty_list(rule: object) -> Any:
-    """Declare a list that is empty by default, as it counts for runs recorded before the key existed."""
+    """Declare a list that is empty by default and for runs recorded before the key existed."""
     return field(default_factory=list, metadata={"rule": rule})
 
 
 def target(path: str) -> Any:
-    """Declare the class that an option of a slot stands for, which nobody can change."""
+    """Declare the class of a slot's option, which can't be changed."""
     return field(default=path, metadata={"rule": OneOf((path,))})
 
 
 def called(name: str) -> Any:
-    """Declare the name of a slot's option, which nobody can change. It enters the identity of a run."""
+    """Declare the name of a slot's option, which can't be changed and enters the identity of a run."""
     return field(default=name, metadata={"rule": OneOf((name,))})
 
 

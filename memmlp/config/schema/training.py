@@ -105,7 +105,7 @@ class AvatarPoserLossConfig(BaselineLossConfig):
 
 @dataclass
 class OwnLossConfig(BaselineLossConfig):
-    """No loss beside the network's own, for networks that have one of their outputs (BoDiffusion)."""
+    """No loss besides the network's own, for networks that define a loss on their outputs (BoDiffusion)."""
 
     name: str = called("own")
     _target_: str = target("memmlp.training.losses.OwnLoss")

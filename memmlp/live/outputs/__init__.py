@@ -1,1 +1,1 @@
-"""Where a live body goes while it is there: other programs, and files."""
+"""Where a live body is sent: other programs, and files."""

@@ -1,7 +1,7 @@
-"""OSC bundles that are sent sixty times a second: laid out once by python-osc, then only their floats change.
+"""OSC bundles that are sent sixty times a second: python-osc lays them out once, then only floats change.
 
-All of a bundle lies at multiples of four bytes (Open Sound Control 1.0), so its floats are elements of one
-array of big-endian float32.
+Every element of a bundle is at a multiple of four bytes (Open Sound Control 1.0), so its floats are elements
+of one array of big-endian float32.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ class Message(NamedTuple):
     """A message whose last arguments are floats.
 
     Attributes:
-        address: its OSC address.
-        fixed: the arguments before, each an integer or a text.
+        address: the message's OSC address.
+        fixed: the arguments before the floats, each an integer or a text.
         floats: how many floats follow.
     """
 
@@ -60,21 +60,21 @@ class Bundle:
         self.places = np.concatenate(places).astype(int)
 
     def write(self, values: np.ndarray) -> bytes:
-        """Return the datagram with these floats."""
+        """Return the bundle's datagram with these floats."""
         self.data[self.places] = values
         return self.data.tobytes()
 
 
 class Receiver:
-    """A program that takes datagrams at an address. Nobody need be there.
+    """A program that takes datagrams at an address; it need not be running.
 
     Args:
-        host: its name or address.
+        host: the program's host name or address.
         port: its UDP port.
-        key: what it was given as.
+        key: the option by which the user named it.
 
     Raises:
-        InputError: for an unknown name.
+        InputError: for an unknown host name.
     """
 
     def __init__(self, host: str, port: int, key: str):
@@ -91,7 +91,10 @@ class Receiver:
         return f"{self.address[0]}:{self.address[1]}"
 
     def send(self, datagram: bytes) -> None:
-        """Send a datagram, or drop it where the network is busy. Raises OSError where there is no way."""
+        """Send a datagram, or drop it if the network is busy.
+
+        Raises OSError if the address can't be reached.
+        """
         try:
             self.socket.sendto(datagram, self.address)
         except OSError as error:

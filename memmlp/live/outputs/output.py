@@ -1,4 +1,4 @@
-"""The slot of an output, and what it is given: the wearer's body, frame by frame."""
+"""The slot of an output, and the frames that it gets: the wearer's body."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from memmlp.live.stream import Pose, Stream
 
 
 class BodyFrame(NamedTuple):
-    """The wearer's body at a time, in AMASS' conventions, the floor at height zero.
+    """The wearer's body at a time, in AMASS' conventions, with the floor at height zero.
 
     Attributes:
         time: seconds of the trackers' clock.
-        local: rotations (22, 3, 3), relative to the parents; the root's is global.
+        local: rotations (22, 3, 3), relative to the parents, except for the root's, which is global.
         positions: the joints (22, 3), metres.
         rest: the joints in the rest pose (22, 3), metres, SMPL's body frame, at the wearer's height.
-        scale: the network's body height over the wearer's.
+        scale: the network's body height divided by the wearer's.
         restarted: whether the network began anew at this frame.
     """
 
@@ -32,7 +32,7 @@ class BodyFrame(NamedTuple):
 
 
 class Output(Protocol):
-    """Takes frames, at once or not at all: it never waits.
+    """Takes frames without ever waiting: each frame is taken at once, or dropped.
 
     Attributes:
         name: the output in words.
@@ -41,10 +41,10 @@ class Output(Protocol):
     name: str
 
     def take(self, frame: BodyFrame) -> None:
-        """Take a frame. Raises OSError where that fails."""
+        """Take a frame. Raises OSError if that fails."""
 
     def close(self) -> None:
-        """Finish what was begun."""
+        """Finish what was begun, such as files."""
 
 
 def body_frame(stream: Stream, pose: Pose) -> BodyFrame:
@@ -56,7 +56,7 @@ def body_frame(stream: Stream, pose: Pose) -> BodyFrame:
 
 
 class Outputs:
-    """Several outputs. One that fails is reported once, and tried again with the next frame.
+    """Several outputs; one that fails is reported once, and tried again with the next frame.
 
     Args:
         outputs: the outputs.
@@ -84,7 +84,7 @@ class Outputs:
             self.tell(f"{name}: {error.strerror or error}; the others go on")
 
     def close(self) -> None:
-        """Finish all outputs, each whatever becomes of the others; the first error is raised at the end."""
+        """Close all outputs, even if closing one of them fails; the first error is raised at the end."""
         errors = []
         for output in self.outputs:
             try:

@@ -1,10 +1,10 @@
 """A recording: files of the wearer's motion, written at the end from frames that were kept on disk.
 
-All files are of the same frames. Those with a skeleton (BVH, glTF) are at the wearer's height. An npz has no
-body, and whoever reads it brings one of the network's size; so it is the motion of that body.
+All files contain the same frames. Formats with a skeleton (BVH, glTF) have the wearer's height. An npz has no
+body, and its readers use one of the network's size, so it holds the motion of the network's body.
 
-Times in between that no frame was made for are filled by interpolation. Breaks, over which the network began
-anew, are left out, and told.
+Missing frames between two poses are interpolated. Breaks, after which the network began anew, are left out of
+the files, and reported.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ LONGEST = 1.0  # seconds without a frame that are filled
 
 
 class KeptFrame(NamedTuple):
-    """A frame as it is kept: of the network's body.
+    """A frame as it is kept on disk, with the network's body size.
 
     Attributes:
         time: seconds.
-        local: rotations (22, 3, 3), relative to the parents; the root's is global.
+        local: rotations (22, 3, 3), relative to the parents, except for the root's, which is global.
         root: the root's position (3,), metres, AMASS' axes.
     """
 
@@ -43,10 +43,10 @@ class KeptFrame(NamedTuple):
 
 
 class Recorder:
-    """Records to files.
+    """An output that records to files.
 
     Args:
-        paths: the files; their suffixes tell the formats.
+        paths: the files; their suffixes determine the formats.
         rest: the network's joints in the rest pose (22, 3), metres, SMPL's body frame.
         fps: the network's frames per second.
         tell: gets a line about each file that was written, and about breaks.
@@ -69,7 +69,7 @@ class Recorder:
         self.last: KeptFrame | None = None
 
     def take(self, frame: BodyFrame) -> None:
-        """Keep a frame, after those that are missing before it."""
+        """Keep a frame, after interpolated frames for those that are missing before it."""
         kept = KeptFrame(frame.time, frame.local, frame.scale * frame.positions[ROOT])
         for between in self._missing(kept, frame.restarted):
             self._keep(between)
@@ -78,7 +78,7 @@ class Recorder:
         self.last, self.scale = kept, frame.scale
 
     def _missing(self, kept: KeptFrame, restarted: bool) -> list[KeptFrame]:
-        """Return the frames between the last one and this one, which no pose was made for."""
+        """Return interpolated frames between the last one and this one, where no pose was made."""
         last = self.last
         if last is None:
             return []
@@ -108,7 +108,7 @@ class Recorder:
         """Write the files.
 
         Raises:
-            InputError: where one of them could not be written; the others are.
+            InputError: if a file can't be written; the other files are written all the same.
         """
         with self.frames:
             if not self.count:
@@ -121,7 +121,7 @@ class Recorder:
             raise failed[0]
 
     def _write(self, path: Path, rows: np.ndarray) -> InputError | None:
-        """Write a file. Return the error where that fails."""
+        """Write a file, and return the error if that fails."""
         chosen = format_of(path)
         scale = self.scale if chosen.has_bones else 1.0
         rest = self.rest / scale
@@ -135,7 +135,7 @@ class Recorder:
         return None
 
     def _remarks(self) -> str:
-        """Return what must be known of the files' frames."""
+        """Return remarks on the files' frames, for the user: breaks and interpolated frames."""
         remarks = []
         if self.breaks:
             remarks.append(f"{self.breaks} break{'s' * (self.breaks > 1)} left out")
@@ -145,7 +145,11 @@ class Recorder:
 
 
 def _spool(path: Path) -> IO[bytes]:
-    """Return a file without a name, on the disk of another file."""
+    """Open an unnamed temporary file on the disk of another file.
+
+    Raises:
+        InputError: if that file's folder can't be written to.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         return tempfile.TemporaryFile(dir=path.parent)

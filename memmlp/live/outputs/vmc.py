@@ -5,7 +5,7 @@ normal mode), `/VMC/Ext/T` (seconds since the beginning), `/VMC/Ext/Root/Pos` an
 `/VMC/Ext/Bone/Pos` (name, position and quaternion xyzw in the parent's frame). The frame of reference is
 Unity's. In the rest pose, a T-pose that faces +Z, all rotations are the identity.
 
-The root stays at the origin, and the hips carry the whole movement, since not all programs apply the root.
+The root stays at the origin, and all movement is in the hips, since not all programs apply the root's.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ STILL = np.array([0.0, 0, 0, 0, 0, 0, 1])  # position and quaternion of a root t
 
 
 class VMC:
-    """Sends bones by the VMC protocol.
+    """An output that sends bones by the VMC protocol.
 
     Args:
         receiver: the program that takes them.
@@ -61,7 +61,7 @@ class VMC:
 
 
 def bones(frame: BodyFrame) -> np.ndarray:
-    """Return each bone's position, metres, and quaternion xyzw in its parent's frame (22, 7), of Unity."""
+    """Return each bone's position, metres, and quaternion xyzw in its parent's frame (22, 7), for Unity."""
     values = np.empty((N_JOINTS, 7))
     offsets = frame.rest - frame.rest[list(PARENTS)]  # the root's is replaced
     values[:, :3] = offsets * SPACE.body

@@ -1,9 +1,9 @@
-"""VRChat's OSC trackers: up to eight, where its own full-body tracking expects devices, and the head.
+"""VRChat's OSC trackers: up to eight, at the places where VRChat expects full-body trackers, and the head.
 
 By VRChat's documentation (docs.vrchat.com/docs/osc-trackers): `/tracking/trackers/1/position` and so on,
 three floats each; metres of the real world and Euler angles in degrees, applied in the order Z, X, Y, in
-Unity's frame of reference. Which tracker is which VRChat finds out when the wearer calibrates in its T-pose.
-It shifts all of them so that the head is at its avatar's head bone, and turns them to the head's heading.
+Unity's frame of reference. VRChat finds out which tracker is which when the wearer calibrates in its T-pose.
+It shifts all trackers so that the head is at its avatar's head bone, and turns them to the head's heading.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ NAMES = (*map(str, range(1, len(PLACES))), "head")
 
 
 class VRChat:
-    """Sends trackers to VRChat.
+    """An output that sends trackers to VRChat.
 
     Args:
         receiver: VRChat's address.
@@ -51,14 +51,14 @@ class VRChat:
 
 
 def trackers(frame: BodyFrame) -> np.ndarray:
-    """Return position (metres) and Euler angles (degrees) of trackers and head (9, 2, 3), of Unity."""
+    """Return position (metres) and Euler angles (degrees) of trackers and head (9, 2, 3), in Unity's axes."""
     positions = SPACE.positions_out(frame.positions[AT])
     angles = euler_degrees(SPACE.rotations_out(global_rotations(frame.local)[TURNS_WITH]))
     return np.stack([positions, angles], 1)
 
 
 def global_rotations(local: np.ndarray) -> np.ndarray:
-    """Return global rotations (22, 3, 3) of local ones, the root's global."""
+    """Return global rotations (22, 3, 3) from local ones, of which the root's is global already."""
     turned = np.array(local, np.float64)
     for joint in range(1, N_JOINTS):
         turned[joint] = turned[PARENTS[joint]] @ turned[joint]
@@ -68,7 +68,7 @@ def global_rotations(local: np.ndarray) -> np.ndarray:
 def euler_degrees(rotations: np.ndarray) -> np.ndarray:
     """Return Unity's angles (n, 3) about X, Y and Z, degrees, with Ry Rx Rz = rotations (n, 3, 3).
 
-    In gimbal lock, where X is a right angle, the product is the rotation all the same.
+    The product is correct in gimbal lock, too, where the angle about X is a right angle.
     """
     y = np.arctan2(rotations[:, 0, 2], rotations[:, 2, 2])
     cosine, sine = np.cos(y)[:, None], np.sin(y)[:, None]

@@ -1,6 +1,6 @@
 """The files that the page needs for a VRM avatar: the avatar itself, and three-vrm from its npm package.
 
-The page's own three.js is replaced by the one of the package, which the loader belongs to.
+The page's own three.js is replaced by the three.js of the npm package to which the loader belongs.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ EXTENSIONS = ("VRMC_vrm", "VRM")  # of VRM 1.0, and 0.x
 
 
 def mannequin_vrm(rest: np.ndarray) -> bytes:
-    """Return the project's own avatar, with these rest joints (22, 3), metres, as a VRM file."""
+    """Return the project's own avatar as a VRM file, with the given rest joints (22, 3), metres."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "mannequin.vrm"
         write_vrm(path, rest)
@@ -34,7 +34,7 @@ def mannequin_vrm(rest: np.ndarray) -> bytes:
 
 
 def read_vrm(path: Path) -> bytes:
-    """Return a VRM file. Raises InputError for what is none."""
+    """Return a VRM file's content. Raises InputError if the file is no VRM file."""
     try:
         content = path.read_bytes()
         if content[:4] != b"glTF":
@@ -49,7 +49,7 @@ def read_vrm(path: Path) -> bytes:
 
 
 def avatar_files(vrm: bytes) -> dict[str, File]:
-    """Return the page's files with an avatar. Raises InputError where a package cannot be had."""
+    """Return the page's files with an avatar. Raises InputError if an npm package can't be downloaded."""
     scripts = _of(npm.THREE, THREE) | _of(npm.THREE_VRM, THREE_VRM)
     files = {f"npm/{name}": File(SCRIPT, _given(content)) for name, content in scripts.items()}
     model = {"avatar.vrm": File("model/gltf-binary", _given(vrm)), "": File(HTML, _page)}
@@ -65,5 +65,5 @@ def _given(content: bytes) -> Callable[[], bytes]:
 
 
 def _page() -> bytes:
-    """Return the page with the three.js of the package."""
+    """Return the page, changed to use the three.js of the npm package."""
     return read_page("index.html").replace(b"./three/three.module.min.js", b"./npm/build/three.module.js")

@@ -7,8 +7,8 @@ A pose is seven numbers, `x y z qx qy qz qw`: metres and a unit quaternion. In J
 In OSC a bundle has the messages `/memmlp/head`, `/memmlp/left`, `/memmlp/right` (seven floats each),
 `/memmlp/time` (a double or float) and `/memmlp/seq` (an integer).
 
-A tracker that is null or missing is lost. Without a time the time of arrival counts. The sample's number,
-seq, only serves to count lost packets.
+A tracker that is null or missing is lost. A packet without a time gets its time of arrival. The sample's
+number, seq, only serves to count lost packets.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class Packet(NamedTuple):
     Attributes:
         trackers: head, left and right, each a position (3,), metres, and a quaternion xyzw (4,); None if
             lost.
-        time: seconds of the sender's clock; None where it sent none.
-        seq: the sample's number; None where the sender gave none.
+        time: seconds of the sender's clock; None if the packet has no time.
+        seq: the sample's number; None if the packet has none.
     """
 
     trackers: TrackerPoses
@@ -101,7 +101,7 @@ def to_osc(packet: Packet) -> bytes:
 
 
 def packet(fields: Mapping[str, Any]) -> Packet:
-    """Return the packet of named values. Raises ValueError where they make none."""
+    """Return the packet with named values. Raises ValueError if the values are no packet."""
     if not any(name in fields for name in TRACKERS):
         raise ValueError(f"none of {', '.join(TRACKERS)}")
     time, seq = fields.get("time"), fields.get("seq")
@@ -114,13 +114,13 @@ def packet(fields: Mapping[str, Any]) -> Packet:
 
 
 def needs_osc(option: str = "--osc", instead: str = "--udp") -> None:
-    """Raise InputError where python-osc is not installed, which an option needs."""
+    """Raise InputError if python-osc, which an option needs, is not installed."""
     if find_spec("pythonosc") is None:
         raise InputError(f"{option}: needs python-osc, pip install 'memmlp[osc]'; allowed without: {instead}")
 
 
 def _tracker(name: str, values: Any) -> TrackerPose:
-    """Return a tracker from its seven numbers. Raises ValueError where they are no pose."""
+    """Return a tracker from its seven numbers. Raises ValueError if they are no pose."""
     if values is None:
         return None
     if not isinstance(values, list) or len(values) != POSE or not all(map(_number, values)):

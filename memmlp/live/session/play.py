@@ -1,4 +1,4 @@
-"""The loop of `memmlp live`: samples go from a source through the stream to outputs, and to all who watch."""
+"""The loop of `memmlp live`: samples go from a source through the stream to outputs and to open pages."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Publish = Callable[[dict[str, Any]], None]
 
 
 def greeting(source: TrackerSource, network: str, outputs: Outputs | None = None) -> dict[str, Any]:
-    """Return what the page must know before the first frame."""
+    """Return the message that a page gets before the first frame."""
     limbs = [{"start": a, "end": b, "radii": radii, "tip": tip} for a, b, radii, tip in LIMBS]
     words = {"network": network, "source": source.name, "fps": FPS, "joints": JOINTS}
     words |= {"outputs": [output.name for output in outputs.outputs] if outputs else []}
@@ -39,7 +39,7 @@ def greeting(source: TrackerSource, network: str, outputs: Outputs | None = None
 
 
 def with_avatar(words: Mapping[str, Any], rest: np.ndarray) -> dict[str, Any]:
-    """Return a greeting that tells of an avatar, too: its bones, and the height of the wearer's hips, metres.
+    """Return a greeting with an avatar's bones and the height of the wearer's hips, metres, added.
 
     Args:
         words: the greeting.
@@ -59,13 +59,13 @@ def play(
     avatar: bool = False,
     tell: Callable[[str], None] = lambda line: None,
 ) -> None:
-    """Feed samples to the stream, and its frames to the outputs and to who watches, until `stopped` is set.
+    """Feed samples to the stream, and its frames to the outputs and to open pages, until `stopped` is set.
 
-    A message has the frame's number and time (s); milliseconds that the network itself took (`ms`) and that
-    the whole pose took, from the sample's arrival until all outputs had it (`whole`); how many samples were
-    dropped, malformed, or foreign so far; whether their times jump (`Jumps`); the trackers that are held; and
-    the joints, predicted and true (66 whole millimetres, axes of openxr). Packets that were not taken are
-    reported at once, by a message that has the counts alone.
+    A message has the frame's number and time (s); the milliseconds that the network itself took (`ms`), and
+    those that the whole pose took, from the sample's arrival until all outputs had it (`whole`); how many
+    samples were dropped, malformed, or foreign so far; whether the samples' times jump (`Jumps`); the
+    trackers that are held; and the joints, predicted and true (66 whole millimetres each, axes of openxr).
+    Packets that are not taken are reported at once, by a message with these counts alone.
 
     Args:
         stream: the network.
@@ -75,7 +75,7 @@ def play(
         outputs: get the frames first.
         fitting: fits the stream to its wearer between the samples.
         avatar: whether messages have the joints' rotations as well.
-        tell: gets a line where the samples' times jump.
+        tell: gets a line if the samples' times jump.
     """
     jumps = Jumps(tell)
     number, refused, dropped, told = 0, 0, 0, (0, 0)
@@ -114,10 +114,10 @@ def play(
 
 
 class Jumps:
-    """Notices times that jump with every sample, as milliseconds do; the network begins anew each time.
+    """Detects times that jump at every sample, as those in milliseconds do; each jump restarts the network.
 
     Args:
-        tell: gets a line when it is noticed first.
+        tell: gets a line at the first detection.
     """
 
     def __init__(self, tell: Callable[[str], None]):
@@ -127,7 +127,7 @@ class Jumps:
 
     @property
     def many(self) -> bool:
-        """Whether so many times in a row jumped that it is no pause."""
+        """Whether more times in a row jumped than a pause would explain."""
         return self.row >= JUMPS
 
     def take(self, time: float) -> None:
@@ -143,7 +143,7 @@ class Jumps:
 
 
 def take_step(stream: Stream, sample: SourceSample) -> Pose | None:
-    """Return the pose of a sample; None where the stream refuses it."""
+    """Return the pose for a sample; None if the stream refuses the sample."""
     try:
         return stream.step(*sample.trackers, time=sample.time)
     except InputError:
@@ -171,7 +171,7 @@ def millimetres(space: Space, joints: np.ndarray | None) -> list[int] | None:
 def rotations_message(space: Space, pose: Pose) -> dict[str, Any]:
     """Return the part of a message with the joints' rotations: 22 quaternions xyzw as 88 whole numbers.
 
-    They are those of VRM's T-pose, which is SMPL's: Y up, facing +Z; the root's is in the page's axes.
+    They are relative to VRM's T-pose, which is SMPL's: Y up, facing +Z. The root's is in the page's axes.
     """
     local = space.pose_in(pose.rotations)
     local[0] = PAGE_SPACE.world.T @ local[0]

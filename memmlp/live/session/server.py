@@ -1,7 +1,7 @@
-"""The server of the page: its files, the frames as server-sent events, and orders of its wearer.
+"""The server of the page: it serves the page's files, sends frames as server-sent events, and takes orders.
 
-It listens on 127.0.0.1 unless another address is asked for; then every request needs a token. Watchers come
-and go; a slow one misses frames, and holds up nobody.
+It listens on 127.0.0.1 unless another address is asked for; in that case every request needs a token. Pages
+may be opened and closed at any time; a slow page misses frames, and does not delay the others.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class File(NamedTuple):
     """A file of the page.
 
     Attributes:
-        kind: its content type.
-        read: returns its content.
+        kind: the file's content type.
+        read: returns the file's content.
     """
 
     kind: str
@@ -48,7 +48,7 @@ class File(NamedTuple):
 
 
 def read_page(name: str) -> bytes:
-    """Return the content of a file of the page that comes with memmlp."""
+    """Return the content of a file of the page, which is part of the package."""
     return resources.files("memmlp.live.session").joinpath("page", name).read_bytes()
 
 
@@ -60,10 +60,10 @@ FILES: dict[str, File] = {
 
 
 class Hub:
-    """Hands frames to all watchers.
+    """Hands frames to all watchers, which are the open pages.
 
     Args:
-        greeting: what each watcher gets first.
+        greeting: the message that each watcher gets first.
     """
 
     def __init__(self, greeting: Mapping[str, Any]):
@@ -73,11 +73,11 @@ class Hub:
         self.closed = False
 
     def publish(self, message: Mapping[str, Any]) -> None:
-        """Hand a frame's message to all who watch now."""
+        """Hand a frame's message to all present watchers."""
         self._hand(event("frame", message))
 
     def tell(self, name: str, state: Mapping[str, Any]) -> None:
-        """Hand a state to all who watch now, and to all who come later until it changes."""
+        """Hand a state to all present watchers, and to later ones until the state changes."""
         line = event(name, state)
         with self.lock:
             self.states[name] = line
@@ -90,7 +90,7 @@ class Hub:
 
     @contextlib.contextmanager
     def watch(self) -> Iterator[queue.Queue[bytes | None]]:
-        """Give a watcher a queue of events for as long as it watches; None in it is the end."""
+        """Give a watcher a queue of events for as long as it watches; None in the queue means the end."""
         watcher: queue.Queue[bytes | None] = queue.Queue(QUEUED)
         with self.lock:
             for state in self.states.values():
@@ -105,7 +105,7 @@ class Hub:
                 self.watchers.discard(watcher)
 
     def close(self) -> None:
-        """End every watcher's stream, and accept no more."""
+        """End every watcher's stream of events, and accept no more events."""
         with self.lock:
             self.closed = True
             for watcher in self.watchers:
@@ -113,7 +113,7 @@ class Hub:
 
 
 def _put(watcher: queue.Queue[bytes | None], line: bytes | None) -> None:
-    """Append a line to a watcher's queue; where that is full, its oldest line goes."""
+    """Append a line to a watcher's queue; if the queue is full, drop its oldest line."""
     try:
         watcher.put_nowait(line)
     except queue.Full:
@@ -133,7 +133,7 @@ class LiveHandler(BaseHTTPRequestHandler):
     server: LiveServer
 
     def do_GET(self) -> None:
-        """Send a file of the page, or the events until the end."""
+        """Send a file of the page, or the stream of events until its end."""
         url, access, port = urllib.parse.urlsplit(self.path), self.server.access, self.server.server_port
         name = url.path.lstrip("/")
         with contextlib.suppress(ConnectionError):  # raised when the page was closed
@@ -149,7 +149,7 @@ class LiveHandler(BaseHTTPRequestHandler):
                 self.send_error(404)
 
     def do_POST(self) -> None:
-        """Take an order of the page: an empty answer, or a line that says what is wrong with it."""
+        """Take an order from the page; the answer is empty, or a line that says what is wrong with it."""
         with contextlib.suppress(ConnectionError):
             if not self.server.access.allows_change(self.path, self.headers, self.server.server_port):
                 self.send_error(403)
@@ -200,7 +200,7 @@ class LiveHandler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Log nothing, for requests are no news."""
+        """Log nothing, since requests are not worth a line."""
 
 
 class LiveServer(ThreadingHTTPServer):
@@ -210,12 +210,12 @@ class LiveServer(ThreadingHTTPServer):
         hub: gives the frames to the pages.
         port: the port; 0 for any free one.
         host: the address to serve at; 127.0.0.1 is this machine alone.
-        token: what every request needs at another address than that; None for a new one.
-        files: the files of the page, by their paths.
-        ask: takes an order of the page, or raises InputError; None where there is nobody to fit.
+        token: what every request needs at any other address; None for a new random token.
+        files: the page's files, by their paths.
+        ask: takes an order from the page, or raises InputError; None where the stream takes no orders.
 
     Raises:
-        InputError: where the address is none of this machine's, or the port is taken.
+        InputError: if the address does not belong to this machine, or the port is taken.
     """
 
     daemon_threads = True
@@ -242,7 +242,7 @@ class LiveServer(ThreadingHTTPServer):
             raise InputError(f"--host {host} --port {port}: {reason}; {allowed}") from None
 
     def server_bind(self) -> None:
-        """Bind to the address, without asking a name server for its name."""
+        """Bind to the address, without asking a name server for the host's name."""
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.socket.bind(self.server_address)
         self.server_address = name, port, *_ = self.socket.getsockname()
@@ -250,12 +250,15 @@ class LiveServer(ThreadingHTTPServer):
 
     @property
     def url(self) -> str:
-        """The page's address, with the token where one is needed; at all addresses, one that others reach."""
+        """The page's address, with the token if one is needed.
+
+        A server at all addresses gives one that other machines can reach.
+        """
         name = own_address() if self.server_name == EVERYWHERE else str(self.server_name)
         return self.access.url(name, self.server_port)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore the error, for what one page breaks off does not concern the others."""
+        """Ignore the error, since a request that one page breaks off does not concern the others."""
 
     def __enter__(self) -> LiveServer:
         self.thread = threading.Thread(target=self.serve_forever, args=(0.05,), daemon=True)
@@ -270,7 +273,7 @@ class LiveServer(ThreadingHTTPServer):
 
 
 def own_address() -> str:
-    """Return the address of this machine by which others of its network reach it. Nothing is sent."""
+    """Return this machine's address in its network, at which other machines reach it; nothing is sent."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))  # an address for documentation (RFC 5737)

@@ -38,13 +38,14 @@ FORGOTTEN = 10_000  # so many missing numbers are not lost packets but another s
 
 
 class SourceSample(NamedTuple):
-    """What a source gives.
+    """A sample from a source.
 
     Attributes:
         time: seconds of the trackers' clock.
         trackers: head, left and right.
         dropped: how many samples were lost before this one.
-        arrived: when it came, seconds of `time.perf_counter`; None for when it is given.
+        arrived: the time of arrival, seconds of `time.perf_counter`; None for the time at which it is
+            returned.
     """
 
     time: float
@@ -60,7 +61,7 @@ class TrackerSource(Protocol):
         name: the source in words.
         space: the frame of reference of its poses.
         malformed: how many packets could not be read.
-        foreign: how many packets came from machines that were not asked for.
+        foreign: how many packets came from machines whose packets are not taken.
         worn: whether somebody wears the trackers now.
     """
 
@@ -71,17 +72,17 @@ class TrackerSource(Protocol):
     worn: bool
 
     def read(self) -> SourceSample | None:
-        """Return the next sample; None where none came within `WAIT` seconds."""
+        """Return the next sample; None if none came within `WAIT` seconds."""
 
     def truth(self, time: float) -> np.ndarray | None:
-        """Return the true joints (22, 3), metres, at a time; None where they are not known."""
+        """Return the true joints (22, 3), metres, at a time; None if they are not known."""
 
     def close(self) -> None:
         """Release what the source holds."""
 
 
 class TrackedClip:
-    """A clip whose tracker poses and true joints can be had at any time.
+    """A clip, from which tracker poses and true joints can be read at any time.
 
     Args:
         name: the clip's name.
@@ -105,7 +106,7 @@ class TrackedClip:
         return head, left, right
 
     def truth(self, time: float) -> np.ndarray:
-        """Return the joints (22, 3), metres, world, at a time, interpolated; outside the clip the nearest."""
+        """Return the joints (22, 3), metres, world, at a time, interpolated, or at the clip's nearest end."""
         first, weight = self._place(time)
         return self.joints[first] + weight * (self.joints[first + 1] - self.joints[first])
 
@@ -142,7 +143,7 @@ def npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
 
 
 def in_space(trackers: TrackerPoses, space: Space) -> TrackerPoses:
-    """Bring trackers, positions and quaternions (xyzw), from AMASS' world to a space."""
+    """Convert trackers, positions and quaternions (xyzw), from AMASS' world to a frame of reference."""
     positions, rotations = (np.stack(part) for part in zip(*filter(None, trackers), strict=True))
     matrices = space.rotations_out(quaternion_to_matrix(rotations))
     head, left, right = zip(space.positions_out(positions), matrix_to_quaternion(matrices), strict=True)
@@ -150,16 +151,16 @@ def in_space(trackers: TrackerPoses, space: Space) -> TrackerPoses:
 
 
 class ClipSource:
-    """Plays a clip as a headset would send it: at a rate, in real time, over and over.
+    """Plays a clip as a headset would send it: at a fixed rate, in real time, in repeated rounds.
 
-    A sample that is due while the last one is still being worked on is dropped, as a device's would be.
+    A sample that is due while the last one is still being processed is dropped, as with a device.
 
     Args:
         clip: the clip.
-        hz: samples a second.
-        rounds: how often it is played; endlessly by default.
+        hz: samples per second.
+        rounds: how often the clip is played; endlessly by default.
         clock: returns the time, seconds; the machine's by default.
-        sleep: waits so many seconds; the machine's by default.
+        sleep: waits for a number of seconds; the machine's by default.
     """
 
     space: SpaceName = "amass"
@@ -182,7 +183,7 @@ class ClipSource:
 
     @property
     def over(self) -> bool:
-        """Whether all rounds are played."""
+        """Whether all rounds have been played."""
         return self.next >= self.rounds * self.count
 
     def read(self) -> SourceSample | None:
@@ -200,7 +201,7 @@ class ClipSource:
 
     @property
     def round(self) -> float:
-        """The seconds from the beginning of a round to that of the next."""
+        """The seconds from the beginning of one round to the beginning of the next."""
         return (self.count - 1) / self.hz + PAUSE
 
     def truth(self, time: float) -> np.ndarray:
@@ -209,22 +210,23 @@ class ClipSource:
         return self.clip.truth((time + half) % self.round - half)
 
     def close(self) -> None:
-        """Do nothing, for nothing is held."""
+        """Do nothing, since this source holds no resources."""
 
 
 class PacketSource:
-    """Takes packets that arrive at a UDP port, from this machine and from others that it is told of.
+    """Takes packets that arrive at a UDP port, from this machine and from listed other machines.
 
     Args:
-        name: what kind of packets, in words.
+        name: the kind of packets, in words.
         port: the port; 0 for any free one.
         parse: reads the packet of a datagram, or raises ValueError.
         space: the frame of reference of the poses.
-        senders: the other machines whose packets are taken; without any, nobody else reaches the port.
-        tell: gets a line about each machine whose packets are not.
+        senders: the other machines whose packets are taken; without any, only this machine can reach the
+            port.
+        tell: gets a line about each machine whose packets are refused.
 
     Raises:
-        InputError: where the port is taken.
+        InputError: if the port is taken.
     """
 
     worn = True
@@ -249,7 +251,7 @@ class PacketSource:
         self.last: int | None = None
 
     def read(self) -> SourceSample | None:
-        """Return the next packet's sample; None where none came in time, or what came is not taken."""
+        """Return the next packet's sample; None if no packet came in time, or if the packet is not taken."""
         try:
             datagram, (sender, _) = self.socket.recvfrom(LARGEST)
         except TimeoutError:
@@ -277,7 +279,7 @@ class PacketSource:
             self.tell(f"packets from {sender} are ignored; --from {sender} takes them")
 
     def _dropped(self, packet: Packet) -> int:
-        """Return how many numbers are missing between the last packet and this one."""
+        """Return how many sample numbers are missing between the last packet and this one."""
         last, self.last = self.last, packet.seq
         if last is None or packet.seq is None:
             return 0
@@ -285,7 +287,7 @@ class PacketSource:
         return missing if 0 < missing < FORGOTTEN else 0
 
     def truth(self, time: float) -> None:
-        """Return None, for the truth is not known."""
+        """Return None, since the truth is not known."""
 
     def close(self) -> None:
         """Release the port."""
@@ -293,7 +295,7 @@ class PacketSource:
 
 
 def bind(listener: socket.socket, port: int, host: str = HOST) -> None:
-    """Bind a socket to a port, by default of this machine alone. Raises InputError where it is taken."""
+    """Bind a socket to a port, by default on this machine alone. Raises InputError if the port is taken."""
     try:
         listener.bind((host, port))
     except OSError as error:
@@ -306,10 +308,10 @@ def bind(listener: socket.socket, port: int, host: str = HOST) -> None:
 
 
 def send(source: ClipSource, port: int, pack: Callable[[Packet], bytes], space: Space) -> int:
-    """Send a clip's samples, in a space, to a UDP port of this machine until all rounds are played.
+    """Send a clip's samples in a frame of reference to a UDP port of this machine, for all rounds.
 
     Returns:
-        How many were sent.
+        The number of samples sent.
     """
     sent = 0
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:

@@ -1,7 +1,7 @@
-"""Fits a running stream to its wearer, by the page's orders: body height, floor, a T-pose to calibrate in.
+"""Fits a running stream to its wearer by orders from the page: body height, floor, calibration in a T-pose.
 
-Orders come from the server's threads; they are carried out between two samples. Who calibrates has walked
-away from the keyboard, so that this waits for a countdown.
+Orders arrive in the server's threads and are carried out between two samples. The wearer has to walk away
+from the keyboard before a calibration, so it waits for a countdown.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ Tell = Callable[[str, Mapping[str, Any]], None]
 
 
 class Order(NamedTuple):
-    """What the page wants.
+    """An order from the page.
 
     Attributes:
-        action: of ACTIONS.
-        value: metres, for height and floor; seconds of the countdown, for calibrate and touch_floor.
+        action: one of ACTIONS.
+        value: metres for height and floor; seconds of the countdown for calibrate and touch_floor.
     """
 
     action: str
@@ -61,9 +61,9 @@ class Fitting:
 
     Args:
         stream: the stream.
-        space: its frame of reference.
-        path: the file that each change is saved to; None for none.
-        tell: gets "wearer" and the state, whenever it changes.
+        space: the stream's frame of reference.
+        path: the file to which each change is saved; None to save nothing.
+        tell: gets "wearer" and the state whenever the state changes.
         clock: returns the time, seconds.
     """
 
@@ -92,14 +92,14 @@ class Fitting:
         self._say("")
 
     def ask(self, fields: object) -> None:
-        """Take an order, from any thread. Raises InputError for what is none."""
+        """Take an order, from any thread. Raises InputError if it is no valid order."""
         self.orders.put(read_order(fields))
 
     def step(self, trackers: TrackerPoses | None) -> None:
-        """Carry out what is due: new orders at once, and one that waits when its time has come.
+        """Carry out the orders that are due: new ones at once, and a waiting one after its countdown.
 
         Args:
-            trackers: the devices now; None where no sample came.
+            trackers: the devices' present poses; None if no sample came.
         """
         while not self.orders.empty():
             self._begin(self.orders.get())
@@ -108,7 +108,7 @@ class Fitting:
             self._carry_out(order, trackers)
 
     def _begin(self, order: Order) -> None:
-        """Carry out an order, or let it wait for its countdown."""
+        """Carry out an order, or start its countdown."""
         if order.action in ("calibrate", "touch_floor"):
             seconds = COUNTDOWN if order.value is None else min(max(order.value, 0.0), LONGEST)
             self.waiting, self.due = order, self.clock() + seconds
@@ -118,7 +118,7 @@ class Fitting:
             self._carry_out(order, None)
 
     def _carry_out(self, order: Order, trackers: TrackerPoses | None) -> None:
-        """Carry out an order, save what it changed, and tell how it went."""
+        """Carry out an order, save what it changed, and report the result."""
         try:
             said = self.actions[order.action](order.value if trackers is None else trackers)
             if order.action != "cancel":
@@ -129,7 +129,7 @@ class Fitting:
             self._say(said)
 
     def _calibrate(self, trackers: TrackerPoses) -> str:
-        """Learn the offsets of the devices, unless these cannot be worn in a T-pose."""
+        """Learn the offsets of the devices, unless the devices can't be worn like that in a T-pose."""
         before = self.stream.offsets
         apart = distances(self.stream.calibrate(*trackers))
         worst = int(apart.argmax())
@@ -140,7 +140,7 @@ class Fitting:
         return f"Calibrated; the devices are up to {100 * apart[worst]:.0f} cm from the joints."
 
     def _touch_floor(self, trackers: TrackerPoses) -> str:
-        """Take the floor where the lower hand is."""
+        """Set the floor's height to that of the lower hand."""
         hands = [tracker[0] for tracker in trackers[1:] if tracker is not None]
         if not hands:
             raise InputError("floor: no hand was seen; touch the floor with one")
@@ -148,18 +148,18 @@ class Fitting:
         return self._floor(round(floor, 4))
 
     def _height(self, value: float | None) -> str:
-        """Take a body height, metres; None for the network's."""
+        """Set the wearer's body height, metres; None for the network's."""
         self.stream.fit(value, self.stream.wearer.floor)
         self.own_height = value
         return "" if self.stream.offsets is None else "Calibrate again: the offsets are of another height."
 
     def _floor(self, value: float | None) -> str:
-        """Take a height of the floor, metres."""
+        """Set the height of the floor, metres."""
         self.stream.fit(self.own_height, value or 0.0)
         return f"The floor is at {100 * (value or 0.0):.0f} cm."
 
     def _forget(self, _: float | None) -> str:
-        """Take the devices for the joints again."""
+        """Forget the calibration: devices count as joints again."""
         self.stream.offsets = None
         self.stream.reset()
         return "The calibration is forgotten."
@@ -191,7 +191,7 @@ class Fitting:
 
 
 def hips_height(rest: np.ndarray) -> float:
-    """Return how high the hips of a rest pose (22, 3), metres, are above its lowest joint."""
+    """Return the height of the hips above the lowest joint, in a rest pose (22, 3), metres."""
     return float(rest[ROOT, 1] - rest[:, 1].min())
 
 

@@ -1,1 +1,1 @@
-"""A static site that times networks in the browser it is opened in, plays clips, and is worn."""
+"""A static site that times networks in the visitor's browser, plays clips, and runs on headsets."""

@@ -1,4 +1,4 @@
-"""A site's clips: trackers and true joints of some seconds, as small binary files."""
+"""A site's clips: a few seconds of trackers and true joints, as small binary files."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from memmlp.live.spaces import SPACES
 from memmlp.motion.body import FPS
 
 NUMBERS = 9 + 12 + 66
-"""Of a frame: positions and quaternions (xyzw) of head and wrists, true joints; metres, axes of openxr."""
+"""Numbers per frame: positions and quaternions (xyzw) of head and wrists, joints; metres, openxr axes."""
 
 
 class SiteClip(NamedTuple):
     """A clip of a site.
 
     Attributes:
-        key: what it is called in files: a digest of its content.
-        name: its name for people.
+        key: the clip's name in files: a digest of its content.
+        name: the clip's readable name.
         content: little-endian float32 (frames, 87).
     """
 
@@ -34,17 +34,17 @@ class SiteClip(NamedTuple):
 
     @property
     def frames(self) -> int:
-        """How many frames it has, at 60 Hz."""
+        """Number of the clip's frames, at 60 Hz."""
         return len(self.content) // (4 * NUMBERS)
 
 
 def packed(name: str, frames: np.ndarray, seconds: float) -> SiteClip:
-    """Return the middle of a clip.
+    """Return the middle part of a clip.
 
     Args:
         name: the clip's name.
         frames: [X | Theta] (N, 252) at 60 Hz, world (`memmlp.motion.body`).
-        seconds: how much of it, at most.
+        seconds: the longest duration of the part.
     """
     count = min(len(frames), round(seconds * FPS))
     first = (len(frames) - count) // 2
@@ -56,7 +56,7 @@ def packed(name: str, frames: np.ndarray, seconds: float) -> SiteClip:
 
 
 def write_clips(clips: Iterable[SiteClip], folder: Path) -> list[dict[str, Any]]:
-    """Write clips into a site's folder, and return what the page has to know of them."""
+    """Write clips into a site's folder, and return the entries that tell the page about them."""
     entries = []
     for clip in clips:
         path = folder / "clips" / f"{clip.key}.gz"

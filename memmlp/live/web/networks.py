@@ -1,4 +1,4 @@
-"""A site's networks: the graphs that are timed, and the one that is played and worn."""
+"""A site's networks: the graphs that are timed, and the one that plays clips and is worn."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class SiteNetwork:
     """A network of a site.
 
     Attributes:
-        key: its name in files and on the page's inside.
-        name: its name for people.
-        run: its run's id, "random" for random weights.
+        key: the network's name in files and in the page's code.
+        name: the network's readable name.
+        run: the id of the network's run; "random" for random weights.
         model: the network as it was trained.
-        clips: the names of its test clips on the site.
+        clips: the names of those of its test clips that are on the site.
     """
 
     key: str
@@ -53,7 +53,7 @@ class SiteNetwork:
 
     @property
     def trained(self) -> bool:
-        """Whether it is trained, so that it can be played and worn; any other is only timed."""
+        """Whether the network is trained, so that it can play clips and be worn; any other is only timed."""
         return self.run != "random"
 
 
@@ -63,8 +63,8 @@ class Writer:
 
     Attributes:
         folder: the site's folder.
-        calibration: clips (N, 252) that int8's ranges are found with.
-        bench: whether there are graphs to be timed; if not, only those to be played.
+        calibration: clips (N, 252) from which the ranges of int8 are found.
+        bench: whether to write the graphs that are timed; if not, only those that play clips.
     """
 
     folder: Path
@@ -72,7 +72,7 @@ class Writer:
     bench: bool = True
 
     def write(self, network: SiteNetwork) -> Entry:
-        """Write a network's graphs, and return what the page has to know of it."""
+        """Write a network's graphs, and return the entry that tells the page about them."""
         tell(f"web: export {network.name}")
         model = network.model.cpu().eval()
         stream = streaming(model) if has_stream(model) else None
@@ -94,7 +94,7 @@ class Writer:
         }
 
     def _played(self, network: SiteNetwork, stream: StreamingGraph | None, made: Path) -> Entry:
-        """Write the full graph with its weights."""
+        """Write the full graph with its weights, which plays clips."""
         path = _whole(made, "streaming" if stream else "naive")
         export_full(stream or network.model, path, network.run, SPACE.name)
         return {"file": self._kept(network.key, path.read_bytes()), "weights": []}
@@ -102,7 +102,7 @@ class Writer:
     def _timed(
         self, network: SiteNetwork, stream: StreamingGraph | None, made: Path, played: Entry | None
     ) -> list[Entry]:
-        """Write the graphs that are timed: as published, as stream, and that in less precision."""
+        """Write the graphs that are timed: as published, as a stream, and the stream with lower precision."""
         rows = [self._pair(network, network.model, "naive", made, None if stream else played)]
         if stream is not None:
             rows.append(self._pair(network, stream, "streaming", made, played))
@@ -112,7 +112,7 @@ class Writer:
     def _less_precise(
         self, network: SiteNetwork, stream: StreamingGraph, precision: str, made: Path
     ) -> Entry:
-        """Write a stream in less precision; of int8 there is no full graph."""
+        """Write a stream with lower precision; there is no full graph in int8."""
         path, key, whole = made / "less.onnx", f"{network.key}-{precision}", None
         if precision == "fp16":
             lower(precision, _whole(made, "streaming"), path, stream, self.calibration)
@@ -129,7 +129,7 @@ class Writer:
         made: Path,
         played: Entry | None,
     ) -> Entry:
-        """Write a graph in float32, alone and as the whole way from trackers to joints."""
+        """Write a graph in float32: the network's step, and the full graph from trackers to joints."""
         step, whole = made / f"{name}.onnx", _whole(made, name)
         export(graph, step, network.run)
         if played is None:
@@ -139,7 +139,7 @@ class Writer:
         return {"graph": name, "precision": "fp32", "step": alone, "whole": played}
 
     def skeleton(self, name: str, model: onnx.ModelProto) -> Entry:
-        """Write a graph without its weights, and return where it is and what is to be drawn for it."""
+        """Write a graph without its weights; return its address and the weights that the page has to draw."""
         drawn = without_weights(model)
         file = self._kept(name, model.SerializeToString())
         return {"file": file, "weights": [part._asdict() for part in drawn]}
@@ -157,7 +157,7 @@ def _whole(made: Path, graph: str) -> Path:
 
 
 def body_of(rest: np.ndarray) -> Entry:
-    """Return what a stream has to know of a network's body.
+    """Return what the site's stream has to know of a network's body.
 
     Args:
         rest: joints in the rest pose (22, 3), metres, SMPL's body frame.

@@ -1,4 +1,4 @@
-"""The files of npm packages that a site has: onnxruntime-web and three.js, of pinned versions."""
+"""The files of npm packages that a site contains: onnxruntime-web and three.js, in pinned versions."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ WEBGPU = {
 
 
 DOCUMENTED = re.compile(rb"^[ \t]*/\*\*(?!\s*\* @license)(?:(?!\*/).)*\*/[ \t]*\n", re.MULTILINE | re.DOTALL)
-"""A comment for a library's developers, on lines of its own: a third of three.js. Licences stay."""
+"""Comments for a library's developers on lines of their own, a third of three.js; licences are kept."""
 
 
 def write_packages(folder: Path, webgpu: bool) -> dict[str, str]:
     """Write the packages' files into a site's folder, and return the versions by name.
 
     Raises:
-        InputError: where a package cannot be had.
+        InputError: if a package can't be downloaded.
     """
     _write(folder, THREE, DRAWING)
     _write(folder, ONNXRUNTIME_WEB, {**WASM, **WEBGPU} if webgpu else WASM)

@@ -1,4 +1,4 @@
-"""ONNX files without weights, which the page draws at random: they do not matter for a step's time."""
+"""ONNX files without weights; the page draws random ones, since values do not matter for a step's time."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ KINDS = {TensorProto.FLOAT: "float32", TensorProto.FLOAT16: "float16", TensorPro
 
 
 class Drawn(NamedTuple):
-    """A tensor that the page draws.
+    """A tensor that the page draws at random.
 
     Attributes:
-        offset: where it begins among all of the graph's, bytes.
-        size: how many numbers it has.
-        kind: their type: float32, float16 or int8.
-        scale: their standard deviation about 0, which is that of the weights they stand for.
+        offset: where the tensor begins among all drawn tensors of the graph, bytes.
+        size: how many numbers the tensor has.
+        kind: the numbers' type: float32, float16 or int8.
+        scale: the numbers' standard deviation about 0, that of the weights which they replace.
     """
 
     offset: int
@@ -32,9 +32,9 @@ class Drawn(NamedTuple):
 
 
 def without_weights(model: onnx.ModelProto) -> list[Drawn]:
-    """Take the large weights out of a graph, and return what is to be drawn in their place.
+    """Remove the large weights from a graph, and return the tensors that are to be drawn in their place.
 
-    Numbers of the same size go through the same operations: none becomes infinite, or so small that a
+    Drawn numbers of about the same size keep the operations' speed: none becomes infinite, or so small that a
     processor takes longer over it.
     """
     drawn, end = [], 0

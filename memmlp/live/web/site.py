@@ -32,20 +32,20 @@ SHARED = {
     "memmlp.live.session": ("stage.js", "history.js"),
     "memmlp.common": ("theme.js", "dom.js", "style.css"),
 }
-"""Files of other rooms' pages that a site has, too."""
+"""Files of other pages of the package that a site uses, too."""
 ABOUT = "site.json"
 
 
 @dataclass(frozen=True)
 class Site:
-    """What a site is made of.
+    """The contents of a site.
 
     Attributes:
         networks: the networks; those that are trained can be played and worn.
         base: the network that the others' times are compared with; None for a site without a bench.
         clips: the clips that can be played.
-        calibration: clips (N, 252) that int8's ranges are found with, for the bench.
-        webgpu: whether the site has what WebGPU needs.
+        calibration: clips (N, 252) from which the ranges of int8 are found, for the bench.
+        webgpu: whether the site has the files that WebGPU needs.
     """
 
     networks: Sequence[SiteNetwork]
@@ -55,12 +55,12 @@ class Site:
     webgpu: bool = True
 
     def make(self, out: Path) -> int:
-        """Write the site, whole or not at all, and return its size in bytes.
+        """Write the site, completely or not at all, and return its size in bytes.
 
-        A site that is there already is replaced.
+        An earlier site in that folder is replaced.
 
         Raises:
-            InputError: where something else is there, or a package cannot be had.
+            InputError: if the folder holds something else, or a package can't be downloaded.
         """
         check_place(out)
         unfinished = temporary(out)
@@ -96,7 +96,7 @@ class Site:
 
 
 def check_place(out: Path) -> None:
-    """Raise InputError where a site must not be written: over something else, or into no folder."""
+    """Raise InputError if no site may be written there: over other content, or in place of a file."""
     if out.exists() and not out.is_dir():
         raise InputError(f"--out {out}: a file; allowed is a new folder, or a site that is to be replaced")
     if out.is_dir() and any(out.iterdir()) and "packages" not in read_json(out / ABOUT):
@@ -108,7 +108,7 @@ def check_place(out: Path) -> None:
 
 
 def _replace(out: Path, unfinished: Path) -> None:
-    """Put a finished site in its place; an earlier one is gone when the new one stands."""
+    """Put a finished site in its place; an earlier site is moved away first, and deleted at the end."""
     earlier = temporary(out)
     if out.exists():
         out.rename(earlier)
@@ -121,7 +121,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _copy(folder: Path) -> None:
-    """Copy the page's own files, and those that it shares with other pages."""
+    """Copy the page's own files, and the files that it shares with other pages."""
     own = resources.files("memmlp.live.web").joinpath("page")
     for path in own.iterdir():
         (folder / path.name).write_bytes(path.read_bytes())
@@ -133,7 +133,7 @@ def _copy(folder: Path) -> None:
 
 
 def _policy(page: Path) -> str:
-    """Return the Content-Security-Policy: no other host; scripts are files, and the import map."""
+    """Return the Content-Security-Policy: no other hosts; scripts are files, or the import map."""
     inline = re.search(r'<script type="importmap">(.*?)</script>', page.read_text("utf-8"), re.DOTALL)
     assert inline is not None
     digest = base64.b64encode(hashlib.sha256(inline[1].encode()).digest()).decode()
@@ -145,7 +145,7 @@ def _policy(page: Path) -> str:
 
 
 def _worker(folder: Path) -> None:
-    """Tell the service worker which files there are, and give it a version that changes with any of them."""
+    """Write the list of files into the service worker, and a version that changes with any of them."""
     path = folder / "sw.js"
     digests = {str(file.relative_to(folder).as_posix()): file_digest(file) for file in _files(folder)}
     version = hashlib.sha256(json.dumps(digests).encode()).hexdigest()[:16]

@@ -26,7 +26,7 @@ class Target:
 
     Attributes:
         name: the clip's name: its path below the source folder, without suffix.
-        source: its npz file.
+        source: the clip's npz file.
         path: the file to write.
     """
 
@@ -42,11 +42,11 @@ class Target:
 
 @dataclass(frozen=True)
 class ExportPlan:
-    """What is to be written, and how.
+    """The clips that an export writes, and their format.
 
     Attributes:
         targets: the clips.
-        format: their files' format.
+        format: the format of the files.
         skipped: folders that cannot be listed.
     """
 
@@ -57,12 +57,12 @@ class ExportPlan:
 
 @dataclass(frozen=True)
 class ExportReport:
-    """What an export did.
+    """The result of an export.
 
     Attributes:
-        written: the files that it wrote.
-        seconds: how long they last, together.
-        skipped: the clips that it skipped.
+        written: the files that were written.
+        seconds: the total duration of the written clips.
+        skipped: the clips that were skipped.
     """
 
     written: tuple[Path, ...]
@@ -76,10 +76,10 @@ def plan_export(source: Path, out: Path, name: str | None = None) -> ExportPlan:
     Args:
         source: file or folder.
         out: file or folder; in a folder each file has its source's path, with the format's suffix.
-        name: the format, of FORMATS; by default a file's suffix decides.
+        name: the format, one of FORMATS; by default a file's suffix decides.
 
     Raises:
-        InputError: where there is nothing to export, the format is unclear, `out` is a file where a folder is
+        InputError: if there is nothing to export, the format is unclear, `out` is a file where a folder is
             needed or the other way round, or a file would be written over a source.
     """
     if not source.exists():
@@ -106,10 +106,11 @@ def _plan_folder(source: Path, out: Path, chosen: Format) -> ExportPlan:
 
 
 def choose_format(out: Path, name: str | None, folder: bool) -> Format:
-    """Return the format of the file, or the folder of files, `out`: the named one, or that of its suffix.
+    """Return the format of the file, or the folder of files, `out`: the named format, or its suffix's.
 
     Raises:
-        InputError: where neither tells, they contradict, a folder has a file's suffix, or a file is a folder.
+        InputError: if neither determines the format, they contradict each other, a folder has a file's
+            suffix, or a file is a folder.
     """
     if folder and name is None:
         raise InputError(f"--format: needed for a folder; allowed: {', '.join(FORMATS)}")
@@ -133,7 +134,7 @@ def _targets(folder: Path, files: list[str], out: Path, suffix: str) -> Iterator
 
 
 def _check_folder(source: Path, out: Path) -> None:
-    """Raise InputError where a file below `out` could be written over a source, or be taken for one later."""
+    """Raise InputError if files below `out` could overwrite sources, or be taken for sources later."""
     above, below = source.resolve(), out.resolve()
     if below.is_relative_to(above) or above.is_relative_to(below):
         raise InputError(f"--out {out}: in {source}, or around it; allowed: a folder beside it")
@@ -147,11 +148,11 @@ def read_targets(
     Args:
         plan: the targets.
         read: reads a target's source, or raises InputError: NoMotion for a file that is no clip at all.
-        skipped: gets the other sources that cannot be read, unless there is only one.
-        strict: whether the first of those raises instead.
+        skipped: gets the other sources that cannot be read, unless the plan has only one target.
+        strict: whether the first source that cannot be read raises instead.
 
     Raises:
-        InputError: as told, and at the end where every source was skipped.
+        InputError: as described above, and at the end if every source was skipped.
     """
     alone, usable = len(plan.targets) == 1, False
     for target in progress_bar(plan.targets, "export"):
@@ -171,7 +172,7 @@ def read_targets(
 
 
 def read_motion(target: Target) -> Clip:
-    """Read a target's clip. Raises InputError where it is damaged or cannot be a person's motion."""
+    """Read a target's clip. Raises InputError if it is damaged or can't be a person's motion."""
     clip = read_clip(target.source, target.name)
     check_plausible(target.source, clip)
     return clip
@@ -184,9 +185,9 @@ def export(
 
     Args:
         plan: what to write.
-        body: `builtin`, or an SMPL-H model.npz: the bones of the formats that have bones.
+        body: `builtin`, or an SMPL-H model.npz; it gives the bones in formats that have bones.
         fps: frame rate, Hz, to which the clips are resampled; by default each keeps its own.
-        strict: whether a bad file raises; otherwise it is skipped and reported, if there are others.
+        strict: whether a bad file raises; otherwise it is skipped and reported, if there are other files.
 
     Raises:
         InputError: for a bad body, if no clip could be read, or a file cannot be written.

@@ -19,9 +19,9 @@ class Format(NamedTuple):
     """A format that clips are written in.
 
     Attributes:
-        suffix: of its files.
+        suffix: the suffix of the format's files.
         write: writes a clip on a body with rest joints (22, 3), metres, atomically.
-        has_bones: whether the body is in the file.
+        has_bones: whether the file contains the body.
     """
 
     suffix: str
@@ -30,7 +30,7 @@ class Format(NamedTuple):
 
 
 def _write_npz(path: Path, clip: Clip, rest: np.ndarray) -> None:
-    """Write AMASS' npz, which has no bones: whoever reads it brings the body."""
+    """Write AMASS' npz, which has no bones; its readers supply the body."""
     write_clip(path, clip)
 
 
@@ -43,10 +43,10 @@ SUFFIXES = {each.suffix: each for each in FORMATS.values()}
 
 
 def format_of(path: Path, key: str = "path") -> Format:
-    """Return the format that a file's suffix means.
+    """Return the format that belongs to a file's suffix.
 
     Raises:
-        InputError: for any other suffix; `key` is what the path was given as.
+        InputError: for any other suffix; its message names the path by `key`, the option or argument.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{key} {path}: no such kind of file; allowed: {', '.join(SUFFIXES)}")
@@ -54,7 +54,7 @@ def format_of(path: Path, key: str = "path") -> Format:
 
 
 def write_motion(path: Path, clip: Clip, rest: np.ndarray, chosen: Format) -> None:
-    """Write a clip in a format, atomically; folders that are missing are made.
+    """Write a clip in a format, atomically; missing folders are made.
 
     Raises:
         InputError: if the file cannot be written there.

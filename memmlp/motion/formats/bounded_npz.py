@@ -1,9 +1,10 @@
 """Reads arrays of an npz within fixed bounds of memory, whatever the file says of itself.
 
-An npz is a zip of npy files. Before an array is allocated its header, its size in the zip's directory and the
-bounds below must agree; it is read in blocks, and of a wide array only the first columns are kept. Nothing is
-ever unpickled. What damaged bytes can make `zipfile` and `numpy.lib.format` raise is written down nowhere
-(among others tokenize.TokenError, RecursionError, struct.error): whatever they raise means a bad file.
+An npz is a zip of npy files. Before an array is allocated, its header must agree with its size in the zip's
+directory and with the bounds below. It is read in blocks, and only the first columns of a wide array are
+kept. Nothing is ever unpickled. The exceptions that `zipfile` and `numpy.lib.format` raise for damaged bytes
+are not documented (among others tokenize.TokenError, RecursionError, struct.error), so any exception of
+theirs means a bad file.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # NumPy's; others unpack w
 
 @dataclass(frozen=True)
 class Header:
-    """What an npy file says of its array.
+    """The header of an npy file, which describes its array.
 
     Attributes:
-        shape: of the array.
-        fortran: whether it lies column by column.
-        dtype: of its numbers.
+        shape: the array's shape.
+        fortran: whether the array is stored column by column.
+        dtype: the type of its numbers.
         offset: bytes before its data.
     """
 
@@ -66,7 +67,7 @@ class Npz:
         self.names = {name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")}
 
     def header(self, name: str) -> Header:
-        """Return what an array's header says, if the zip's directory says the same."""
+        """Return an array's header, after a check that the zip's directory agrees with it."""
         info = self._zip.getinfo(f"{name}.npy")
         if info.compress_type not in METHODS:
             raise InputError(
@@ -91,7 +92,7 @@ class Npz:
     def columns(self, name: str, count: int, *, exact: bool = False) -> np.ndarray:
         """Read the first `count` columns of an array of numbers (N, >= count), or (N, J, 3), as float64.
 
-        With `exact` the array may have no others.
+        With `exact`, the array must not have further columns.
 
         Raises:
             InputError: for other shapes or types, no rows, or more rows or columns than allowed.
@@ -110,7 +111,7 @@ class Npz:
         return columns
 
     def _check(self, name: str, header: Header, count: int, exact: bool) -> tuple[int, int]:
-        """Return rows and width of an array that may be read."""
+        """Return rows and width of an array, after a check that it may be read."""
         shape = header.shape
         flat = len(shape) == 2 or (len(shape) == 3 and shape[2] == 3 and not header.fortran)
         rows, width = (shape[0], math.prod(shape[1:])) if flat else (0, 0)
@@ -133,7 +134,7 @@ class Npz:
 
 @contextmanager
 def open_npz(path: Path) -> Iterator[Npz]:
-    """Open an npz; what is wrong with its bytes is an InputError, here and while it is read.
+    """Open an npz; damaged bytes raise InputError, here and while the file is read.
 
     Raises:
         InputError: if the file cannot be opened, is no zip, or is damaged; the message names it.
@@ -160,10 +161,10 @@ def brief(error: Exception) -> str:
 
 
 class _Bounded(io.BufferedReader):
-    """A file that gives at most a block at a time, so that no directory of a zip can fill the memory."""
+    """A file that is read at most a block at a time, so that no zip directory can fill the memory."""
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Read `size` bytes, or all; raise ValueError where that is more than a block."""
+        """Read `size` bytes, or all; raise ValueError if that is more than a block."""
         left = os.fstat(self.fileno()).st_size - self.tell()
         wanted = min(left, size) if size is not None and size >= 0 else left
         if wanted > BLOCK:
@@ -172,7 +173,7 @@ class _Bounded(io.BufferedReader):
 
 
 def _parse_header(start: bytes) -> Header:
-    """Parse an npy header from the first bytes of its file; raise anything if it is none."""
+    """Parse an npy header from the first bytes of its file; any exception means that it is none."""
     stream = io.BytesIO(start)
     version = np.lib.format.read_magic(stream)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}

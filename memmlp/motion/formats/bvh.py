@@ -40,8 +40,8 @@ class EndSite:
 
     Attributes:
         name: `<joint>.end`.
-        parent: index of the joint that it belongs to.
-        offset: (3,) from that joint.
+        parent: index of the joint to which the end site belongs.
+        offset: offset (3,) from that joint.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Bvh:
     """A BVH file. Its nodes are its J joints, each after its parent, and then its E end sites.
 
     Attributes:
-        path: where it was read from, for messages.
+        path: the file's path, for messages.
         names: the J joints' names, all different.
         parents: index of each joint's parent; the root's is -1.
         offsets: joint minus parent in the zero pose (J, 3).
@@ -62,7 +62,7 @@ class Bvh:
         ends: the E end sites.
         frame_time: seconds between frames.
         values: channel values (N, C), degrees and the file's unit.
-        rounding: half of the last digit that the header has of the frame time, seconds.
+        rounding: half a unit of the last digit of the frame time in the header, seconds.
     """
 
     path: Path
@@ -90,7 +90,7 @@ class Bvh:
 
     @property
     def fps(self) -> float:
-        """Frames per second: a whole number, or else a usual rate, where the header's few digits mean one."""
+        """Frames per second, rounded to a whole number or a usual rate where the header's digits allow it."""
         rate = 1 / self.frame_time
         if abs(rate - round(rate)) <= RATE_DIGITS * rate:
             return float(round(rate))
@@ -130,11 +130,11 @@ class Bvh:
         """Return the nodes' global rotations (J+E, 3, 3) and positions (J+E, 3) in a pose.
 
         Args:
-            angles: joint -> the values of its rotation channels, degrees, in the file's order; the others'
-                are zero, and so are the root's position channels.
+            angles: joint -> the values of its rotation channels, degrees, in the file's order; other joints
+                have zeros, and so do the root's position channels.
 
         Raises:
-            InputError: if there is no such joint, or not as many channels.
+            InputError: if there is no such joint, or it has another number of channels.
         """
         values = []
         for joint, name in enumerate(self.names):
@@ -198,7 +198,7 @@ def read_bvh(path: Path) -> Bvh:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
-    """Yield the file's lines with their numbers, whatever ends them (LF, CRLF or CR)."""
+    """Yield the file's lines with their numbers, whatever the line ends (LF, CRLF or CR)."""
     try:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path}: too large; allowed: a BVH of at most {MAX_BYTES >> 20} MiB")
@@ -212,7 +212,7 @@ def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
 
 
 def _head(path: Path, lines: Iterator[tuple[int, bytes]]) -> list[bytes]:
-    """Take the lines before MOTION, and MOTION itself, from the file's lines; return those before."""
+    """Take the lines up to MOTION from the file's lines; return those before it."""
     head: list[bytes] = []
     size = 0
     for _, line in lines:
@@ -232,7 +232,7 @@ def _fail(path: Path, line: int, wrong: str, allowed: str) -> NoReturn:
 
 
 def _number(word: str) -> float:
-    """Parse a number as BVH writes it; NaN for anything else, as Python would take `1_0` or `Infinity`."""
+    """Parse a number as BVH writes it; NaN for anything else, also for `1_0` or `Infinity`."""
     try:
         return float(word) if re.fullmatch(r"[-+.0-9eE]+", word) else float("nan")
     except ValueError:
@@ -283,7 +283,7 @@ class _Words:
         return _number(word) if abs(_number(word)) <= LIMIT else self.fail(_show(word), allowed)
 
     def channels(self) -> tuple[str, ...]:
-        """Read a count and as many different channels."""
+        """Read a count, and that many different channels."""
         allowed = f"0 to {len(CHANNELS)} and as many different ones of {', '.join(CHANNELS)} after CHANNELS"
         count = self.next(allowed)
         if count not in map(str, range(len(CHANNELS) + 1)):
@@ -293,7 +293,7 @@ class _Words:
         return names if wrong is None else self.fail(_show(wrong), allowed)
 
     def finish(self) -> None:
-        """Check that there is no further word."""
+        """Check that no further word follows."""
         word = next(self._words, None)
         if word is not None:
             self.fail(_show(word), "MOTION after the root's last }")
@@ -301,7 +301,7 @@ class _Words:
 
 @dataclass
 class _Hierarchy:
-    """The joints as they are read, without recursion; `open` holds those whose } is still to come."""
+    """The joints as they are read, without recursion; `open` holds those whose closing } is still to come."""
 
     words: _Words
     names: list[str] = field(default_factory=list)
@@ -339,7 +339,7 @@ class _Hierarchy:
         self.channels.append(self.words.channels())
 
     def _end(self) -> None:
-        """Read `Site { OFFSET x y z }`, which stands after `End`."""
+        """Read `Site { OFFSET x y z }`, which follows `End`."""
         joint = self.open[-1]
         name = self._new_name(self.names[joint] + END)
         for keyword in ("SITE", "{", "OFFSET"):
@@ -354,7 +354,7 @@ class _Hierarchy:
 
 
 def _motion(path: Path, lines: Iterator[tuple[int, bytes]], width: int) -> tuple[float, float, np.ndarray]:
-    """Read frame time, its rounding and values (N, width) from the lines after MOTION, but for blank ones."""
+    """Read frame time, its rounding and values (N, width) from the lines after MOTION, without blank ones."""
     rows = ((number, line) for number, line in lines if line.strip())
     first, second = next(rows, None), next(rows, None)
     if first is None or second is None or width == 0:

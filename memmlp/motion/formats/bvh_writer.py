@@ -1,7 +1,7 @@
 """Writes clips as BVH: 22 joints and their end sites, centimetres, Y up, the body's T-pose as zero pose.
 
-`memmlp data import` knows the joints (`importing/skeletons/smpl_words.yaml`); `memmlp.yaml` there tells the
-axes as well, for clips in which nobody stands up.
+`memmlp data import` knows the joints (`importing/skeletons/smpl_words.yaml`); `memmlp.yaml` there also gives
+the axes, for clips in which nobody stands up.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ def write_bvh(path: Path, clip: Clip, rest: np.ndarray) -> None:
 def euler_zxy(rotations: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
     """Return angles (N, ..., 3), degrees, with Rz Rx Ry = rotations (N, ..., 3, 3).
 
-    Of an angle's equals (the two triples of a rotation, and full turns) each frame has those nearest to the
-    frame before, so that a program may interpolate between frames. In gimbal lock, where only the sum of the
-    outer angles counts, the product is the rotation all the same. The first frame's are near to the angles
-    (..., 3) `before` it, where there are some.
+    Several triples of angles give the same rotation (two, and full turns). Each frame has the triple nearest
+    to the frame before, so that a program may interpolate between frames. In gimbal lock, where only the sum
+    of the outer angles counts, the product is still the rotation. The first frame's triple is near the angles
+    (..., 3) `before` it, if there are some.
     """
     z = np.arctan2(-rotations[..., 0, 1], rotations[..., 1, 1])
     cosine, sine = np.cos(z)[..., None], np.sin(z)[..., None]
@@ -81,7 +81,7 @@ def _hierarchy(rest: np.ndarray) -> Iterator[str]:
 
 
 def _joint(joint: int, rest: np.ndarray, indent: str) -> Iterator[str]:
-    """Yield the lines of a joint and of all below it.
+    """Yield the lines of a joint and of all joints below it.
 
     The root's offset is zero, since some programs add it to the position channels and others do not.
     """
@@ -104,7 +104,7 @@ def _children(joint: int) -> list[int]:
 
 
 def _below(joint: int) -> Iterator[int]:
-    """Yield a joint and all below it, in the hierarchy's order."""
+    """Yield a joint and all joints below it, in the hierarchy's order."""
     yield joint
     for child in _children(joint):
         yield from _below(child)

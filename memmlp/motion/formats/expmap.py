@@ -1,16 +1,19 @@
 """Reads text of exponential maps in the CMU layout of the papers on human motion prediction.
 
-A file has no header: a line is a frame of 117 numbers with commas between them, three of the root's position
-and three of each of 38 nodes' rotation vector, radians, Y up. The first line is a T-pose. The skeleton is
-that of the database's "MotionBuilder-friendly" BVH conversion, from which the files were made (Li et al.
-2018, "Convolutional Sequence to Sequence Model for Human Dynamics", whose code has the tree and the offsets),
-and so are the names here; the three numbers of an end site are zeros. A vector v is of the inverse rotation:
-on column vectors a node's local rotation is exp(-v), since that code multiplies row vectors from the left.
+A file has no header: each line is a frame of 117 numbers with commas between them: three for the root's
+position, and three for each of 38 nodes' rotation vectors, radians, Y up. The first line is a T-pose. The
+skeleton is that of the database's "MotionBuilder-friendly" BVH conversion, from which the files were made (Li
+et al. 2018, "Convolutional Sequence to Sequence Model for Human Dynamics", whose code has the tree and the
+offsets), and so are the names here; the three numbers of an end site are zeros. A vector v describes the
+inverse rotation: on column vectors, a node's local rotation is exp(-v), since that code multiplies row
+vectors from the left.
 
-No file says its frame rate. The published ones are at 120 Hz: walkers in them go 1.2 m/s with steps of 0.56 s
-and jumpers fall at 10 m/s^2 then, and only then, though the papers count them as 25 Hz and an author as 30.
+No file states its frame rate. The published files are at 120 Hz, although the papers treat them as 25 Hz and
+one author as 30: only at 120 Hz do walkers move at 1.2 m/s with steps of 0.56 s, and jumpers fall at 10
+m/s^2.
 
-Human3.6M's files of 99 numbers have another tree and a root told from frame to frame; they are refused.
+Human3.6M's files of 99 numbers have another tree, and a root that is given relative to the frame before; they
+are refused.
 """
 
 from __future__ import annotations
@@ -83,8 +86,8 @@ class Expmap:
     """A file of exponential maps on the CMU skeleton of 38 nodes; end sites are nodes, too.
 
     Attributes:
-        path: where it was read from, for messages.
-        fps: frames per second, as the caller told them.
+        path: the file's path, for messages.
+        fps: frames per second, as given by the caller.
         values: (N, 117), the file's unit and radians.
     """
 
@@ -113,10 +116,10 @@ class Expmap:
         """Return global rotations (38, 3, 3) and positions (38, 3), the root at the origin, of one pose.
 
         Args:
-            angles: node -> its rotation vector as the file would have it, radians; the others are zero.
+            angles: node -> its rotation vector as in the file, radians; the others are zero.
 
         Raises:
-            InputError: for a node that is not there, or another number of values.
+            InputError: for an unknown node, or a wrong number of values.
         """
         vectors = np.zeros((len(NODES), 3))
         for node, vector in angles.items():
@@ -137,7 +140,8 @@ def read_expmap(path: Path, fps: float) -> Expmap:
 
     Args:
         path: the file.
-        fps: its frame rate, Hz, which it does not tell (`PUBLISHED_FPS` for the published files).
+        fps: the file's frame rate, Hz, which the file does not state (`PUBLISHED_FPS` for the published
+            files).
 
     Raises:
         InputError: for anything else than lines of 117 finite numbers, or a file of more than 64 MiB; the
@@ -159,7 +163,7 @@ def read_expmap(path: Path, fps: float) -> Expmap:
 
 
 def _numbered(file: TextIO) -> Iterator[tuple[int, str]]:
-    """Yield a file's lines with their numbers; of a line that is too long only the beginning."""
+    """Yield a file's lines with their numbers; a line that is too long is cut."""
     return enumerate(iter(lambda: file.readline(MAX_LINE), ""), start=1)
 
 

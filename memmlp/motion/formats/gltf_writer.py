@@ -52,7 +52,7 @@ _MATERIAL = {"baseColorFactor": COLOUR, "metallicFactor": 0.0, "roughnessFactor"
 
 @dataclass
 class Buffer:
-    """The binary part, as it grows, and what the JSON says of it."""
+    """The binary part of a file as it grows, and the JSON entries that describe it."""
 
     data: bytearray = field(default_factory=bytearray)
     views: list[dict[str, Any]] = field(default_factory=list)
@@ -65,7 +65,8 @@ class Buffer:
             array: the elements, of a component type that glTF knows.
             kind: SCALAR, VEC3, VEC4 or MAT4.
             target: VERTICES or INDICES, for a mesh.
-            bounds: whether the smallest and largest values are told, as glTF demands of times and positions.
+            bounds: whether the smallest and largest values are given, as glTF demands for times and
+                positions.
         """
         about: dict[str, Any] = {"bufferView": len(self.views), "componentType": COMPONENTS[array.dtype.str]}
         about |= {"count": len(array), "type": kind}
@@ -131,8 +132,8 @@ def _curves(clip: Clip, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def continuous_quaternions(rotations: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
     """Return unit quaternions xyzw (N, J, 4) of rotations (N, J, 3, 3).
 
-    Of the two of a rotation each frame has the one nearer to the frame before; the first one's is near to the
-    quaternions (J, 4) `before` it, where there are some.
+    Two quaternions stand for each rotation; each frame has the one nearer to the frame before. The first
+    frame's are near the quaternions (J, 4) `before` it, if there are some.
     """
     quaternions = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat().reshape(*rotations.shape[:2], 4)
     away = (quaternions[1:] * quaternions[:-1]).sum(-1, keepdims=True) < 0
@@ -175,7 +176,7 @@ def merged(parts: Sequence[Mesh]) -> Mesh:
 
 
 def capsule(joint: int, radii: tuple[float, float], start: np.ndarray, end: np.ndarray) -> Mesh:
-    """Return a round limb that follows a joint: rings around its axis, which become a point at either end.
+    """Return a round limb that follows a joint: rings around its axis that narrow to a point at both ends.
 
     Args:
         joint: the joint.
@@ -206,7 +207,7 @@ def _tube(rings: int) -> np.ndarray:
 
 
 def primitive(buffer: Buffer, mesh: Mesh, material: int = 0) -> dict[str, Any]:
-    """Return the mesh as glTF has it: up to four joints a vertex, of which ours uses one."""
+    """Return the mesh as a glTF primitive, with four joints per vertex, of which only one is used."""
     joints = np.zeros((len(mesh.joints), 4), "|u1")
     weights = np.zeros((len(mesh.joints), 4), "<f4")
     joints[:, 0], weights[:, 0] = mesh.joints, 1
@@ -225,7 +226,7 @@ def write_glb(path: Path, content: dict[str, Any], buffer: Buffer) -> None:
 
     Args:
         path: the file.
-        content: the JSON, without what the buffer knows.
+        content: the JSON, without the buffer's entries.
         buffer: the binary data.
     """
     buffers = {"accessors": buffer.accessors, "bufferViews": buffer.views}

@@ -1,6 +1,7 @@
 """Reads and writes motion clips as npz of the SMPL family, in AMASS' layout.
 
-Read are the first 22 joints, which all its bodies share, as rotation vectors in radians, Z up, metres:
+The first 22 joints, which all of the family's bodies share, are read as rotation vectors in radians, Z up,
+metres:
 
 | body | rotations |
 |---|---|
@@ -41,7 +42,7 @@ FARTHEST = 1e4  # metres from the origin
 
 
 class NoMotion(InputError):
-    """A sound npz of something else than motion, such as AMASS' shape.npz."""
+    """The file is a sound npz of something other than motion, such as AMASS' shape.npz."""
 
 
 def read_clip(path: Path, name: str) -> Clip:
@@ -54,7 +55,7 @@ def read_clip(path: Path, name: str) -> Clip:
     Raises:
         NoMotion: if it is a sound npz without rotations.
         InputError: if the file is damaged, of the wrong shapes, empty, too large, or not finite; the message
-            names it. Whether it is a person's motion is another question (`motion.plausible`).
+            names it. Whether it can be a person's motion is checked elsewhere (`motion.plausibility`).
     """
     with open_npz(path) as file:
         layout, trans_key, rate_key = _keys(file)
@@ -85,7 +86,7 @@ def _keys(file: Npz) -> tuple[dict[str, int], str, str]:
 
 
 def _check_numbers(path: Path, body: np.ndarray, trans: np.ndarray) -> None:
-    """Raise InputError for numbers that are not finite or beyond all bounds."""
+    """Raise InputError for numbers that are not finite, or beyond all plausible bounds."""
     bad = ~(np.isfinite(body).all(1) & np.isfinite(trans).all(1))
     if bad.any():
         raise InputError(f"{path}: NaN or Inf in {bad.sum()} frames, first in frame {bad.argmax()}")

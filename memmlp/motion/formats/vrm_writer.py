@@ -83,7 +83,7 @@ def _material(name: str, colour: tuple[float, ...], roughness: float) -> dict[st
 
 
 def _humanoid() -> dict[str, Any]:
-    """Return which node is which bone: a joint's node has its index."""
+    """Return which node is which bone; a joint's node has the joint's index."""
     return {"humanBones": {bone: {"node": joint} for joint, bone in enumerate(VRM)}}
 
 

@@ -1,4 +1,4 @@
-"""The body's motion in a world whose Y axis points up, as the formats of animation programs want it."""
+"""The body's motion in a world whose Y axis points up, as formats of animation programs need it."""
 
 from __future__ import annotations
 

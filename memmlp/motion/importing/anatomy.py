@@ -1,4 +1,4 @@
-"""What a body looks like: its segments, the stance from which a skeleton is read, how its joints lie in it.
+"""A body's anatomy: its segments, the stance from which a skeleton is read, and its joints in that stance.
 
 All positions (..., 22, 3) here are in Y-up axes and metres. `mapped` (22,) says which joints a file has.
 """
@@ -33,11 +33,11 @@ HINGE_BEND, HINGE_AGREEMENT = 0.1, 0.8  # mean sine of the bend and agreement of
 
 
 class Segment(NamedTuple):
-    """The straight line from a joint to the next one of its chain that the file has.
+    """The straight line from a joint to the next joint of its chain that the file has.
 
     Attributes:
-        start: the joint whose rotation turns it.
-        end: the joint at its end.
+        start: the joint whose rotation turns the segment.
+        end: the joint at the segment's end.
     """
 
     start: int
@@ -68,8 +68,8 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 def least_rotation(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return the smallest rotations (..., 3, 3) that turn directions (..., 3) onto others.
 
-    Where a direction has no length there is nothing to turn, and the identity is returned. Opposite
-    directions are carried onto each other by a half turn about one of the axes across them.
+    For a direction without length, the identity is returned. Opposite directions are carried onto each other
+    by a half turn about one of the axes across them.
     """
     axis, along = np.cross(source, target), (source * target).sum(-1, keepdims=True)
     norm = np.linalg.norm(axis, axis=-1, keepdims=True)
@@ -89,9 +89,9 @@ def _across(vectors: np.ndarray) -> np.ndarray:
 
 
 def aligned(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the rotation (3, 3) that turns one direction exactly, and another as far as that lets it.
+    """Return the rotation (3, 3) that aligns one direction exactly, and another as far as possible then.
 
-    Each is a pair: what is turned, and what it is turned onto.
+    Each argument is a pair: a direction, and the direction onto which it is turned.
     """
     (a, to_a), (b, to_b) = first, second
     once = least_rotation(a, to_a)
@@ -105,9 +105,9 @@ def aligned(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.n
 
 
 def why_no_stance(pose: np.ndarray) -> str | None:
-    """Say why a pose (22, 3) isn't that of a person who stands upright; None where it is.
+    """Say why a pose (22, 3) isn't that of a person who stands upright; None if it is.
 
-    Which way the person faces, and what is left and what is right, does not matter here.
+    Which way the person faces, and what is left and right, does not matter here.
     """
     for start, end in ((0, HEAD), *LIMBS.items()):
         if np.linalg.norm(pose[end] - pose[start]) < SHORTEST:
@@ -132,7 +132,7 @@ def why_no_stance(pose: np.ndarray) -> str | None:
 
 
 def wrong_sides(pose: np.ndarray, mapped: np.ndarray) -> str | None:
-    """Say what contradicts the hips about left and forward in a stance (22, 3); None where nothing does."""
+    """Say what contradicts the hips about left and forward in a stance (22, 3); None if nothing does."""
     left = pose[HIPS[0]] - pose[HIPS[1]]
     forward = np.cross(left, UP)
     if (pose[SHOULDERS[0]] - pose[SHOULDERS[1]]) @ left < 0:
@@ -150,7 +150,7 @@ def arms_lifted(pose: np.ndarray) -> bool:
 
 
 def unevenness(poses: np.ndarray) -> np.ndarray:
-    """Return how far poses (N, 22, 3) are from standing straight: a sum of angles (N,), degrees."""
+    """Return how far poses (N, 22, 3) are from standing straight, as sums of angles (N,), degrees."""
     total = sum(angles(poses[:, end] - poses[:, start], along) for start, end, along, _ in _verticals())
     left, across = (poses[:, a] - poses[:, b] for a, b in (HIPS, SHOULDERS))
     bends = [angles(poses[:, e] - poses[:, m], poses[:, m] - poses[:, s]) for s, m, e in _joints_of_arms()]
@@ -164,7 +164,7 @@ def facing(pose: np.ndarray) -> np.ndarray:
 
 
 def _verticals() -> Iterator[tuple[int, int, np.ndarray, float]]:
-    """Yield the segments that are vertical in a stance, which way, and how many degrees they may be off."""
+    """Yield the segments that are vertical in a stance, their direction, and the tolerance in degrees."""
     yield 0, HEAD, UP, TRUNK
     for start, end in LEGS.items():
         yield start, end, DOWN, THIGHS if start in HIPS else SHINS
@@ -178,11 +178,12 @@ def _joints_of_arms() -> tuple[tuple[int, int, int], ...]:
 
 
 def orientations(stance: np.ndarray, mapped: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Return how a body's joints must be turned (22, 3, 3) to stand as in a stance (22, 3) that faces +Z.
+    """Return the rotations (22, 3, 3) of a body's joints that make it stand as in a stance (22, 3) facing +Z.
 
-    Every segment points as in the stance. About themselves, the pelvis follows the hips, the chest the
-    shoulders, the spine both; limbs take the least turn from the body's rest pose (22, 3), the lower ones
-    from the upper ones; the head is upright and looks where the chest faces. Wrists and toes go on straight.
+    Every segment points as in the stance. About its own axis, the pelvis follows the hips, the chest the
+    shoulders, and the spine both. Upper limbs take the smallest rotation from the body's rest pose (22, 3),
+    lower limbs the smallest rotation from the upper ones. The head is upright and looks where the chest
+    faces. Wrists and toes continue straight.
     """
     result = np.tile(np.eye(3), (len(JOINTS), 1, 1))
     ends = {segment.start: segment.end for segment in segments(mapped)}
@@ -214,7 +215,7 @@ def _long(pose: np.ndarray, start: int, end: int) -> bool:
 
 
 def bend(stance: np.ndarray, joint: int) -> np.ndarray | None:
-    """Return the axis (3,) of a knee or elbow that is bent in a stance (22, 3); None where it is straight."""
+    """Return the axis (3,) of a knee or elbow that is bent in a stance (22, 3); None if it is straight."""
     middle, end = LIMBS[joint], LIMBS[LIMBS[joint]]
     upper, lower = stance[middle] - stance[joint], stance[end] - stance[middle]
     return unit(np.cross(upper, lower)) if angles(upper, lower) > BENT else None
@@ -226,11 +227,11 @@ def hinge(upper: np.ndarray, positions: np.ndarray, joint: int) -> np.ndarray | 
     Args:
         upper: global rotations (N, 3, 3) of the thigh or upper arm.
         positions: the joints' positions (N, 22, 3).
-        joint: the joint that turns it, of `HINGES`.
+        joint: the joint that turns the thigh or upper arm, one of `HINGES`.
 
     Returns:
-        The axis (3,) in the thigh's or upper arm's own frame; None where it bends too little or about too
-        many axes to tell.
+        The axis (3,) in the thigh's or upper arm's own frame; None if it bends too little, or about too many
+        axes, to tell.
     """
     middle, end = LIMBS[joint], LIMBS[LIMBS[joint]]
     bones = unit(positions[:, middle] - positions[:, joint]), unit(positions[:, end] - positions[:, middle])

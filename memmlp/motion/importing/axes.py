@@ -1,8 +1,8 @@
-"""A recording's unit and up axis: as its skeleton's map tells them, or found from the person in it.
+"""A recording's unit and up axis: given by its skeleton map, or found from the person in it.
 
-Up is where the zero pose has the head, if that is a person who stands, whoever lies in the motion. Where the
-motion has the head along the other axis, two things may be meant, and it has to be told which: a person who
-lies all the time, or one who walks while the root's rotation alone has the other axis up.
+Up is the direction of the head in the zero pose, if that is a person who stands, whoever lies in the motion.
+If the motion has the head along the other axis, it can mean two things: a person who lies all the time, or
+one who walks while the root's rotation alone has the other axis up. Then the user has to say which.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ MOST_UPRIGHT = 0.5  # how much of the way from pelvis to head lies along the up 
 
 
 def settle(recording: Recording, skeleton: SkeletonMap) -> SkeletonMap:
-    """Return the map with the recording's unit and up axis where it leaves them to be found.
+    """Return the map with unit and up axis filled in from the recording, where the map leaves them open.
 
     Raises:
-        InputError: if they can't be found, or a told unit gives no person's legs.
+        InputError: if they can't be found, or if a given unit makes the legs no person's.
     """
     at = {
         joint: recording.nodes.index(node)
@@ -54,7 +54,7 @@ def _leg(positions: np.ndarray, at: dict[str, int]) -> float:
 
 
 def _unit(recording: Recording, skeleton: SkeletonMap, leg: float) -> float:
-    """Return the unit, metres, of a file with legs of that length."""
+    """Return the unit, metres, of a file whose legs have the given length."""
     if skeleton.unit is not None:
         low, high = TOLD_LEG
         if not low <= leg * skeleton.unit <= high:
@@ -70,7 +70,7 @@ def _unit(recording: Recording, skeleton: SkeletonMap, leg: float) -> float:
 
 
 def _up(recording: Recording, trunk: np.ndarray, at: dict[str, int]) -> str:
-    """Return the axis, `y` or `z`, that is up in a file with the ways from pelvis to head (N, 3)."""
+    """Return the axis, `y` or `z`, that is up in a file, from the vectors from pelvis to head (N, 3)."""
     mean = (trunk / np.linalg.norm(trunk, axis=-1, keepdims=True).clip(1e-9)).mean(0)
     along = dict(zip("yz", mean[1:].tolist(), strict=True))
     moving = max(along, key=lambda axis: along[axis])
@@ -88,7 +88,7 @@ def _up(recording: Recording, trunk: np.ndarray, at: dict[str, int]) -> str:
 
 
 def _standing(recording: Recording, at: dict[str, int]) -> str | None:
-    """Return the axis along which the person stands in the zero pose; None where that is no stance."""
+    """Return the axis along which the person stands in the zero pose; None if the pose is no stance."""
     if not set(REQUIRED) <= set(at):
         return None
     zero, pose = recording.zero_pose(), np.zeros((len(JOINTS), 3))

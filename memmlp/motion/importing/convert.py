@@ -1,4 +1,4 @@
-"""One recording on its own skeleton -> a clip on the body: axes, stance, rotations, floor, and the check."""
+"""Converts a recording on its own skeleton to a clip on the body: axes, stance, rotations, floor, check."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ AUTO, NONE = "auto", "none"  # what a floor may be beside a height
 
 @dataclass(frozen=True)
 class Converted:
-    """A recording brought to the body.
+    """A recording converted to the body.
 
     Attributes:
-        clip: the motion, world (Z up), its floor at 0 where one is known.
-        mapped_motion: what it was made from.
-        fidelity: how far it is from that, and what is wrong with it.
-        floor: height of the floor in the recording, metres on the body's scale, which was taken off; None
-            where it is unknown or was not asked for.
+        clip: the motion, world (Z up), with its floor at 0 if the floor is known.
+        mapped_motion: the mapped joints' motion from which the clip was made.
+        fidelity: how far the clip is from that motion, and what is wrong with it.
+        floor: height of the floor in the recording, metres on the body's scale, which was subtracted; None if
+            it is unknown or was not asked for.
         rest_pose: the pose from which the skeleton was read, in words.
-        unit: the file's unit, metres, told or found.
-        up: the file's up axis, told or found.
+        unit: the file's unit, metres, given or found.
+        up: the file's up axis, given or found.
     """
 
     clip: Clip
@@ -51,15 +51,15 @@ def convert(
     fps: float | None = None,
     floor: str | float = AUTO,
 ) -> Converted:
-    """Bring a recording to a body.
+    """Convert a recording to a body.
 
     Args:
         recording: the file's motion.
-        skeleton: its skeleton map.
+        skeleton: the recording's skeleton map.
         rest: the body's rest joints (22, 3), metres.
         name: the clip's name.
         fps: the true frame rate, Hz; by default the file's.
-        floor: `auto`, found from the feet; `none`, left as it is; or its height in the file, metres.
+        floor: `auto`, found from the feet; `none`, left as it is; or the floor's height in the file, metres.
 
     Raises:
         InputError: as `mapped_motion.pick_joints` and `retarget.fit` do.

@@ -1,7 +1,7 @@
-"""The check of an import: a clip beside the file that it came from, and beside what people look like.
+"""The check of an import: a clip is compared with the file that it came from, and with people's anatomy.
 
-Nothing here uses what the import was fitted with. The clip is posed on the built-in body (or another) by
-forward kinematics; the file's joints are taken from the file.
+Nothing here uses the import's own fit. The clip is posed on the built-in body (or another) by forward
+kinematics; the file's joints are taken from the file.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ STRETCH = 0.02  # metres by which a segment may change its length
 
 
 class Worst(NamedTuple):
-    """The largest of some errors.
+    """The largest one of several errors.
 
     Attributes:
         value: the error.
@@ -73,9 +73,9 @@ class Fidelity:
         skeleton: the map's name.
         frames: number of frames compared.
         mm: largest distance, millimetres, between a joint in the file and in the import posed on the file's
-            own bones; a bone is as long as it is in the file at that frame.
+            own bones; a bone has its length in the file at that frame.
         degrees: largest angle, degrees, between the directions of a segment on the body and in the file.
-        faults: what is wrong, a sentence each; what `data verify` and `data import` say of the clip.
+        faults: what is wrong with the clip, one sentence each, as `data verify` and `data import` report it.
     """
 
     name: str
@@ -115,8 +115,8 @@ def pose(clip: Clip, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _on_own_bones(rotations: np.ndarray, expected: np.ndarray, mapped: np.ndarray) -> Worst:
     """Return the worst distance, mm, of joints posed by a clip's rotations on the bones of the file.
 
-    Where a bone points from its joint is the mean over the frames, so rotations that do not turn with the
-    file's joints put the next joint elsewhere.
+    A bone's direction in its joint's frame is its mean over the frames, so rotations that do not turn with
+    the file's joints put the next joint elsewhere.
     """
     posed = expected.copy()
     for joint in np.flatnonzero(mapped)[1:]:
@@ -156,7 +156,7 @@ def _worst(errors: np.ndarray, names: list[str] | tuple[str, ...]) -> Worst:
 def _unlike_the_file(
     found: Fidelity, positions: np.ndarray, expected: np.ndarray, mapped: np.ndarray
 ) -> Iterator[str]:
-    """Yield what differs from the file."""
+    """Yield descriptions of the differences from the file."""
     if found.mm.value > MOST_MM:
         where, frame = found.mm.where, found.mm.frame
         yield f"{where} is {found.mm.value:.1f} mm off on the file's own bones in frame {frame}"
@@ -177,7 +177,7 @@ def _unlike_the_file(
 
 
 def _unlike_people(rotations: np.ndarray, positions: np.ndarray, mapped: np.ndarray) -> Iterator[str]:
-    """Yield what no person's body does."""
+    """Yield descriptions of what no person's body does."""
     upright = (positions[:, HEAD, 2] > positions[:, 0, 2]).mean()
     if upright < UPRIGHT_SHARE:
         yield f"the head is below the pelvis in {1 - upright:.0%} of the frames"
@@ -192,14 +192,14 @@ def _unlike_people(rotations: np.ndarray, positions: np.ndarray, mapped: np.ndar
 
 
 def _implausible(clip: Clip) -> Iterator[str]:
-    """Yield why preparing will skip the clip."""
+    """Yield the reason why preparing would skip the clip, if any."""
     reason = implausible(clip)
     if reason is not None:
         yield reason.partition("; allowed: ")[0]
 
 
 def _forward_bends(rotations: np.ndarray, positions: np.ndarray) -> float:
-    """Return the share of all bending of the knees that is forward, to the pelvis."""
+    """Return the share of all knee bending that is forward, with respect to the pelvis."""
     bends = []
     for hip in HIPS:
         knee, ankle = LIMBS[hip], LIMBS[LIMBS[hip]]
@@ -218,7 +218,7 @@ def _backward_feet(rotations: np.ndarray, positions: np.ndarray, mapped: np.ndar
 
 
 def _odd_turns(rotations: np.ndarray) -> Iterator[str]:
-    """Yield the joints of the torso that are turned as far as no body's are."""
+    """Yield the joints of the torso that are turned further than any person's."""
     turns = [angles(rotations[:, HEAD, :, axis], rotations[:, CHEST, :, axis]) for axis in (1, 2)]
     odd = np.max(turns, axis=0) > HEAD_TURN
     if odd.mean() > HEAD_SHARE:
@@ -233,7 +233,7 @@ def _odd_turns(rotations: np.ndarray) -> Iterator[str]:
 
 
 def _twisted_limbs(rotations: np.ndarray, positions: np.ndarray) -> Iterator[str]:
-    """Yield the thighs and upper arms that are turned about themselves, by the axes of knees and elbows."""
+    """Yield the thighs and upper arms that are twisted, as the axes of knees and elbows show."""
     for joint, axis in HINGES.items():
         own = hinge(rotations[:, joint], positions, joint)
         off = 0.0 if own is None else angles(own, np.array(axis))
@@ -243,7 +243,7 @@ def _twisted_limbs(rotations: np.ndarray, positions: np.ndarray) -> Iterator[str
 
 
 def _odd_lengths(expected: np.ndarray, rest: np.ndarray) -> Iterator[str]:
-    """Yield the limbs whose lengths in the file are no body's."""
+    """Yield the limbs whose lengths in the file are no person's."""
 
     def length(at: np.ndarray, start: int, end: int) -> float:
         return float(np.median(np.linalg.norm(at[..., end, :] - at[..., start, :], axis=-1)))

@@ -1,4 +1,4 @@
-"""The stance from which a file's skeleton is read, with all of its nodes, and the body as it stands alike."""
+"""The stance from which a file's skeleton is read, with all of its nodes, and the body in the same stance."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from memmlp.motion.importing.skeleton import SkeletonMap
 
 @dataclass(frozen=True)
 class FileStance:
-    """A person who stands and faces +Z, Y up, left on +X, in metres; the root's place is that of the file.
+    """A person who stands and faces +Z, Y up, left on +X, in metres; the root is where the file has it.
 
     Attributes:
         nodes: the nodes' names; parents: the index of each node's parent, -1 for the root.
         positions: the nodes' positions (nodes, 3).
         mapped: body joint -> index of its node.
-        body: the body's joints (22, 3) as it stands alike, the pelvis at the origin.
-        source: what pose it is, in words.
+        body: the body's joints (22, 3) in the same stance, the pelvis at the origin.
+        source: which pose of the file it is, in words.
     """
 
     nodes: tuple[str, ...]
@@ -37,15 +37,15 @@ class FileStance:
 
 
 def find_stance(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -> FileStance:
-    """Return the stance that `import` reads a file's skeleton from.
+    """Return the stance from which `import` reads a file's skeleton.
 
     Args:
         recording: the file's motion.
-        skeleton: its map, with the nodes spelt as in the file.
+        skeleton: the file's skeleton map, with the nodes spelt as in the file.
         rest: the body's rest joints (22, 3), metres.
 
     Raises:
-        InputError: as importing does: where no person stands in the file, or the map does not fit it.
+        InputError: as importing does: if no person stands in the file, or the map does not fit it.
     """
     settled = settle(recording, skeleton)
     mapped_motion = pick_joints(recording, settled)
@@ -61,9 +61,9 @@ def find_stance(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -
 def _all_nodes(
     recording: Recording, skeleton: SkeletonMap, mapped_motion: MappedMotion, pose: RestPose
 ) -> np.ndarray:
-    """Return the positions (nodes, 3) of all nodes in the pose of which the mapped ones are known.
+    """Return the positions (nodes, 3) of all nodes in a pose that is known for the mapped nodes only.
 
-    It is the one of the zero pose, the map's and the frames in which these are as high.
+    The pose is looked up among the zero pose, the map's pose and the frames, by the mapped nodes' heights.
     """
     given = skeleton.rest if isinstance(skeleton.rest, dict) else {}
     frames = recording.kinematics()[1][int(skeleton.calibration_frame) :]

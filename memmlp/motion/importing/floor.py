@@ -1,4 +1,4 @@
-"""The floor of a clip: where its feet stand."""
+"""The height of the floor in a clip, found from where its feet stand."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def find_floor(positions: np.ndarray, fps: float) -> float | None:
         fps: frames per second.
 
     Returns:
-        None where no toe stands long enough for a floor to be known.
+        None if no toe stands long enough to tell the floor's height.
     """
     toes = positions[:, list(FEET.values())]
     if len(toes) < 2:

@@ -1,7 +1,7 @@
 """A skeleton map proposed for a file: from its nodes' names, its tree, and the person who moves in it.
 
-What a joint is follows from its name where that is a known word at a place of the tree where such a joint can
-be; else from the lengths of the bones. The map says of each joint what it is from.
+A node's joint is found from its name, if that is a known word and such a joint can be at the node's place in
+the tree; otherwise from the lengths of the bones. The map says for each joint how it was found.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ class Guess:
 
     Attributes:
         skeleton: the map.
-        sources: what each mapped joint is from: `name`, `name and shape`, or what it was guessed from.
-        doubts: what can't be told, or is contradictory, a sentence each.
+        sources: how each mapped joint was found: `name`, `name and shape`, or what it was guessed from.
+        doubts: what can't be decided, or is contradictory, one sentence each.
     """
 
     skeleton: SkeletonMap
@@ -64,7 +64,7 @@ class Guess:
 
 
 def guess(recording: Recording, name: str) -> Guess:
-    """Propose a map, of that name, for a file.
+    """Propose a map with the given name for a file.
 
     Raises:
         InputError: if the tree is not that of a person with two legs, two arms and a head.
@@ -93,7 +93,7 @@ def guess(recording: Recording, name: str) -> Guess:
 
 
 def _chosen(tree: Tree, named: int | None, shaped: int | None) -> tuple[int | None, str]:
-    """Return a joint's node, and what it is from."""
+    """Return a joint's node, and how it was found."""
     if named is not None:
         return named, "name and shape" if named == shaped else "name"
     if shaped is None:
@@ -111,7 +111,7 @@ def _head_by_name(tree: Tree, said: Sequence[NodeWords]) -> int | None:
 
 
 def _by_name(tree: Tree, said: Sequence[NodeWords], limbs: Limbs) -> Found:
-    """Return what the names tell: `0.knee` and `1.knee` for the knees of both chains."""
+    """Return the joints that names identify: `0.knee` and `1.knee` for the knees of both chains."""
     found: Found = {}
     for side in (0, 1):
         leg, arm = limbs.legs.chains[side], limbs.arms.chains[side]
@@ -131,7 +131,7 @@ def _by_name(tree: Tree, said: Sequence[NodeWords], limbs: Limbs) -> Found:
 def _spelt(
     tree: Tree, said: Sequence[NodeWords], chain: Sequence[int], parts: dict[str, tuple[str, ...]]
 ) -> dict[str, int]:
-    """Return the joints of a chain whose nodes have their names, each below the one before it."""
+    """Return the joints of a chain that its nodes' names identify, each below the one before it."""
     found: dict[str, int] = {}
     rest = [node for node in chain if not tree.is_end(node)]
     for part, spellings in parts.items():
@@ -147,7 +147,7 @@ def _spelt(
 
 
 def _by_shape(tree: Tree, limbs: Limbs) -> Found:
-    """Return what the tree and the lengths tell, with the keys of `_by_name`."""
+    """Return the joints that tree and lengths identify, with the keys of `_by_name`."""
     found: Found = {"pelvis": limbs.trunk[0]}
     for side in (0, 1):
         for pair, names in ((limbs.legs, tuple(LEG)), (limbs.arms, tuple(ARM))):
@@ -189,7 +189,7 @@ def _neck_and_head(tree: Tree, limbs: Limbs) -> tuple[int | None, int]:
 def _sides(
     tree: Tree, said: Sequence[NodeWords], limbs: Limbs, shape: Found
 ) -> tuple[dict[tuple[str, bool], int], list[str]]:
-    """Return which chain is (side, of a leg), and the doubts about it."""
+    """Return which chain is on which side, by (side, whether it is a leg), and the doubts about it."""
     result: dict[tuple[str, bool], int] = {}
     doubts = []
     leg = _left_by_name(said, limbs.legs)
@@ -220,7 +220,7 @@ def _left_by_name(said: Sequence[NodeWords], pair: Pair) -> int | None:
 
 
 def _left_by_motion(tree: Tree, shape: Found) -> tuple[int | None, str]:
-    """Return which leg is the left one where knees bend back and feet point forward, and what told it."""
+    """Return which leg is the left one, as knees bend back and feet point forward, and the evidence."""
 
     def at(part: str) -> np.ndarray:
         node = shape[part]
@@ -257,7 +257,11 @@ def _same_side(tree: Tree, shape: Found, leg: int) -> int:
 
 
 def _first_step(recording: Recording) -> float:
-    """Return how far frame 0 is from frame 1, to what the 10 % farthest other frames are from their next."""
+    """Return the step from frame 0 to frame 1, divided by the 90 % quantile of all later steps.
+
+    A step is the largest distance by which a node moves relative to the root. The result is 0 for a short
+    recording, or if the first step is small compared with the body.
+    """
     if len(recording) < 4:
         return 0.0
     positions = recording.kinematics()[1]
@@ -272,17 +276,17 @@ def _first_step(recording: Recording) -> float:
 
 
 def check(recording: Recording, proposed: Guess, body: str = "builtin") -> tuple[str, tuple[str, ...]]:
-    """Import a file with a proposed map; return the stance that it was read from, and the faults.
+    """Import a file with a proposed map; return the stance from which it was read, and the faults.
 
     Raises:
-        InputError: if the file can't be imported so.
+        InputError: if the file can't be imported with this map.
     """
     done = convert(recording, proposed.skeleton, load_rest_joints(body), name=proposed.skeleton.name)
     return done.rest_pose, done.fidelity.faults
 
 
 def as_yaml(proposed: Guess, recording: Recording) -> str:
-    """Return the map as YAML, with what is sure and what is guessed as comments."""
+    """Return the map as YAML, with comments about what is certain and what is guessed."""
     skeleton = proposed.skeleton
     guessed = [joint for joint, source in proposed.sources.items() if "name" not in source]
     lines = [
@@ -307,7 +311,7 @@ def as_yaml(proposed: Guess, recording: Recording) -> str:
 
 
 def _axes_lines(recording: Recording, skeleton: SkeletonMap) -> Iterator[str]:
-    """Yield the lines of unit and up axis: found in each file, as they were in this one."""
+    """Yield the lines of unit and up axis: found in each file, with this file's values as comments."""
     try:
         settled = settle(recording, skeleton)
         yield f"unit: auto  # in this file {settled.unit:.4g} m"
@@ -318,7 +322,7 @@ def _axes_lines(recording: Recording, skeleton: SkeletonMap) -> Iterator[str]:
 
 
 def _scalar(text: str) -> str:
-    """Return text as YAML that stays text."""
+    """Return a text as a YAML scalar that is read back as text."""
     plain = yaml.safe_dump(text, width=1000, allow_unicode=True).splitlines()[0]
     return plain if yaml.safe_load(plain) == text else json.dumps(text)
 

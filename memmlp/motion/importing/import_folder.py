@@ -1,4 +1,4 @@
-"""Imports a folder of recordings as AMASS npz, with a record of what came from what, or nothing at all."""
+"""Imports a folder of recordings as AMASS npz, with a record of sources and settings, or nothing at all."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ class Imported:
         up: the file's up axis, `y` or `z`.
         rest_pose: the pose from which the skeleton was read, in words.
         frames: number of frames.
-        header_fps: frame rate that the file's header tells, Hz.
+        header_fps: frame rate in the file's header, Hz.
         fps: frame rate of the clip, Hz.
-        fps_reason: where that rate is from.
-        floor: height of the floor that was taken off, metres at the body's size; None where none was found or
+        fps_reason: where the clip's frame rate is from.
+        floor: height of the floor that was subtracted, metres at the body's size; None if none was found or
             asked for.
-        faults: what is wrong with the clip, a sentence each (`fidelity.compare`).
+        faults: what is wrong with the clip, one sentence each (`fidelity.compare`).
     """
 
     source: str
@@ -69,12 +69,13 @@ class Imported:
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What an import did.
+    """The result of an import.
 
     Attributes:
-        clips: the clips that it wrote.
-        notes: what a person has to know of them: folders whose header rate it corrected, notes of the maps.
-        skipped: the files that it skipped.
+        clips: the clips that were written.
+        notes: what the user should know of the clips: folders whose frame rates were corrected, notes of the
+            maps.
+        skipped: the files that were skipped.
     """
 
     clips: tuple[Imported, ...]
@@ -87,16 +88,17 @@ class ImportSettings:
     """How files are imported.
 
     Attributes:
-        skeleton: a shipped map or the path of one; None lets each file's joints decide.
-        fps: true frame rates, Hz, by folder below the source ("" for all); they override what is known of a
-            file, what stands beside it and what its header says.
+        skeleton: the name of a shipped map, or the path of a map; None lets each file's joints decide.
+        fps: true frame rates, Hz, by folder below the source ("" for all); they override known rates of
+            files, files beside the data, and headers.
         body: `builtin`, or an SMPL-H model.npz.
         floor: `auto`: the lowest stable contact of the feet is at 0; `none`: left as the file has it; or the
             floor's height in the files, metres.
-        takes: patterns (regular expressions); clips that match one alike were recorded at once, and have one
-            floor.
+        takes: patterns (regular expressions); clips that match a pattern with the same captured groups were
+            recorded together, and share a floor.
         strict: whether a bad file raises; otherwise it is skipped and reported.
-        sound: whether a clip with faults is skipped, too; otherwise it is written and its faults are told.
+        sound: whether a clip with faults is skipped, too; otherwise it is written and its faults are
+            reported.
         up: the files' up axis, `y` or `z`; None leaves it to the map.
     """
 
@@ -111,7 +113,7 @@ class ImportSettings:
 
 
 def import_folder(source: Path, out: Path, how: ImportSettings | None = None) -> ImportReport:
-    """Write each file of a folder, or a single one, as out/<its path>.npz, and out/import.json about it.
+    """Write each file of a folder, or a single file, as out/<its path>.npz, and a record as out/import.json.
 
     Args:
         source: folder or file.
@@ -153,7 +155,7 @@ def import_folder(source: Path, out: Path, how: ImportSettings | None = None) ->
 
 
 def _one_floor_a_take(clips: list[Imported], takes: Mapping[str, str], staging: Path) -> list[Imported]:
-    """Lower the clips of a take by its lowest floor instead of each by its own."""
+    """Lower the clips of a take by the take's lowest floor, instead of each clip by its own."""
     floors: dict[str, float] = {}
     for clip in clips:
         if clip.floor is not None:
@@ -173,7 +175,7 @@ def _npz(relative: Path) -> Path:
 
 
 def _check_import(files: Mapping[Path, Path], out: Path, how: ImportSettings) -> None:
-    """Raise InputError for two sources of one clip, foreign clips in `out`, wrong takes or rates."""
+    """Raise InputError for two sources of one clip, foreign clips in `out`, or wrong takes or rates."""
     npz, count = Counter(_npz(relative) for relative in files).most_common(1)[0]
     if count > 1:
         raise InputError(f"{npz.with_suffix('').as_posix()}: {count} recordings of this name; allowed: one")
@@ -243,7 +245,7 @@ def _import_file(
 
 
 def _notes(clips: Sequence[Imported], maps: Mapping[str, SkeletonMap], how: ImportSettings) -> Iterator[str]:
-    """Yield what a person has to know of an import, a line each."""
+    """Yield what the user should know of an import, one line each."""
     yield from _rate_notes([clip for clip in clips if clip.fps != clip.header_fps])
     yield from (f"{skeleton.name}: {skeleton.note}" for skeleton in maps.values() if skeleton.note)
     for name in maps:
@@ -255,7 +257,7 @@ def _notes(clips: Sequence[Imported], maps: Mapping[str, SkeletonMap], how: Impo
 
 
 def _family_notes(name: str, clips: Sequence[Imported]) -> Iterator[str]:
-    """Yield what may differ from clip to clip of one skeleton."""
+    """Yield what may differ between the clips of one skeleton."""
     for key in ("up", "unit"):
         found = Counter(getattr(clip, key) for clip in clips)
         if len(found) > 1:
@@ -268,7 +270,7 @@ def _family_notes(name: str, clips: Sequence[Imported]) -> Iterator[str]:
 
 
 def _rate_notes(clips: Sequence[Imported]) -> Iterator[str]:
-    """Describe corrected rates, a line for the clips of a folder that have the same one."""
+    """Describe corrected rates, one line for all clips of a folder with the same correction."""
     alike: dict[str, list[str]] = {}
     for clip in clips:
         told = f"{clip.fps:g} Hz, {clip.fps_reason}; the header says {clip.header_fps:g} Hz"
@@ -281,8 +283,8 @@ def _rate_notes(clips: Sequence[Imported]) -> Iterator[str]:
 def _publish(staging: Path, out: Path, report: ImportReport, body: str) -> None:
     """Move clips and record from staging to `out`, and remove earlier clips of the files skipped now.
 
-    A new folder `out` is there with all of them at once. In an earlier import's the record comes last, and
-    its own goes first: a folder without one holds clips of two imports.
+    A new folder `out` appears with all files at once. In the folder of an earlier import, the old record is
+    removed first and the new one is written last, so a folder without a record may hold clips of two imports.
     """
     record = {"body": body, **asdict(report)}
     (staging / RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")

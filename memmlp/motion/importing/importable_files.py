@@ -32,7 +32,7 @@ def find_recordings(source: Path) -> dict[Path, Path]:
 
 
 def read_recording(path: Path) -> Recording:
-    """Read a recording; one whose format tells no frame rate (`tells_rate`) gets that of the published files.
+    """Read a recording; if its format has no frame rate (`tells_rate`), it gets that of the published files.
 
     Raises:
         InputError: if the file is damaged.
@@ -41,12 +41,12 @@ def read_recording(path: Path) -> Recording:
 
 
 def tells_rate(path: Path) -> bool:
-    """Return whether a file's format tells its frame rate."""
+    """Return whether a file's format states its frame rate."""
     return path.suffix.lower() == BVH
 
 
 def _is_recording(path: Path) -> bool:
-    """Return whether a file is a BVH by its name, or exponential maps by its first line."""
+    """Return whether a file is a BVH, by its name, or has exponential maps, by its first line."""
     suffix = path.suffix.lower()
     return suffix == BVH or (suffix == EXPMAP and _first_line(path).count(b",") >= COLUMNS)
 

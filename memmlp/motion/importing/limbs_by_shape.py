@@ -1,7 +1,7 @@
 """A file's tree as limbs: two legs, two arms, a trunk and a head, found from how the bones branch.
 
-No name is looked at here. Legs and arms are the two pairs of chains whose bones are alike and long, and a leg
-is longer than an arm.
+Names are not used here. Legs and arms are the two pairs of long chains whose bones have similar lengths, and
+a leg is longer than an arm.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Tree:
     """A recording's nodes.
 
     Attributes:
-        nodes: their names.
+        nodes: the nodes' names.
         parents: the index of each node's parent; -1 for the root.
         positions: positions (F, nodes, 3) in some of the frames, in the file's unit and axes.
     """
@@ -49,7 +49,7 @@ class Tree:
 
     @cached_property
     def children(self) -> list[list[int]]:
-        """The nodes just below each node."""
+        """The child nodes of each node."""
         children: list[list[int]] = [[] for _ in self.nodes]
         for child, parent in enumerate(self.parents):
             if parent >= 0:
@@ -64,7 +64,7 @@ class Tree:
         return line
 
     def below(self, node: int) -> set[int]:
-        """Return a node and all below it."""
+        """Return a node and all nodes below it."""
         inside = {node}
         for other, parent in enumerate(self.parents):
             if parent in inside:
@@ -88,8 +88,8 @@ class Pair(NamedTuple):
 
     Attributes:
         branch: the node from which they leave.
-        chains: the nodes of each, from the one below `branch` to the tip of its longest branch.
-        size: length of the upper and lower half of a limb, the mean of both.
+        chains: the nodes of each limb, from the one below `branch` to the tip of its longest branch.
+        size: length of the upper and the lower half of a limb together, averaged over both limbs.
     """
 
     branch: int
@@ -102,9 +102,9 @@ class Limbs:
     """A person's limbs as nodes.
 
     Attributes:
-        legs: the pair of legs; arms: that of the arms.
+        legs: the pair of legs; arms: the pair of arms.
         trunk: nodes from the pelvis to the one from which the arms leave.
-        head: nodes after that to the tip of the head; the last one may be an end site.
+        head: nodes after these to the tip of the head; the last one may be an end site.
     """
 
     legs: Pair
@@ -119,10 +119,10 @@ def find_limbs(path: object, tree: Tree, head: int | None = None) -> Limbs:
     Args:
         path: the file, for messages.
         tree: the nodes.
-        head: the node of the head where it is known by its name.
+        head: the node of the head, if it is known by its name.
 
     Raises:
-        InputError: if it has no two arms and two legs, or nothing between the arms.
+        InputError: if the tree does not have two arms and two legs, or has nothing between the arms.
     """
     reach = _reach(tree)
     pairs = sorted(_pairs(tree, reach), key=lambda pair: -pair.size)[:PAIRS]
@@ -141,7 +141,7 @@ def find_limbs(path: object, tree: Tree, head: int | None = None) -> Limbs:
 
 
 def _reach(tree: Tree) -> np.ndarray:
-    """Return the length (nodes,) of the longest way down from each node."""
+    """Return the length (nodes,) of the longest path down from each node."""
     lengths, reach = tree.lengths, np.zeros(len(tree.nodes))
     for node in reversed(range(1, len(tree.nodes))):
         parent = tree.parents[node]
@@ -150,7 +150,7 @@ def _reach(tree: Tree) -> np.ndarray:
 
 
 def _longest(tree: Tree, reach: np.ndarray, node: int) -> list[int]:
-    """Return the nodes of the longest way down, with `node`."""
+    """Return the nodes of the longest path down from `node`, which is included."""
     chain, lengths = [node], tree.lengths
     while children := tree.children[chain[-1]]:
         chain.append(max(children, key=lambda child: reach[child] + lengths[child]))
@@ -158,7 +158,7 @@ def _longest(tree: Tree, reach: np.ndarray, node: int) -> list[int]:
 
 
 def _pairs(tree: Tree, reach: np.ndarray) -> Iterator[Pair]:
-    """Yield all pairs of chains that leave from one node and are alike."""
+    """Yield all pairs of chains that leave from the same node and are alike."""
     for branch in range(len(tree.nodes)):
         children = [child for child in tree.children[branch] if not tree.is_end(child)]
         chains = [tuple(_longest(tree, reach, child)) for child in children]
@@ -168,7 +168,7 @@ def _pairs(tree: Tree, reach: np.ndarray) -> Iterator[Pair]:
 
 
 def _alike(tree: Tree, chains: Chains) -> bool:
-    """Return whether the bones of two chains are about as long, down to ankle or wrist."""
+    """Return whether the bones of two chains have similar lengths, down to ankle or wrist."""
     count = middle(tree, chains) + 2
     a, b = (tree.lengths[list(chain[:count])] for chain in chains)
     longer = np.maximum(a, b)
@@ -178,8 +178,8 @@ def _alike(tree: Tree, chains: Chains) -> bool:
 def middle(tree: Tree, chains: Chains) -> int:
     """Return the index in a pair's chains of the knees or elbows: between the two longest bones.
 
-    Of several places that are nearly as good the last one: a collar-bone may be as long as a forearm, but
-    a hand is not.
+    If several places are nearly as good, the last one is taken: a collar-bone may be as long as a forearm,
+    but a hand is not.
     """
     count = min(map(len, chains))
     lengths = np.mean([tree.lengths[list(chain[:count])] for chain in chains], axis=0)
@@ -188,7 +188,7 @@ def middle(tree: Tree, chains: Chains) -> int:
 
 
 def _size(tree: Tree, chains: Chains) -> float:
-    """Return the length of a limb from hip to ankle or from shoulder to wrist, the mean of both."""
+    """Return the length of a limb from hip to ankle or from shoulder to wrist, averaged over both limbs."""
     joint = middle(tree, chains)
     return float(sum(tree.lengths[chain[joint]] + tree.lengths[chain[joint + 1]] for chain in chains)) / 2
 

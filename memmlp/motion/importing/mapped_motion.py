@@ -19,8 +19,8 @@ class MappedMotion:
 
     Attributes:
         path: the file, for messages.
-        mapped: whether (22,) a node of the file stands for each body joint.
-        nodes: index (22,) of that node; where there is none, the one of the parent joint.
+        mapped: whether (22,) each body joint has a node in the file.
+        nodes: index (22,) of that node; without one, that of the parent joint's node.
         rotations: global rotations (N, 22, 3, 3) of these nodes.
         positions: their positions (N, 22, 3).
         zero: their positions (22, 3) in the file's zero pose, where all rotations are the identity.
@@ -62,7 +62,7 @@ def pick_joints(recording: Recording, skeleton: SkeletonMap) -> MappedMotion:
 
 
 def _nodes(recording: Recording, skeleton: SkeletonMap) -> np.ndarray:
-    """Return the index (22,) of each body joint's node; its parent's where it has none."""
+    """Return the index (22,) of each body joint's node; a joint without a node has its parent's."""
     missing = sorted(set(skeleton.joints.values()) - set(recording.nodes))
     if missing:
         lacking = f"no {', '.join(missing)}, which skeleton {skeleton.name} names"

@@ -29,9 +29,10 @@ class NodeWords(NamedTuple):
 
 
 def without_namespace(nodes: Sequence[str]) -> list[str]:
-    """Return the names without what all of them begin with, such as `mixamorig:`, `Character1_` or `m_avg_`.
+    """Return the names without their common beginning, such as `mixamorig:`, `Character1_` or `m_avg_`.
 
-    What ends in a colon is a namespace wherever it stands. Names stay whole where two would become the same.
+    Anything that ends in a colon is a namespace, common or not. The names are left whole if two would become
+    the same.
     """
     plain = [re.sub(r".*[:|]", "", node) for node in nodes]
     length = _common(plain)
@@ -40,7 +41,7 @@ def without_namespace(nodes: Sequence[str]) -> list[str]:
 
 
 def _common(names: Sequence[str]) -> int:
-    """Return the length of what all names begin with, up to a separator or before a capital letter."""
+    """Return the length of the names' common beginning, up to a separator or before a capital letter."""
     letters = zip(*(name.removesuffix(END) for name in names), strict=False)
     shared = [each[0] for each in takewhile(lambda each: len(set(each)) == 1, letters)]
     for length in range(len(shared), 0, -1):
@@ -51,7 +52,7 @@ def _common(names: Sequence[str]) -> int:
 
 
 def keys(nodes: Sequence[str]) -> list[str]:
-    """Return what is the same for all spellings of each name: `Left_hip`, `left_hip` and `x:LeftHip` are."""
+    """Return keys that are equal for all spellings of a name: `Left_hip`, `left_hip` and `x:LeftHip`."""
     return [_key(name) for name in without_namespace(nodes)]
 
 
@@ -61,9 +62,9 @@ def _key(name: str) -> str:
 
 
 def find_nodes(nodes: Sequence[str], wanted: Sequence[str]) -> dict[str, str] | None:
-    """Find the file's node for each wanted name: the very name, else the only one that is spelt alike.
+    """Find the file's node for each wanted name: the exact name, else the only node that is spelt alike.
 
-    Returns None if one of them has none.
+    Returns None if a wanted name has no node.
     """
     spelt = keys(nodes)
     count = Counter(spelt)
@@ -79,7 +80,8 @@ def words(name: str, known: frozenset[str]) -> NodeWords:
 
     Args:
         name: such as `LeftUpLeg`, `lShldr`, `UpperArm_L`, `thigh.r`, `lfemur`.
-        known: words; a side is taken off the front of `lfemur` only where one of them is left.
+        known: known words; the side letter of a name like `lfemur` is split off only if the rest is one of
+            them.
     """
     tokens = [token.lower() for token in TOKENS.findall(name.removesuffix(END))]
     sides = {SIDES[token] for token in tokens if token in SIDES}

@@ -1,4 +1,4 @@
-"""A recording's true frame rate: told by a person, beside the data, known of the file, or its header's."""
+"""A recording's true frame rate: given by the user, by a file beside the data, by a list, or its header."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Rate(NamedTuple):
 
     Attributes:
         fps: frames per second.
-        reason: where it is from, in words.
+        reason: where the rate is from, in words.
     """
 
     fps: float
@@ -34,7 +34,7 @@ def true_rate(header: float, relative: Path, sha256: str, top: Path, told: Mappi
     """Return a file's frame rate.
 
     Args:
-        header: the rate that the file tells, Hz.
+        header: the rate in the file's header, Hz.
         relative: the file's path below `top`.
         sha256: the file's digest.
         top: the folder that is imported.
@@ -55,7 +55,7 @@ def true_rate(header: float, relative: Path, sha256: str, top: Path, told: Mappi
 
 
 def folder_key(folder: Path) -> str:
-    """Return a folder below the imported one as `--fps` names it; "" is that one itself."""
+    """Return a folder below the imported one as `--fps` names it; "" for the imported folder itself."""
     return "" if folder == Path() else folder.as_posix()
 
 
@@ -67,7 +67,7 @@ def _known() -> dict[str, float]:
 
 
 def _sidecar(path: Path) -> float | None:
-    """Return the rate that a folder's `motion.yaml` tells; None where there is none."""
+    """Return the rate in a folder's `motion.yaml`; None if there is no such file."""
     if not path.is_file():
         return None
     try:

@@ -1,4 +1,4 @@
-"""What importing needs of a file of motion in any format."""
+"""The interface to a motion file of any format, as importing needs it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Recording(Protocol):
 
     @property
     def path(self) -> Path:
-        """Where it was read from, for messages."""
+        """The file's path, for messages."""
         ...
 
     @property
@@ -29,7 +29,7 @@ class Recording(Protocol):
 
     @property
     def fps(self) -> float:
-        """Frames per second, as the file tells them."""
+        """Frames per second, as the file states them."""
         ...
 
     def zero_pose(self) -> np.ndarray:
@@ -43,7 +43,8 @@ class Recording(Protocol):
     def posed(self, angles: Mapping[str, Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
         """Return global rotations (nodes, 3, 3) and positions (nodes, 3) of a pose.
 
-        It is told by each node's rotation values as the file would have them in a frame; the others are zero.
+        The pose is given by nodes' rotation values as in a frame of the file; the other nodes' values are
+        zero.
         """
         ...
 

@@ -1,7 +1,7 @@
 """The pose of a file in which the person is known to stand, from which its skeleton is read.
 
-A zero pose may be a T-pose, or nothing that a person can be: bones that lie along one axis, a folded body, a
-person who lies. Then a frame of the motion serves, or rotations that the skeleton's map gives.
+A zero pose may be a T-pose, or a pose that no standing person has: bones along one axis, a folded body, a
+person who lies. Then a frame of the motion is used, or rotations that the skeleton map gives.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ class RestPose:
     Attributes:
         rotations: global rotations (22, 3, 3) of the mapped joints' nodes.
         positions: their positions (22, 3).
-        source: where it is from, in words.
-        straight: whether it is a zero pose, whose limbs are taken as not turned about themselves.
+        source: where the pose is from, in words.
+        straight: whether it is a zero pose, whose limbs are assumed to have no twist.
     """
 
     rotations: np.ndarray
@@ -41,7 +41,7 @@ def find_rest_pose(recording: Recording, skeleton: SkeletonMap, mapped_motion: M
     """Find the pose in which the person stands: the map's, else the zero pose, else the straightest frame.
 
     Raises:
-        InputError: if there is none, or left and right contradict each other in it.
+        InputError: if there is no such pose, or left and right contradict each other in it.
     """
     if isinstance(skeleton.rest, dict):
         return _given(recording, skeleton, mapped_motion)

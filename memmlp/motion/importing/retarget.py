@@ -1,10 +1,11 @@
 """Brings a recording's motion to the 22-joint tree, by a skeleton map.
 
 The global rotation of a file's node is that of the body joint it is mapped to, up to a constant correction on
-the right. The corrections come from one pose in which the person stands (`rest_pose`): there it is known how
-the body's joints must lie (`anatomy.orientations`), whatever the file's zero pose is. Where an unmapped joint
-between two mapped ones turns, the correction is not constant: the segment between them is then turned by the
-least rotation to where the file has it. A body joint without a counterpart takes its parent's rotation.
+the right. The corrections come from one pose in which the person stands (`rest_pose`): in that pose the
+rotations of the body's joints are known (`anatomy.orientations`), whatever the file's zero pose is. Where an
+unmapped joint between two mapped ones turns, the correction is not constant: the segment between them is then
+turned by the least rotation to where the file has it. A body joint without a counterpart takes its parent's
+rotation.
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ HIP_LINE = Segment(HIPS[1], HIPS[0])
 
 @dataclass(frozen=True)
 class Retargeting:
-    """What is constant between a recording's skeleton and a body.
+    """The constants that convert a recording's skeleton to a body.
 
     Attributes:
         corrections: (22, 3, 3), on the right of the rotations of the mapped nodes, in Y-up axes.
-        scale: the body's leg length over the recording's.
+        scale: the body's leg length divided by the recording's.
         rest_pose: where the corrections are from, in words.
     """
 
@@ -65,7 +66,7 @@ def to_body(
 ) -> Clip:
     """Return mapped motion as a clip on the body that it was fitted to, in the world (Z up).
 
-    The middle of the hips goes where the recording has it, scaled by the length of the legs.
+    The middle of the hips is where the recording has it, scaled by the ratio of leg lengths.
 
     Args:
         mapped_motion: the recording's mapped joints.
@@ -90,7 +91,7 @@ def to_body(
 
 
 def _aimed(mapped_motion: MappedMotion, turned: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Return rotations (N, 22, 3, 3) whose segments point as in the recording; unmapped joints don't turn."""
+    """Return rotations (N, 22, 3, 3) whose segments point as in the recording; unmapped joints stay."""
     for start, end in (HIP_LINE, *segments(mapped_motion.mapped)):
         joint = 0 if (start, end) == HIP_LINE else start
         if joint > 0 or (start, end) == HIP_LINE:
@@ -108,7 +109,7 @@ def _turned_to_hinges(
 ) -> np.ndarray:
     """Turn thighs and upper arms about themselves, so that knees and elbows bend about their axes.
 
-    These are seen in the stance where the limb is bent in it, else in the motion.
+    The axes are found from the stance if the limb is bent in it, otherwise from the motion.
     """
     for joint in HINGES:
         axis = anatomy.bend(stance.positions, joint)
@@ -129,6 +130,6 @@ def _turned_to_hinges(
 
 
 def _leg_length(positions: np.ndarray) -> np.ndarray:
-    """Return the lengths (...) of thigh and shin of positions (..., 22, 3), the mean of both sides."""
+    """Return the lengths (...) of thigh plus shin in positions (..., 22, 3), averaged over both sides."""
     bones = [positions[..., end, :] - positions[..., start, :] for start, end in LEGS.items()]
     return np.linalg.norm(bones, axis=-1).sum(0) / 2

@@ -33,13 +33,13 @@ class SkeletonMap:
     Attributes:
         name: the map's name.
         joints: body joint -> the file's node (a joint, or `<joint>.end`) that stands for it.
-        unit: the file's unit in metres, None where it is to be found from the legs.
-        up: the file's up axis, `y` or `z`, None where it is to be found from the motion.
+        unit: the file's unit in metres, None if it is to be found from the legs.
+        up: the file's up axis, `y` or `z`, None if it is to be found from the motion.
         calibration_frame: whether frame 0 is a calibration pose, not motion.
-        rest: the pose in which the person stands, from which the skeleton is read: `auto` (the zero pose
-            where that is one, else the straightest frame), a frame's number, or the rotation values, degrees,
-            of each joint as the file would have them in a frame.
-        note: what a person who imports such files has to know.
+        rest: the pose in which the person stands, from which the skeleton is read: `auto` (the zero pose if
+            the person stands in it, else the straightest frame), a frame's number, or the rotation values,
+            degrees, of joints as in a frame of the file.
+        note: what users who import such files should know.
     """
 
     name: str
@@ -51,7 +51,7 @@ class SkeletonMap:
     note: str = ""
 
     def with_up(self, up: str | None) -> SkeletonMap:
-        """Return the map with an up axis, `y` or `z`, that a person told; None leaves it as it is."""
+        """Return the map with an up axis, `y` or `z`, that the user gave; None changes nothing."""
         return self if up is None else replace(self, up=up)
 
     @property
@@ -83,15 +83,16 @@ def load_skeleton(which: str) -> SkeletonMap:
 
 
 def find_skeleton(recording: Recording, chosen: SkeletonMap | None = None) -> SkeletonMap:
-    """Find the shipped map all of whose nodes the file has; of several, the one with the most nodes.
+    """Find the shipped map all of whose nodes the file has; of several maps, the one with the most nodes.
 
-    Of as many nodes, the one that presumes less: that finds unit and up axis in the file.
+    Of maps with equally many nodes, the one that finds unit and up axis in the file is preferred.
 
-    Spellings and namespaces may differ (`names.find_nodes`); the map has the file's own. A map that was
-    chosen by a person is returned spelt like that, and as it is where the file lacks some of its nodes.
+    Spellings and namespaces may differ (`names.find_nodes`); the returned map has the file's spellings. A map
+    that the user chose is returned with the file's spellings, too, or unchanged if the file lacks some of its
+    nodes.
 
     Raises:
-        InputError: if there is none, or none has more than all others.
+        InputError: if no map fits, or several fit equally well.
     """
     if chosen is not None:
         return spelt_as_in(chosen, recording) or chosen
@@ -117,14 +118,14 @@ def _shipped_maps(folder: Path) -> tuple[SkeletonMap, ...]:
 
 
 def _rank(skeleton: SkeletonMap) -> tuple[int, int]:
-    """Return how good a map is among those that fit a file."""
+    """Return the rank of a map among those that fit a file; the highest rank wins."""
     return len(skeleton.joints), (skeleton.unit, skeleton.up).count(None)
 
 
 def spelt_as_in(skeleton: SkeletonMap, recording: Recording) -> SkeletonMap | None:
-    """Return a map with its nodes spelt as in the file, with the namespace that they have there.
+    """Return a map with its nodes spelt as in the file, including the file's namespace.
 
-    None if the file lacks one of them.
+    Returns None if the file lacks one of the nodes.
     """
     told = skeleton.rest if isinstance(skeleton.rest, dict) else {}
     nodes = find_nodes(recording.nodes, sorted({*skeleton.joints.values(), *told}))
@@ -136,7 +137,7 @@ def spelt_as_in(skeleton: SkeletonMap, recording: Recording) -> SkeletonMap | No
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """A YAML loader that raises ValueError for a key that stands twice."""
+    """A YAML loader that raises ValueError for a key that occurs twice."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
@@ -147,7 +148,7 @@ class _StrictLoader(yaml.SafeLoader):
 
 
 def _parsed(path: Path, content: object) -> SkeletonMap:
-    """Return the map that a YAML file holds. Raises InputError unless it has what a SkeletonMap needs."""
+    """Return the map in a YAML file. Raises InputError unless it has what a SkeletonMap needs."""
 
     def require(good: bool, key: str, allowed: str) -> None:
         if not good:
@@ -172,7 +173,7 @@ def _parsed(path: Path, content: object) -> SkeletonMap:
 
 
 def _check_joints(require: Callable[[bool, str, str], None], joints: object) -> None:
-    """Require that a map's joints are those of the body, with the needed ones, and different nodes."""
+    """Check that a map's joints are joints of the body, include the needed ones, and have different nodes."""
     require(isinstance(joints, dict), "joints", f"{', '.join(JOINTS)}, each with the file's joint")
     assert isinstance(joints, dict)
     for joint, node in joints.items():

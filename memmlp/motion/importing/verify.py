@@ -1,4 +1,4 @@
-"""The check of files: imports each, reads back what an import would keep, and compares."""
+"""The check of files: imports each file, reads back what the import would keep, and compares."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Unusable:
     """A file that can't be imported.
 
     Attributes:
-        name: its path below the folder.
-        reason: why, in one line.
+        name: the file's path below the folder.
+        reason: why it can't be imported, in one line.
     """
 
     name: str
@@ -40,14 +40,14 @@ def verify(
     floor: str | float = AUTO,
     up: str | None = None,
 ) -> Fidelity:
-    """Import a file, read the npz that came of it, and compare it with the file.
+    """Import a file, read the resulting npz, and compare it with the file.
 
     Args:
         path: the file.
-        skeleton: a shipped map or the path of one; by default the file's joints decide.
+        skeleton: the name of a shipped map, or the path of a map; by default the file's joints decide.
         body: `builtin`, or an SMPL-H model.npz.
         name: the name to report; by default the file's.
-        floor: as `convert` has it.
+        floor: see `convert`.
         up: the file's up axis, `y` or `z`; None leaves it to the map.
 
     Raises:

@@ -1,1 +1,1 @@
-"""From a folder of clips to a split, memory-mappable cache."""
+"""Turns a folder of clips into a split, memory-mappable cache."""

@@ -1,9 +1,9 @@
-"""AMASS: the names of its clips, which its releases write differently, and what its names tell.
+"""AMASS: the names of its clips, which differ between its releases, and what the names tell.
 
 Three namings are known. The first SMPL+H release has folders like `BioMotionLab_NTroje` and `MPI_HDM05`, and
-files that end in `_poses`. Later downloads call the folders `BMLrub` and `HDM05`. The SMPL-X release has
-those folders, files that end in `_stageii`, and `_` where a name had a blank. BABEL's paths, and archives
-that are unpacked each into a folder of its own, have the subset's folder twice, as in
+files that end in `_poses`. Later downloads name the folders `BMLrub` and `HDM05`. The SMPL-X release has
+those folders, files that end in `_stageii`, and `_` in place of blanks. BABEL's paths, and archives that are
+unpacked each into a folder of its own, have the subset's folder twice, as in
 `BMLrub/BioMotionLab_NTroje/...`, or in a folder of any other name, as in `archive-1/CMU/...`.
 """
 
@@ -29,7 +29,7 @@ SUFFIX = re.compile(r"_(?:poses|stageii)$", re.IGNORECASE)
 
 
 def subset(name: str) -> str:
-    """Return the subset of a clip's or a subset's name: equal for all names that it ever had."""
+    """Return the subset of a clip's or a subset's name, the same for all names that the subset ever had."""
     top = name.split("/")[0].lower().replace("_", "")
     return RENAMED.get(top, top)
 
@@ -54,7 +54,7 @@ FOLDERS = frozenset((
 
 
 def unpacked(name: str) -> str:
-    """Return a clip's name without the folders of archives around the folder of the subset itself."""
+    """Return a clip's name without the folders of archives above the subset's own folder."""
     archive, _, rest = name.partition("/")
     if "/" not in rest:
         return name
@@ -64,13 +64,13 @@ def unpacked(name: str) -> str:
 
 
 def clip_key(name: str) -> str:
-    """Return what is equal for all names of one clip, whichever release they are from, but for case."""
+    """Return a key that is the same for all names of a clip in all releases, except for letter case."""
     _, _, rest = unpacked(name).partition("/")
     return f"{subset(unpacked(name))}/{SUFFIX.sub('', rest.replace(' ', '_'))}"
 
 
 def divided_subjects(parts: Iterable[tuple[str, str]]) -> list[str]:
-    """Return AMASS' subjects, SUBSET/SUBJECT, of whom clips are both in training and in test.
+    """Return the AMASS subjects, SUBSET/SUBJECT, that have clips in both training and test.
 
     Args:
         parts: clips' names and parts.

@@ -1,8 +1,8 @@
 """Turns a folder of AMASS npz into a memory-mappable cache of 60 Hz frames with a manifest.
 
-The sources are read twice, a clip at a time: once to learn which are sound and how long they are, so that the
-split divides sound clips only and every array's size is known, and once to write the frames. The manifest is
-written last: a cache without one is unfinished, and the next call makes it again.
+The sources are read twice, one clip at a time. The first reading finds out which clips are sound and how long
+they are, so that the split divides sound clips only and every array's size is known; the second writes the
+frames. The manifest is written last: a cache without one is unfinished, and the next call makes it again.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ ITEM_BYTES = FRAME_DIM * 4
 
 @dataclass(frozen=True)
 class ClipFolder:
-    """What a cache is made from.
+    """The source and the settings from which a cache is made.
 
     Attributes:
         root: folder of npz files, at any depth, or several of them by name.
@@ -63,7 +63,7 @@ class ClipFolder:
 
 
 def prepare(source: ClipFolder, out: Path) -> Manifest:
-    """Make the cache in `out`, or find it there finished; concurrent callers wait for one another.
+    """Make the cache in `out`, unless it is there already; concurrent callers wait for one another.
 
     Raises:
         InputError: for a root without usable clips, an impossible split, a bad file under `strict`, a folder
@@ -189,7 +189,7 @@ def frame_blocks(clip: Clip, rest: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _body(body: str, rest: np.ndarray) -> str:
-    """Name a body; a model's name includes a digest, since the model files of all bodies are named alike."""
+    """Return a body's name; a model's includes a digest, since all bodies' model files have the same name."""
     return "builtin" if body == "builtin" else f"{Path(body).name} {_hash(rest.tolist())[:8]}"
 
 
@@ -228,14 +228,14 @@ def _digest(clips: Sequence[ClipRecord], rest: np.ndarray, min_frames: int) -> s
 
 
 def _request(source: ClipFolder, rest: np.ndarray) -> str:
-    """Return a digest of the settings and of each source's path, size and time, without opening any."""
+    """Return a digest of the settings and of each source's path, size and time, without opening any file."""
     files = [(file, *_stamp(source.root / file)) for file in find_all(source.root).files]
     code = [FORMAT, FRAMES_VERSION, RECIPES["features"]]
     return _hash([*code, source.min_frames, rest.tolist(), source.split.describe(), files])
 
 
 def _stamp(path: Path) -> tuple[int, int]:
-    """Return size and time of a file; zeros for a dangling link, which reading will find and skip."""
+    """Return size and time of a file; zeros for a dangling link, which reading will skip."""
     try:
         stat = path.stat()
     except OSError:
@@ -248,7 +248,7 @@ def _hash(value: Any) -> str:
 
 
 def _finished(out: Path, request: str) -> Manifest | None:
-    """Return the manifest in `out` if it answers the request and its arrays are complete, else None."""
+    """Return the manifest in `out` if it matches the request and its arrays are complete, else None."""
     try:
         manifest = Manifest.load(out)
         whole = all(_array_frames(out, part) == manifest.totals[part]["frames"] for part in PARTS)
@@ -258,7 +258,7 @@ def _finished(out: Path, request: str) -> Manifest | None:
 
 
 def _array_frames(out: Path, part: str) -> int:
-    """Return the frames in a part's array; raise ValueError if its size does not agree with its header."""
+    """Return the number of frames in a part's array; raise ValueError if its size contradicts its header."""
     return len(np.lib.format.open_memmap(out / f"{part}.npy", mode="r"))
 
 

@@ -1,4 +1,4 @@
-"""How much there is of what a split lists, so that a part of a protocol never passes for the whole."""
+"""How many of a split's entries have clips, so that a part of a protocol never passes for the whole."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class Coverage:
     """How many entries of a split (list entries, subsets) have a clip.
 
     Attributes:
-        listed: number of entries by subset; empty for a split that divides whatever there is.
-        absent: number of those without a clip by subset; subsets that are whole are not in it.
+        listed: number of entries by subset; empty for a split that divides all clips in the folder.
+        absent: number of entries without a clip by subset; complete subsets are left out.
     """
 
     listed: Mapping[str, int]
@@ -34,7 +34,7 @@ class Coverage:
 
     @property
     def counts(self) -> tuple[int, int]:
-        """The number of entries that have a clip, and of all."""
+        """The number of entries that have a clip, and the number of all entries."""
         every = sum(self.listed.values())
         return every - sum(self.absent.values()), every
 
@@ -44,13 +44,13 @@ class Coverage:
 
     @property
     def gaps(self) -> str:
-        """What is absent, in words: the whole number, and that of each subset."""
+        """The missing entries in words: how many in all, and how many of each subset."""
         there, every = self.counts
         each = [f"{name} {count} of {self.listed[name]}" for name, count in self.absent.items()]
         return f"{every - there} of {every} entries of the split's list have no clip ({', '.join(each)})"
 
     def check(self, root: Root) -> None:
-        """Check that every entry has a clip below the data's root. Raises InputError where one has none."""
+        """Check that every entry has a clip below the data's root. Raises InputError if one has none."""
         if not self.whole:
             raise InputError(
                 f"data.root: {self.gaps} below {root}; data.partial=true takes the part there is"

@@ -1,4 +1,4 @@
-"""Groups of clips taken into parts: what all splits do alike (`memmlp.motion.preparing.splits`).
+"""The assignment of groups of clips to parts, which all splits share (`memmlp.motion.preparing.splits`).
 
 Fractions count groups, and a clip that nothing ties to another is a group of its own. Nothing depends on the
 order of the names: groups are ranked by a hash of seed and name, so a clip that is added later moves few
@@ -19,7 +19,7 @@ from memmlp.motion.preparing.groups import Grouping
 
 
 class Grouped:
-    """A split that divides groups of clips in a seeded order, and its keys of that."""
+    """A split that divides groups of clips in a seeded order; the base of all such splits."""
 
     groups: Sequence[str]
     groups_file: Path | str | None
@@ -29,7 +29,7 @@ class Grouped:
 
     @cached_property
     def grouping(self) -> Grouping:
-        """What ties clips together."""
+        """The rules that tie clips together."""
         return Grouping.of(self.groups, self.groups_file)
 
     @property
@@ -43,19 +43,19 @@ class Grouped:
         self.grouping.check(names, files)
 
     def described(self) -> dict[str, Any]:
-        """Return what all such splits describe alike (`Split.describe`)."""
+        """Return the part of `Split.describe` that all such splits share."""
         digest = self.groups_digest
         file = {"groups_file_sha256": digest} if digest else {}
         fewer = {"train_fraction": self.train_fraction} if self.train_fraction < 1 else {}
         return {"val": self.val, "seed": self.seed, "groups": list(self.groups), **file, **fewer}
 
     def divided(self, seen: Mapping[str, str], fractions: Mapping[str, float]) -> dict[str, str | None]:
-        """Map clips to parts: the first groups in the seeded order fill those of `fractions`, the rest train.
+        """Map clips to parts: the first groups in seeded order fill those of `fractions`, the others train.
 
-        Of the rest the last groups are left out (None), as `train_fraction` says.
+        The last groups of train are left out (None), as `train_fraction` says.
 
         Args:
-            seen: each clip's name -> the name by which patterns and the seed know it.
+            seen: each clip's name -> the name that patterns and the seeded order use.
             fractions: part -> its fraction of the groups.
 
         Raises:
@@ -75,7 +75,7 @@ class Grouped:
 
 
 def check_fractions(train_fraction: float, **fractions: float) -> None:
-    """Raise InputError, naming the key, for fractions that leave no part its share."""
+    """Raise InputError, naming the key, for fractions that are out of range or leave nothing for train."""
     if not 0 < train_fraction <= 1:
         raise InputError(
             f"data.split.train_fraction: {train_fraction} is none; allowed is above 0 and at most 1"
@@ -88,7 +88,7 @@ def check_fractions(train_fraction: float, **fractions: float) -> None:
 
 
 def rank(name: str, seed: int) -> str:
-    """Return what names are sorted by for an order that depends on the seed and on nothing else."""
+    """Return the key by which names are sorted for an order that depends on the seed alone."""
     return hashlib.sha256(json.dumps([seed, name]).encode()).hexdigest()
 
 

@@ -1,11 +1,11 @@
-"""Clips of the same frames: never in two parts of a split, and one group.
+"""Clips with the same frames: they are never in two parts of a split, and form one group.
 
-They are told by their frames, so a file that was saved again is one, too, and so is one at another frame rate
-(`resampled_copies`); clips without any motion are not told apart, and so are no copies. Where the split
-divides whatever there is, copies are drawn together, like any group. Where it is a published list that has
-them in several parts, those in training give way to those in validation, and both to those in testing: the
-test set stays as published, and nothing in it was seen. Copies within one part stay, as the list has them;
-statistics count their group once.
+Copies are found by their frames, so a file that was saved again is a copy, and so is one at another frame
+rate (`resampled_copies`). Clips without any motion can't be told apart, so they do not count as copies. If
+the split divides all clips in the folder, copies are drawn together, like any group. If it is a published
+list with copies in several parts, those in training give way to those in validation, and both to those in
+test: the test set stays as published, and nothing in it was seen in training. Copies within one part stay, as
+in the list; statistics count their group once.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from memmlp.motion.preparing.splits import PARTS, Split
 def assign(
     split: Split, clips: Sequence[ClipRecord]
 ) -> tuple[dict[str, str | None], dict[str, str], dict[str, str]]:
-    """Return each clip's part and group, and for each dropped copy the clip that stayed.
+    """Return each clip's part and group, and for each dropped copy the clip that was kept.
 
     Raises:
         InputError: if the split is impossible.
@@ -40,7 +40,7 @@ def assign(
 def one_part_each(
     clips: Sequence[ClipRecord], parts: Mapping[str, str | None]
 ) -> tuple[dict[str, str | None], dict[str, str]]:
-    """Return the parts with no frames in two of them, and the clips that gave way -> one that stayed.
+    """Return the parts such that no frames are in two of them, and each dropped clip -> a kept copy of it.
 
     Args:
         clips: the clips with their content.
@@ -57,7 +57,7 @@ def one_part_each(
 
 
 def tied(clips: Sequence[ClipRecord], groups: Mapping[str, str]) -> dict[str, str]:
-    """Return each clip's group; groups that share frames are one, named after the first of them."""
+    """Return each clip's group; groups that share frames are merged, and named after the first of them."""
     merged = {group: group for group in groups.values()}
 
     def last(group: str) -> str:
@@ -72,7 +72,7 @@ def tied(clips: Sequence[ClipRecord], groups: Mapping[str, str]) -> dict[str, st
 
 
 def _copies(clips: Sequence[ClipRecord]) -> list[list[str]]:
-    """Return the names of clips of the same frames, sorted, for all frames that are there more than once."""
+    """Return the sorted names of clips with the same frames, for all frames that occur more than once."""
     by_content = defaultdict(list)
     for clip in clips:
         if clip.content != STILL:

@@ -1,4 +1,4 @@
-"""Finds the npz files of a folder, each once however many paths lead to it, and says what it passes over."""
+"""Finds the npz files of a folder, each once however many paths lead to it, and reports what it ignores."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ SUFFIX = ".npz"  # in any case
 
 @dataclass
 class FoundFiles:
-    """What lies below a folder; paths are relative to it.
+    """The content of a folder; paths are relative to it.
 
     Attributes:
         files: the npz files, sorted, each by the path that is nearest to the folder, real before linked.
-        links: other paths of the same files or folders (symbolic or hard links) -> the path that counts.
+        links: other paths of the same files or folders (symbolic or hard links) -> the path that is used.
         unreadable: folders that cannot be listed -> why.
-        passed_over: number of the other files by suffix.
+        passed_over: number of files that are no npz, by suffix.
     """
 
     files: list[str] = field(default_factory=list)
@@ -82,7 +82,7 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
 
 
 def _identity(path: Path) -> tuple[int, int] | str:
-    """Return what is the same for all paths of a file or folder; a dangling link is only like itself."""
+    """Return a key that is the same for all paths of a file or folder; a dangling link equals only itself."""
     try:
         stat = path.stat()
     except OSError:

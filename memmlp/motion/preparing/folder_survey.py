@@ -1,4 +1,4 @@
-"""Reads every npz of a folder once, so that what is bad, odd or there twice is known and said."""
+"""Reads every npz of a folder once, so that bad, odd and duplicate files are known and reported."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from memmlp.motion.preparing.resampled_duplicates import copies_alike, first_fra
 
 @dataclass(frozen=True)
 class Survey:
-    """What a folder of npz files holds.
+    """The content of a folder of npz files.
 
     Attributes:
         clips: sound clips, without split and group yet.
         skipped: bad files.
         ignored: number of npz files without motion.
-        short: names of those of the bad files that are sound clips of too few frames.
+        short: names of the bad files that are sound clips with too few frames.
         unusual: clip -> what is odd about it, though it may be sound.
-        found: the files, and other paths of them.
+        found: the files, and other paths to them.
     """
 
     clips: tuple[ClipRecord, ...]
@@ -43,12 +43,12 @@ class Survey:
 
     @property
     def damaged(self) -> tuple[str, ...]:
-        """Names of the bad files that are no sound clips."""
+        """Names of the bad files that are not just short."""
         return tuple(name for file in self.skipped if (name := clip_name(file.file)) not in self.short)
 
     @property
     def duplicates(self) -> dict[str, str]:
-        """Clip -> the first clip of the same frames, at whatever rate."""
+        """Clip -> the first clip with the same frames, at whatever rate."""
         firsts: dict[str, str] = {}
         moving = [clip for clip in self.clips if clip.content != STILL]
         pairs = {clip.name: firsts.setdefault(clip.content, clip.name) for clip in moving}
@@ -63,7 +63,7 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
     """Read every npz below a folder.
 
     Raises:
-        InputError: if there are none, or at the first bad one if `strict`.
+        InputError: if there are none, or for the first bad file if `strict`.
     """
     clips: dict[str, ClipRecord] = {}
     firsts: dict[str, np.ndarray] = {}
@@ -91,7 +91,7 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
 
 
 def _check_name(path: Path, file: str, clips: dict[str, ClipRecord]) -> None:
-    """Raise InputError for what is no regular file, or whose name cannot be a clip's."""
+    """Raise InputError for anything but a regular file whose name can be a clip's."""
     if one_line(file) != file:
         raise InputError(f"{path}: line feeds or other control characters in its name; rename it")
     if clip_name(file) in clips:
@@ -101,7 +101,7 @@ def _check_name(path: Path, file: str, clips: dict[str, ClipRecord]) -> None:
 
 
 def _inspect(path: Path, file: str, clip: Clip, min_frames: int) -> ClipRecord:
-    """Return the record of a sound clip, without split and start; raise InputError for any other."""
+    """Return the record of a sound clip, without split and start; raise InputError for any other clip."""
     check_plausible(path, clip)
     resampled, how = resample(clip)
     if len(resampled) < min_frames:
@@ -112,7 +112,7 @@ def _inspect(path: Path, file: str, clip: Clip, min_frames: int) -> ClipRecord:
 
 
 def _content(clip: Clip) -> str:
-    """Return a digest of the frames in single precision, however and at whatever rate they were saved."""
+    """Return a digest of the frames in single precision, whatever their saved type and stated frame rate."""
     numbers = np.concatenate(
         [clip.poses.reshape(len(clip), -1), clip.trans], 1, dtype="<f4", casting="same_kind"
     )

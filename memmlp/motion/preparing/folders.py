@@ -1,4 +1,4 @@
-"""Several folders of clips as one, each under a name that stands in front of its clips' names."""
+"""Several folders of clips as one; each folder's name is put in front of its clips' names."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from memmlp.motion.preparing.find import FoundFiles, find_clips
 
 @dataclass(frozen=True)
 class Folders:
-    """Named folders of clips, used where the path of one folder is: `folders / "cmu/salsa/01.npz"`.
+    """Named folders of clips, used in place of one folder's path: `folders / "cmu/salsa/01.npz"`.
 
     Attributes:
         sources: name -> folder.
@@ -22,7 +22,7 @@ class Folders:
 
     @classmethod
     def of(cls, paths: Sequence[Path]) -> Folders:
-        """Name folders after their own last parts. Raises InputError where two are named alike."""
+        """Name folders after their own last parts. Raises InputError if two have the same name."""
         sources = {path.resolve().name: path for path in paths}
         if len(sources) < len(paths):
             raise InputError(
@@ -72,5 +72,5 @@ def find_all(root: Root) -> FoundFiles:
 
 
 def source_of(clip: str) -> str:
-    """Return the source of a clip, where there are several: that with which its name begins."""
+    """Return the source of a clip, with whose name the clip's name begins, if there are several sources."""
     return clip.split("/")[0]

@@ -1,8 +1,8 @@
-"""Groups of clips that are no replications of each other: of one subject, take or session.
+"""Groups of clips that are not independent: clips of the same subject, take or session.
 
-Clips of one group are never divided between parts, and statistics count a group once. What belongs together
-is told by patterns, by a column file, or by both: two clips that match the same pattern anywhere
-(`re.search`) with the same captured groups are tied, and so are two clips with the same group in the file.
+Clips of one group are never divided between parts, and statistics count a group once. Patterns, a column
+file, or both say which clips belong together: two clips that match the same pattern anywhere (`re.search`)
+with the same captured groups are tied, and so are two clips with the same group in the file.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ KEY = "data.split.groups_file"
 
 @dataclass(frozen=True)
 class Grouping:
-    """What ties clips together.
+    """The rules that tie clips together.
 
     Attributes:
         patterns: regular expressions.
@@ -48,7 +48,7 @@ class Grouping:
 
     @property
     def digest(self) -> str | None:
-        """A digest of what the column file says; None without a file."""
+        """A digest of the column file's content; None without a file."""
         if self.rows is None:
             return None
         return hashlib.sha256(json.dumps(sorted(self.rows.items())).encode()).hexdigest()
@@ -58,7 +58,7 @@ class Grouping:
 
         Args:
             names: clips to be split.
-            files: names of all files, of clips or not.
+            files: names of all files, whether they are clips or not.
 
         Raises:
             InputError: naming the first clip that is missing or unknown.
@@ -77,7 +77,7 @@ class Grouping:
         """Return clips in groups; ties are transitive (union-find over names and ties).
 
         Args:
-            seen: clip name -> the name that patterns and the order within a group go by.
+            seen: clip name -> the name that patterns, and the order within a group, use.
 
         Raises:
             InputError: if a pattern is no regular expression.
@@ -100,13 +100,13 @@ class Grouping:
         return list(groups.values())
 
     def names(self, seen: Mapping[str, str]) -> dict[str, str]:
-        """Map each clip to its group's name: the column file's, or else that of the first clip in it."""
+        """Map each clip to its group's name: the column file's, else the name of the group's first clip."""
         rows = self.rows or {}
         return {name: rows.get(group[0], group[0]) for group in self.tied(seen) for name in group}
 
 
 def unfitting(split: Mapping[str, Any], names: Collection[str]) -> str:
-    """Say that a split has patterns of which none fits a clip, so that they tie none; empty otherwise.
+    """Return a warning if a split has patterns of groups and none of them matches a clip; empty otherwise.
 
     Args:
         split: the split's settings (`Split.describe`).
@@ -123,7 +123,7 @@ def unfitting(split: Mapping[str, Any], names: Collection[str]) -> str:
 
 
 def read_groups(file: Path) -> dict[str, str]:
-    """Read a column file: CSV with the columns `clip` and `group`; others are passed over.
+    """Read a column file: CSV with the columns `clip` and `group`; other columns are ignored.
 
     A clip is named by its path below the data's folder, with or without `.npz`.
 

@@ -1,4 +1,4 @@
-"""What a cache holds: its clips, what became of every file, and how they were split."""
+"""What a cache holds: its clips, the outcome for every file, and the split."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ class ClipRecord:
         file: path below the data root.
         split: its part, "train", "val" or "test".
         group: name of the clip's group (`Grouping.names`); its own name where nothing ties it to another.
-        start: its first frame in that part's array.
-        length: its number of frames there.
+        start: the clip's first frame in its part's array.
+        length: the clip's number of frames in that array.
         sha256: digest of the source file.
-        content: digest of its frames in single precision, the same for every copy of them, at another frame
-            rate too (`resampled_copies`); `STILL` without motion.
+        content: digest of the frames in single precision, the same for every copy of the clip, even at
+            another frame rate (`resampled_copies`); `STILL` for a clip without motion.
         fps: frame rate of the source, Hz.
-        resampling: how it was brought to 60 Hz.
+        resampling: how the clip was resampled to 60 Hz.
     """
 
     name: str
@@ -55,27 +55,28 @@ class Manifest:
     """What a cache holds; the content of `manifest.json`.
 
     Attributes:
-        digest: sha256 over everything that determines the frames and their split. Groups are not in it, since
-            training does not know them.
+        digest: sha256 over everything that determines the frames and their split. Groups are not included,
+            since training does not use them.
         request: sha256 over the settings and each source's path, size and time, by which a finished cache is
             recognised.
         body: "builtin", or the model file's name and a digest of its rest pose: "model.npz 0a1b2c3d".
         rest_joints: rest positions (22, 3), metres.
         split: the split's settings.
-        min_frames: fewest frames at 60 Hz of a clip that is taken.
+        min_frames: smallest number of frames at 60 Hz that a clip must have.
         clips: the clips, sorted by name.
         skipped: bad files.
         ignored: number of npz files without poses (shape.npz and the like).
         left_out: number of sound clips without a part in the split, by top-level folder.
-        listed: number of the split's entries (list entries, subsets) by subset; empty where it has no list.
+        listed: number of the split's entries (list entries, subsets) by subset; empty if the split has no
+            list.
         missing: entries of the split for which there is no file.
         damaged: entries of the split whose file is no sound clip; a clip that is too short is not among them.
         totals: part -> clips, frames, hours.
-        duplicates: clip that was left out -> the clip of the same frames in another part, which was kept.
+        duplicates: clip that was left out -> the clip with the same frames in another part, which was kept.
         links: other path of a file or folder -> the path by which it was read.
         unusual: clip -> what is odd about it, though it may be sound.
         passed_over: number of files that are no npz, by suffix.
-        sources: names of the sources, with one of which every clip's name begins; empty for one folder.
+        sources: names of the sources; every clip's name begins with one of them. Empty for one folder.
         format: format number of the cache.
     """
 
@@ -135,7 +136,7 @@ class Manifest:
 
     @property
     def coverage(self) -> Coverage:
-        """How much there is of what the split lists."""
+        """How many of the split's entries have a clip."""
         return Coverage.of(self.listed, (*self.missing, *self.damaged))
 
     def part(self, part: str) -> list[ClipRecord]:
@@ -144,5 +145,5 @@ class Manifest:
 
 
 def write_manifest(manifest: Manifest, out: Path) -> None:
-    """Write the manifest of a cache, which with it is finished."""
+    """Write the manifest of a cache, which marks the cache as finished."""
     atomic_write(out / MANIFEST, json.dumps(asdict(manifest), indent=1))

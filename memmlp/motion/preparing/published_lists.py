@@ -1,4 +1,4 @@
-"""Published lists of training and test clips, and the clips of a data root that their entries fit."""
+"""Published lists of training and test clips, and the assignment of a data root's clips to their entries."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ PHASES = ("train", "test")  # the parts for which there are published lists
 
 
 def entries_of_clips(entries: Collection[str], names: Collection[str]) -> dict[str, str]:
-    """Map clips to the entries that they fit: by name, else by the name in another release of AMASS.
+    """Map clips to their entries in a list: by name, else by the name in another release of AMASS.
 
     Raises:
-        InputError: if several clips have an entry's name in another release, and none has it as it stands.
+        InputError: if several clips have an entry's name in another release, and none has exactly the entry's
+            name.
     """
     fits = {name: name for name in names if name in entries}
     others = {clip_key(entry).lower(): entry for entry in sorted(set(entries) - set(fits), reverse=True)}
@@ -29,7 +30,7 @@ def entries_of_clips(entries: Collection[str], names: Collection[str]) -> dict[s
 
 
 def check_once(names: Iterable[str]) -> None:
-    """Refuse clips that are there more than once, from several releases of AMASS."""
+    """Raise InputError for clips that occur more than once, from several releases of AMASS."""
     found = defaultdict(list)
     for name in sorted(names):
         found[clip_key(name)].append(name)
@@ -47,7 +48,7 @@ def _refuse_several(found: Iterable[Sequence[str]]) -> None:
 
 
 def read_lists(folder: Path) -> dict[str, str]:
-    """Map clip names to "train" or "test" by all lists below a folder."""
+    """Map clip names to "train" or "test", by all lists below a folder."""
     files = {phase: sorted(folder.rglob(f"{phase}_split.txt")) for phase in PHASES}
     if not files["train"]:
         raise InputError(f"data.split: no SUBSET/train_split.txt below {folder}")
@@ -61,7 +62,7 @@ def read_lists(folder: Path) -> dict[str, str]:
 
 
 def _read_list(file: Path) -> Iterator[str]:
-    """Yield the clip names of one list; a path counts from the folder that is named like the list's own."""
+    """Yield the clip names of a list; a path begins at the folder that is named like the list's own."""
     try:
         lines = file.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

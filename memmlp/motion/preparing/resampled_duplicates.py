@@ -1,7 +1,8 @@
-"""Copies of a clip at another frame rate, which have other frames and yet are the same motion.
+"""Copies of a clip at another frame rate: the same motion with other frames.
 
-Such a copy begins with the original's first frame and is as long as it, to a frame of the slower one. A pair
-of clips of which that is true is read whole and compared at the times of the slower one's frames.
+Such a copy begins with the original's first frame and has the same duration, to within a frame of the slower
+clip. Pairs of clips for which this is true are read completely, and compared at the times of the slower
+clip's frames.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ DEGREES, METRES = 1.0, 0.01  # by which a copy is off at most, on average over f
 
 
 def first_frame(clip: Clip) -> np.ndarray:
-    """Return what copies at any frame rate begin with: rotations and place of the first frame (201,)."""
+    """Return rotations and position of the first frame (201,), with which all copies at other rates begin."""
     rotations = Rotation.from_rotvec(clip.poses[0]).as_matrix()
     return np.concatenate([rotations.ravel(), clip.trans[0]]).astype(np.float32)
 
@@ -30,10 +31,10 @@ def first_frame(clip: Clip) -> np.ndarray:
 def copies_alike(
     root: Root, clips: Sequence[ClipRecord], firsts: Mapping[str, np.ndarray]
 ) -> tuple[ClipRecord, ...]:
-    """Return the clips, each copy of another one at another frame rate with that one's content.
+    """Return the clips; each copy of a clip at another frame rate gets the original's content digest.
 
     Args:
-        root: where their files are.
+        root: the folder of their files.
         clips: records of sound clips.
         firsts: clip -> its first frame (`first_frame`).
     """
@@ -54,7 +55,7 @@ def copies_alike(
 def _candidates(
     clips: Sequence[ClipRecord], firsts: Mapping[str, np.ndarray]
 ) -> Iterator[tuple[ClipRecord, ClipRecord]]:
-    """Yield pairs of moving clips of different rates, but of one length and with one first frame."""
+    """Yield pairs of moving clips with different rates, but the same duration and the same first frame."""
     moving = sorted((clip for clip in clips if clip.content != STILL), key=lambda clip: clip.length)
     if len({clip.fps for clip in moving}) < 2:
         return
@@ -71,7 +72,7 @@ def _candidates(
 
 
 def _same_motion(one: Clip, other: Clip) -> bool:
-    """Return whether two clips are the same motion at their frame rates."""
+    """Return whether two clips with different frame rates are the same motion."""
     slow, fast = sorted((one, other), key=lambda clip: clip.fps)
     fast, _ = resample(fast, slow.fps)
     frames = min(len(slow), len(fast))

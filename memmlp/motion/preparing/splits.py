@@ -1,9 +1,9 @@
 """Splits, which assign clip names to train, val, test or nothing.
 
 A clip's name is its path below the data root without suffix, `/`-separated. Clips that belong together
-(`Grouping`) are never divided (`memmlp.motion.preparing.dividing`). Entries of lists and names of subsets fit
-AMASS' clips whatever release these are from (`memmlp.motion.preparing.amass`), and patterns of groups don't
-see the folder of an archive around that of a subset.
+(`Grouping`) are never divided (`memmlp.motion.preparing.dividing`). Entries of lists and names of subsets
+match AMASS' clips from any release (`memmlp.motion.preparing.amass`), and patterns of groups don't see an
+archive's folder above that of a subset.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ PARTS = ("train", "val", "test")
 
 @dataclass(frozen=True)
 class Assignment:
-    """What a split decided.
+    """The result of a split.
 
     Attributes:
         parts: clip name -> "train", "val", "test", or None for a clip that is left out.
-        groups: clip name -> the name of its group; its own where nothing ties it to another.
-        missing: entries of the split (list entries, subsets) that no clip's name fits.
+        groups: clip name -> the name of its group; its own name if it is tied to no other clip.
+        missing: entries of the split (list entries, subsets) without a matching clip.
     """
 
     parts: Mapping[str, str | None]
@@ -47,20 +47,20 @@ class Split(Protocol):
         ...
 
     def limited(self, parts: Mapping[str, str | None], groups: Mapping[str, str]) -> dict[str, str | None]:
-        """Return the parts of clips in groups, without clips that the split leaves out of large groups."""
+        """Return the clips' parts without the clips that the split leaves out of large groups."""
         ...
 
     def missing(self, names: Collection[str]) -> tuple[str, ...]:
-        """Return the entries of the split (list entries, subsets) that none of the names fits."""
+        """Return the entries of the split (list entries, subsets) that match none of the names."""
         ...
 
     def describe(self) -> dict[str, Any]:
-        """Return everything that determines `assign`, ready for JSON, without a path of this machine."""
+        """Return everything that determines `assign`, ready for JSON, without paths on this machine."""
         ...
 
     @property
     def listed(self) -> Mapping[str, int]:
-        """The number of the split's entries by subset; empty where it divides whatever there is."""
+        """The number of the split's entries by subset; empty if it divides all clips in the folder."""
         ...
 
     @property
@@ -78,14 +78,14 @@ class SeededSplit(Grouped):
     """A random split with a seed.
 
     Args:
-        test: fraction of the groups (of the clips, where nothing ties them) for test; 0 leaves it empty.
+        test: fraction of the groups for test (of the clips, if none are tied); 0 leaves it empty.
         val: fraction of the groups for validation; 0 leaves it empty.
         seed: seed of the order in which groups are taken.
         groups: patterns of clips that stay together.
         groups_file: column file that says which clips stay together; None for none.
-        train_fraction: fraction of the groups left to train that are used; the others are left out.
-        per_group: the most clips of a group in test, and in validation; the others are left out. None for
-            all. Repetitions of one motion tell little more than one of them.
+        train_fraction: fraction of train's groups that are used; the others are left out.
+        per_group: the largest number of clips of a group in test, and in validation; the others are left out,
+            since repetitions of a motion tell little more than one of them. None for all clips.
     """
 
     test: float = 0.1
@@ -130,7 +130,8 @@ class SeededSplit(Grouped):
 class MixedSplit:
     """Several sources, each split by itself, so that each has all parts.
 
-    A clip's name is its source's, a `/`, and the name that it has there; the source's split sees the latter.
+    A clip's name is the source's name, a `/`, and the clip's name in that source; the source's split sees the
+    latter.
 
     Args:
         splits: source's name -> its split.
@@ -186,7 +187,7 @@ class MixedSplit:
             self.splits[source].check_groups(own, every[source])
 
     def _own(self, names: Iterable[str]) -> Iterator[tuple[str, list[str]]]:
-        """Yield each source with the names that its clips have there."""
+        """Yield each source with its clips' names in that source."""
         for source in self.splits:
             yield source, [rest for name in names if (rest := name.removeprefix(f"{source}/")) != name]
 
@@ -195,10 +196,10 @@ class MixedSplit:
 class ListSplit(Grouped):
     """Published lists (AvatarPoser, AGRoL): FOLDER/SUBSET/train_split.txt and test_split.txt.
 
-    A line is the relative path of an npz; blank lines, CRLF, a leading `./` and whatever stands before the
-    subset's own folder are accepted. An entry is the clip of that name, or else the one that has that name in
-    another release of AMASS. Clips in no list are left out. Patterns of groups see an entry's name, so that a
-    list divides every release alike.
+    A line is the relative path of an npz; blank lines, CRLF, a leading `./` and anything before the subset's
+    own folder are accepted. An entry stands for the clip of that name, or else for the clip that has that
+    name in another release of AMASS. Clips in no list are left out. Patterns of groups see an entry's name,
+    so that a list divides every release in the same way.
 
     Args:
         folder: where the user keeps the lists.
@@ -206,7 +207,7 @@ class ListSplit(Grouped):
         seed: seed of the validation part.
         groups: patterns of clips that stay together in the validation part.
         groups_file: column file that says which clips stay together; None for none.
-        train_fraction: fraction of the groups left to train that are used; the others are left out.
+        train_fraction: fraction of train's groups that are used; the others are left out.
     """
 
     folder: Path
@@ -253,7 +254,7 @@ class SubsetSplit(Grouped):
         seed: seed of the validation part.
         groups: patterns of clips that stay together in the validation part.
         groups_file: column file that says which clips stay together; None for none.
-        train_fraction: fraction of the groups left to train that are used; the others are left out.
+        train_fraction: fraction of train's groups that are used; the others are left out.
     """
 
     train: Sequence[str]

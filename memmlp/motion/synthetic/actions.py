@@ -180,7 +180,7 @@ def _blows(rng: np.random.Generator, t: Array, lead: int) -> list[tuple[int, flo
 
 
 def _aimed(puppet: Puppet, side: int, target: Array) -> Array:
-    """Convert a target (3,) seen along the heading to the same point as seen in the turned trunk (N, 3)."""
+    """Convert a target (3,) relative to the heading to the same point relative to the turned trunk (N, 3)."""
     yaw = LEFT_RIGHT[side] * (puppet.tilt[:, 1] + puppet.spine[:, 1])
     out, up, forward = target
     cosine, sine = np.cos(yaw), np.sin(yaw)

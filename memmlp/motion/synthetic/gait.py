@@ -16,16 +16,16 @@ GRAVITY = 9.81
 
 @dataclass(frozen=True)
 class Gait:
-    """A way of going; metres, seconds, radians. A cycle is two steps.
+    """A gait; metres, seconds, radians. A cycle is two steps.
 
     Attributes:
         speed: range of the full speed, m/s.
-        cadence: cycles per second at no speed, and how many more for each m/s.
+        cadence: cycles per second at zero speed, and the increase for each m/s.
         duty: part of the cycle during which a foot is on the floor.
         ahead: part of the contact that passes before the pelvis is over the foot.
         turn: largest turn of the path at one time.
         width: factor on the distance of the feet.
-        sink: how much lower than in standing the pelvis is.
+        sink: how much lower the pelvis is than in standing.
         bounce: amplitude of the pelvis' height.
         lift: see FootStep.
         heel: see FootStep.
@@ -71,14 +71,14 @@ RUN = Gait(
 
 @dataclass(frozen=True)
 class Course:
-    """The way that is gone over N frames.
+    """The path of a gait over N frames.
 
     Attributes:
         path: positions (N, 2), metres, world.
         heading: directions (N,), radians, world.
         pace: speeds (N,), m/s.
         phase: phases (N,), cycles.
-        go: 0 while standing and 1 while going (N,).
+        go: 0 while standing and 1 while moving (N,).
     """
 
     path: Array
@@ -104,7 +104,7 @@ def running(rng: np.random.Generator, t: Array) -> Puppet:
 
 
 def _locomotion(rng: np.random.Generator, t: Array, gait: Gait) -> Puppet:
-    """Go as the gait says, in one person's style."""
+    """Move with a gait, in one person's style."""
     style = Style.draw(rng)
     course = _course(rng, t, gait, style)
     puppet = stand(rng, t, style)
@@ -118,7 +118,7 @@ def _locomotion(rng: np.random.Generator, t: Array, gait: Gait) -> Puppet:
 
 
 def _course(rng: np.random.Generator, t: Array, gait: Gait, style: Style) -> Course:
-    """Draw a course: stand, go for most of the time with turns, stand."""
+    """Draw a course: stand, move for most of the time with turns, stand."""
     fps = 1.0 / (t[1] - t[0])
     start, stop = t[0] + rng.uniform(0.3, 1.2), t[-1] - rng.uniform(1.2, 2.0)
     top = rng.uniform(*gait.speed)

@@ -34,9 +34,8 @@ class Puppet:
     Attributes:
         fps: frames per second.
         heading: direction (N,) the body faces: 0 is world +X, pi/2 is +Y.
-        pelvis: position (N, 3) of the root, world; it is lowered where a standing leg would not reach the
-            foot.
-        settle: seconds over which it is lowered.
+        pelvis: position (N, 3) of the root, world; it is lowered if a standing leg would not reach the foot.
+        settle: seconds over which the pelvis is lowered.
         tilt: rotation vector (N, 3) of the pelvis against the heading.
         spine: rotation vector (N, 3) of the chest against the pelvis.
         gaze: (pitch, yaw) (N, 2) of the head against the heading.
@@ -93,11 +92,11 @@ def two_bone(
 
     Args:
         start: positions (N, 3).
-        target: positions (N, 3); one out of reach is approached as far as the bones go.
+        target: positions (N, 3); a position out of reach is approached as far as the bones go.
         pole: directions (N, 3) to which the joint between the bones points.
         upper: first bone (3,) in the rest pose.
         lower: second bone (3,) in the rest pose.
-        rest_pole: direction (3,) to which that joint points in the rest pose.
+        rest_pole: direction (3,) to which the joint between the bones points in the rest pose.
         free: in [0, 1] (N,): how early a limb that is being stretched slows down; with 0 it reaches exactly,
             up to nearly its full length.
     """
@@ -126,7 +125,7 @@ def ankles(feet: Feet, side: int) -> tuple[Array, Rotation]:
 
 
 def _root(puppet: Puppet, pelvis: Rotation) -> Array:
-    """Return the root (N, 3), lowered where a leg that carries, or is about to, would be stretched out."""
+    """Return the root (N, 3), lowered if a leg that carries, or is about to, would be stretched out."""
     wanted = puppet.pelvis[:, 2]
     ceiling = wanted + 0.3
     frames = round(puppet.settle * puppet.fps)

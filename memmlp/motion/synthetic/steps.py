@@ -17,10 +17,10 @@ class FootStep:
     Attributes:
         foot: 0 left, 1 right.
         off: when the toes leave the floor.
-        on: when the heel comes back to it.
+        on: when the heel touches the floor again.
         to: position (2,) on the floor below the ankle, world.
-        yaw: direction of the foot there, world.
-        lift: how high it is carried on the way.
+        yaw: direction of the foot after the step, world.
+        lift: how high the foot is lifted on the way.
         heel: angle by which the heel is up when the toes leave.
         toe: angle by which the toes are up when the heel arrives.
         push: how long before `off` the heel rises.

@@ -177,7 +177,7 @@ class AGRoLDiffusion(WholeWindow):
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
         """Make a training call: add noise to the truth (B, T, 252), and denoise it in one call.
 
-        Each window gets noise of a time that is drawn for it.
+        A diffusion time is drawn for each window.
 
         Args:
             sparse: world inputs (B, n, 54) of the newest frames.

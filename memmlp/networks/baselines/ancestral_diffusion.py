@@ -19,11 +19,12 @@ BIN = 2 / 255  # the width of the bins of the first step's likelihood: a pixel's
 
 
 class Denoised(NamedTuple):
-    """What a network makes of noisy signals (B, ...).
+    """What a network predicts from noisy signals (B, ...).
 
     Attributes:
-        noise: the noise in them (B, ...).
-        share: where the logarithm of a step's variance lies (B, ...): -1 at the least, 1 at the largest.
+        noise: the noise in the signals (B, ...).
+        share: where the logarithm of a step's variance lies (B, ...) between its limits: -1 at the least
+            variance, 1 at the largest.
     """
 
     noise: Tensor
@@ -31,7 +32,7 @@ class Denoised(NamedTuple):
 
 
 def posterior(signal: Tensor) -> Tensor:
-    """Return what the step from a noisy signal to the one before it follows from (Ho et al. 2020, Eq. 7).
+    """Return the coefficients of the step from a noisy signal to the one before it (Ho et al. 2020, Eq. 7).
 
     Args:
         signal: share (n,) of signal in the noisy signal's variance, float64.
@@ -69,11 +70,11 @@ class AncestralDiffusion(Noising):
 
     @property
     def draws(self) -> int:
-        """How many draws of noise a sample takes: its start, and one each step but for the last 50."""
+        """How many draws of noise a sample takes: one for its start, one for each step but the last 50."""
         return 1 + max(len(self.times) - QUIET, 0)
 
     def clean(self, noisy: Tensor, noise: Tensor, time: Tensor) -> Tensor:
-        """Return the clean signals (B, ...) of noisy ones with this noise (B, ...) at times (B,)."""
+        """Return the clean signals (B, ...) of noisy ones, given their noise (B, ...) and times (B,)."""
         signal = at(self.signal, time, noisy)
         return (noisy - (1 - signal).sqrt() * noise) / signal.sqrt()
 
@@ -85,13 +86,13 @@ class AncestralDiffusion(Noising):
         Args:
             clean: true signals (B, ...).
             noise: the noise (B, ...) that was mixed into them.
-            time: the times (B,) at which it was.
-            made: what the network made of the result.
+            time: the times (B,) at which the noise was mixed in.
+            made: what the network predicted from the noisy signals.
             limits: the least and the largest value of a clean signal, to be broadcast to it.
 
         Returns:
-            The noise's mean squared error, and the variational bound in bits, from which the variances alone
-            learn.
+            The mean squared error of the noise, and the variational bound in bits, whose gradient reaches the
+            variances only.
         """
         noisy = self.noised(clean, time, noise)
         first, second, least, largest = at(self.trained, time, clean)
@@ -109,14 +110,14 @@ class AncestralDiffusion(Noising):
     ) -> tuple[Tensor, Tensor]:
         """Return the mean and the variance (B, ...) of the signal after a sampling step.
 
-        The last step's estimate is not kept within the limits, where the columns of a rotation that was not
-        learned could be parallel: that is none.
+        The last step's estimate is not clamped to the limits: if the network has not learned a rotation,
+        clamping could make the two columns of its 6D form parallel, which is no rotation.
 
         Args:
             noisy: the noisy signal (B, ...) at sampling step `index`.
-            made: what the network made of it.
+            made: what the network predicted from the noisy signal.
             index: number of the sampling step, from 0.
-            limits: between which the estimate of the clean signal is kept.
+            limits: the least and the largest value to which the estimate of the clean signal is clamped.
         """
         time = torch.full((1,), self.times[index], device=noisy.device)
         first, second, least, largest = self.spaced[:, index]
@@ -140,7 +141,7 @@ def binned_surprise(
 ) -> Tensor:
     """Return how surprising clean signals (B, ...) are to a Gaussian, in nats, by bins of 2/255 (Ho et al.).
 
-    The outermost bins, at the limits, are without end.
+    The two outermost bins, at the limits, reach to minus and plus infinity.
     """
     scale, (low, high) = (-log_variance / 2).exp(), limits
     below, above = (torch.special.ndtr((clean + edge - mean) * scale) for edge in (-BIN / 2, BIN / 2))

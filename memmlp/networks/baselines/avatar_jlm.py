@@ -35,7 +35,7 @@ PARTS = (SPARSE_ROTATION, SPARSE_ANGULAR_VELOCITY, SPARSE_POSITION, SPARSE_VELOC
 
 
 def tracker_features(encoded: Tensor) -> Tensor:
-    """Return inputs (..., 54) by tracker (..., 3, 18)."""
+    """Return inputs (..., 54) grouped by tracker (..., 3, 18)."""
     return torch.cat([encoded[..., part].unflatten(-1, (len(TRACKED), -1)) for part in PARTS], -1)
 
 
@@ -57,24 +57,7 @@ def with_tracked(joints: Tensor, tracked: Tensor) -> Tensor:
 
 
 class AvatarJLM(WholeWindow):
-    """A coarse pose of each frame, tokens of its joints, encoder layers, and a head on all tokens of a frame.
-
-    It has 63,807,240 parameters at the paper's sizes (T = 41, d = 512, 6 blocks). It predicts all frames of a
-    window; a live stream keeps the last one.
-
-    Args:
-        normalizer: converts between the world and network space.
-        frames: T, the window's length.
-        width: d, the width of a token; the layers of the coarse pose have 2 d.
-        depth: number of blocks: an encoder layer over a frame's tokens, and one over each token's frames.
-        heads: number of attention heads; it divides d.
-        feedforward: width of the encoders' hidden layers.
-        dropout: dropout rate of the encoders, while training.
-        coarse: weight of the loss of the coarse pose's joints.
-
-    Attributes:
-        outputs: how many numbers are read from the tokens of a frame.
-    """
+    """Return features of all joints (..., 22, n), those of the tracked joints replaced by (..., 3, n)."""
 
     outputs: ClassVar[int] = ROTATION.stop
 
@@ -126,7 +109,7 @@ class AvatarJLM(WholeWindow):
         return positions - positions[..., HEAD : HEAD + 1, :], matrix_to_sixd(rotations)
 
     def tokens(self, encoded: Tensor) -> Tensor:
-        """Map inputs (..., 54) in network space to their frames' tokens (..., 45, d), without places."""
+        """Map inputs (..., 54) in network space to tokens (..., 45, d), without position embeddings."""
         embedded = self.embedding(joint_features(encoded))
         positions, rotations = self.coarse_joints(embedded)
         seen = encoded * self.normalizer.std[:SPARSE_DIM] + self.normalizer.mean[:SPARSE_DIM]
@@ -137,12 +120,15 @@ class AvatarJLM(WholeWindow):
         return torch.cat([self.position_token(positions), self.rotation_token(rotations), whole], -2)
 
     def placed(self, tokens: Tensor) -> Tensor:
-        """Add the places of joints and frames to the tokens (..., T, 45, d) of a window."""
+        """Add the position embeddings of joints and frames to the tokens (..., T, 45, d) of a window."""
         return tokens + self.joint_places + self.time_places[: tokens.shape[-3]]
 
     @staticmethod
     def renewed(h: Tensor, first: Tensor) -> Tensor:
-        """Return tokens (..., 45, d) with the inputs' token as it was at first (..., 1, d), detached."""
+        """Return tokens (..., 45, d) with the last one, that of the inputs, as it was at first (..., 1, d).
+
+        The first value is detached: no gradient flows through it.
+        """
         return torch.cat([h[..., :-1, :], first.detach()], -2)
 
     def rotations(self, encoded: Tensor) -> Tensor:
@@ -150,7 +136,7 @@ class AvatarJLM(WholeWindow):
         return self.regressed(encoded)
 
     def regressed(self, encoded: Tensor) -> Tensor:
-        """Map inputs (B, T, 54) in network space to what is read from their tokens (B, T, n)."""
+        """Map inputs (B, T, 54) in network space to what the regressor reads from their tokens (B, T, n)."""
         h = self.placed(self.tokens(encoded))
         first = h[..., -1:, :]
         for index, layer in enumerate(self.layers):
@@ -162,7 +148,7 @@ class AvatarJLM(WholeWindow):
         return self.regressor(h.flatten(-2).flatten(0, 1)).unflatten(0, encoded.shape[:2])
 
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
-        """Make a training call, whose coarse pose has a loss of its own; see MotionModel."""
+        """Make a training call, which adds a loss of the coarse pose; see MotionModel."""
         return Learned(*self.advance(sparse, state), self.coarse_loss(truth))
 
     def coarse_loss(self, truth: Tensor) -> dict[str, Tensor]:

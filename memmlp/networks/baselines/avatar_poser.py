@@ -25,11 +25,11 @@ def head(width: int, size: int) -> nn.Module:
 
 
 class OwnWindows(MotionModel):
-    """The base of networks that make every frame from its own window (`rotations`).
+    """The base of networks that predict every frame from the window that ends with it (`rotations`).
 
-    Both evaluation modes give the same numbers, except for the last window of a clip, which is shifted to its
-    end: the buffer ends with frames that the window begins with, so that these stand in a frame's own window
-    twice, and those before them are missing.
+    Both evaluation modes give the same numbers, except for the last window of a clip. That window is shifted
+    back to end with the clip, so the buffer of past inputs already holds the frames with which it begins:
+    they appear twice in the windows of its frames, in place of earlier ones.
     """
 
     def rotations(self, encoded: Tensor) -> Tensor:
@@ -39,7 +39,7 @@ class OwnWindows(MotionModel):
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         """Take in the newest frames; see MotionModel.
 
-        By default the n new frames are returned, which are the most that it can make.
+        By default the n new frames are returned, which are the most that this network can make.
         """
         inputs, kept = self.taken_in(sparse, state)
         wanted = sparse.shape[1] if newest is None else newest
@@ -69,7 +69,7 @@ class AvatarPoser(OwnWindows):
 
     Attributes:
         inputs: how many features of a frame are embedded.
-        rotated: how many joints' rotations are read beside the root's.
+        rotated: how many joints' rotations are predicted besides the root's.
     """
 
     inputs: ClassVar[int] = SPARSE_DIM
@@ -98,7 +98,7 @@ class AvatarPoser(OwnWindows):
         return self.encode(self.embedding(encoded))
 
     def encode(self, h: Tensor) -> Tensor:
-        """Map the embeddings of windows (B, T, d) to their last frames' rotations (B, 132)."""
+        """Map the embeddings of windows (B, T, d) to the rotations (B, 132) of their last frames."""
         for layer in self.layers:
             h = layer(h)
         return self.read(h[:, -1])

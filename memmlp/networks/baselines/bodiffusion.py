@@ -31,7 +31,7 @@ class DiTBlock(nn.Module):
     Args:
         width: d, the width of the features.
         heads: number of attention heads; it divides d.
-        ratio: the MLP's hidden layer has so many times d.
+        ratio: the width of the MLP's hidden layer, as a multiple of d.
     """
 
     def __init__(self, width: int, heads: int, ratio: int = 1):
@@ -66,8 +66,8 @@ class DiTBlock(nn.Module):
 class BoDiffusion(WholeWindow):
     """A denoiser of rotations that predicts their noise, conditioned on the window's inputs.
 
-    It has 21,942,270 trained parameters at the paper's sizes (T = 41, d = 384, 12 blocks), and places of the
-    frames that are zeros and stay so, as published.
+    It has 21,942,270 trained parameters at the paper's sizes (T = 41, d = 384, 12 blocks), and position
+    embeddings of the frames that are zero and not trained, as published.
 
     The noise of a sample is always the same, drawn from `noise_seed`, as AGRoLDiffusion's is. A live stream
     samples a window at each frame and keeps its last one.
@@ -81,7 +81,7 @@ class BoDiffusion(WholeWindow):
         diffusion_steps: number of steps of the training's noise schedule.
         sampling_steps: number of denoiser calls at inference.
         noise_seed: seed of the noise of samples.
-        noise: weight of the loss of the noise.
+        noise: weight of the loss of the predicted noise.
         bound: weight of the variational bound, from which the variances learn.
         offline: whether window mode denoises the windows of a clip together, as published.
     """
@@ -118,31 +118,31 @@ class BoDiffusion(WholeWindow):
 
     @property
     def streams(self) -> bool:
-        """Whether a frame is made without later ones: not as published."""
+        """Whether each frame is predicted without later ones; false in the published, offline mode."""
         return not self.offline
 
     @property
     def joint(self) -> bool:
-        """Whether window mode makes all windows of a clip together: as published."""
+        """Whether window mode denoises all windows of a clip together; true in the published mode."""
         return self.offline
 
     def drawn(self, frames: int) -> Tensor:
-        """Draw the noise (draws, N, 132) of a sample of N frames, always the same."""
+        """Draw the noise (draws, N, 132) for a sample of N frames; it is always the same."""
         draw = torch.Generator().manual_seed(self.noise_seed)
         return torch.randn(self.diffusion.draws, frames, ROTATION.stop, generator=draw)
 
     def limits(self) -> tuple[Tensor, Tensor]:
-        """Return the least and the largest values (132,) of rotations in network space: 6D's -1 and 1."""
+        """Return the least and the largest values (132,) of 6D rotations, -1 and 1, in network space."""
         mean, std = (part[SPARSE_DIM:][ROTATION] for part in (self.normalizer.mean, self.normalizer.std))
         return (-1 - mean) / std, (1 - mean) / std
 
     def mixed(self, encoded: Tensor) -> Tensor:
-        """Mix the thirds of inputs (..., 54) to channels of each joint (..., 22, 18)."""
+        """Spread inputs (..., 54) over the joints (..., 22, 18), mixing the thirds of the input vector."""
         thirds = encoded.unflatten(-1, (len(TRACKED), CHANNELS))
         return self.spread(thirds.transpose(-1, -2)).transpose(-1, -2)
 
     def denoise(self, noisy: Tensor, time: Tensor, encoded: Tensor) -> Denoised:
-        """Predict the noise in rotations (B, T, 132), and the share of a step's variance.
+        """Predict the noise in rotations (B, T, 132), and where each step's variance lies between its limits.
 
         Args:
             noisy: noisy rotations (B, T, 132).
@@ -157,7 +157,7 @@ class BoDiffusion(WholeWindow):
         return Denoised(*(part.flatten(-2).to(noisy) for part in made.chunk(2, -1)))
 
     def step(self, noisy: Tensor, encoded: Tensor, index: int) -> tuple[Tensor, Tensor]:
-        """Return mean and variance (B, T, 132) after a sampling step of rotations given inputs (B, T, 54)."""
+        """Return mean and variance (B, T, 132) after a sampling step, given motion and inputs (B, T, 54)."""
         time = torch.full((len(noisy),), self.diffusion.times[index], device=noisy.device)
         return self.diffusion.step(noisy, self.denoise(noisy, time, encoded), index, self.limits())
 
@@ -171,10 +171,10 @@ class BoDiffusion(WholeWindow):
         return self.diffusion.sample(step, self.noises[:, None].expand(-1, len(encoded), -1, -1))
 
     def whole(self, sparse: Tensor) -> Tensor:
-        """Sample the world motion (N, 198) of a clip's world inputs (N, 54), N >= T, its windows together.
+        """Sample the world motion (N, 198) of a clip's world inputs (N, 54), N >= T, all windows together.
 
-        A window begins every T // 2 frames, the last one where it ends with the clip; at every step the
-        windows are averaged where they overlap (Castillo et al. 2023; the released code drops the tail).
+        A window begins every T // 2 frames, and the last one ends with the clip. After every sampling step,
+        overlapping windows are averaged (Castillo et al. 2023; the released code drops the clip's tail).
         """
         count, size = len(sparse), self.frames
         begin = torch.tensor([*range(0, count - size, size // 2), count - size], device=sparse.device)
@@ -195,9 +195,9 @@ class BoDiffusion(WholeWindow):
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
         """Make a training call: add noise to the truth (B, T, 252), and denoise it in one call.
 
-        Each window gets noise of a time that is drawn for it. The motion is that of the rotations which the
-        predicted noise leaves, kept within their limits as in sampling; the losses are those of the noise and
-        of its variances.
+        A diffusion time is drawn for each window. The returned motion is made from the rotations that remain
+        once the predicted noise is removed, clamped to their limits as in sampling; the losses are those of
+        the noise and of the variances.
 
         Args:
             sparse: world inputs (B, n, 54) of the newest frames.

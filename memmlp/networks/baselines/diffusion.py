@@ -31,7 +31,7 @@ def linear_schedule(steps: int) -> Tensor:
     """Return the linear schedule: the signal's share (steps,) of the noisy signal's variance, float64.
 
     The noise that one step adds has a share that grows linearly from 1e-4 to 0.02 over 1000 steps (Ho et al.
-    2020, Sec. 4); of fewer steps each adds in proportion more, at most 0.999.
+    2020, Sec. 4); with fewer steps each one adds proportionally more, at most 0.999.
     """
     added = torch.linspace(1e-4, 0.02, steps, dtype=torch.float64) * (1000 / steps)
     return (1 - added.clamp_max(0.999)).cumprod(0)
@@ -42,8 +42,8 @@ class Noising(nn.Module):
 
     Args:
         signal: share (steps,) of signal in the noisy signal's variance, by step.
-        sampling_steps: number of denoiser calls for a sample, evenly spaced from the last step down (Song et
-            al. 2021, App. D.2: linear), so that the first one sees noise alone.
+        sampling_steps: number of denoiser calls for a sample, evenly spaced, from the noise schedule's last
+            step down (Song et al. 2021, App. D.2: linear), so that the first one sees noise alone.
     """
 
     signal: Tensor
@@ -70,7 +70,7 @@ def at(table: Tensor, time: Tensor, like: Tensor) -> Tensor:
 
 
 class Diffusion(Noising):
-    """Diffusion with a cosine schedule, whose network predicts the clean signal, and which DDIM samples.
+    """Diffusion with a cosine schedule, whose network predicts the clean signal; DDIM samples it.
 
     Args:
         steps: number of steps of the noise schedule.

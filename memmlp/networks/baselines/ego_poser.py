@@ -19,13 +19,13 @@ PLACES = 2 * len(TRACKED)  # components of the trackers' places on the floor
 
 
 def beside_head(sparse: Tensor) -> Tensor:
-    """Return inputs (..., 54) with places on the floor relative to the same frame's head."""
+    """Return inputs (..., 54) with positions on the floor relative to the head in the same frame."""
     space = HeadRelative()
     return space.sparse_in(sparse, space.origin(sparse))
 
 
 def places(sparse: Tensor) -> Tensor:
-    """Return the trackers' places on the floor (..., 6) of inputs (..., 54)."""
+    """Return the trackers' positions on the floor (..., 6), from inputs (..., 54)."""
     return sparse[..., SPARSE_POSITION].unflatten(-1, (len(TRACKED), 3))[..., :2].flatten(-2)
 
 
@@ -34,8 +34,8 @@ class EgoPoser(AvatarPoser):
 
     It has 4,126,340 parameters at the paper's sizes (T = 80, otherwise AvatarPoser's); the released code has
     a further layer of 7,808 that nothing uses. Positions are relative to the point of the floor below the
-    head in the same frame, and how far they moved since the window's first frame is appended to each frame's
-    inputs.
+    head in the same frame, and how far the trackers moved on the floor since the window's first frame is
+    appended to each frame's inputs.
     """
 
     inputs: ClassVar[int] = SPARSE_DIM + PLACES

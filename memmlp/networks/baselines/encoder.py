@@ -16,7 +16,7 @@ GAIN = 0.2  # by which the weights at the beginning are smaller than Kaiming's
 class Attention(nn.Module):
     """Multi-head self-attention over the frames of a window (Vaswani et al. 2017, Sec. 3.2).
 
-    Windows may have no batch axis.
+    Windows without a batch axis are allowed, too.
 
     Args:
         width: d, the width of the features.
@@ -83,11 +83,12 @@ class EncoderLayer(nn.Module):
 
 @torch.no_grad()
 def draw_weights(part: nn.Module) -> None:
-    """Draw the first weights of linear layers as AvatarPoser's released code does, and those made from it.
+    """Draw initial weights of linear layers as AvatarPoser's released code, and code derived from it, does.
 
-    They are of Kaiming's normal distribution (He et al. 2015, Eq. 10) times 0.2, with biases of 0, so that a
-    network begins near the mean pose. Queries, keys and values of torch's own attention are of one matrix,
-    which that code leaves as torch draws it, by Xavier's uniform distribution (Glorot & Bengio 2010, Eq. 16).
+    They have Kaiming's normal distribution (He et al. 2015, Eq. 10) times 0.2, with biases of 0, so that a
+    network begins near the mean pose. In torch's own attention, queries, keys and values share one matrix,
+    which the released code leaves as torch draws it, by Xavier's uniform distribution (Glorot & Bengio 2010,
+    Eq. 16).
     """
     for layer in part.modules():
         if isinstance(layer, nn.Linear):

@@ -55,9 +55,9 @@ def in_head(rotation: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def hands_in_head(sparse: Tensor) -> list[Tensor]:
-    """Return what `by_tracker` does for both hands in the head's frame, from world inputs (..., 54).
+    """Return what `by_tracker` returns, for both hands in the head's frame, from world inputs (..., 54).
 
-    The frame before follows from the inputs' velocities.
+    The previous frame is reconstructed from the velocities in the inputs.
     """
     rotation, turn, position, velocity = by_tracker(sparse)
     now = sixd_to_matrix(rotation)
@@ -68,11 +68,11 @@ def hands_in_head(sparse: Tensor) -> list[Tensor]:
 
 
 class TokenEmbedding(nn.Module):
-    """A token made of its parts side by side, each through a linear layer and LeakyReLU.
+    """A token made of several parts side by side, each through a linear layer and LeakyReLU.
 
     Args:
-        inputs: numbers of features of the parts.
-        outputs: widths that the parts get in the token.
+        inputs: number of features of each part.
+        outputs: number of the token's features that each part makes.
     """
 
     def __init__(self, inputs: Sequence[int], outputs: Sequence[int]):
@@ -86,7 +86,7 @@ class TokenEmbedding(nn.Module):
 
 
 def shares(width: int) -> list[int]:
-    """Divide a width into four parts as equal as can be."""
+    """Divide a width into four parts that are as equal as possible."""
     bounds = [width * part // 4 for part in range(5)]
     return [stop - start for start, stop in pairwise(bounds)]
 
@@ -156,9 +156,9 @@ class TimeAndTokenBlock(nn.Module):
 class HMDPoser(WindowlessModel):
     """Tokens of trackers, blocks of LSTMs and encoder layers, and a head on all tokens of a frame.
 
-    It has 17,444,484 parameters at the paper's sizes, 528,656 of them the head of the body's shape, and
-    carries two states of d for each LSTM: 8,192 numbers. Evaluation runs over whole clips, training over
-    windows of T frames, both from zero states.
+    It has 17,444,484 parameters at the paper's sizes, of which 528,656 belong to the head for the body's
+    shape, and carries two states of d for each LSTM: 8,192 numbers. Evaluation runs over whole clips,
+    training over windows of T frames, both from zero states.
 
     Args:
         normalizer: converts between the world and network space.
@@ -169,8 +169,8 @@ class HMDPoser(WindowlessModel):
         heads: number of attention heads; it divides d.
         feedforward: width of the encoders' hidden layers.
         dropout: dropout rate of the encoders, while training.
-        shape: weight of the loss that keeps the predicted shape the same in a window; 0 leaves the shape's
-            head out, which no prediction needs.
+        shape: weight of the loss that keeps the predicted shape the same in a window; 0 leaves out the head
+            for the shape, which no prediction needs.
     """
 
     def __init__(
@@ -238,19 +238,19 @@ class HMDPoser(WindowlessModel):
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         """Take in the newest frames; see MotionModel.
 
-        By default the n new frames are returned, which are the most that it can make.
+        By default the n new frames are returned, which are the most that this network can make.
         """
         features, kept = self.features(sparse, state)
         wanted = sparse.shape[1] if newest is None else newest
         return self.normalizer.posed(self.pose(features[:, -wanted:]), sparse[:, -wanted:]), kept
 
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
-        """Make a training call, which predicts the shape too; see MotionModel."""
+        """Make a training call, which adds the loss of the predicted shape; see MotionModel."""
         features, kept = self.features(sparse, state)
         return Learned(self.normalizer.posed(self.pose(features), sparse), kept, self._shape_loss(features))
 
     def _shape_loss(self, features: Tensor) -> dict[str, Tensor]:
-        """Return how much the shapes that features (B, T, d) give differ within their windows, weighted."""
+        """Return the weighted loss of how much the shapes of features (B, T, d) vary within a window."""
         if self.shape is None:
             return {}
         shapes = self.shape(features)

@@ -1,7 +1,8 @@
 """Arms and legs in closed form, as MANIKIN has them (Jiang et al., ECCV 2024).
 
-A limb has a base (shoulder, hip), a middle (elbow, knee) and an end (wrist, ankle). Base and end leave the
-middle a circle to be on; the **swivel** is the angle on it. Elbows and knees bend about one axis each.
+A limb has a base (shoulder, hip), a middle (elbow, knee) and an end (wrist, ankle). Given its base and end,
+the middle can be anywhere on a circle; the **swivel** is the angle on that circle. Elbows and knees bend
+about one axis each.
 
 Vectors and rotations of the four limbs stand side by side: left arm, right arm, left leg, right leg.
 """
@@ -32,12 +33,12 @@ OFFSET = 1e-3  # metres; which way a limb bends that is straighter than that fol
 
 
 def dot(one: Tensor, other: Tensor) -> Tensor:
-    """Return the products (..., 1) of vectors (..., 3)."""
+    """Return the dot products (..., 1) of vectors (..., 3)."""
     return (one * other).sum(-1, keepdim=True)
 
 
 def of_joints(joints: Tensor, which: Sequence[int], axis: int = -2) -> Tensor:
-    """Return what a tensor holds of some joints, which stand on the given axis."""
+    """Return the entries of a tensor for some joints, which are indexed along the given axis."""
     return joints.index_select(axis, torch.tensor(which, device=joints.device))
 
 
@@ -57,13 +58,13 @@ def applied(rotation: Tensor, vector: Tensor) -> Tensor:
 
 
 def about(axis: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
-    """Return the rotations (..., 3, 3) about unit axes (..., 3), of cosines and sines (..., 1) of angles."""
+    """Return the rotations (..., 3, 3) about unit axes (..., 3), given the cosine and sine (..., 1)."""
     across, identity = skew(axis), axis.new_tensor(IDENTITY)
     return identity + sine[..., None] * across + (1 - cosine)[..., None] * (across @ across)
 
 
 def aligning(start: Tensor, goal: Tensor) -> Tensor:
-    """Return the smallest rotations (..., 3, 3) that carry unit vectors (..., 3) to others."""
+    """Return the smallest rotations (..., 3, 3) that turn unit vectors (..., 3) onto others."""
     across, identity = skew(cross(start, goal)), goal.new_tensor(IDENTITY)
     return identity + across + across @ across / (1 + dot(start, goal)).clamp_min(1e-6)[..., None]
 
@@ -74,7 +75,7 @@ def frame(first: Tensor, second: Tensor) -> Tensor:
 
 
 def circle(axis: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the directions (..., 3) of a swivel of 0 and of 90 degrees.
+    """Return the directions (..., 3) that belong to swivels of 0 and of 90 degrees.
 
     Args:
         axis: unit vectors (..., 3) from base to end.
@@ -85,7 +86,7 @@ def circle(axis: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def swivels(base: Tensor, middle: Tensor, end: Tensor, up: Tensor) -> Tensor:
-    """Return the cosines and sines (..., 2) of limbs' swivels, from joints (..., 3) and the bases' Y axes."""
+    """Return the cosines and sines (..., 2) of swivels, from limbs' joints (..., 3) and the bases' Y axes."""
     axis = F.normalize(end - base, dim=-1)
     start, quarter = circle(axis, up)
     away = middle - base
@@ -93,7 +94,7 @@ def swivels(base: Tensor, middle: Tensor, end: Tensor, up: Tensor) -> Tensor:
 
 
 def bend_direction(axis: Tensor, up: Tensor, swivel: Tensor) -> Tensor:
-    """Return the unit vectors (..., 3) from the axis to the middle, at swivels (..., 2), cosine and sine."""
+    """Return the unit vectors (..., 3) from the axis to the middle, for swivels (..., 2), cosine and sine."""
     start, quarter = circle(axis, up)
     return swivel[..., :1] * start + swivel[..., 1:] * quarter
 
@@ -124,8 +125,8 @@ def bones(rest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def flexed(upper: Tensor, lower: Tensor, axis: Tensor, reach: Tensor) -> Tensor:
     """Return the rotations (..., 4, 3, 3) of elbows and knees that bring hands and feet to a given reach.
 
-    Of the two ways to bend, each limb takes the one about its own axis of flexion. A limb that is asked to
-    reach further, or less far, than it can is as straight, or as bent, as can be.
+    Of the two ways to bend, each limb takes the one about its own axis of flexion. If the reach is out of a
+    limb's range, the limb is as straight, or as bent, as possible.
 
     Args:
         upper, lower, axis: see `bones`.
@@ -142,7 +143,12 @@ def flexed(upper: Tensor, lower: Tensor, axis: Tensor, reach: Tensor) -> Tensor:
 
 
 def twist(rotation: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
-    """Return cosines and sines (..., 1) of how far rotations (..., 3, 3) turn about unit axes (..., 3)."""
+    """Return cosines and sines (..., 1) of the angles by which rotations (..., 3, 3) turn about an axis.
+
+    Args:
+        rotation: rotations (..., 3, 3).
+        axis: the axes, unit vectors (..., 3).
+    """
     flat = rotation.flatten(-2)
     turned, trace = flat @ flat.new_tensor(SKEW).T, flat @ flat.new_tensor(IDENTITY).flatten()[:, None]
     both = torch.cat([trace - dot(axis, applied(rotation, axis)), dot(axis, turned)], -1)
@@ -151,15 +157,15 @@ def twist(rotation: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def untwisting(local: Tensor, bone: Tensor, axis: Tensor) -> Tensor:
-    """Return the smallest rotations (..., 4, 3, 3) about the axes that bring the bases' twists to the limits.
+    """Return the smallest rotations (..., 4, 3, 3) about the limbs' axes that limit the bases' twists.
 
-    With h the half of a rotation's angle, the twist of the rotated base is a ratio of sums of sin h and
-    cos h; tan h follows. A base within its limits is not rotated.
+    If h is half of such a rotation's angle, the twist of the rotated base is a ratio of sums of sin h and cos
+    h, from which tan h follows. A base within its limits is not rotated.
 
     Args:
         local: the bases' local rotations (..., 4, 3, 3).
         bone: the upper bones' unit vectors (4, 3) in the rest pose.
-        axis: the unit vectors (..., 4, 3) from base to end, as the bases' parents see them.
+        axis: the unit vectors (..., 4, 3) from base to end, in the frames of the bases' parents.
     """
     real, vector = matrix_to_wxyz(local).split([1, 3], -1)
     limit = (local.new_tensor(TWIST) * (math.pi / 360)).tan()[:, None]
@@ -176,9 +182,9 @@ def untwisting(local: Tensor, bone: Tensor, axis: Tensor) -> Tensor:
 
 
 def chain_frame(bent: Tensor, rest: Tensor) -> Tensor:
-    """Return where limbs with bent middles (..., 4, 3, 3) point, in the frames of their bases.
+    """Return the orientation of limbs with bent middles (..., 4, 3, 3), in the frames of their bases.
 
-    The first columns of these rotations (..., 4, 3, 3) lead to the ends, the second ones out to the middles.
+    The first columns of these rotations (..., 4, 3, 3) point to the ends, the second ones out to the middles.
     """
     upper, lower, flexion = bones(rest)
     chain = F.normalize(upper + applied(bent, lower), dim=-1)
@@ -187,7 +193,7 @@ def chain_frame(bent: Tensor, rest: Tensor) -> Tensor:
 
 
 def handed(arms: Tensor, hands: Tensor, forearm: Tensor) -> tuple[Tensor, Tensor]:
-    """Share the rotations of hands out to elbows and wrists.
+    """Divide the rotations of the hands between elbows and wrists.
 
     Args:
         arms: global rotations (..., 2, 3, 3) of elbows that are bent and not yet rolled.
@@ -195,7 +201,7 @@ def handed(arms: Tensor, hands: Tensor, forearm: Tensor) -> tuple[Tensor, Tensor
         forearm: the forearms (2, 3) in the rest pose.
 
     Returns:
-        What the elbows are rolled by about their forearms, and the wrists' local rotations, (..., 2, 3, 3).
+        The elbows' roll about their forearms, and the wrists' local rotations, (..., 2, 3, 3) each.
     """
     seen = arms.transpose(-1, -2) @ hands
     axis = F.normalize(forearm, dim=-1).expand(*seen.shape[:-2], 3)
@@ -204,7 +210,13 @@ def handed(arms: Tensor, hands: Tensor, forearm: Tensor) -> tuple[Tensor, Tensor
 
 
 def footed(shins: Tensor, toe: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
-    """Return where feet point at rest and where they should, unit vectors (..., 2, 3) seen from the knees."""
+    """Return the unit vectors (..., 2, 3) where feet point at rest and where they should, as knees see them.
+
+    Args:
+        shins: global rotations (..., 2, 3, 3) of the knees.
+        toe: vectors (..., 2, 3) from the ankles to the toes, of any length.
+        rest: rest positions (22, 3), metres.
+    """
     bone = F.normalize(rest[list(TOES)] - rest[list(ANKLES)], dim=-1)
     goal = applied(shins.transpose(-1, -2), F.normalize(toe, dim=-1))
     return bone.expand(goal.shape), goal
@@ -222,11 +234,11 @@ def solved(
 ) -> Tensor:
     """Return the local rotations (..., 22, 3, 3) of a body with its limbs solved.
 
-    Wrists and ankles come to their ends as far as the limbs reach. What a hand is turned by about its forearm
-    is the elbow's rotation, the rest the wrist's; a foot is turned the least way to its toe.
+    Wrists and ankles get to their given positions as far as the limbs reach. The part of a hand's rotation
+    about its forearm goes to the elbow, the rest to the wrist; a foot takes the smallest rotation to its toe.
 
     Args:
-        local: local rotations (..., 22, 3, 3), of which those of the limbs do not count.
+        local: local rotations (..., 22, 3, 3), of which those of the limbs are ignored.
         turned: global rotations (..., 22, 3, 3) of the same body.
         base: positions (..., 4, 3) of shoulders and hips, metres.
         end: positions (..., 4, 3) of wrists and ankles.

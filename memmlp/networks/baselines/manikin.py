@@ -3,7 +3,7 @@
 MANIKIN-S has AvatarPoser's encoder, MANIKIN-L AvatarJLM's network. What they predict of a frame (`Parts`) is
 turned into a pose in closed form (memmlp.networks.baselines.limb_solver). Readings: all heights are the
 world's, since a stream does not know the lowest foot of its clip; the head has its tracker's rotation; and a
-straight limb is not held as in the frame before.
+straight limb does not keep the swivel of the frame before.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ AUXILIARY = 6 * (N_JOINTS - 1)  # rotations that MANIKIN-L predicts in training 
 
 
 def follows(joint: int) -> bool:
-    """Return whether a joint's position follows from rotations that are predicted."""
+    """Return whether a joint's position follows from the predicted rotations alone."""
     parent = PARENTS[joint]
     return parent <= ROOT or (parent in KEPT and follows(parent))
 
@@ -66,7 +66,7 @@ PLACED = [joint for joint in range(N_JOINTS) if follows(joint)]
 
 
 class Parts(NamedTuple):
-    """What is predicted of a frame, in the network's coordinates without z-scores.
+    """What the network predicts for a frame, in its own coordinates without z-scores.
 
     Attributes:
         sixd: the local 6D rotations (..., 11, 6) of the root and of the joints KEPT.
@@ -97,7 +97,7 @@ class Parts(NamedTuple):
 
     @property
     def trunk(self) -> Tensor:
-        """The local rotations (..., 22, 3, 3) of a body whose other joints are not turned."""
+        """The local rotations (..., 22, 3, 3) of a body; joints that are not predicted have no rotation."""
         found = sixd_to_matrix(self.sixd)
         still = found.new_tensor(IDENTITY).expand(found[..., 0, :, :].shape)
         rows = [still] * N_JOINTS
@@ -111,7 +111,7 @@ class Parts(NamedTuple):
         return trunk, *forward_kinematics(trunk, torch.zeros_like(trunk[..., ROOT, :, 0]), rest)
 
     def posed(self, encoded: Tensor, normalizer: Normalizer) -> Tensor:
-        """Return the rotations (..., 132) in network space, the limbs solved, at inputs (..., 54)."""
+        """Return the rotations (..., 132) in network space, with the limbs solved, given inputs (..., 54)."""
         seen = encoded * normalizer.std[:SPARSE_DIM] + normalizer.mean[:SPARSE_DIM]
         places = seen[..., SPARSE_POSITION].unflatten(-1, (len(TRACKED), 3))
         trackers = sixd_to_matrix(seen[..., SPARSE_ROTATION].unflatten(-1, (len(TRACKED), 6)))
@@ -135,7 +135,7 @@ class Parts(NamedTuple):
 
 
 class Truth:
-    """What the parts of a frame should be.
+    """The true values that the predicted parts of a frame are compared with.
 
     Args:
         motion: true motion (..., 198), in the network's coordinates without z-scores.
@@ -156,13 +156,13 @@ class Truth:
 
 
 class Manikin(MotionModel):
-    """What both networks have in common: limbs that are solved, and how they are trained.
+    """The common base of both MANIKIN networks: how limbs are solved, and how the networks are trained.
 
-    Any loss compares the solved pose, through which it reaches all parts; the network's own losses are of the
-    parts themselves, as its authors have them.
+    The losses of the motion compare the solved pose, and their gradients reach every predicted part through
+    it. The network's own losses, as its authors have them, compare the predicted parts themselves.
 
     Attributes:
-        parts: weight of all these losses.
+        parts: weight of all losses of the parts.
         turned: whether training windows are turned by headings drawn at random.
     """
 
@@ -170,19 +170,19 @@ class Manikin(MotionModel):
     turned: bool
 
     def predicted(self, encoded: Tensor) -> Tensor:
-        """Map windows (B, T, 54) in network space to outputs of their last n frames (B, n, 86 or more)."""
+        """Map windows (B, T, 54) in network space to outputs (B, n, 86 or more) for their last n frames."""
         raise NotImplementedError
 
     def losses_of_parts(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
-        """Return the losses of the parts, weighted as by its authors, of outputs (B, n, 86 or more)."""
+        """Return the losses of the parts in outputs (B, n, 86 or more), weighted as in the authors' work."""
         raise NotImplementedError
 
     def posed(self, made: Tensor, encoded: Tensor) -> Tensor:
-        """Map outputs (..., 86 or more) and their frames' inputs (..., 54) to rotations (..., 132)."""
+        """Map outputs (..., 86 or more) and the same frames' inputs (..., 54) to rotations (..., 132)."""
         return Parts.of(made, self.normalizer).posed(encoded, self.normalizer)
 
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
-        """Make a training call with each window turned by a heading of its own; see MotionModel."""
+        """Make a training call in which each window is turned by its own random heading; see MotionModel."""
         inputs, kept = self.taken_in(sparse, state)
         heading, space = self.heading(truth), Heading()
         window = space.sparse_in(inputs[:, -self.frames :], heading)
@@ -200,7 +200,7 @@ class Manikin(MotionModel):
         return torch.cat([torch.zeros_like(truth[:, :1, :3]), angle.cos(), angle.sin()], -1)
 
     def losses(self, made: Tensor, true: Tensor) -> dict[str, Tensor]:
-        """Return the weighted losses of outputs (B, n, 86 or more) at true world frames (B, T, 252)."""
+        """Return the weighted losses of outputs (B, n, 86 or more), given true world frames (B, T, 252)."""
         motion = self.normalizer.coordinates.motion_in(
             true[..., SPARSE_DIM:], self.normalizer.origin(true[..., :SPARSE_DIM])
         )
@@ -259,7 +259,7 @@ class ManikinS(Manikin, AvatarPoser):
         return torch.cat([super().read(newest), self.swivel(newest), self.places(newest)], -1)
 
     def predicted(self, encoded: Tensor) -> Tensor:
-        """Map windows (B, T, 54) in network space to outputs of their last frame (B, 1, 86)."""
+        """Map windows (B, T, 54) in network space to outputs (B, 1, 86) for their last frame."""
         return self.encode(self.embedding(encoded))[:, None]
 
     def rotations(self, encoded: Tensor) -> Tensor:
@@ -267,11 +267,11 @@ class ManikinS(Manikin, AvatarPoser):
         return self.posed(self.predicted(encoded), encoded[:, -1:])[:, 0]
 
     def losses_of_parts(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
-        """Return the losses of the parts, weighted as by its authors, of outputs (B, 1, 86).
+        """Return the losses of the parts in outputs (B, 1, 86), weighted as in the authors' work.
 
-        Swivels are counted from the predicted shoulders and hips, which learn nothing by that: the gradient
-        has no bound where a limb is nearly along the axis that it is counted from, as a standing leg is, and
-        trainings fell apart. The losses of middles and of swivels are sums over the limbs.
+        Swivels are measured from the predicted shoulders and hips, to which no gradient flows from them: it
+        would have no bound where a limb is nearly along the axis from which its swivel is measured, as in a
+        standing leg, and trainings diverged. The losses of middles and of swivels are sums over the limbs.
         """
         parts = Parts.of(made, self.normalizer)
         _, turned, joints = parts.body(self.normalizer.rest)
@@ -291,11 +291,11 @@ class ManikinS(Manikin, AvatarPoser):
 
 
 class ManikinL(Manikin, AvatarJLM):
-    """AvatarJLM's network, whose regressor predicts the parts, and in training all rotations beside them.
+    """AvatarJLM's network, whose regressor predicts the parts and, for training only, all rotations as well.
 
-    It has 63,889,240 parameters at the paper's sizes (AvatarJLM's). Its authors' MANIKIN-LN are the same
-    weights on windows that do not overlap, all of whose frames count: that is no stream. (They also raise
-    ankles to the true floor, which is left out here.)
+    It has 63,889,240 parameters at the paper's sizes (AvatarJLM's). Its authors' MANIKIN-LN uses the same
+    weights on windows that do not overlap and takes all frames of each: it can't run as a live stream. (They
+    also raise ankles to the true floor, which is left out here.)
 
     Args:
         normalizer: converts between the world and network space.
@@ -342,11 +342,11 @@ class ManikinL(Manikin, AvatarJLM):
 
     @property
     def streams(self) -> bool:
-        """Whether a frame is made without later ones: not as MANIKIN-LN."""
+        """Whether each frame is predicted without later ones; false for MANIKIN-LN."""
         return not self.offline
 
     def predicted(self, encoded: Tensor) -> Tensor:
-        """Map windows (B, T, 54) in network space to outputs of all their frames (B, T, 212)."""
+        """Map windows (B, T, 54) in network space to outputs (B, T, 212) for all their frames."""
         return self.regressed(encoded)
 
     def rotations(self, encoded: Tensor) -> Tensor:
@@ -358,10 +358,10 @@ class ManikinL(Manikin, AvatarJLM):
         return super().losses(made, true) | self.coarse_loss(true)
 
     def losses_of_parts(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
-        """Return the losses of the parts, weighted as by its authors, of outputs (B, T, 212).
+        """Return the losses of the parts in outputs (B, T, 212), weighted as in the authors' work.
 
-        Swivels are compared as angles, counted from the true shoulders and hips; toes with the head on its
-        tracker.
+        Swivels are compared as angles, measured from the true shoulders and hips. Toes are compared with the
+        head on its tracker.
         """
         parts = Parts.of(made, self.normalizer)
         turned, _ = forward_kinematics(

@@ -1,6 +1,6 @@
 """RPM (Rolling Prediction Model, CVPR 2025): each step predicts the next frames anew.
 
-What was predicted for a frame changes the less, the nearer the frame is; the nearest one is shown.
+The nearer a predicted frame is, the less a new prediction may change it; the nearest one is shown.
 """
 
 from __future__ import annotations
@@ -23,7 +23,10 @@ FRESH = 0.25  # of the training windows begin as a live stream does, without a p
 
 
 def sines(length: int, width: int) -> Tensor:
-    """Return the places (length, d) of a sequence as sines and cosines (Vaswani et al. 2017, Sec. 3.5)."""
+    """Return sine and cosine position embeddings (length, d) of a sequence (Vaswani et al.
+
+    2017, Sec. 3.5).
+    """
     rates = torch.exp(-math.log(10_000) * torch.arange(0, width, 2) / width)
     angles = torch.arange(length)[:, None] * rates
     return torch.stack([angles.sin(), angles.cos()], -1).flatten(-2)[:, :width]
@@ -39,20 +42,21 @@ class RPM(WindowlessModel):
     """Cross-attention from past and future motion to the newest inputs, then encoder layers.
 
     It has 9,626,756 parameters at the paper's sizes; the released code has a further layer of 262,656 that
-    nothing uses (9,889,412). Readings: a frame that is predicted for the first time takes the prediction as
-    it is; a live stream begins with zeros as its past motion, as a quarter of the training windows do, and
-    with its first frame's inputs for those before it.
+    nothing uses (9,889,412). Readings: a frame that is predicted for the first time takes the prediction
+    unchanged; a live stream begins with zeros as its past motion, as a quarter of the training windows do,
+    and with its first frame's inputs in place of earlier ones.
 
     Args:
         normalizer: converts between the world and network space.
-        frames: T, the frames of a training window: past motion, free running and prediction.
+        frames: T, the frames of a training window: past motion, frames of free running, and predicted frames.
         width: d, the width of the features.
         depth: number of encoder layers.
         heads: number of attention heads; it divides d.
         feedforward: width of the encoder's hidden layers.
         dropout: dropout rate of the encoder, while training.
-        context: how many frames of its own past motion it sees; of inputs it sees one more.
-        horizon: W, how many frames it predicts.
+        context: how many frames of its own past motion the network sees; it sees the inputs of one frame
+            more.
+        horizon: W, how many frames the network predicts.
     """
 
     places: Tensor
@@ -115,7 +119,7 @@ class RPM(WindowlessModel):
 
         Args:
             encoded: inputs (B, 1, 54) in network space.
-            state: the state before it.
+            state: the state before that frame.
 
         Returns:
             The prediction (B, W, 132) that begins with that frame, in network space, and the state after it.
@@ -141,7 +145,7 @@ class RPM(WindowlessModel):
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         """Take in the newest frames, one after the other; see MotionModel.
 
-        By default the n new frames are returned, which are the most that it can make.
+        By default the n new frames are returned, which are the most that this network can make.
         """
         shown = []
         for frame in self.encoded(sparse).split(1, 1):
@@ -151,9 +155,10 @@ class RPM(WindowlessModel):
         return self.normalizer.posed(torch.cat(shown[-wanted:], 1), sparse[:, -wanted:]), state
 
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
-        """Make a training call: a few frames of free running without gradient, and one step with it.
+        """Make a training call: a few frames of free running without gradients, then one step with gradients.
 
-        How many is drawn for each call. The window's last W frames are those that are predicted.
+        The number of free-running frames is drawn for each call. The step predicts the window's last W
+        frames.
 
         Args:
             sparse: world inputs (B, T, 54).
@@ -173,7 +178,7 @@ class RPM(WindowlessModel):
         return Learned(self.normalizer.posed(made, sparse[:, now:]), state, {})
 
     def begun(self, fresh: State, encoded: Tensor, truth: Tensor) -> State:
-        """Return the state after true frames; a drawn share of the windows gets a fresh start instead.
+        """Return the state after true frames, or a fresh start for a randomly drawn share of the windows.
 
         Args:
             fresh: a fresh start.

@@ -1,8 +1,8 @@
 """The networks of SAGE-Net (Feng et al., CVPR 2024): the body's halves as codes, their diffusion, a decoder.
 
-A VQ-VAE of each half makes latents of a window; a diffusion model of the upper half's latents sees the
-inputs, that of the lower half the upper latents, too; the decoder makes rotations of both. The refiner that
-follows is memmlp.networks.refiner. All latents are (B, T // 2, 384).
+A VQ-VAE of each half makes latents of a window; one diffusion model makes the upper half's latents from the
+inputs, another makes the lower half's from the inputs and the upper latents; the decoder makes rotations from
+both. The refiner that follows is memmlp.networks.refiner. All latents are (B, T // 2, 384).
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ HIDDEN = 0.01  # what stands in training for joints that are hidden
 
 
 class Mixture(nn.Module):
-    """Mixes the trackers' features to those of joints (a convolution of kernel 1 over the trackers).
+    """Mixes the trackers' features into features of joints (a convolution of kernel 1 over the trackers).
 
     Args:
-        joints: how many joints.
+        joints: number of joints.
     """
 
     def __init__(self, joints: int):
@@ -49,7 +49,7 @@ class Mixture(nn.Module):
 
 
 class AttentionBlock(nn.Module):
-    """Attention and an MLP of four times the width, each of normalised features and added to them (pre-norm).
+    """Attention and an MLP of four times the width, both pre-norm and residual.
 
     Args:
         width: d, the width of the features.
@@ -68,7 +68,7 @@ class AttentionBlock(nn.Module):
         return self.newest(h, h.shape[-2])
 
     def newest(self, h: Tensor, count: int) -> Tensor:
-        """Map features (..., T, d) to those of the newest frames (..., count, d), without the others."""
+        """Map features (..., T, d) to those of the newest frames (..., count, d), without the rest."""
         seen, attention = self.attention_norm(h), self.attention
         query = attention.query(seen[..., -count:, :])
         attended = attention.attend(query, attention.key(seen), attention.value(seen))
@@ -77,7 +77,7 @@ class AttentionBlock(nn.Module):
 
 
 class Stack(nn.Module):
-    """Blocks on features with sine places, between layers that a subclass puts before and after them.
+    """Blocks on features with sine position embeddings; subclasses put layers before and after the blocks.
 
     Args:
         width: d, the width of the features.
@@ -92,11 +92,11 @@ class Stack(nn.Module):
         self.norm, self.head = nn.LayerNorm(width), nn.Linear(width, width, bias=False)
 
     def before(self, h: Tensor) -> Tensor:
-        """Return what the blocks see of features (B, T, d): these themselves."""
+        """Return the features that the blocks get, made from features (B, T, d); by default unchanged."""
         return h
 
     def after(self, h: Tensor) -> Tensor:
-        """Return what follows of the blocks' features (B, T, d): these themselves."""
+        """Return the features made from the blocks' output (B, T, d); by default unchanged."""
         return h
 
     def forward(self, h: Tensor) -> Tensor:
@@ -106,7 +106,10 @@ class Stack(nn.Module):
 
 
 def places(h: Tensor) -> Tensor:
-    """Return the sine places (T, d) of features (B, T, d), d even (Vaswani et al. 2017, Sec. 3.5)."""
+    """Return sine position embeddings (T, d) for features (B, T, d), d even (Vaswani et al.
+
+    2017, Sec. 3.5).
+    """
     count, width = h.shape[-2:]
     rates = torch.exp(torch.arange(0, width, 2, device=h.device) * (-math.log(10_000) / width))
     angles = torch.arange(count, device=h.device)[:, None] * rates
@@ -114,7 +117,7 @@ def places(h: Tensor) -> Tensor:
 
 
 class Shortened(Stack):
-    """Blocks after a convolution over time and the larger of every two frames: T to T // 2 frames."""
+    """Blocks after a convolution over time and a maximum over every two frames: T to T // 2 frames."""
 
     def __init__(self, width: int, depth: int, heads: int, dropout: float):
         super().__init__(width, depth, heads, dropout)
@@ -137,7 +140,7 @@ class Lengthened(Stack):
         return self.convolution(h.transpose(1, 2))[..., 1:].transpose(1, 2)
 
     def last(self, h: Tensor, at: Tensor) -> Tensor:
-        """Map features (T, d), at places (T, d), to the last of 2 T frames (1, d) without the others."""
+        """Map features (T, d) and their position embeddings (T, d) to the last of 2 T frames (1, d) alone."""
         *earlier, block = self.blocks
         h = h + at
         for one in earlier:
@@ -150,7 +153,7 @@ class Lengthened(Stack):
 class ProductQuantiser(nn.Module):
     """Eight codebooks of 64 vectors of 48, one for each part of a latent, learned by gradient.
 
-    While training, codes that are hardly used move towards the nearest latents; see `revive`.
+    While training, code-vectors that are hardly used move towards the nearest latents; see `revive`.
     """
 
     usage: Tensor
@@ -178,12 +181,12 @@ class ProductQuantiser(nn.Module):
 
     @torch.no_grad()
     def revive(self, parts: Tensor, distance: Tensor, index: Tensor) -> None:
-        """Move each code towards the latent next to it, the more the less it is used.
+        """Move each code-vector towards its nearest latent, the more the less the code-vector is used.
 
         Args:
             parts: the latents' parts (8, N, 48).
-            distance: squared distances (8, N, 64) of parts and codes.
-            index: the nearest codes (8, N).
+            distance: squared distances (8, N, 64) between parts and code-vectors.
+            index: the index of each part's nearest code-vector (8, N).
         """
         share = F.one_hot(index, CODES).to(parts).mean(1)
         self.usage.lerp_(share, 1 - DECAY)
@@ -193,10 +196,10 @@ class ProductQuantiser(nn.Module):
 
 
 def contrast(distance: Tensor) -> Tensor:
-    """Return the contrastive loss of a book: each code near its nearest latents, far from the farther half.
+    """Return a codebook's contrastive loss: near for the latents closest to a code, far for the farther half.
 
     Args:
-        distance: squared distances (N, 64) of latents and codes.
+        distance: squared distances (N, 64) between latents and code-vectors.
     """
     near = -distance.sort(0, descending=True).values  # the last are the nearest
     positive = near[-max(1, len(near) // (BOOKS * CODES)) :].mean(0, keepdim=True)
@@ -205,7 +208,7 @@ def contrast(distance: Tensor) -> Tensor:
 
 
 class HalfVQVAE(nn.Module):
-    """The VQ-VAE of a half of the body; 7,239,436 parameters for the upper, 7,200,986 for the lower one.
+    """The VQ-VAE of one half of the body: 7,239,436 parameters for the upper half, 7,200,986 for the lower.
 
     Args:
         joints: the joints of the half.
@@ -238,7 +241,7 @@ class HalfVQVAE(nn.Module):
         """Return quantised latents (B, T // 2, 384) and their loss.
 
         Args:
-            rotation: rotations (B, T, 132) of all joints, of which the half's count.
+            rotation: rotations (B, T, 132) of all joints, of which only those of this half are used.
             encoded: inputs (B, T, 54).
         """
         own = rotation.unflatten(-1, (N_JOINTS, 6))[..., list(self.joints), :]
@@ -251,7 +254,7 @@ class HalfVQVAE(nn.Module):
 
 
 class Halved(nn.Module):
-    """Inputs of a window as features of half as many frames: mixed to joints, and then over time.
+    """Maps a window's inputs to features of half as many frames: mixes them over joints, then over time.
 
     Args:
         frames: T, the window's length.
@@ -307,7 +310,7 @@ class UpperDenoiser(nn.Module):
     def forward(self, noisy: Tensor, time: Tensor, encoded: Tensor, hidden: Tensor | None = None) -> Tensor:
         """Map noisy latents (B, T // 2, 384), times (B,) and inputs (B, T, 54) to clean latents.
 
-        In training joints (B, 22) may be `hidden`; see Halved.
+        In training, `hidden` says which joints (B, 22) are hidden; see Halved.
         """
         return self.denoise(noisy, time, self.condition(encoded, hidden))
 
@@ -321,19 +324,19 @@ class UpperDenoiser(nn.Module):
 
 
 class LowerDenoiser(UpperDenoiser):
-    """Predicts the lower half's clean latents given the upper half's, too; 58,264,728 parameters."""
+    """Predicts the lower half's clean latents, given the upper half's as well; 58,264,728 parameters."""
 
     def __init__(self, frames: int = 20, *, width: int = 512, depth: int = 12, heads: int = 8):
         super().__init__(frames, width=width, depth=depth, heads=heads)
         self.beside = nn.Linear(2 * LATENT, LATENT)
 
     def joined(self, noisy: Tensor, upper: Tensor) -> Tensor:
-        """Make one of noisy latents (..., 384) and the upper half's (..., 384)."""
+        """Merge noisy latents (..., 384) and the upper half's latents (..., 384) into one (..., 384)."""
         return self.beside(torch.cat([upper, noisy], -1))
 
 
 class Decoder(nn.Module):
-    """Makes rotations of both halves' latents and the inputs; 4,035,374 parameters.
+    """Makes rotations from both halves' latents and the inputs; 4,035,374 parameters.
 
     Args:
         frames: T, the window's length.

@@ -1,6 +1,6 @@
-"""SAGE-Net (Feng et al., CVPR 2024): diffusion makes latents of the body's halves, a decoder the pose.
+"""SAGE-Net (Feng et al., CVPR 2024): diffusion makes latents of the body's halves, a decoder makes the pose.
 
-Its parts are trained one after the other (memmlp.training.train_sage) before they are as a whole.
+Its parts are trained one after the other (memmlp.training.train_sage), and then together.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ class SAGENet(OwnWindows):
     """Samples the upper half's latents, then the lower half's given these, and decodes both to a pose.
 
     It has 120,269,534 parameters at the paper's sizes (120.27 M in Table 16); the VQ-VAEs that make the
-    latents it learns from are no part of it. Every frame is the last one of its own window, the only one that
-    its losses are of.
+    latents it learns from are not part of it. Every frame is the last one of its own window, and only that
+    frame has losses.
 
     The noise that sampling starts from is always the same, drawn from `noise_seed`, as AGRoLDiffusion's is.
 
@@ -33,12 +33,12 @@ class SAGENet(OwnWindows):
         heads: number of the denoisers' attention heads; it divides d.
         code_width: the width of the decoder's and the VQ-VAEs' features, even.
         code_depth: number of blocks of the decoder, and of each VQ-VAE's encoder and decoder.
-        code_heads: number of their attention heads; it divides `code_width`.
-        dropout: dropout rate in their blocks, while training.
+        code_heads: number of attention heads of the decoder and the VQ-VAEs; it divides `code_width`.
+        dropout: dropout rate in the blocks of the decoder and the VQ-VAEs, while training.
         diffusion_steps: number of steps of the training's noise schedule.
         sampling_steps: number of calls of each denoiser at inference.
         noise: standard deviation of the noise that sampling starts from.
-        noise_seed: its seed.
+        noise_seed: the seed of that noise.
     """
 
     noises: Tensor
@@ -71,7 +71,7 @@ class SAGENet(OwnWindows):
         self.register_buffer("noises", noise * torch.randn(2, frames // 2, LATENT, generator=draw))
 
     def codes(self, joints: tuple[int, ...]) -> HalfVQVAE:
-        """Make a VQ-VAE of a half of the body with fresh weights, given its joints."""
+        """Make a VQ-VAE with fresh weights for the half of the body that has the given joints."""
         return HalfVQVAE(joints, **self._codes, dropout=self._dropout)
 
     def upper_latent(self, encoded: Tensor) -> Tensor:
@@ -96,5 +96,5 @@ class SAGENet(OwnWindows):
         return self.decoder(upper, self.lower_latent(upper, encoded), encoded)[:, -1]
 
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
-        """Make a training call through both samplers, of the newest frame alone; see MotionModel."""
+        """Make a training call through both samplers, for the newest frame alone; see MotionModel."""
         return Learned(*self.advance(sparse, state, 1), {})

@@ -1,9 +1,10 @@
 """VAE-HMD (Dittadi et al., ICCV 2021): a variational autoencoder of poses, and an encoder from the trackers.
 
-There is no code of its authors; sizes are those of the one re-implementation that is public. Its two stages,
-the autoencoder and then the encoder from the trackers over its frozen decoder, are trained side by side here:
+Its authors published no code; sizes are those of the one public re-implementation. Its two stages, the
+autoencoder and then the encoder from the trackers over its frozen decoder, are trained side by side here:
 about half of a batch's windows are encoded from their true poses, and train the autoencoder; the others are
-encoded from the trackers, and train that encoder through the decoder, whose weights they leave as they are.
+encoded from the trackers, and train the encoder from the trackers through the decoder, whose weights they do
+not change.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ TRACKERS = sum(part.stop - part.start for part in POSES)  # no velocities
 
 
 class Residual(nn.Module):
-    """Two linear layers, each after a LeakyReLU, added to their input by a learned share that begins at 0.
+    """Two linear layers, each after a LeakyReLU; their output, times a learned share from 0 on, is added.
 
     Args:
         width: d, the width of inputs and outputs.
@@ -73,14 +74,14 @@ class Perceptron(nn.Module):
 def divergence(latent: Tensor) -> Tensor:
     """Return the KL divergence of latents (..., 2 z), means and log variances, from the standard normal.
 
-    It is summed over the z components and the mean over the rest.
+    It is summed over the z components and averaged over all other axes.
     """
     mean, log_variance = latent.chunk(2, -1)
     return 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1).mean()
 
 
 def drawn(latent: Tensor) -> Tensor:
-    """Draw (..., z) from latents (..., 2 z), means and log variances."""
+    """Draw samples (..., z) from latents (..., 2 z), which are means and log variances."""
     mean, log_variance = latent.chunk(2, -1)
     return mean + (0.5 * log_variance).exp() * distributed.drawn(torch.randn_like, mean)
 
@@ -130,7 +131,7 @@ class VAEHMD(WindowlessModel):
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         """Take in the newest frames, each on its own; see MotionModel.
 
-        By default the n new frames are returned, which are the most that it can make.
+        By default the n new frames are returned, which are the most that this network can make.
         """
         seen = sparse if newest is None else sparse[:, -newest:]
         return self.normalizer.posed(self.decoder(self.latent(seen).chunk(2, -1)[0]), seen), state
@@ -138,7 +139,7 @@ class VAEHMD(WindowlessModel):
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
         """Make a training call: each window is decoded either from its true poses or from its trackers.
 
-        The loss beside the motion's is the latents' KL divergence.
+        The one further loss is the latents' KL divergence.
 
         Args:
             sparse: world inputs (B, T, 54).

@@ -1,7 +1,8 @@
-"""The memory slot: what the backbone is told of the past, and what is kept for the next call.
+"""The memory slot: what the backbone sees of the past, and what is kept for the next call.
 
 A memory makes the backbone's blocks (`block`), turns the buffers of past frames into what those blocks see
-(`recall`), and updates its buffers with the network's output (`remember`). All of it is in network space.
+(`recall`), and updates its buffers with the network's output (`remember`). All of these values are in network
+space.
 """
 
 from memmlp.networks.memory.memory_block import (

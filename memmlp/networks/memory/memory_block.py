@@ -1,4 +1,4 @@
-"""Memory features, which memory blocks compute from what is recalled, and the memory block itself."""
+"""Memory features, which memory blocks compute from the recalled past, and the memory block itself."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class Blend(nn.Module):
 
 
 class ProjectedFeature(nn.Module):
-    """A memory feature made of projections; the base of those with and without code-vectors."""
+    """A memory feature made of projections; the base of the features with and without code-vectors."""
 
 
 class CodeFeature(ProjectedFeature):
@@ -145,7 +145,7 @@ class RecurredFeature(nn.Module):
 
 
 class MemoryBlock(nn.Module):
-    """A block that computes its memory feature from what is recalled of the past, and takes it in.
+    """A block that computes a memory feature from the recalled past, and takes that feature in.
 
     Args:
         feature: computes the feature (B, T, k).

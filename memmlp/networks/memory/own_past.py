@@ -16,7 +16,7 @@ from memmlp.networks.vqvae import VQVAE, straight_through
 
 
 class OwnPastMemory(FeatureMemory):
-    """A memory of the network's own past, with or without code-vectors; the base of both.
+    """A memory of the network's own past; the base of those with and without code-vectors.
 
     Args:
         layers: the backbone's layers (1-based) that get a memory feature.
@@ -54,7 +54,7 @@ class OwnPastMemory(FeatureMemory):
         self.length = frames + self.shift - 1
 
     def initial_state(self, batch: int) -> State:
-        """Return a motion of zeros, the paper's fallback where there is no previous prediction."""
+        """Return zeros as the past motion, the paper's fallback where there is no previous prediction."""
         return {"motion": torch.zeros(batch, self.length, MOTION_DIM)}
 
     def true_state(self, sparse: Tensor, motion: Tensor) -> State:
@@ -68,8 +68,7 @@ class OwnPastMemory(FeatureMemory):
     def recall(self, sparse: Tensor, state: State, new: int) -> Past:
         """Recall the T frames that end one shift before the newest frame.
 
-        Where several new frames make that window reach into them, it ends just before the first of them
-        instead.
+        If that window would reach into the new frames, it ends just before the first of them instead.
 
         Args:
             sparse: inputs (B, length + new, 54).
@@ -104,7 +103,8 @@ class OwnPastMemory(FeatureMemory):
     def rewound(self, state: State, frames: Tensor) -> State:
         """Return the buffers (B, length, C) of inputs and motion as they were `frames` (B,) ago.
 
-        What they no longer have of that time lies before the T frames that a whole new window recalls.
+        Frames that the buffers no longer hold are replaced by their oldest one; they lie before the T frames
+        that a whole new window recalls.
         """
         index = torch.arange(self.length, device=frames.device) - frames[:, None]
         rows = torch.arange(len(frames), device=frames.device)[:, None]
@@ -124,7 +124,7 @@ class NoCodesMemory(OwnPastMemory):
 
 
 class VQMemory(OwnPastMemory):
-    """A memory of the network's own past with code-vectors (Sec. 3.2.1), whatever VQ-VAE they come from.
+    """A memory of the network's own past with code-vectors (Sec. 3.2.1), from any kind of VQ-VAE.
 
     Each frame of the past window has one code-vector, shared by all memory blocks (reading 4).
     """
@@ -186,7 +186,7 @@ class JointCodeMemory(VQMemory):
         return straight_through(latent, self.codes.codebook(latent)[0])
 
     def auxiliary_losses(self, frames: Tensor, normalizer: Normalizer) -> dict[str, Tensor]:
-        """Return the VQ-VAE's losses, Eq. 1 of its reconstruction and its codebook's, at true world frames.
+        """Return the VQ-VAE's losses on true world frames: Eq. 1 of its reconstruction, and the codebook's.
 
         An EMA codebook learns from this call.
         """

@@ -25,7 +25,7 @@ class Recurrence(nn.Module):
 
     Attributes:
         kind: the class of the recurrent layer.
-        carried: names of its states, the hidden one first.
+        carried: names of the recurrent layer's states, the hidden one first.
     """
 
     kind: ClassVar[Callable[..., nn.RNNBase]]
@@ -58,10 +58,10 @@ class Recurrence(nn.Module):
 
 @register_flop_formula(torch.ops.aten.mkldnn_rnn_layer)
 def lstm_flops(x: Sequence[int], to_gates: Sequence[int], again: Sequence[int], *shapes, **rest) -> int:
-    """Count the FLOPs of a CPU's LSTM, an operation that torch's counter does not know.
+    """Count the FLOPs of an LSTM on a CPU, an operation that torch's counter does not know.
 
-    The arguments are the shapes of what the operation takes: the inputs (n, B, inputs), and the weights of
-    the inputs (4 k, inputs) and of the hidden state (4 k, k).
+    The arguments are the shapes of the operation's arguments: the inputs (n, B, inputs), the weights of the
+    inputs (4 k, inputs), and the weights of the hidden state (4 k, k).
     """
     return 2 * x[0] * x[1] * (to_gates[0] * to_gates[1] + again[0] * again[1])
 
@@ -70,7 +70,7 @@ def lstm_flops(x: Sequence[int], to_gates: Sequence[int], again: Sequence[int], 
 def lstm_backward_flops(
     x: Sequence[int], to_gates: Sequence[int], again: Sequence[int], *shapes, **rest
 ) -> int:
-    """Count the FLOPs of its gradients, those of the weights and those of the inputs; see `lstm_flops`."""
+    """Count the FLOPs of the gradients of the weights and of the inputs; see `lstm_flops`."""
     return 2 * lstm_flops(x, to_gates, again)
 
 

@@ -22,12 +22,12 @@ class Memory(nn.Module):
     Attributes:
         uses_codes: whether the memory needs a frozen VQ-VAE.
         trains_codes: whether it has a VQ-VAE of its own that is trained with the network.
-        shift: by how many frames the recalled past ends before the newest frame, and a training step moves; 0
-            without a past.
+        shift: how many frames before the newest one the recalled past ends, which is also how many frames a
+            training step moves on; 0 without a past.
         length: how many past frames of inputs the buffer holds; the last one directly precedes the new ones.
         frames: T, the window's length.
-        settled: whether what is recalled of a frame never changes, so that a stream may compute it once. A
-            memory of one's own that does not say so is exported as it was trained.
+        settled: whether what is recalled of a frame never changes, so that a stream may compute it once. For
+            a custom memory that does not set it, only the graph of the network as trained can be exported.
     """
 
     uses_codes: ClassVar[bool] = False
@@ -46,11 +46,11 @@ class Memory(nn.Module):
         raise NotImplementedError
 
     def initial_state(self, batch: int) -> State:
-        """Return what is kept at a fresh start: zeros."""
+        """Return the memory's state at a fresh start: zeros."""
         return {}
 
     def true_state(self, sparse: Tensor, motion: Tensor) -> State:
-        """Return the state after inputs (B, length, 54) with the true motion (B, length, 198) as history."""
+        """Return the state after inputs (B, length, 54), with the true motion (B, length, 198) as history."""
         return {}
 
     def needed(self, new: int) -> int:
@@ -58,7 +58,7 @@ class Memory(nn.Module):
         return 0
 
     def recall(self, sparse: Tensor, state: State, new: int) -> Past | Recurred | None:
-        """Return what the blocks see of the past.
+        """Return what the memory blocks see of the past.
 
         Args:
             sparse: inputs (B, length + new, 54) in network space.
@@ -79,11 +79,18 @@ class Memory(nn.Module):
         return {}
 
     def rewound(self, state: State, frames: Tensor) -> State:
-        """Return what of the network's state is other where each of the batch goes `frames` (B,) back."""
+        """Return the entries of the network's state that change when each batch element is rewound.
+
+        By default nothing changes.
+
+        Args:
+            state: the network's state.
+            frames: how many frames each batch element goes back (B,).
+        """
         return {}
 
     def auxiliary_losses(self, frames: Tensor, normalizer: Normalizer) -> dict[str, Tensor]:
-        """Return the memory's own losses at true world frames (B, T, 252), added to the network's."""
+        """Return the memory's own losses on true world frames (B, T, 252); they add to the network's."""
         return {}
 
 
@@ -110,7 +117,7 @@ class NoMemory(Memory):
         return MLPBlock(self.hidden, self.frames)
 
     def memory_block(self) -> nn.Module:
-        """Raise InputError, since there are no memory blocks."""
+        """Raise InputError, since this memory has no memory blocks."""
         raise InputError("memory=none has no memory blocks: allowed is a predictor without memory")
 
 

@@ -1,7 +1,7 @@
 """Streaming graphs: a trained network's live stream with nothing computed twice; same numbers, less work.
 
-What depends on one frame alone is computed when the frame enters, and carried in the state. Of the last
-layers only what the newest frame needs is computed.
+What depends on one frame alone is computed when the frame enters the window, and carried in the state. The
+last layers compute only what the newest frame needs.
 """
 
 from __future__ import annotations
@@ -61,12 +61,12 @@ STREAMS: dict[type[MotionModel], type[StreamingGraph]] = {
 
 
 def streaming(model: MotionModel) -> StreamingGraph:
-    """Make the streaming graph of a trained network, which itself stays as it is.
+    """Make the streaming graph of a trained network, without changing the network.
 
     Raises:
-        InputError: if the network has none: where estimates of past frames change at each step
-            (`memory.history=latest`), nothing can be carried; frames made with later ones are no stream;
-            and a part of one's own may have no graph.
+        InputError: if the network has no streaming graph: estimates of past frames change at each step
+            (`memory.history=latest`), so nothing can be carried; frames are made with later ones, so it is no
+            stream; or a custom part has no graph.
     """
     if not model.settled:
         raise InputError(
@@ -86,7 +86,7 @@ def streaming(model: MotionModel) -> StreamingGraph:
 
 
 def has_stream(model: MotionModel) -> bool:
-    """Return whether there is a streaming graph of a network; of parts of one's own there may be none."""
+    """Return whether there is a streaming graph for a network; custom parts may have none."""
     if isinstance(model, Refined):
         return has_stream(model.network)
     graph = STREAMS.get(type(model))

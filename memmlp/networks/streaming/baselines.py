@@ -1,7 +1,7 @@
-"""The baselines' streaming graphs.
+"""The streaming graphs of AvatarPoser, MANIKIN, EgoPoser, AGRoL, HMD-Poser, VAE-HMD, RPM and AvatarJLM.
 
-AvatarPoser reads one frame of its last layer, and of AGRoL's output one frame is kept: so the last layer
-computes that frame alone. The first layer's products that depend on one frame alone are carried.
+Networks with a window read only the newest frame of their last layers' output, so the last layer computes
+that frame alone, and what their first layers compute from one frame alone is carried.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class AvatarPoserStream(StreamingGraph):
         return {"first": torch.zeros(self.frames, 4 * self.model.embedding.out_features)}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
         embedded = self.model.embedding(encoded)
         *earlier, last = self.layers
@@ -70,7 +70,7 @@ class AvatarPoserStream(StreamingGraph):
 
 
 class ManikinSStream(AvatarPoserStream):
-    """MANIKIN-S' streaming graph: AvatarPoser's, and the limbs of the newest frame."""
+    """MANIKIN-S' streaming graph: AvatarPoser's graph, then the solver of the newest frame's limbs."""
 
     float32_modules = (*AvatarPoserStream.float32_modules, "model.swivel", "model.places")
     model: ManikinS
@@ -81,7 +81,7 @@ class ManikinSStream(AvatarPoserStream):
 
 
 def newest_frame(layers: list[EncoderLayer], h: Tensor) -> Tensor:
-    """Apply encoder layers to (T, d), the last one for the newest frame (1, d) alone."""
+    """Apply encoder layers to features (T, d); the last layer computes the newest frame (1, d) alone."""
     *earlier, last = layers
     for layer in earlier:
         h = layer(h)
@@ -92,10 +92,11 @@ def newest_frame(layers: list[EncoderLayer], h: Tensor) -> Tensor:
 
 
 class EgoPoserStream(StreamingGraph):
-    """EgoPoser's streaming graph: what the embedding makes of each frame is carried, in order of time.
+    """EgoPoser's streaming graph, which carries the embedding's output for each frame, in order of time.
 
-    Which frames the slow view adds to which changes at every step, so nothing after that can be carried. The
-    movement since the window's first frame is linear, so the first frame's contribution is taken off the sum.
+    At every step the slow view pairs other frames, so nothing after the embedding can be carried. The
+    movement since the window's first frame enters linearly, so the first frame's contribution is subtracted
+    from the sum.
     """
 
     float32_modules = ("model.embedding", "model.orientation", "model.rotation")
@@ -112,7 +113,7 @@ class EgoPoserStream(StreamingGraph):
         return {name: torch.zeros(self.frames - 1, size) for name, size in sizes.items()}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         local = beside_head(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
         place = places(local)
         entering = {"embedded": self.model.embedding(torch.cat([local, place], -1)), "places": place}
@@ -133,21 +134,21 @@ class AGRoLStream(StreamingGraph):
     width: int
 
     def windows(self) -> State:
-        """Return zeros (T - 1, d): what the stem makes of each earlier frame's inputs."""
+        """Return zeros (T - 1, d): the stem's output for each earlier frame's inputs."""
         return {"stem": torch.zeros(self.frames - 1, self.width)}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         entering = self.entering(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
         window = torch.cat([filled(state["stem"], entering, fresh), entering])
         return self.normalizer.posed(self.rotation(window), sparse), {"stem": window[1:]}
 
     def entering(self, encoded: Tensor) -> Tensor:
-        """Return what the stem makes (1, d) of a frame's inputs (1, 54)."""
+        """Return the stem's output (1, d) for one frame's inputs (1, 54), as it is carried."""
         raise NotImplementedError
 
     def rotation(self, window: Tensor) -> Tensor:
-        """Map a window of such contributions (T, d) to the rotations (1, 132) of its newest frame."""
+        """Map a window of the stem's carried outputs (T, d) to the rotations (1, 132) of its newest frame."""
         raise NotImplementedError
 
 
@@ -168,7 +169,7 @@ class AGRoLMLPStream(AGRoLStream):
         return self.model.stem(encoded)
 
     def rotation(self, window: Tensor) -> Tensor:
-        """Apply the blocks to (T, d), the last one for the newest frame alone, and the head: (1, 132)."""
+        """Apply the blocks to (T, d), the last block for the newest frame alone, then the head: (1, 132)."""
         *earlier, last = self.blocks
         for block in earlier:
             window = block(window)
@@ -196,7 +197,10 @@ class AGRoLDiffusionStream(AGRoLStream):
         self.register_buffer("shifts", torch.stack([block.time(embedding) for block in timed], 1))
 
     def entering(self, encoded: Tensor) -> Tensor:
-        """Return the stem's output (1, d) for a frame's inputs (1, 54), less what the noisy motion adds."""
+        """Return the part of the stem's output (1, d) that comes from a frame's inputs (1, 54).
+
+        The part that comes from the noisy motion is added at each denoiser call.
+        """
         return F.linear(encoded, self.model.stem.weight[:, ROTATION.stop :], self.model.stem.bias)
 
     def rotation(self, window: Tensor) -> Tensor:
@@ -217,7 +221,7 @@ class AGRoLDiffusionStream(AGRoLStream):
 
 
 class FrameStream(StreamingGraph):
-    """The streaming graph of a network without a window: the network as it is, one frame a step."""
+    """The streaming graph of a network without a window: the network itself, one frame per step."""
 
     model: WindowlessModel
 
@@ -231,7 +235,7 @@ class FrameStream(StreamingGraph):
         return self.model.initial_state(1)
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         motion, kept = self.model.advance(sparse[None], state, 1)
         return motion[0], kept
 
@@ -243,7 +247,7 @@ class HMDPoserStream(FrameStream):
     model: HMDPoser
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         features, kept = self.model.features(sparse[None], state)
         return self.normalizer.posed(self.model.pose(features[0]), sparse), kept
 
@@ -268,10 +272,10 @@ class RPMStream(FrameStream):
 
 
 class AvatarJLMStream(StreamingGraph):
-    """AvatarJLM's streaming graph: the tokens of each frame are carried, in order of time.
+    """AvatarJLM's streaming graph, which carries the tokens of each frame, in order of time.
 
-    Their places change at every step and attention looks both ways, so the layers are computed anew; the last
-    one, over time, for the newest frame alone.
+    The tokens' position embeddings change at every step and attention looks both ways in time, so all layers
+    are computed anew; the last one, over time, is computed for the newest frame alone.
     """
 
     float32_modules = ("model.embedding", "model.coarse", "model.regressor")
@@ -284,11 +288,11 @@ class AvatarJLMStream(StreamingGraph):
         self.model, self.layers = model, cast(list[EncoderLayer], list(model.layers))
 
     def windows(self) -> State:
-        """Return zeros (T - 1, 45 d): each earlier frame's tokens, without places."""
+        """Return zeros (T - 1, 45 d): each earlier frame's tokens, without position embeddings."""
         return {"tokens": torch.zeros(self.frames - 1, self.model.joint_places.numel())}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
         entering = self.model.tokens(encoded).flatten(1)
         window = torch.cat([filled(state["tokens"], entering, fresh), entering])
@@ -309,7 +313,7 @@ class AvatarJLMStream(StreamingGraph):
 
 
 class ManikinLStream(AvatarJLMStream):
-    """MANIKIN-L's streaming graph: AvatarJLM's, and the limbs of the newest frame."""
+    """MANIKIN-L's streaming graph: AvatarJLM's graph, then the solver of the newest frame's limbs."""
 
     model: ManikinL
 
@@ -319,7 +323,7 @@ class ManikinLStream(AvatarJLMStream):
 
 
 def attended(layer: EncoderLayer, h: Tensor, seen: Tensor) -> Tensor:
-    """Apply an encoder layer to (N, n, d), which sees (N, m, d), by products of plain matrices."""
+    """Apply an encoder layer to (N, n, d), which attends to (N, m, d), written as plain matrix products."""
     attention, flat, all_seen = layer.attention, h.flatten(0, 1), seen.flatten(0, 1)
     query = attention.query(flat).view(h.shape)
     key, value = (part(all_seen).view(seen.shape) for part in (attention.key, attention.value))

@@ -43,7 +43,8 @@ class StreamingBlock(nn.Module):
 
         Args:
             h: the hidden state (T, d).
-            contributions: what each memory block's feature adds to its linear layer, a window (T, d) each.
+            contributions: what each memory block's feature adds to the output of its linear layer, a window
+                (T, d) each.
             take: `whole` or `newest`.
         """
         mix = self.time_mix
@@ -56,9 +57,9 @@ class StreamingBlock(nn.Module):
 
 
 class SharedBlock(StreamingBlock):
-    """A memory block whose memory feature was multiplied by its part of the linear layer beforehand.
+    """A memory block whose memory feature is multiplied by its part of the linear layer in advance.
 
-    The feature's contribution: [h; z] W = h W_h + z W_z, and z W_z is known when a frame enters.
+    In [h; z] W = h W_h + z W_z, the feature's contribution z W_z is known when a frame enters.
 
     Args:
         block: the network's block.
@@ -79,7 +80,7 @@ class SharedBlock(StreamingBlock):
         """Split a layer on [h; z] into its parts for h and for z.
 
         Returns:
-            The part that sees h, without bias; that of z, with the bias, is kept as `feature_part`.
+            The part for h, without bias. The part for z, with the bias, is kept as `feature_part`.
         """
         self.feature_part = part(layer, slice(self.hidden, None), layer.bias)
         return part(layer, slice(0, self.hidden), None)
@@ -120,7 +121,7 @@ def part(layer: nn.Linear, inputs: slice, bias: Tensor | None) -> nn.Linear:
 
 
 class FrameGRU(nn.Module):
-    """GRU layers for one frame, in plain layers: not every runtime has a GRU.
+    """GRU layers for one frame, written as plain layers, since not every runtime has a GRU.
 
     Args:
         gru: the layers, batch first.
@@ -155,7 +156,7 @@ class StreamedBranch(nn.Module):
 
 
 class Converter:
-    """Turns a network's blocks into streaming ones, one after the other, and gathers what they share.
+    """Turns a network's blocks into streaming ones, one after the other, and collects what they share.
 
     Attributes:
         features: the feature modules of all memory blocks so far.

@@ -16,11 +16,11 @@ from memmlp.networks.streaming.baselines import AGRoLStream
 
 
 class BoDiffusionStream(AGRoLStream):
-    """BoDiffusion's streaming graph, in which layers that follow each other without a non-linearity are one.
+    """BoDiffusion's streaming graph, in which successive layers without a non-linearity between are merged.
 
-    What the stem makes of each frame's inputs is carried, in order of time. What the diffusion times make of
-    each block is the same at every step of a stream, so it is computed once. Of the last call the newest
-    frame alone is made.
+    The stem's output for each frame's inputs is carried, in order of time. What the blocks compute from the
+    diffusion times is the same at every step of a stream, so it is computed once. The last denoiser call
+    makes the newest frame alone.
     """
 
     float32_modules = ("sparse", "motion", "made")
@@ -48,7 +48,10 @@ class BoDiffusionStream(AGRoLStream):
         self.made = linear(made.transpose(1, 2).flatten(0, 2), bias.transpose(0, 1).flatten())
 
     def entering(self, encoded: Tensor) -> Tensor:
-        """Return the stem's output (1, d) for a frame's inputs (1, 54), less what the noisy motion adds."""
+        """Return the part of the stem's output (1, d) that comes from a frame's inputs (1, 54).
+
+        The part that comes from the noisy motion is added at each denoiser call.
+        """
         return self.sparse(encoded)
 
     def rotation(self, window: Tensor) -> Tensor:
@@ -65,7 +68,7 @@ class BoDiffusionStream(AGRoLStream):
         return diffusion.sample(step, self.model.noises)
 
     def _made(self, noisy: Tensor, window: Tensor, index: int, count: int) -> Denoised:
-        """Predict the newest `count` frames' noise and variance at sampling step `index` of (T, 132)."""
+        """Predict noise and variance of the newest `count` frames of (T, 132) at sampling step `index`."""
         h = window + self.motion(noisy) + self.model.places
         *earlier, last = zip(self.blocks, self.modulations[index], strict=True)
         for block, modulation in earlier:

@@ -1,7 +1,7 @@
 """The interface of streaming graphs, and how a frame enters the windows that they carry.
 
-A step has static shapes and no operation whose work depends on the data (no condition, no index that is
-computed), so that accelerators take all of it.
+A step has static shapes and no operation that depends on the data's values (no condition, no computed index),
+so that accelerators can run all of it.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from memmlp.networks.motion_model import MotionModel
 
 
 def filled(earlier: Tensor, first: Tensor, fresh: Tensor) -> Tensor:
-    """Return a window's earlier frames; at a fresh start they are all copies of the first frame.
+    """Return a window's earlier frames, which at a fresh start are all copies of the first frame.
 
-    They are zeros then, so that a sum does it: it needs no condition, which not every runtime has.
+    The carried frames are zeros then, so a sum is enough; a condition is not available in every runtime.
 
     Args:
-        earlier: the frames (n, size) that are carried.
-        first: what stands for them (1, size).
+        earlier: the carried frames (n, size).
+        first: the copy that stands for earlier frames (1, size).
         fresh: 1 at a fresh start and 0 after it (1,).
     """
     return earlier + fresh * first
 
 
 def slid(window: Tensor, entering: Tensor, before: Tensor, fresh: Tensor) -> Tensor:
-    """Return a window (T, size) whose oldest frame has left and a new one (1, size) entered.
+    """Return a window (T, size) without its oldest frame and with a new one (1, size) at its end.
 
     At a fresh start `before` (1, size) stands for the frames before it; see `filled`.
     """
@@ -37,7 +37,7 @@ def slid(window: Tensor, entering: Tensor, before: Tensor, fresh: Tensor) -> Ten
 
 
 def counted(count: Tensor, frames: int) -> Tensor:
-    """Return the count (1,) of frames that were taken in, after a step; it stays at `frames`."""
+    """Return the count (1,) of frames taken in, after one more step; it grows no further than `frames`."""
     return count.clamp_max(frames - 1) + 1
 
 
@@ -49,8 +49,8 @@ class StreamingGraph(nn.Module):
 
     Attributes:
         float32_modules: names of the modules that stay in float32 when the graph is quantised: those at the
-            network's two ends, from the inputs to the hidden state and from it to the motion, and others
-            whose rounding would be seen.
+            network's two ends, from the inputs to the hidden state and from there to the motion, and others
+            whose rounding would be visible.
     """
 
     float32_modules: tuple[str, ...]
@@ -64,7 +64,7 @@ class StreamingGraph(nn.Module):
 
     @classmethod
     def fits(cls, model: MotionModel) -> bool:
-        """Return whether a network of the graph's class has only parts that it knows."""
+        """Return whether the graph's class knows all parts of a network, whose class it fits."""
         return True
 
     def build(self, model: MotionModel) -> None:
@@ -72,7 +72,7 @@ class StreamingGraph(nn.Module):
         raise NotImplementedError
 
     def windows(self) -> State:
-        """Return what is carried beside the count of steps, at a fresh start: zeros."""
+        """Return the state of a fresh start, without the count of steps: zeros."""
         raise NotImplementedError
 
     def initial_state(self, batch: int = 1) -> State:
@@ -110,10 +110,10 @@ class StreamingGraph(nn.Module):
 
         Args:
             sparse: world inputs (1, 54).
-            state: what is carried, all zeros at a fresh start.
+            state: the state, all zeros at a fresh start.
             fresh: 1 at a fresh start and 0 after it (1,).
 
         Returns:
-            World motion (1, 198), and what is carried on.
+            World motion (1, 198), and the new state.
         """
         raise NotImplementedError

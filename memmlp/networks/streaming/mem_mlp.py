@@ -2,7 +2,7 @@
 
 When a frame enters, everything that depends on it alone is computed, and carried: the stem's output, the
 code-vector, the projections and, for each memory block, what its memory feature contributes to the block's
-linear layer. Only the mixing over frames, and what follows it, is left for every step.
+linear layer. Every step then computes only the mixing over frames and what follows it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class MemMLPStream(StreamingGraph):
 
     @classmethod
     def fits(cls, model: MotionModel) -> bool:
-        """Return whether the predictor is made of branches, which alone can be streamed."""
+        """Return whether the predictor is made of branches; no other predictor can be streamed."""
         return isinstance(model, MemMLP) and all(isinstance(c, Branch) for c in model.predictor.children())
 
     def build(self, model: MotionModel) -> None:
@@ -61,7 +61,7 @@ class MemMLPStream(StreamingGraph):
         }
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         memory = self.recall.memory
         origin = self.normalizer.origin(sparse)
         encoded = self.conversions.encode_sparse(sparse, origin)

@@ -1,4 +1,4 @@
-"""The normalizer of a live graph, which converts one frame in few operations."""
+"""The normalizer of a streaming graph, which converts one frame in few operations."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class OneFrameNormalizer(Normalizer):
     """A normalizer of single frames, whose conversions are matrices.
 
     For a given turn of the coordinates the conversions are linear, and their matrices are linear in the
-    turn's numbers, the cosine and sine of the heading. So the matrices are found by converting a basis.
+    cosine and sine of the heading. So the matrices are found by converting a basis.
 
     Args:
         normalizer: the normalizer whose conversions these are.

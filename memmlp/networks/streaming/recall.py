@@ -1,4 +1,4 @@
-"""What a memory recalls for one frame: what enters a stream's windows at a step."""
+"""What a memory recalls for one frame, and what therefore enters a stream's windows at a step."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Projections(nn.Module):
 
 
 class CodeTable(nn.Module):
-    """The projections of all code-vectors, which are few: computed beforehand, looked up by index.
+    """The projections of all code-vectors, computed in advance and looked up by index.
 
     Args:
         parts: the blocks' projections.
@@ -98,7 +98,7 @@ class Recall(nn.Module):
         """Join the blocks' feature modules into one that computes a frame's features for all of them."""
 
     def forward(self, past: Past | Recurred | None) -> tuple[Pieces, Pieces]:
-        """Return what each block (1, d) gets from the frame that enters, and from frames before the first."""
+        """Return each block's contribution (1, d): of the entering frame, and of frames before the first."""
         if not self.parts:
             return (), ()
         z = self.feature(past)
@@ -119,7 +119,7 @@ class Recall(nn.Module):
 
 
 class OwnPast(Recall):
-    """For memories that project the inputs and the network's own motion."""
+    """Recall for memories that project the inputs and the network's own motion."""
 
     def gather(self, features: Sequence[ProjectedFeature]) -> None:
         """Make one feature module whose projections are those of all blocks."""
@@ -129,7 +129,7 @@ class OwnPast(Recall):
                 setattr(self.whole, name, self.projections(name, [getattr(f, name) for f in features]))
 
     def projections(self, name: str, parts: Sequence[Projection]) -> nn.Module:
-        """Join all blocks' projections of the input of that name: "sparse", "motion" or "codes"."""
+        """Join all blocks' projections of the input with the given name: "sparse", "motion" or "codes"."""
         return Projections(parts)
 
     def feature(self, past: Past) -> Tensor:
@@ -138,7 +138,7 @@ class OwnPast(Recall):
 
 
 class Coded(OwnPast):
-    """For memories that have code-vectors as well, whose projections are looked up."""
+    """Recall for memories that have code-vectors as well, whose projections are looked up."""
 
     def gather(self, features: Sequence[ProjectedFeature]) -> None:
         """Make one feature module whose projections are those of all blocks."""
@@ -149,15 +149,15 @@ class Coded(OwnPast):
         self.memory._modules = {**self.memory._modules, "codes": Indices(self.memory.codes)}
 
     def projections(self, name: str, parts: Sequence[Projection]) -> nn.Module:
-        """Join all blocks' projections of the input of that name; those of code-vectors are a table."""
+        """Join all blocks' projections of the input with the given name; code-vectors get a table."""
         return CodeTable(parts, self.vectors) if name == "codes" else super().projections(name, parts)
 
 
 class FromRecurrence(Recall):
-    """For recurrent memories, whose features before the first frame are zeros."""
+    """Recall for recurrent memories, whose features before the first frame are zeros."""
 
     def gather(self, features: Sequence[Any]) -> None:
-        """Note the index of each block's recurrent layer, and write GRUs out."""
+        """Note the index of each block's recurrent layer, and replace GRUs by plain layers."""
         self.layers = [feature.index for feature in features]
         assert isinstance(self.memory, RecurrentMemory)
         for recurrence in self.memory.recurrences:

@@ -12,10 +12,10 @@ from memmlp.networks.streaming.one_frame_normalizer import OneFrameNormalizer
 
 
 class RecurrentPoserStream(FrameStream):
-    """The network as it is, its cells as plain layers for one frame.
+    """RecurrentPoser's streaming graph: the network itself, with cells written as plain layers for one frame.
 
-    Quantised, the cells alone are int8: a state averages what rounding adds to each frame, whereas the MLPs
-    hand it on to the motion, where it is seen as jitter.
+    When the graph is quantised, only the cells become int8: a state averages the rounding errors of many
+    frames, whereas the MLPs would pass them on to the motion, where they show as jitter.
     """
 
     model: RecurrentPoser
@@ -32,5 +32,5 @@ class RecurrentPoserStream(FrameStream):
         self.float32_modules = tuple(outer)
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         return self.model.step(sparse, state)

@@ -12,7 +12,7 @@ from memmlp.networks.streaming.graph import StreamingGraph
 
 
 class RefinedStream(StreamingGraph):
-    """The network's own streaming graph, and a step of the recurrent layers.
+    """The network's own streaming graph, followed by a step of the refiner's recurrent layers.
 
     Args:
         model: the network with its refiner.
@@ -31,17 +31,17 @@ class RefinedStream(StreamingGraph):
         )
 
     def build(self, model: MotionModel) -> None:
-        """Keep a copy of the refiner; of the network the graph has one."""
+        """Keep a copy of the refiner; the copy of the network is in its own graph."""
         assert isinstance(model, Refined)
         self.model, self.hidden = model, model.initial_state(1)[HIDDEN]
         model.add_module("layers", FrameGRU(model.layers))  # of another class than the network's
 
     def windows(self) -> State:
-        """Return what the network's graph carries, and the hidden states (1, depth, width): zeros."""
+        """Return zeros: the state that the network's graph carries, and the hidden one (1, depth, width)."""
         return {**self.graph.windows(), HIDDEN: self.hidden}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         motion, kept = self.graph.step(sparse, state, fresh)
         refined, hidden = self.model.refined(motion[None], sparse[None], state[HIDDEN])
         return refined[0], {**kept, HIDDEN: hidden}

@@ -20,10 +20,10 @@ from memmlp.networks.streaming.graph import StreamingGraph, slid
 
 
 class SAGENetStream(StreamingGraph):
-    """SAGE-Net's streaming graph: what its three parts see of each frame is carried, and sampled from.
+    """SAGE-Net's streaming graph, which carries what each of the three parts computes from single frames.
 
-    What the diffusion times make of each block is the same at every step of a stream, so it is computed once.
-    The decoder makes the newest frame alone.
+    What the blocks compute from the diffusion times is the same at every step of a stream, so it is computed
+    once. The decoder makes the newest frame alone.
     """
 
     float32_modules: tuple[str, ...] = ("sparse", "decoder.heads")
@@ -51,11 +51,11 @@ class SAGENetStream(StreamingGraph):
         )
 
     def windows(self) -> State:
-        """Return zeros (T, d + d + 384): what denoisers and decoder see of each frame on its own."""
+        """Return zeros (T, d + d + 384): what the denoisers and the decoder compute from each frame alone."""
         return {"seen": torch.zeros(self.frames, sum(self.widths))}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
         entering = self.sparse(encoded)
         seen = slid(state["seen"], entering, entering, fresh)
@@ -63,7 +63,7 @@ class SAGENetStream(StreamingGraph):
         return self.normalizer.posed(rotation, sparse), {"seen": seen}
 
     def decoded(self, for_upper: Tensor, for_lower: Tensor, for_decoder: Tensor) -> Tensor:
-        """Return the newest frame's rotations (1, 132) of what each part sees of the window (T, ...)."""
+        """Return the newest frame's rotations (1, 132), from what each part has of the window (T, ...)."""
         upper = self.sampled(self.upper, for_upper, self.noises[0], lambda noisy: noisy)
         lower = self.sampled(
             self.lower, for_lower, self.noises[1], lambda noisy: self.beside(torch.cat([upper, noisy], -1))
@@ -80,7 +80,7 @@ class SAGENetStream(StreamingGraph):
         noise: Tensor,
         joined: Callable[[Tensor], Tensor],
     ) -> Tensor:
-        """Sample latents (T // 2, 384) from noise, given what is seen of the window (T, d)."""
+        """Sample latents (T // 2, 384) from noise, given what the denoiser has of the window (T, d)."""
         condition, noisy = sampler.condition(seen), noise
         for index in range(len(self.diffusion.times)):
             clean = sampler(joined(noisy), condition, index)
@@ -90,11 +90,11 @@ class SAGENetStream(StreamingGraph):
 
 
 class DenoiserAtSamplingTimes(nn.Module):
-    """A denoiser at the times of sampling alone.
+    """A denoiser restricted to the diffusion times at which samples are made.
 
     Args:
         denoiser: the denoiser.
-        times: the times.
+        times: the diffusion times.
     """
 
     modulations: Tensor
@@ -110,7 +110,7 @@ class DenoiserAtSamplingTimes(nn.Module):
         self.denoiser, self.seen, self.noisy = denoiser, linear(seen, denoiser.stem.bias), linear(noisy)
 
     def condition(self, seen: Tensor) -> Tensor:
-        """Return what the stem makes (T // 2, d) of what is seen of the window (T, d)."""
+        """Return the condition (T // 2, d) that the stem makes from the window's inputs as carried (T, d)."""
         return self.seen(self.denoiser.condition.shortened(seen))
 
     def forward(self, noisy: Tensor, condition: Tensor, index: int) -> Tensor:

@@ -1,1 +1,1 @@
-"""`memmlp ui`: runs, sweeps and searches on a page of this machine, which follows them while they go on."""
+"""`memmlp ui`: runs, sweeps and searches on a page of this machine, which is updated while they run."""

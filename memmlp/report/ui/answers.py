@@ -1,4 +1,4 @@
-"""What the page asks, by address, and the answer to it."""
+"""The page's questions, by address, and the answers to them."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Answers:
 
     Args:
         outputs: the folder of runs and caches.
-        predict: computes what a run's network makes of a test clip; None where nothing is to be computed.
-        kept: whether what was parsed is kept below the cache for the next start.
+        predict: computes a run's prediction for a test clip; None to compute nothing.
+        kept: whether parsed facts are stored in the cache folder for the next start.
     """
 
     def __init__(self, outputs: Path, predict: Predict | None = None, kept: bool = True):
@@ -39,7 +39,7 @@ class Answers:
         self.looked = False
 
     def look(self) -> str:
-        """Look at everything again, and return a text that is another one when something changed."""
+        """Look at everything again, and return a text that changes whenever anything has changed."""
         generation = self.index.refresh()
         self.index.keep()
         self.looked = True
@@ -47,15 +47,15 @@ class Answers:
         return f"{generation} {hash((self.sweeps.stamp(), self.searches.stamp()))}"
 
     def places(self) -> dict[str, list[dict[str, Any]]]:
-        """Return, by run id, the sweeps and searches in which a run stands."""
+        """Return, by run id, the sweeps and searches that use a run."""
         return places(self.sweeps.known(), self.searches.runs())
 
     def of(self, name: str, query: Mapping[str, str]) -> Mapping[str, Any]:
         """Return the answer to a question.
 
         Raises:
-            KeyError: where there is nothing of that name.
-            ValueError: for a number that is none.
+            KeyError: if there is nothing with that name.
+            ValueError: for a text that should be a number.
         """
         if not self.looked:
             self.look()
@@ -81,7 +81,7 @@ class Answers:
         raise KeyError(name)
 
     def missing(self, name: str) -> str:
-        """Say that there is nothing of that name, and where it would be."""
+        """Say that there is nothing with that name, and where it would be."""
         room, _, rest = name.partition("/")
         folder = {"run": "runs", "replay": "runs", "sweeps": "sweeps", "searches": "tune"}.get(room)
         if folder is None or not rest:
@@ -104,5 +104,5 @@ class Answers:
         return self.replays.get(run_id, query["clip"], mode, begin)
 
     def close(self) -> None:
-        """Let go of what waits to be computed."""
+        """Cancel the computations that are still waiting."""
         self.replays.close()

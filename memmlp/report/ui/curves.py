@@ -14,7 +14,7 @@ MOST = 400  # about how many points a curve has at most
 
 
 class Log:
-    """A metrics log, of which only what is new is read again."""
+    """A metrics log, of which only new lines are read again."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -25,7 +25,7 @@ class Log:
         self.series: dict[str, dict[int, float]] = defaultdict(dict)
 
     def update(self) -> None:
-        """Read what was appended; all of it, where the file was replaced by another one."""
+        """Read the appended lines, or the whole file if it was replaced by another one."""
         try:
             with open(self.path, "rb") as file:
                 first = file.readline()
@@ -60,7 +60,7 @@ class Curves:
         self.lock = threading.Lock()
 
     def of(self, run_id: str, names: list[str] | None = None) -> dict[str, Any]:
-        """Return a run's curves by name, such as "train loss": [steps, values]; None stands for no number."""
+        """Return a run's curves by name, such as "train loss": [steps, values]; None is a missing number."""
         with self.lock:
             log = self.logs.setdefault(run_id, Log(self.outputs / "runs" / run_id / "metrics.jsonl"))
             log.update()
@@ -69,7 +69,7 @@ class Curves:
 
 
 def thinned(points: dict[int, float], most: int = MOST) -> list[list[Any]]:
-    """Return steps and values, with the smallest and the largest of each stretch where there are many."""
+    """Return steps and values; of many, only the smallest and the largest in each stretch."""
     pairs = sorted(points.items())
     if len(pairs) > most:
         size = math.ceil(2 * len(pairs) / most)

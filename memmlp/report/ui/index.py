@@ -1,4 +1,4 @@
-"""All runs below an outputs folder: parsed again when their files change, kept between starts."""
+"""The index of all runs below an outputs folder: parsed again when files change, stored between starts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from memmlp.runs.identity import ID
 from memmlp.runs.run import Run
 
 FORMAT = hashlib.sha256(Path(run_facts.__file__).read_bytes()).hexdigest()[:16]
-"""Facts that other code made are parsed again."""
+"""A digest of the code that makes facts; stored facts from other code are made again."""
 
 FILES = ("config.yaml", "manifest.json", "metrics.jsonl", "DONE", "FAILED", "results.json", "notes.json")
 FOLDERS = ("evaluations", "deployments")
@@ -28,13 +28,13 @@ class Index:
 
     Attributes:
         outputs: the folder of runs and caches.
-        generation: a number that grows whenever something changed.
-        runs: the facts by run id; each has the `status` of its run and the `generation` of its last change.
-        removed: the ids of runs that are gone, with the generation in which they went.
+        generation: a number that grows with every change.
+        runs: the facts by run id, including the run's `status` and the `generation` of its last change.
+        removed: the ids of deleted runs, with the generation in which they disappeared.
 
     Args:
         outputs: the folder of runs and caches.
-        store: the file in which facts are kept between starts; None to keep none.
+        store: the file in which facts are stored between starts; None to store none.
     """
 
     def __init__(self, outputs: Path, store: Path | None = None):
@@ -72,7 +72,7 @@ class Index:
                     yield Path(entry.path)
 
     def _renew(self, run_id: str, folder: Path, generation: int) -> bool:
-        """Bring a run's facts up to date, and return whether they changed."""
+        """Update a run's facts, and return whether they changed."""
         signature = _signature(folder)
         known = self.runs.get(run_id)
         if known is None or self.signatures.get(run_id) != signature:
@@ -90,14 +90,14 @@ class Index:
         return True
 
     def keep(self) -> None:
-        """Write what was parsed since the last time into the store."""
+        """Write the facts that were parsed since the last call into the store."""
         with self.lock:
             if self.store:
                 self.store.commit(set(self.runs))
 
 
 def _status(folder: Path) -> str:
-    """Return how far a run is, or what somebody does with it."""
+    """Return a run's status: its progress, or what a process is doing with it."""
     try:
         return Run(folder).status
     except (KeyError, ValueError, TypeError, AttributeError):  # somebody's damaged .holder
@@ -105,14 +105,14 @@ def _status(folder: Path) -> str:
 
 
 def _claimed(folder: Path) -> bool:
-    """Return whether somebody may be at a run, as the last claim of its folder is not an empty one."""
+    """Return whether a process may be working on a run, as the last claim of its folder is not empty."""
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         return any(entry.name.startswith(".lease-") and entry.stat().st_size for entry in entries)
     return False
 
 
 def _signature(folder: Path) -> str:
-    """Return a text that changes when one of the files does from which a run's facts come."""
+    """Return a text that changes when any file changes from which a run's facts come."""
     parts = _stats(folder, FILES)
     for name in FOLDERS:
         parts += _stats(folder / name)
@@ -129,7 +129,7 @@ def _names(folder: Path) -> list[str]:
 
 
 def _stats(folder: Path, names: tuple[str, ...] | None = None) -> list[tuple[str, str, int, int]]:
-    """Return name, time and size of a folder's files, of some names or of all."""
+    """Return name, time and size of a folder's files, either of certain names or all."""
     found = []
     try:
         with os.scandir(folder) as entries:
@@ -143,14 +143,14 @@ def _stats(folder: Path, names: tuple[str, ...] | None = None) -> list[tuple[str
 
 
 class Store:
-    """Facts in an sqlite file, which may be removed at any time; where it can't be used, nothing is kept."""
+    """Facts in an sqlite file, which may be removed at any time; if it can't be used, nothing is stored."""
 
     def __init__(self, path: Path):
         self.path = path
         self.fresh: dict[str, tuple[str, str]] = {}
 
     def load(self) -> list[tuple[str, str, dict[str, Any]]]:
-        """Return id, signature and facts of each run that is kept."""
+        """Return id, signature and facts of each stored run."""
         try:
             with contextlib.closing(self._open()) as database:
                 rows = database.execute(
@@ -163,11 +163,11 @@ class Store:
             return []
 
     def put(self, run_id: str, signature: str, found: dict[str, Any]) -> None:
-        """Keep a run's facts from the next `commit` on."""
+        """Remember a run's facts for the next `commit`."""
         self.fresh[run_id] = (signature, json.dumps(found))
 
     def commit(self, known: set[str]) -> None:
-        """Write what was put since the last time, and forget the runs that are not known any more."""
+        """Write what was put since the last time, and remove runs that no longer exist."""
         if not self.fresh:
             return
         rows = [(run_id, FORMAT, *row) for run_id, row in self.fresh.items()]

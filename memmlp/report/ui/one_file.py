@@ -1,4 +1,4 @@
-"""The page as one file: what a server would answer about some sweeps, their runs, and all searches."""
+"""The page as one file, with a server's answers about some sweeps, their runs, and all searches."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SECONDS = 4  # the length of a replay
 MOST_REPLAYS = 4
 ERROR = "stream.rotation.MPJPE"
 CURVES = ("train loss", "val rotation ", "val position MPJPE", "val loss")
-"""The beginnings of the names of the curves that are kept."""
+"""Curves whose names begin like this are kept."""
 
 
 class ReportedSweep(NamedTuple):
@@ -34,7 +34,7 @@ def page_text(answers: Answers, sweeps: Iterable[ReportedSweep], extra: str, rep
 
     Args:
         answers: answers about the outputs folder.
-        sweeps: the sweeps to show, with all their runs that began.
+        sweeps: the sweeps to show, with all of their runs that have begun.
         extra: HTML of the page "Tables and figures".
         replays: whether the worst seconds of the best runs are computed and shown.
     """
@@ -76,7 +76,7 @@ def _curves(answers: Answers, run_id: str) -> dict[str, Any]:
 
 
 def _run(page: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a run's page without what only its server could show."""
+    """Return a run's page without the parts that only its server could show."""
     clips = sorted(page["clips"], key=lambda clip: -float(_error(clip) or 0))[:MOST_CLIPS]
     manifest = {
         key: value for key, value in page["manifest"].items() if not key.startswith(("sources", "attempts"))
@@ -92,7 +92,7 @@ def _error(clip: Mapping[str, Any]) -> float | None:
 
 
 def _replays(answers: Answers, sweeps: Iterable[list[str]], found: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the worst seconds of the worst clip of each sweep's best run, and of its control there."""
+    """Return the worst seconds of the worst clip of each sweep's best run, and its control's of that clip."""
     made: dict[str, Any] = {}
     for ids in sweeps:
         known = {
@@ -120,12 +120,12 @@ def _replays(answers: Answers, sweeps: Iterable[list[str]], found: Mapping[str, 
 
 
 def query(**words: str) -> str:
-    """Return words as a page's URLSearchParams write them."""
+    """Return words encoded as a browser's URLSearchParams encodes them."""
     return urllib.parse.urlencode(words).replace("~", "%7E").replace("%2A", "*")
 
 
 def rounded(value: Any) -> Any:
-    """Return a value with all its numbers to six digits; NaN and infinities are no number there."""
+    """Return a value with all its numbers rounded to six digits; NaN and infinities become None."""
     if isinstance(value, Mapping):
         return {str(key): rounded(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

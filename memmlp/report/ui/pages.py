@@ -1,4 +1,4 @@
-"""The files of the page: one by one for a browser, or all in one file that needs no server."""
+"""The files of the page, either one by one for a browser, or all in one file that needs no server."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ FILES = {
     "theme.js": SHARED,
     **MODULES,
 }
-"""All files that there are, with the package that has them; nothing else is ever sent."""
+"""All files of the page, with the package that contains each; no other file is ever sent."""
 
 
 @cache
 def read(name: str) -> bytes:
-    """Return a file of the page. Raises KeyError for a name that is none."""
+    """Return a file of the page. Raises KeyError for an unknown name."""
     return resources.files(FILES[name]).joinpath("page", *name.split("/")).read_bytes()
 
 
@@ -46,7 +46,7 @@ def content_type(name: str) -> str:
 
 
 def policy() -> str:
-    """Return the Content-Security-Policy: scripts of this page alone, and its import map."""
+    """Return the Content-Security-Policy: only scripts of this page, and its import map."""
     inline = re.search(r'<script type="importmap">(.*?)</script>', read("index.html").decode(), re.DOTALL)
     assert inline is not None
     digest = base64.b64encode(hashlib.sha256(inline[1].encode()).digest()).decode()
@@ -61,7 +61,7 @@ def one_file(answers: Mapping[str, Any], extra: str = "") -> str:
     """Return the page as one file.
 
     Args:
-        answers: what the server would answer, by address.
+        answers: the server's answers, by address.
         extra: HTML of a further page, "Tables and figures"; empty for none.
     """
     page = read("index.html").decode()
@@ -87,7 +87,7 @@ def one_file(answers: Mapping[str, Any], extra: str = "") -> str:
 
 
 def _put(page: str, old: str, new: str) -> str:
-    """Return a page with a text in place of the one thing that the pattern fits."""
+    """Return a page in which the only match of a pattern is replaced by a text."""
     page, count = re.subn(old, lambda _: new, page, flags=re.DOTALL)
     assert count == 1, old
     return page
@@ -99,7 +99,7 @@ def _bare(name: str) -> str:
 
 
 def _module(name: str) -> str:
-    """Return a module's text with names in place of relative addresses, which data: addresses don't have."""
+    """Return a module's text with names in place of relative addresses, which data: addresses can't have."""
     text = read(name).decode()
     return re.sub(
         r"""(from\s*|import\s*\(?\s*)(["'])\.{1,2}/([\w./]+)\2""",
@@ -109,7 +109,7 @@ def _module(name: str) -> str:
 
 
 def _full(importer: str, name: str) -> str:
-    """Return the name of a module that another one imports as a neighbour."""
+    """Return the full name of a module that another module imports by a relative address."""
     return next(one for one in (f"{importer.rpartition('/')[0]}/{name}".lstrip("/"), name) if one in MODULES)
 
 
@@ -118,5 +118,5 @@ def _address(name: str) -> str:
 
 
 def _closed(script: str) -> str:
-    """Return a script that can stand inside HTML."""
+    """Return a script in a form that may be put inside HTML."""
     return script.replace("</script", "<\\/script")

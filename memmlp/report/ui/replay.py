@@ -1,4 +1,4 @@
-"""Replays: what a run's network makes of a test clip, computed in the background and kept below the cache."""
+"""Replays: a network's predictions for test clips, computed in the background and stored in the cache."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ WORST = 3  # how many of a clip's worst seconds are told
 
 
 class Replays:
-    """Makes replays one after the other, and keeps what was predicted.
+    """Makes replays one after the other, and stores the predictions.
 
     Args:
         outputs: the folder of runs and caches.
-        predict: computes a prediction; None where nothing can be computed.
+        predict: computes a prediction; None if nothing can be computed.
     """
 
     def __init__(self, outputs: Path, predict: Predict | None):
@@ -46,7 +46,7 @@ class Replays:
     def now(
         self, run_id: str, clip: str, mode: str, begin: float | None = None, seconds: float = SECONDS
     ) -> dict[str, Any]:
-        """Return the same as `get` of a piece of so many seconds, once it is computed."""
+        """Compute a piece of `seconds` of a replay, and return it in the form of `get`."""
         try:
             motion = self._motion(Run.of(self.outputs, run_id), clip, mode)
         except Exception as error:
@@ -60,7 +60,7 @@ class Replays:
             run_id: a finished run's id.
             clip: a test clip's name.
             mode: "stream" or "window".
-            begin: where the piece begins, seconds; None for around the worst second.
+            begin: where the piece begins, seconds; None for a piece around the worst second.
 
         Returns:
             `state` is "computing", "failed" (with `reason`) or "ready".
@@ -82,7 +82,7 @@ class Replays:
         return piece(motion["truth"], motion["joints"], begin)
 
     def _motion(self, run: Run, clip: str, mode: str) -> dict[str, np.ndarray]:
-        """Return truth and prediction (N, 22, 3), metres, world, from the cache or newly computed."""
+        """Return truth and prediction (N, 22, 3), metres, world, from the store or newly computed."""
         path = self._path(run, clip, mode)
         known = _read(path)
         if known is not None:
@@ -101,14 +101,14 @@ class Replays:
         return made
 
     def _path(self, run: Run, clip: str, mode: str) -> Path:
-        """Return the file of a prediction, named by the weights that it was made with."""
+        """Return the file of a prediction, whose name depends on the weights with which it was made."""
         weights = str(read_json(run.marker).get("artifacts", {}).get(run.model.name))
         data = str(run.manifest.get("data"))
         words = hashlib.sha256("\n".join([run.id, weights, data, clip, mode]).encode()).hexdigest()[:24]
         return self.outputs / "cache" / "ui" / "replays" / f"{words}.npz"
 
     def close(self) -> None:
-        """Let go of what waits to be computed."""
+        """Cancel the computations that are still waiting."""
         self.worker.shutdown(wait=False, cancel_futures=True)
 
 
@@ -118,7 +118,7 @@ def _failed(error: Exception) -> dict[str, Any]:
 
 
 def _read(path: Path) -> dict[str, np.ndarray] | None:
-    """Return a kept prediction; None where there is none, or the file is damaged."""
+    """Return a stored prediction; None if there is none, or if its file is damaged."""
     try:
         with np.load(path, allow_pickle=False) as file:
             found = {name: file[name] for name in ("truth", "joints")}
@@ -129,7 +129,7 @@ def _read(path: Path) -> dict[str, np.ndarray] | None:
 
 
 def body() -> dict[str, Any]:
-    """Return what a page must know to draw a person."""
+    """Return what a page needs in order to draw a person."""
     limbs = [{"start": a, "end": b, "radii": radii, "tip": tip} for a, b, radii, tip in LIMBS]
     return {"limbs": limbs, "heat": HEAT, "joints": JOINTS, "fps": FPS}
 
@@ -141,13 +141,13 @@ def piece(
 
     Args:
         truth, joints: positions (N, 22, 3), metres, world.
-        begin: where the piece begins, seconds; None for around the worst second.
-        seconds: its length.
+        begin: where the piece begins, seconds; None for a piece around the worst second.
+        seconds: the piece's length, seconds.
 
     Returns:
-        `errors`, the mean over the joints of each frame of the clip, cm; `worst`, the worst seconds, each
-        with its first frame and its mean error, cm; and from frame `from` on, `truth` and `joints` as whole
-        millimetres in the page's axes, 66 a frame.
+        `errors`, the mean error over the joints for each frame of the clip, cm; `worst`, the worst seconds,
+        each with its first frame and its mean error, cm; and from frame `from` on, `truth` and `joints` as
+        whole millimetres in the page's axes, 66 per frame.
     """
     distances = 100 * np.linalg.norm(joints - truth, axis=-1)
     errors = distances.mean(1)
@@ -165,7 +165,7 @@ def piece(
 
 
 def worst_seconds(errors: np.ndarray) -> list[dict[str, Any]]:
-    """Return the worst seconds of a clip, the worst first, none of which overlap.
+    """Return the worst seconds of a clip, the worst first, without overlaps.
 
     Args:
         errors: the mean error of each frame (N,), cm.

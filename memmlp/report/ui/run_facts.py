@@ -1,4 +1,4 @@
-"""The facts of a run folder that the table of runs shows; a damaged folder has facts, too."""
+"""The facts in a run's folder that the table of runs shows; a damaged folder has facts, too."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from memmlp.runs.run import Run
 from memmlp.runs.shown_name import run_name
 
 HIDDEN = ("paths", "tracking", "tracker", "force", "hydra", "save_predictions")
-"""Groups of the config that say nothing about a run."""
+"""Config groups that are not shown with a run."""
 
 ACTING = {key.split(".")[0] for key in INFERENCE}
 """Groups of the config that say how a trained network is used."""
@@ -31,13 +31,13 @@ COSTS = {
     "parameters": "", "macs": "",
     "onnx_bytes": "",
 }  # fmt: skip
-"""What is shown of a deployment's costs, with units. Lower is better."""
+"""The costs of a deployment that are shown, with units; lower is better."""
 
 Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def facts(folder: Path) -> dict[str, Any]:
-    """Return what the table of runs shows of a run's folder; `damage` lists what could not be read."""
+    """Return the facts in a run's folder for the table of runs; `damage` lists what could not be read."""
     run, damage = Run(folder), list[str]()
     manifest = _object(run.manifest_path, damage)
     config, shown = _config(run.config_path, damage)
@@ -87,7 +87,7 @@ def last_entries(path: Path) -> list[list[Any]]:
 
 
 def parsed_line(line: bytes) -> dict[str, Any] | None:
-    """Return the entry of a line of a metrics log, its values as numbers; None where it is none."""
+    """Return the entry in a line of a metrics log, its values as numbers; None if there is none."""
     try:
         entry = json.loads(line)
         values = {str(key): float(value) for key, value in entry["values"].items()}
@@ -102,12 +102,12 @@ def parsed_line(line: bytes) -> dict[str, Any] | None:
 
 
 def finite(value: float | None) -> float | None:
-    """Return a number; None for none, NaN and infinity."""
+    """Return a number; None for None, NaN and infinity."""
     return value if value is not None and math.isfinite(value) else None
 
 
 def total_steps(kind: object, config: Mapping[str, Any]) -> int | None:
-    """Return how many steps a run's training has; None where its config does not say."""
+    """Return the number of steps of a run's training; None if its config does not have it."""
     try:
         steps = training_settings(str(kind), config)["steps"]
     except (KeyError, TypeError):
@@ -116,15 +116,15 @@ def total_steps(kind: object, config: Mapping[str, Any]) -> int | None:
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """Read a resolved config. Raises ValueError where the file holds none.
+    """Read a resolved config. Raises ValueError if the file has none.
 
-    The runs of a sweep share most groups of their configs, so that each group's text is parsed once.
+    The runs of a sweep share most groups of their configs, so each group's text is parsed only once.
     """
     return _parsed(path)[0]
 
 
 def _parsed(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the config of a file, and its dotted keys that are shown. Raises ValueError."""
+    """Return a file's config, and those of its dotted keys that are shown. Raises ValueError."""
     try:
         groups = [_group(group) for group in re.split(r"\n(?=[^\s#-])", path.read_text(encoding="utf-8"))]
     except (OSError, UnicodeDecodeError, yaml.YAMLError, TypeError) as error:
@@ -154,7 +154,7 @@ def _config(path: Path, damage: list[str]) -> tuple[dict[str, Any], dict[str, An
 
 
 def _object(path: Path, damage: list[str]) -> dict[str, Any]:
-    """Return the object in a JSON file; where there is none, the file's name is added to the damage."""
+    """Return the object in a JSON file; if there is none, the file's name is added to the damage."""
     found = read_json(path)
     if not found:
         damage.append(path.name)
@@ -178,7 +178,7 @@ def _reports(run: Run, config: Mapping[str, Any], damage: list[str]) -> list[dic
 
 
 def _metrics(run: Run, config: Mapping[str, Any], reports: Iterable[Mapping[str, Any]]) -> dict[str, float]:
-    """Return what was measured as numbers by dotted name, such as "stream.rotation.MPJPE"."""
+    """Return the measured numbers by dotted name, such as "stream.rotation.MPJPE"."""
     found: dict[str, Any] = {}
     for report in reports:
         found |= flatten(report["mean"], f"{report.get('mode')}.")
@@ -199,7 +199,7 @@ def _code(manifest: Mapping[str, Any]) -> str:
 
 
 def _seconds(value: object) -> float | None:
-    """Return how long a run took; None where its manifest does not say."""
+    """Return how long a run took; None if its manifest does not say."""
     if not isinstance(value, dict):
         return None
     numbers = [part for part in value.values() if isinstance(part, int | float)]
@@ -207,7 +207,7 @@ def _seconds(value: object) -> float | None:
 
 
 def _notes(folder: Path) -> dict[str, Any]:
-    """Return the tags and the note that somebody gave to the run."""
+    """Return the run's tags and note."""
     found = read_json(folder / "notes.json")
     tags = found.get("tags")
     return {

@@ -1,4 +1,4 @@
-"""In which sweeps and searches a run stands."""
+"""Finds the sweeps and searches that use a run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from memmlp.sweep.plan import Plan
 def places(
     plans: Iterable[Plan], trials: Iterable[tuple[str, int, str]] = ()
 ) -> dict[str, list[dict[str, Any]]]:
-    """Return, by run id, the sweeps in which a run stands, each with arm and seed, and searches with trials.
+    """Return, by run id, the sweeps that use a run, each with arm and seed, and the searches with trials.
 
     `trials` are the name of a search, the number of a trial and the id of one of its runs.
     """

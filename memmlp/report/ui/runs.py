@@ -1,4 +1,4 @@
-"""What the pages of runs are told: the table's rows, and everything about a single run."""
+"""The content of the pages of runs: the table's rows, and everything about a single run."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ SHOWN_FILES = (
     "notes.json",
     "poses.png",
 )
-"""Files of a run that the page may show as they are."""
+"""Files of a run that the page may show unchanged."""
 
 MOST_FILES = 200
 
 
 class Rows:
-    """The rows of the table of runs, for a page that has some of them already."""
+    """The rows of the table of runs, for a page that may have some of them already."""
 
     def __init__(self, index: Index, places: Callable[[], Mapping[str, Sequence[Mapping[str, Any]]]]):
         self.index, self.places = index, places
 
     def since(self, generation: int, heads: str = "") -> dict[str, Any]:
-        """Return the rows that changed after a generation, and which runs are gone.
+        """Return the rows that changed after a generation, and the runs that were deleted.
 
-        `keys` and `metrics` are the heads of each row's `config` and `metrics`. Where they are not those that
-        the page knows (`heads`), all rows are told.
+        `keys` and `metrics` are the heads of each row's `config` and `metrics`. If they differ from those
+        that the page has (`heads`), all rows are returned.
         """
         with self.index.lock:
             runs, now, removed = dict(self.index.runs), self.index.generation, dict(self.index.removed)
@@ -104,7 +104,7 @@ def row(
 def differing(runs: Any) -> list[str]:
     """Return the config keys in which runs differ, in the order of the configs.
 
-    The path of data differs where the data does, whichever way it is spelled.
+    Paths of data count as different only if the data differs, however they are spelled.
     """
     first: dict[str, Any] = {}
     counts: dict[str, int] = {}
@@ -121,27 +121,27 @@ def differing(runs: Any) -> list[str]:
 
 
 def minor(keys: Sequence[str]) -> list[str]:
-    """Return the keys that change no result, and `profile`, whose choices other keys repeat."""
+    """Return the keys that do not change results, and `profile`, whose choices appear in other keys."""
     groups = [name for name in NEUTRAL if name != "data"]
     return [key for key in keys if any(key == name or key.startswith(f"{name}.") for name in groups)]
 
 
 def measured(runs: Any) -> list[str]:
-    """Return the names of all numbers that were measured of some run."""
+    """Return the names of all numbers that were measured for any run."""
     return list(dict.fromkeys(metric for run in runs for metric in run["metrics"]))
 
 
 def sets(runs: Iterable[Mapping[str, Any]]) -> dict[str, str]:
-    """Return, by short digest, the name and short digest of the data of runs: `mocap 78bb7c86`.
+    """Return the name and short digest of runs' data, by short digest: `mocap 78bb7c86`.
 
-    A VQ-VAE's config does not name its data; a network's on the same data does.
+    A VQ-VAE's config does not name its data; the config of a network on the same data does.
     """
     named = {run["data"]: run["data_name"] for run in runs if run["data"] and run["data_name"]}
     return {data: f"{name} {data}" for data, name in named.items()}
 
 
 def shared(runs: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Return names that several data sets share, so that a digest must be added."""
+    """Return the names that several datasets share, so that a digest must be added."""
     found: dict[str, set[str]] = {}
     for run in runs:
         found.setdefault(run["name"], set()).add(run["data"])
@@ -149,10 +149,10 @@ def shared(runs: Iterable[Mapping[str, Any]]) -> list[str]:
 
 
 def units(metrics: Iterable[str]) -> dict[str, dict[str, str]]:
-    """Return, by the last word of their names, the unit of metrics, and what is better of each.
+    """Return the units of metrics, and which direction is better, by the last word of the metrics' names.
 
-    `better` is "lower" or "higher", and empty for what is no error, as the Jitter of the truth. A metric that
-    nobody knows here, since its package is not in use, is left out.
+    `better` is "lower" or "higher", and empty for a number that is no error, such as the truth's Jitter. A
+    custom metric whose package is not in use is left out.
     """
     found = {}
     for metric in dict.fromkeys(dotted.rpartition(".")[2] for dotted in metrics):
@@ -176,7 +176,7 @@ def page(
         index: the runs.
         plans: the plans of all sweeps.
         every: the places of all runs (`places`).
-        run_id: which run.
+        run_id: the run's id.
     """
     with index.lock:
         facts = dict(index.runs[run_id])
@@ -206,7 +206,7 @@ def page(
 
 
 def whole_config(run: Run) -> dict[str, Any]:
-    """Return the dotted keys of a run's config; empty where it can't be read."""
+    """Return a run's config by dotted key; empty if it can't be read."""
     try:
         return flatten(read_config(run.config_path))
     except ValueError:
@@ -214,7 +214,7 @@ def whole_config(run: Run) -> dict[str, Any]:
 
 
 def control_of(plans: Sequence[Plan], run_id: str, known: Mapping[str, Any]) -> str | None:
-    """Return the run of the same seed in the arm that the first sweep of a run names first; None for none."""
+    """Return the run of the same seed in the first arm of the first sweep that uses a run; None for none."""
     for plan in plans:
         seeds = [entry.seed for entry in plan.entries if entry.id == run_id]
         first = plan.entries[0].label if plan.entries else None
@@ -225,10 +225,11 @@ def control_of(plans: Sequence[Plan], run_id: str, known: Mapping[str, Any]) -> 
 
 
 def partners(known: Mapping[str, Mapping[str, Any]], run_id: str, control: str | None = None) -> list[str]:
-    """Return the finished networks on a run's own data, the one to see beside it first.
+    """Return the finished networks on a run's own data, with the one to compare it with first.
 
-    That is its control, then those of its seed whose configs differ in the fewest groups and keys. What
-    changes no result is no difference. The errors of other data do not compare: its runs are none of these.
+    The first is its control, then come those with its seed whose configs differ in the fewest groups and
+    keys. Keys that do not change results are ignored. Runs on other data are left out, since their errors
+    can't be compared.
     """
     own = known[run_id]
     near = {
@@ -247,14 +248,14 @@ def partners(known: Mapping[str, Mapping[str, Any]], run_id: str, control: str |
 
 
 def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
-    """Return the keys of two configs that differ, without those that change no result."""
+    """Return the keys in which two configs differ, without those that do not change results."""
     keys = [key for key in {**one, **other} if one.get(key) != other.get(key)]
     neutral = {*minor(keys), *filter(is_data_path, keys)}
     return [key for key in keys if key not in neutral]
 
 
 def clips(run: Run) -> list[dict[str, Any]]:
-    """Return the errors of each test clip by mode and branch; empty where they can't be read."""
+    """Return the errors of each test clip by mode and branch; empty if they can't be read."""
     if not is_trained(run):
         return []
     try:
@@ -277,7 +278,7 @@ def clips(run: Run) -> list[dict[str, Any]]:
 
 
 def latency(run: Run) -> dict[str, Any]:
-    """Return the numbers of the deployment that the run prefers."""
+    """Return the measurements of the deployment that the run prefers."""
     try:
         record = run.preferred_deployment.record
     except InputError:
@@ -286,7 +287,7 @@ def latency(run: Run) -> dict[str, Any]:
 
 
 def verified(run: Run) -> list[str]:
-    """Return the files of a finished run that are missing or were changed since."""
+    """Return the files of a finished run that are missing or have changed since."""
     return run.verify() if run.done else []
 
 

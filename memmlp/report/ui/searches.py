@@ -1,4 +1,4 @@
-"""What the pages of searches are told: trials with their values and parameters, importance, Pareto front."""
+"""The content of the pages of searches: trials with values and parameters, importance, Pareto front."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ MOST_STEPS = 60  # so many values of a trial's course are told at most
 
 
 class Searches:
-    """The searches below an outputs folder, each read again when its journal grew."""
+    """The searches below an outputs folder; each is read again when its journal has grown."""
 
     def __init__(self, outputs: Path):
         self.outputs = outputs
         self.pages: dict[str, tuple[Any, dict[str, Any]]] = {}
 
     def names(self) -> list[str]:
-        """Return the names of the searches' folders, the last one changed first."""
+        """Return the names of the searches' folders, the most recently changed first."""
         folders = [path for path in self.outputs.glob("tune/*/") if _stamp(path)]
         return [path.name for path in sorted(folders, key=_stamp, reverse=True)]
 
     def stamp(self) -> str:
-        """Return a text that changes when a search does."""
+        """Return a text that changes when any search changes."""
         return repr([(name, _stamp(self.outputs / "tune" / name)) for name in self.names()])
 
     def runs(self) -> Iterator[tuple[str, int, str]]:
-        """Yield a search's name, a trial's number and the id of one of its runs, for all there are."""
+        """Yield a search's name, a trial's number and the id of one of its runs, for all of them."""
         for name in self.names():
             for trial in self.page(name).get("trials", ()):
                 for run_id in trial["runs"]:
                     yield name, trial["number"], run_id
 
     def rows(self) -> dict[str, Any]:
-        """Return a row for each search; one that can't be read says why."""
+        """Return a row for each search; the row of one that can't be read says why."""
         found = []
         for name in self.names():
             page = self.page(name)
@@ -68,7 +68,7 @@ class Searches:
 
 
 def _stamp(folder: Path) -> int:
-    """Return when a search last changed, ns; 0 where the folder holds none."""
+    """Return when a search last changed, in nanoseconds; 0 if the folder holds no search."""
     times = []
     for file in ("study.journal", "search.json"):
         try:

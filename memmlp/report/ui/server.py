@@ -1,7 +1,7 @@
-"""The server of the page, by the standard library alone: files, answers as JSON, and news as they come.
+"""The server of the page, made with the standard library alone: files, answers as JSON, and change events.
 
-It serves this machine alone, unless another address is asked for; then every request needs the token. It
-only ever reads: nothing that a page can send changes a run.
+It serves this machine alone, unless another address is asked for; in that case every request needs the token.
+It only reads: nothing that a page sends can change a run.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ QUIET = 15.0  # seconds without news after which a comment shows that the connec
 
 
 class Watch:
-    """Looks at the runs again and again while somebody watches, and tells when something changed."""
+    """Looks at the runs repeatedly while somebody watches, and reports when something has changed."""
 
     def __init__(self, look: Callable[[], str], every: float = 1.0):
         self.look, self.every = look, every
@@ -35,13 +35,13 @@ class Watch:
         self.state = ""
 
     def wait(self, known: str, timeout: float = QUIET) -> str:
-        """Wait until the state is another one than a known one, at most so many seconds; return it."""
+        """Wait, at most `timeout` seconds, until the state differs from a known one; return the state."""
         with self.condition:
             self.condition.wait_for(lambda: self.closed or self.state not in ("", known), timeout)
             return self.state
 
     def loop(self) -> None:
-        """Look until closed; a look takes at most a tenth of the time."""
+        """Look repeatedly until closed; looking takes at most a tenth of the time."""
         while not self.closed:
             began = time.monotonic()
             if self.watchers or not self.state:
@@ -54,7 +54,7 @@ class Watch:
                 self.condition.wait_for(lambda: self.closed, pause)
 
     def close(self) -> None:
-        """End the loop, and wake everybody who waits."""
+        """End the loop, and wake all waiting threads."""
         with self.condition:
             self.closed = True
             self.condition.notify_all()
@@ -68,7 +68,7 @@ class RunsHandler(BaseHTTPRequestHandler):
     timeout = 60
 
     def do_GET(self) -> None:
-        """Send a file of the page, an answer, or the news until the end."""
+        """Send a file of the page, an answer, or the stream of changes until its end."""
         with contextlib.suppress(ConnectionError, TimeoutError):  # raised when the page was closed
             url = urllib.parse.urlsplit(self.path)
             query = dict(urllib.parse.parse_qsl(url.query))
@@ -131,7 +131,7 @@ class RunsHandler(BaseHTTPRequestHandler):
         self._json(404, {"error": "nothing is here"})
 
     def _events(self) -> None:
-        """Tell each change until the page or the server is closed."""
+        """Send each change until the page or the server is closed."""
         watch = self.server.watch
         self._head(200, {"Content-Type": "text/event-stream", "Connection": "close"})
         self.close_connection = True
@@ -169,21 +169,21 @@ class RunsHandler(BaseHTTPRequestHandler):
         return "memmlp"
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Log nothing, for requests are no news."""
+        """Log nothing, since requests are not worth a line."""
 
 
 class RunsServer(ThreadingHTTPServer):
     """Serves the page, from threads of its own, inside a `with` block.
 
     Args:
-        answers: what is told of runs, sweeps and searches.
+        answers: the answers about runs, sweeps and searches.
         port: the port; 0 for any free one.
         host: the address to serve at; 127.0.0.1 is this machine alone.
-        token: what every request needs at another address than that; None for a new one.
-        every: seconds between two looks at the runs, at least.
+        token: what every request needs at any other address; None for a new random token.
+        every: the least number of seconds between two looks at the runs.
 
     Raises:
-        InputError: where the address is none of this machine's, or the port is taken.
+        InputError: if the address does not belong to this machine, or the port is taken.
     """
 
     daemon_threads = True
@@ -204,18 +204,18 @@ class RunsServer(ThreadingHTTPServer):
             raise InputError(f"--host {host} --port {port}: {reason}; {allowed}") from None
 
     def server_bind(self) -> None:
-        """Bind to the address, without asking a name server for its name."""
+        """Bind to the address, without asking a name server for the host's name."""
         self.socket.bind(self.server_address)
         self.server_address = name, port, *_ = self.socket.getsockname()
         self.server_name, self.server_port = name, port
 
     @property
     def url(self) -> str:
-        """The page's address, with the token where one is needed."""
+        """The page's address, with the token if one is needed."""
         return self.access.url(self.server_name, self.server_port)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore the error, for what one page breaks off does not concern the others."""
+        """Ignore the error, since a request that one page breaks off does not concern the others."""
 
     def __enter__(self) -> RunsServer:
         self.threads = [threading.Thread(target=work, daemon=True) for work in (self._serve, self.watch.loop)]

@@ -1,4 +1,4 @@
-"""What the pages of sweeps are told: how far they are, how long it will take, effects and verdicts."""
+"""The content of the pages of sweeps: progress, remaining time, effects and verdicts."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ NOT_KEPT = "this sweep's file was not kept with it, so its first arm is the cont
 
 
 class TableAndRounds(NamedTuple):
-    """What was made of a sweep's runs: its table, and its rounds where seeds were spent in rounds."""
+    """The results of a sweep's runs: its table, and its rounds if seeds were spent in rounds."""
 
     table: dict[str, Any]
     rounds: dict[str, Any] | None
@@ -57,7 +57,7 @@ class Sweeps:
         self.bad: dict[str, str] = {}
 
     def known(self) -> list[Plan]:
-        """Return the plans of all sweeps, each under its folder's name, the last one changed first."""
+        """Return the plans of all sweeps, each under its folder's name, the most recently changed first."""
         found: dict[Path, tuple[int, Plan]] = {}
         self.bad = {}
         for path in self.index.outputs.glob("sweeps/*/plan.json"):
@@ -72,7 +72,7 @@ class Sweeps:
         return [plan for _, plan in sorted(found.values(), key=lambda one: -one[0])]
 
     def stamp(self) -> str:
-        """Return a text that changes when a sweep comes, goes, changes, is planned anew, or took a look."""
+        """Return a text that changes when a sweep appears, goes, changes, is planned anew, or has a look."""
         found = [(path, seen) for path, (seen, _) in sorted(self.plans.items())]
         beside = [[_changed(path.with_name(name)) for name in (SWEEP_FILE, ROUNDS_FILE)] for path, _ in found]
         return repr([(str(path), seen, *others) for (path, seen), others in zip(found, beside, strict=True)])
@@ -82,7 +82,7 @@ class Sweeps:
         return {"sweeps": [self.progress(plan) for plan in self.known()], "damaged": self.bad}
 
     def progress(self, plan: Plan) -> dict[str, Any]:
-        """Return how far a sweep is."""
+        """Return the progress of a sweep."""
         states = self.states(plan)
         counts = {kind: Counter(states[task.key] for task in tasks) for kind, tasks in _kinds(plan).items()}
         sweep = self._kept(plan.name)
@@ -122,7 +122,7 @@ class Sweeps:
         return self.progress(plan) | found
 
     def states(self, plan: Plan) -> dict[str, str]:
-        """Return every task's state by its key, as `Plan.states` does, from what the index knows."""
+        """Return every task's state by its key, as `Plan.states` does, from the facts in the index."""
         return plan.with_blocked({task.key: self._state(plan, task) for task in plan.tasks})
 
     def _state(self, plan: Plan, task: RunTask) -> str:
@@ -147,7 +147,7 @@ class Sweeps:
         return {"name": task_name(plan, task), "id": task.id, "state": states[task.key]}
 
     def _left(self, task: RunTask, state: str) -> int:
-        """Return how many steps of a task's training are left."""
+        """Return the number of remaining steps of a task's training."""
         total = int(training_settings(task.kind, task.config)["steps"] or 0)
         facts = self.index.runs.get(task.id)
         if state == "done" or facts is None or not facts["recent"]:
@@ -155,7 +155,7 @@ class Sweeps:
         return max(total - int(facts["recent"][-1][0]), 0)
 
     def _share(self, plan: Plan, states: Mapping[str, str]) -> float:
-        """Return which part of all steps is done; a run that is not done has one left at least."""
+        """Return the share of all steps that is done; a run that is not done has at least one step left."""
         total = sum(
             self._left(task, "new")
             if task.id not in self.index.runs
@@ -167,8 +167,9 @@ class Sweeps:
         return 1 - left / total if total else 0.0
 
     def _time_left(self, plan: Plan, states: Mapping[str, str]) -> float | None:
-        """Return about how many seconds of training the workers that are at it still need; None if nobody is
-        at it, or all is trained.
+        """Return the estimated seconds of training left for the workers that train at present.
+
+        It is None if nobody trains, or if everything is trained.
         """
         running = [task for task in plan.tasks if states[task.key] in STAGE_WORDS.values()]
         paces = [pace for task in plan.tasks if (pace := _pace(self.index.runs.get(task.id))) is not None]
@@ -182,9 +183,9 @@ class Sweeps:
         return left * statistics.median(paces) / len(running) if left else None
 
     def made(self, plan: Plan) -> TableAndRounds:
-        """Return what was made of a sweep's runs.
+        """Return the results of a sweep's runs.
 
-        It is made again when one of them, the sweep, its plan or its rounds changed.
+        They are computed again if a run, the sweep, its plan or its rounds changed.
         """
         with self.lock:
             runs = [self.index.signatures.get(entry.id) for entry in plan.entries]
@@ -232,7 +233,7 @@ class Sweeps:
 
 
 def rounds_of(sweep: Sweep, plan: Plan, path: Path) -> tuple[Rounds | None, list[str]]:
-    """Return the rounds whose verdicts stand, None for none, and what a reader has to know otherwise."""
+    """Return the rounds that decided the verdicts, None for none, and otherwise what a reader has to know."""
     try:
         rounds = read_rounds(path)
         if rounds is None or not rounds.taken:
@@ -246,7 +247,7 @@ def rounds_of(sweep: Sweep, plan: Plan, path: Path) -> tuple[Rounds | None, list
 
 
 def rounds_words(rounds: Rounds, sweep: Sweep) -> dict[str, Any]:
-    """Return the looks of a sweep's rounds, what each decided, and how far each arm is."""
+    """Return the looks of a sweep's rounds, what each look decided, and each arm's progress."""
     looks = []
     for seeds, level in zip(rounds.looks, rounds.levels, strict=True):
         found = [finding for look in rounds.taken if look.seeds == seeds for finding in look.found]
@@ -260,7 +261,7 @@ def rounds_words(rounds: Rounds, sweep: Sweep) -> dict[str, Any]:
 
 
 def table_words(table: Any) -> dict[str, Any]:
-    """Return what a table holds, with its columns' heads, what is better in each, and what explains it."""
+    """Return a table's content, with its columns' heads, their better directions, and the legend."""
     words = json.loads(as_json(table))
     return {
         **words,
@@ -272,7 +273,7 @@ def table_words(table: Any) -> dict[str, Any]:
 
 
 def _kinds(plan: Plan) -> dict[str, list[RunTask]]:
-    """Return a plan's tasks: the networks, which are its arms and seeds, and what these build upon."""
+    """Return a plan's tasks in two groups: networks, which are arms and seeds, and their upstream runs."""
     found: dict[str, list[RunTask]] = {"networks": [], "upstream": []}
     for task in plan.tasks:
         found["networks" if task.kind == NETWORK else "upstream"].append(task)
@@ -285,7 +286,7 @@ def caption_of(sweep: Sweep) -> str:
 
 
 def sweep_of_plan(plan: Plan) -> Sweep:
-    """Return a sweep with a plan's arms and seeds; its first arm is the control."""
+    """Return a sweep with a plan's arms and seeds, of which the first arm is the control."""
     seeds = list(dict.fromkeys(entry.seed for entry in plan.entries)) or [0]
     arms: dict[str, list[str]] = {
         label: [] for label in dict.fromkeys(entry.label for entry in plan.entries)
@@ -294,7 +295,7 @@ def sweep_of_plan(plan: Plan) -> Sweep:
 
 
 def _changed(path: Path) -> int:
-    """Return when a file was last changed, ns; 0 where there is none."""
+    """Return when a file was last changed, in nanoseconds; 0 if there is none."""
     try:
         return path.stat().st_mtime_ns
     except OSError:
@@ -302,7 +303,7 @@ def _changed(path: Path) -> int:
 
 
 def _digest(path: Path) -> str:
-    """Return the digest of a file's content; "" where there is none."""
+    """Return the digest of a file's content; "" if there is no file."""
     try:
         return file_digest(path)
     except OSError:
@@ -310,7 +311,7 @@ def _digest(path: Path) -> str:
 
 
 def _pace(facts: Mapping[str, Any] | None) -> float | None:
-    """Return a run's seconds a step over its last entries; None where they don't tell."""
+    """Return a run's seconds per step over its last entries; None if they are not enough to tell."""
     recent = (facts or {}).get("recent") or []
     if len(recent) < 2 or recent[-1][0] <= recent[0][0]:
         return None

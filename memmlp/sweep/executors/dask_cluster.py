@@ -1,7 +1,7 @@
 """Workers that are tasks of a Dask cluster, each with a process of its own.
 
 Dask runs tasks in threads of one process, where they would share torch's random numbers and number of
-threads, and where nobody can end them. So a task starts a process and looks after it.
+threads, and could not be ended. So each task starts a process and looks after it.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ PAUSE = 1.0  # seconds between looks at whether a worker is to be ended
 
 @dataclass(frozen=True)
 class DaskOptions:
-    """Which cluster is used, and what each worker asks of it.
+    """Which cluster is used, and what each worker requests from it.
 
     Attributes:
-        address: the scheduler's address; None for the one of DASK_SCHEDULER_ADDRESS.
-        resources: how much of which resources of Dask's workers each of ours takes up.
+        address: the scheduler's address; None for the address in DASK_SCHEDULER_ADDRESS.
+        resources: how much each of our workers takes of the resources of Dask's workers, by name.
     """
 
     address: str | None = None
@@ -42,7 +42,7 @@ class DaskOptions:
 
 
 def dask_options(words: Mapping[str, str]) -> DaskOptions:
-    """Return the options that the words `dask.KEY=VALUE` of a command line ask for.
+    """Return the options in the words `dask.KEY=VALUE` of a command line.
 
     Raises:
         InputError: for an unknown key or a value of the wrong kind.
@@ -60,39 +60,39 @@ def dask_options(words: Mapping[str, str]) -> DaskOptions:
 
 
 class DaskTask:
-    """A worker that is a task of Dask's.
+    """A worker that is a task in Dask.
 
     Args:
         future: the task.
-        stop: the event (`distributed.Event`) at which the task ends its process.
+        stop: the event (`distributed.Event`) upon which the task ends its process.
     """
 
     def __init__(self, future: Any, stop: Any):
         self.future, self.stop = future, stop
 
     def alive(self) -> bool:
-        """Return whether the task waits or works."""
+        """Return whether the task is waiting or working."""
         return self.future.status == "pending"
 
     def cancel(self) -> None:
-        """End the task's process, or take the task back where it still waits."""
+        """End the task's process, or withdraw the task if it is still waiting."""
         self.stop.set()
         self.future.cancel()
 
     def complaint(self) -> str | None:
-        """Return the line with which a worker ended that could do nothing; None for any other end."""
+        """Return the worker's own line about why it could do no work; None after any other end."""
         return self.future.result() if self.future.status == "finished" else None
 
 
 class Dask:
-    """Starts workers as tasks of a Dask cluster that runs already.
+    """Starts workers as tasks of a running Dask cluster.
 
     Args:
-        options: the cluster, and what each worker asks of it.
-        gpus: whether workers are to have a GPU where the options leave it open and the cluster declares any.
+        options: the cluster, and what each worker requests from it.
+        gpus: whether workers get a GPU, if the options leave it open and the cluster declares GPUs.
 
     Raises:
-        InputError: where Dask is not installed, or the cluster is not named or can't be reached.
+        InputError: if Dask is not installed, or the cluster is not named or can't be reached.
     """
 
     def __init__(self, options: DaskOptions, gpus: bool = True):
@@ -118,9 +118,10 @@ class Dask:
             _say(f"no worker of the cluster has {asked}; runs wait until one comes")
 
     def submit(self, work: Work, count: int = 1) -> list[DaskTask]:
-        """Start workers, as many of them as the cluster has room for at present.
+        """Start workers, but no more than the cluster has room for at present.
 
-        Dask would bind any more to a worker that is taken, and leave them there when another gets free.
+        Dask would assign further ones to busy workers, and leave them there even when other workers become
+        free.
         """
         self.tasks = [task for task in self.tasks if task.alive()]
         free = max(self._room() - len(self.tasks), 0)
@@ -129,7 +130,7 @@ class Dask:
         return made
 
     def _room(self) -> float:
-        """Return how many of our workers have their resources at once; without any, as many as you like."""
+        """Return how many of our workers can have their resources at once; infinite if they need none."""
         asked = {name: amount for name, amount in self.resources.items() if amount}
         if not asked:
             return math.inf
@@ -153,7 +154,7 @@ def _say(line: str) -> None:
 
 
 def _apart(work: Work, stop: str, gpus: bool) -> str | None:
-    """Do the work in a process of its own, which ends with this one, or once the event `stop` is set."""
+    """Do the work in a separate process, which ends with this one, or when the event `stop` is set."""
     from distributed import Event, get_worker
 
     declared = get_worker().state.total_resources.get(GPU, 0)
@@ -177,14 +178,14 @@ def _apart(work: Work, stop: str, gpus: bool) -> str | None:
 
 
 def _alone(said: Path) -> None:
-    """Do the work that stands on the standard input, and leave in a file what it says."""
+    """Do the work that is read from the standard input, and write the line that it returns to a file."""
     work: Work = pickle.load(sys.stdin.buffer)
     threading.Thread(target=_end_with_the_input, daemon=True).start()
     said.write_text(work() or "")
 
 
 def _end_with_the_input() -> None:
-    """End this process once the one at the other end is gone."""
+    """End this process when the process at the other end of the standard input is gone."""
     while os.read(sys.stdin.fileno(), 1):  # past Python's buffer, which its end waits for
         pass
     os._exit(1)

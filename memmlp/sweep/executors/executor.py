@@ -1,4 +1,4 @@
-"""What every executor and the worker that it started can do."""
+"""The interface of executors, and of the workers that they start."""
 
 from __future__ import annotations
 
@@ -6,30 +6,30 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 Work = Callable[[], str | None]
-"""What a worker does. It returns None at its end, or a line that says why this worker could do nothing."""
+"""A worker's work. It returns None at its end, or a line that says why this worker could do no work."""
 
 
 class Handle(Protocol):
-    """A worker that was started."""
+    """A worker that an executor started."""
 
     def alive(self) -> bool:
-        """Return whether the worker waits or works."""
+        """Return whether the worker is waiting or working."""
 
     def cancel(self) -> None:
         """End the worker."""
 
     def complaint(self) -> str | None:
-        """Return the line with which a worker ended that could do nothing; None for any other end."""
+        """Return the worker's own line about why it could do no work; None after any other end."""
 
 
 class Executor(Protocol):
     """Starts workers.
 
     Attributes:
-        gpus: whether each worker is to have a GPU.
+        gpus: whether each worker gets a GPU.
     """
 
     gpus: bool
 
     def submit(self, work: Work, count: int = 1) -> Sequence[Handle]:
-        """Start `count` workers; `work` must be picklable, and importable where the workers run."""
+        """Start `count` workers; `work` must be picklable, and importable on the workers' machines."""

@@ -10,13 +10,13 @@ from memmlp.common.errors import InputError
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 
 Share = tuple[str, ...]
-"""The GPUs of one worker, by their names in CUDA_VISIBLE_DEVICES; empty for a worker without."""
+"""The GPUs of one worker, by their names in CUDA_VISIBLE_DEVICES; empty for a worker without GPUs."""
 
 
 def visible_gpus() -> Share:
-    """Return the names of the GPUs that this process may use, as CUDA_VISIBLE_DEVICES takes them.
+    """Return the names of the GPUs that this process may use, in the form of CUDA_VISIBLE_DEVICES.
 
-    As in CUDA, a name below 0 hides itself and all that follow.
+    As in CUDA, a name below 0 hides that entry and all that follow.
     """
     words = os.environ.get(VISIBLE)
     if words is None:
@@ -28,14 +28,14 @@ def visible_gpus() -> Share:
 
 
 def shares(gpus: Share, per_worker: int | None = None) -> list[Share]:
-    """Divide the GPUs into shares of `per_worker` each, of which a worker gets one; what is left is idle.
+    """Divide the GPUs into shares of `per_worker` GPUs, one share for each worker; a remainder is idle.
 
     Args:
         gpus: the visible GPUs.
-        per_worker: GPUs of a worker; None for 1 where there are any. With 0 there are no shares.
+        per_worker: GPUs of a worker; None for 1 if there are GPUs. With 0 there are no shares.
 
     Raises:
-        InputError: where a worker is to have more GPUs than there are.
+        InputError: if a worker would have more GPUs than there are.
     """
     size = per_worker if per_worker is not None else min(len(gpus), 1)
     if size > len(gpus):
@@ -48,12 +48,12 @@ def worker_count(shared: list[Share], workers: int | None, per_gpu: int | None) 
     """Return how many workers run at once.
 
     Args:
-        shared: the GPUs that a worker may get; empty where workers have none.
-        workers: how many were asked for; None for one a core, or where there are GPUs one a share.
-        per_gpu: the most workers of a share; None for as many as it takes.
+        shared: the shares of GPUs that a worker may get; empty if workers have no GPUs.
+        workers: how many were asked for; None for one per core, or with GPUs one per share.
+        per_gpu: the largest number of workers per share; None for as many as are needed.
 
     Raises:
-        InputError: where that is more than the GPUs are to have, or there are none to share.
+        InputError: if that is more than the shares allow, or if there are no GPUs to share.
     """
     if per_gpu and not shared:
         raise InputError(

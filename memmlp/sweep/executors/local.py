@@ -18,10 +18,10 @@ from memmlp.sweep.executors.submitit_jobs import UNLIMITED, Requeued, Submitted,
 
 
 class LocalExecutor(submitit.LocalExecutor):
-    """Submitit's executor of processes, which by itself hides all GPUs from them.
+    """Submitit's executor of local processes, which would hide all GPUs from them.
 
     Attributes:
-        gpus: the GPUs that the next process sees.
+        gpus: the GPUs that the next process may use.
     """
 
     gpus: Share = ()
@@ -41,7 +41,7 @@ class Local:
 
     Args:
         folder: the folder of the workers' logs, with %j for a worker's number.
-        shared: the shares of GPUs that workers may have; empty for workers without.
+        shared: the shares of GPUs that workers may have; empty for workers without GPUs.
     """
 
     def __init__(self, folder: Path, shared: Sequence[Share] = ()):
@@ -52,7 +52,7 @@ class Local:
         self.started: list[tuple[Submitted, int]] = []
 
     def submit(self, work: Work, count: int = 1) -> list[Submitted]:
-        """Start workers, each with the share that the fewest living workers have."""
+        """Start workers, each with the share of GPUs that has the fewest living workers."""
         return [self._start(work) for _ in range(count)]
 
     def _start(self, work: Work) -> Submitted:
@@ -68,7 +68,7 @@ class Local:
 
 @contextlib.contextmanager
 def _interruptible() -> Iterator[None]:
-    """Processes started herein hear SIGINT, by which submitit cancels, where this one ignores it (nohup)."""
+    """Let processes that start in the context receive SIGINT, by which submitit cancels, even under nohup."""
     before = signal.getsignal(signal.SIGINT)
     if before is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -81,7 +81,7 @@ def _interruptible() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _stderr_to(path: Path) -> Iterator[None]:
-    """Processes started herein write to a file, at its end, what they would write to stderr."""
+    """Append to a file what processes that are started within the context write to stderr."""
     before = os.dup(2)
     try:
         with path.open("ab") as file:
@@ -93,7 +93,7 @@ def _stderr_to(path: Path) -> Iterator[None]:
 
 
 class Debug:
-    """Runs the work inside this process, when it is asked whether the worker lives."""
+    """Runs the work inside this process, at the moment when the worker is first asked whether it is alive."""
 
     gpus = False
 
@@ -102,5 +102,5 @@ class Debug:
             self.executor = submitit.DebugExecutor(folder=folder)
 
     def submit(self, work: Work, count: int = 1) -> list[Submitted]:
-        """Make workers that work when they are looked at."""
+        """Make workers that do their work when they are first asked whether they are alive."""
         return [Submitted(self.executor.submit(Requeued(work))) for _ in range(count)]

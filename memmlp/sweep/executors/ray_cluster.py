@@ -21,11 +21,13 @@ KEYS = ("address", "num_cpus", "num_gpus", "memory_gb", "accelerator_type", "run
 
 @dataclass(frozen=True)
 class RayOptions:
-    """Which cluster is used, and what each worker asks of it.
+    """Which cluster is used, and what each worker requests from it.
 
     Attributes:
-        address: the cluster's address; None for the one of RAY_ADDRESS, else one on this machine.
-        num_gpus: GPUs of a worker, less than 1 where several share one; None for 1 where the cluster has any.
+        address: the cluster's address; None for the address in RAY_ADDRESS, or else a cluster on this
+            machine.
+        num_gpus: GPUs of a worker, less than 1 if several workers share one; None for 1 if the cluster has
+            GPUs.
         task: Ray's other options of a task.
         runtime_env: Ray's description of the environment in which workers run.
     """
@@ -37,7 +39,7 @@ class RayOptions:
 
 
 def ray_options(words: Mapping[str, str]) -> RayOptions:
-    """Return the options that the words `ray.KEY=VALUE` of a command line ask for.
+    """Return the options in the words `ray.KEY=VALUE` of a command line.
 
     Raises:
         InputError: for an unknown key or a value of the wrong kind.
@@ -81,13 +83,13 @@ def _runtime_env(path: Path) -> Mapping[str, Any]:
 
 
 class RayTask:
-    """A worker that is a task of Ray's."""
+    """A worker that is a task in Ray."""
 
     def __init__(self, reference: Any):
         self.reference = reference
 
     def alive(self) -> bool:
-        """Return whether the task waits or works; that of a dead node does neither."""
+        """Return whether the task is waiting or working; False on a dead node."""
         import ray
 
         return not ray.wait([self.reference], timeout=0)[0]
@@ -99,7 +101,7 @@ class RayTask:
         ray.cancel(self.reference, force=True)
 
     def complaint(self) -> str | None:
-        """Return the line with which a worker ended that could do nothing; None for any other end."""
+        """Return the worker's own line about why it could do no work; None after any other end."""
         import ray
 
         try:
@@ -112,11 +114,11 @@ class Ray:
     """Starts workers as tasks of a Ray cluster: a running one, or one on this machine.
 
     Args:
-        options: the cluster, and what each worker asks of it.
-        gpus: whether workers are to have GPUs where the options leave it open.
+        options: the cluster, and what each worker requests from it.
+        gpus: whether workers get GPUs, if the options leave it open.
 
     Raises:
-        InputError: where Ray is not installed or the cluster can't be reached.
+        InputError: if Ray is not installed or the cluster can't be reached.
     """
 
     def __init__(self, options: RayOptions, gpus: bool = True):
@@ -146,7 +148,7 @@ class Ray:
 
 
 def _connect(options: RayOptions) -> None:
-    """Join the cluster of the options. Raises InputError where it can't be reached."""
+    """Join the cluster that the options name. Raises InputError if it can't be reached."""
     import ray
 
     quiet: dict[str, Any] = {"log_to_driver": False, "configure_logging": False}
@@ -168,6 +170,6 @@ def _with_gpus(work: Work) -> str | None:
 
 
 def _without_gpus(work: Work) -> str | None:
-    """Do the work without GPUs, whatever Ray shows to a task that asked for none."""
+    """Do the work without GPUs, even if Ray shows some to a task that asked for none."""
     os.environ[VISIBLE] = ""
     return work()

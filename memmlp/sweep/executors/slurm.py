@@ -1,4 +1,4 @@
-"""Workers that are jobs of a Slurm cluster, all that start at once being one array."""
+"""Workers that are jobs of a Slurm cluster; all workers that start together are one job array."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ ONE = ("nodes", "ntasks", "ntasks_per_node", "ntasks_per_gpu")  # a worker is on
 
 @dataclass(frozen=True)
 class SlurmOptions:
-    """What the jobs are asked for with.
+    """The options with which jobs are submitted.
 
     Attributes:
         parameters: sbatch's parameters by their long names, with _ for -; True for one without a value.
         srun: words for srun, which starts the worker inside the job.
         setup: a shell command that each job runs first; None for none.
         python: the command that starts Python in the job; None for this process' own.
-        minutes: the time limit, if `parameters` has one that is a number of them.
+        minutes: the time limit, if `parameters` has one that is given in minutes.
     """
 
     parameters: Mapping[str, str | bool] = field(default_factory=dict)
@@ -48,10 +48,10 @@ class SlurmOptions:
 
 
 def slurm_options(words: Mapping[str, str]) -> SlurmOptions:
-    """Return the options that the words `slurm.KEY=VALUE` of a command line ask for.
+    """Return the options in the words `slurm.KEY=VALUE` of a command line.
 
     Raises:
-        InputError: for a value of the wrong kind, and for what memmlp itself has to set.
+        InputError: for a value of the wrong kind, and for options that memmlp sets itself.
     """
     known = {key.replace("-", "_"): value for key, value in words.items()}
     setup, python = known.pop("setup", None), known.pop("python", None)
@@ -65,7 +65,7 @@ def slurm_options(words: Mapping[str, str]) -> SlurmOptions:
 
 
 def _parameter(key: str, value: str) -> dict[str, str | bool]:
-    """Return a word as a parameter of sbatch's."""
+    """Return a word of the command line as a parameter of sbatch."""
     if key in OURS:
         raise InputError(f"slurm.{key}: is set by memmlp; allowed are sbatch's other options")
     if key in ONE:
@@ -88,7 +88,7 @@ def _number(key: str, value: str) -> int:
 
 
 def _minutes(text: str) -> int:
-    """Return the minutes, rounded up, of a time as Slurm writes it: M, M:S, H:M:S, D-H, D-H:M or D-H:M:S."""
+    """Return a time in minutes, rounded up, from Slurm's forms M, M:S, H:M:S, D-H, D-H:M or D-H:M:S."""
     found = TIME.fullmatch(text)
     if not found:
         raise InputError(f"slurm.time={text}: allowed are MINUTES, H:MM:SS, D-HH and D-HH:MM")
@@ -104,15 +104,15 @@ def _dashed(key: str) -> str:
 
 
 class DelayedSubmission(submitit.helpers.DelayedSubmission):  # submitit looks for this name
-    """Work on its way to a job that may have no time limit."""
+    """Submitit's record of work that is being submitted, changed so that the job may have no time limit."""
 
     def set_timeout(self, timeout_min: int | None, max_num_timeout: int) -> None:
-        """Keep the time limit in minutes, by which submitit tells the end of the time from a preemption."""
+        """Keep the time limit in minutes, by which submitit tells a timeout from a preemption."""
         super().set_timeout(timeout_min or UNLIMITED, max_num_timeout)
 
 
 class SlurmExecutor(submitit.SlurmExecutor):
-    """Submitit's executor, which starts jobs without a time limit, too: the cluster's own holds then."""
+    """Submitit's executor, also for jobs without a time limit of their own, where the cluster's applies."""
 
     def _internal_process_submissions(self, delayed_submissions: list) -> list:
         given: list = [
@@ -121,7 +121,7 @@ class SlurmExecutor(submitit.SlurmExecutor):
         return super()._internal_process_submissions(given)
 
     def set(self, options: SlurmOptions) -> None:
-        """Ask for jobs with these options."""
+        """Set the options with which jobs are submitted."""
         words = {"additional_parameters": dict(options.parameters), "srun_args": list(options.srun)}
         setup = {"setup": [options.setup]} if options.setup else {}
         # Submitit would set a wckey of its own, which clusters without such keys refuse.
@@ -129,11 +129,11 @@ class SlurmExecutor(submitit.SlurmExecutor):
 
 
 class Unsent(SlurmExecutor):
-    """An executor that only writes the file, for which Slurm need not be installed."""
+    """An executor that only writes the submission file; Slurm need not be installed."""
 
     @classmethod
     def affinity(cls) -> int:
-        """Return that Slurm is there."""
+        """Return 1, which tells submitit that Slurm is available."""
         return 1
 
 
@@ -142,10 +142,10 @@ class Slurm:
 
     Args:
         folder: the folder of the workers' logs, with %j for a job's number.
-        options: what the jobs are asked for with.
+        options: the options with which jobs are submitted.
 
     Raises:
-        InputError: where there is no Slurm.
+        InputError: if Slurm is not installed.
     """
 
     def __init__(self, folder: Path, options: SlurmOptions):
@@ -155,7 +155,7 @@ class Slurm:
         self.gpus = options.gpu
 
     def submit(self, work: Work, count: int = 1) -> list[Submitted]:
-        """Start workers as one job array. Raises InputError where sbatch refuses an option."""
+        """Start workers as one job array. Raises InputError if sbatch refuses an option."""
         with explained("slurm"):
             with self.executor.batch():
                 jobs: list[Any] = [self.executor.submit(Requeued(work)) for _ in range(count)]
@@ -163,7 +163,7 @@ class Slurm:
 
 
 def script(folder: Path, options: SlurmOptions, workers: int) -> str:
-    """Return the file that sbatch would be given for so many workers; Slurm need not be installed."""
+    """Return the file that sbatch would get for the given number of workers; Slurm need not be installed."""
     executor = Unsent(folder=folder, python=options.python)
     executor.set(options)
     if workers > 1:

@@ -1,4 +1,4 @@
-"""Workers that submitit starts: what its processes and its Slurm jobs have in common."""
+"""Workers that submitit starts: the common part of its processes and its Slurm jobs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ UNLIMITED = 365 * 24 * 60  # minutes, where submitit wants a limit and there is 
 
 
 class Requeued:
-    """Work that a preempted Slurm job does again; its runs go on from their checkpoints."""
+    """Work that a preempted Slurm job does again; its runs continue from their checkpoints."""
 
     def __init__(self, work: Work):
         self.work = work
@@ -29,20 +29,20 @@ class Requeued:
         return self.work()
 
     def checkpoint(self) -> Any:
-        """Return what submitit puts into the queue when the job is preempted or its time is up."""
+        """Return the submission that submitit queues when the job is preempted or its time is up."""
         from submitit.helpers import DelayedSubmission
 
         return DelayedSubmission(self)
 
 
 class Submitted:
-    """A worker that is a job of submitit's."""
+    """A worker that is a job of submitit."""
 
     def __init__(self, job: submitit.Job):
         self.job = job
 
     def alive(self) -> bool:
-        """Return whether the job waits or works."""
+        """Return whether the job is waiting or working."""
         return not self.job.done()
 
     def cancel(self) -> None:
@@ -50,7 +50,7 @@ class Submitted:
         self.job.cancel(check=False)
 
     def complaint(self) -> str | None:
-        """Return the line with which a worker ended that could do nothing; None for any other end."""
+        """Return the worker's own line about why it could do no work; None after any other end."""
         if not self.job.paths.result_pickle.exists() or self.job.exception() is not None:
             return None
         return self.job.result()
@@ -58,7 +58,7 @@ class Submitted:
 
 @contextlib.contextmanager
 def explained(name: str) -> Iterator[None]:
-    """Turn what submitit complains of into an InputError of one line about executor=NAME."""
+    """Turn errors of submitit into an InputError of one line about executor=NAME."""
     logging.getLogger("submitit").setLevel(logging.ERROR)
     try:
         yield

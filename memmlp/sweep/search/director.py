@@ -1,7 +1,7 @@
-"""The director of a search: it asks the study for trials, has their runs made, and tells how they ended.
+"""The director of a search: it asks the study for trials, plans their runs, and records how they ended.
 
 A trial has a run for each seed. The first seed's run decides whether the trial is pruned; the runs of the
-other seeds are made after it.
+other seeds follow after it.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ DROPPED = (TrialState.PRUNED, TrialState.FAIL)  # states of trials whose runs no
 Compose = Callable[[Mapping[str, Value]], Sequence[Sequence[RunTask]]]
 """Makes a list of tasks for each seed from a trial's values; the last task of a list is the seed's run.
 
-Raises InputError where the config refuses the values.
+Raises InputError if the config rejects the values.
 """
 
 
 @dataclass
 class Going:
-    """A trial under way.
+    """A running trial.
 
     Attributes:
         trial: the trial.
-        seeds: the tasks of each seed, the last of which is the seed's run.
-        wanted: for how many seeds the runs are to be made by now.
+        seeds: the tasks of each seed; the last task of a seed is the seed's own run.
+        wanted: for how many seeds runs are wanted so far.
     """
 
     trial: Trial
@@ -52,28 +52,28 @@ class Going:
 
     @property
     def tasks(self) -> list[RunTask]:
-        """The tasks that are to be done by now."""
+        """The tasks that are wanted so far."""
         return [task for tasks in self.seeds[: self.wanted] for task in tasks]
 
     @property
     def runs(self) -> list[str]:
-        """The ids of the seeds' runs that are to be made by now."""
+        """The ids of the seeds' runs that are wanted so far."""
         return [tasks[-1].id for tasks in self.seeds[: self.wanted]]
 
     def want(self, count: int) -> None:
-        """Have the runs of that many seeds made, and record their ids with the trial."""
+        """Set for how many seeds runs are wanted, and record the ids of these runs with the trial."""
         if count != self.wanted:
             self.wanted = count
             self.trial.set_user_attr("runs", self.runs)
 
 
 class Director:
-    """The trials under way, and the plan of their runs.
+    """The running trials, and the plan of their runs.
 
     Args:
         study: owns the trials.
         compose: makes the tasks of a trial.
-        plan: an empty, open plan; plans with the tasks of the trials under way are made from it.
+        plan: an empty, open plan, which is filled with the tasks of the running trials.
     """
 
     def __init__(self, study: Study, compose: Compose, plan: Plan):
@@ -83,10 +83,10 @@ class Director:
             self._begin(trial)
 
     def look(self, capacity: int) -> Plan:
-        """Record what ended, ask for trials until `capacity` runs go on at once, and return the plan.
+        """Record ended trials, ask for new ones until `capacity` runs can run at once, and return the plan.
 
         Raises:
-            InputError: when the first trials all failed.
+            InputError: if all trials failed, and there are at least HOPELESS of them.
         """
         for number in list(self.going):
             if self._ended(self.going[number]):
@@ -97,7 +97,7 @@ class Director:
         return self._planned()
 
     def _begin(self, trial: Trial) -> None:
-        """Take a trial's first run into the plan. A trial whose values the config refuses fails at once."""
+        """Add a trial's first run to the plan. A trial whose values the config rejects fails at once."""
         try:
             going = Going(trial, self.compose(values(trial, self.study.search)))
         except InputError as error:
@@ -131,9 +131,9 @@ class Director:
         return going.wanted == 1 and 0 < news < total and self.study.prune(going.trial)
 
     def _otherwise(self, task: RunTask) -> str | None:
-        """Say why a finished run's validations are not the task's: they used its network in another way.
+        """Say why a finished run's validations don't suit the task: they used its network in another way.
 
-        None where they are.
+        Return None if they suit it.
         """
         run, wanted = self.plan.run_of(task), inference(task.config)
         if not run.done or inference(run.config) == wanted:
@@ -141,21 +141,21 @@ class Director:
         return f"run {run.id} was validated with {inference(run.config)}, not {wanted}; it has no others"
 
     def _busy(self) -> int:
-        """Return how many workers the trials under way can use: one for each wanted run that is not done.
+        """Return how many workers the running trials can use: one for each wanted run that is not done.
 
         A trial whose runs are all done still counts as one until it is recorded as ended.
         """
         return sum(max(1, sum(not run.done for run in self._runs(going))) for going in self.going.values())
 
     def _runs(self, going: Going) -> list[Run]:
-        """Return a trial's runs that are to be made by now."""
+        """Return a trial's runs that are wanted so far."""
         return [Run.of(self.plan.outputs, run_id) for run_id in going.runs]
 
     def _report(self, trial: Trial, run: Run) -> int:
-        """Report the run's new validations to the study, where there is one objective.
+        """Report the run's new validations to the study, if there is only one objective.
 
         Returns:
-            The step of the last new validation; 0 where there is none.
+            The step of the last new validation; 0 if there is none.
         """
         (objective, *others) = self.study.search.objectives
         if others:
@@ -167,7 +167,7 @@ class Director:
         return max(news, default=0)
 
     def _planned(self) -> Plan:
-        """Return the plan of the trials under way, which cancels the runs of pruned and failed trials."""
+        """Return the plan of the running trials, with the runs of pruned and failed trials cancelled."""
         entries = tuple(
             Entry(f"trial {number}", seed, run_id)
             for number, going in self.going.items()
@@ -183,7 +183,7 @@ class Director:
         )
 
     def _check_hope(self) -> None:
-        """Raise InputError when all trials so far failed, and there are at least HOPELESS of them."""
+        """Raise InputError if all trials so far failed, and there are at least HOPELESS of them."""
         ended = [trial for trial in self.study.trials if trial.state.is_finished()]
         if len(ended) >= HOPELESS and all(trial.state == TrialState.FAIL for trial in ended):
             reason = ended[-1].user_attrs.get("reason", "no reason is known")
@@ -191,7 +191,7 @@ class Director:
 
 
 def validations(run: Run) -> list[Metrics]:
-    """Return what a run logged on its validation split."""
+    """Return a run's logged results on the validation split."""
     return [entry for entry in run.metrics() if entry.phase == "val"]
 
 
@@ -199,7 +199,7 @@ def objectives(wanted: Sequence[Objective], run: Run) -> list[float]:
     """Return the objectives' values at a finished run's last validation.
 
     Raises:
-        InputError: where that is missing in the log, which was damaged since.
+        InputError: if the log lacks that validation, because it was damaged.
     """
     found, steps = validations(run), run.config["optim"]["steps"]
     if not found or found[-1].step != steps:
@@ -208,10 +208,10 @@ def objectives(wanted: Sequence[Objective], run: Run) -> list[float]:
 
 
 def direct(director: Director, fleet: Fleet, board: SearchBoard, path: Path) -> None:
-    """Keep the fleet at the trials' runs until the study has all the trials it wants.
+    """Keep the fleet working on the trials' runs until the study has all the trials that it wants.
 
-    `path` is the file of the plan, which the workers read. It is touched all the time, as a sign that the
-    director lives.
+    `path` is the file of the plan, which the workers read. The file is touched repeatedly, as a sign that the
+    director is alive.
     """
     plan = None
     try:

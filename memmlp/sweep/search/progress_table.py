@@ -1,4 +1,4 @@
-"""The live table of a search: what runs, the best trials so far, and how many ended in which way."""
+"""The live table of a search: what runs, the best trials so far, and how many trials ended in each way."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WORDS = {TrialState.COMPLETE: "complete", TrialState.PRUNED: "pruned", TrialStat
 
 
 class SearchBoard(Screen):
-    """Shows a search while it goes on.
+    """Shows a search in progress.
 
     Args:
         outputs: the folder of runs and caches.
@@ -34,7 +34,7 @@ class SearchBoard(Screen):
         self.told: set[int] | None = None
 
     def update(self, study: Study) -> None:
-        """Show the study, and the runs of its trials, as they are now."""
+        """Show the study, and the runs of its trials, in their present state."""
         ended = [trial for trial in study.trials if trial.state in WORDS]
         told = {trial.number for trial in ended} if self.told is None else self.told
         new = [trial for trial in ended if trial.number not in told]
@@ -46,7 +46,7 @@ class SearchBoard(Screen):
 
 
 def line(search: Search, trial: FrozenTrial, ended: int, outputs: Path) -> str:
-    """Say how a trial ended, and on which devices its runs were worked on."""
+    """Say how a trial ended, and on which devices its runs ran."""
     what = trial.user_attrs.get("reason") if trial.state == TrialState.FAIL else figures(trial)
     params = ", ".join(f"{key}={trial.params[key]:.4g}" for key in trial.params)
     names = ", ".join(dict.fromkeys(filter(None, map(device_name, runs_of(trial, outputs)))))
@@ -55,12 +55,12 @@ def line(search: Search, trial: FrozenTrial, ended: int, outputs: Path) -> str:
 
 
 def runs_of(trial: FrozenTrial, outputs: Path) -> list[Run]:
-    """Return the runs that a trial has wanted so far."""
+    """Return the runs that a trial has needed so far."""
     return [Run.of(outputs, run_id) for run_id in trial.user_attrs.get("runs", ())]
 
 
 def figures(trial: FrozenTrial) -> str:
-    """Return a trial's objective values as text, with standard deviations where it has several seeds."""
+    """Return a trial's objective values as text, with standard deviations if it has several seeds."""
     shown = [f"{value:.3f}" for value in trial.values or []]
     if spread := deviations(trial):
         shown = [f"{value} ± {sd:.3f}" for value, sd in zip(shown, spread, strict=True)]
@@ -68,7 +68,7 @@ def figures(trial: FrozenTrial) -> str:
 
 
 def render(study: Study, outputs: Path) -> Group:
-    """Draw the trials under way, the best ones, the counts, and the devices that are at work."""
+    """Draw the running trials, the best ones, the counts, and the devices in use."""
     table = trials_table(study.search, f"search {study.search.name}")
     going = [(trial, runs_of(trial, outputs)) for trial in study.trials if trial.state not in WORDS]
     for trial, runs in going:
@@ -81,7 +81,7 @@ def render(study: Study, outputs: Path) -> Group:
 
 
 def _going(trial: FrozenTrial, runs: Sequence[Run]) -> Text:
-    """Say how far a trial's runs are."""
+    """Describe the progress of a trial's runs."""
     going = next((run for run in runs if run.doing), None)
     count = sum(run.done for run in runs if run is not going)
     done = f"{count} seeds done, " if count else ""
@@ -101,7 +101,7 @@ def trials_table(search: Search, title: str) -> Table:
 
 
 def short(keys: Iterable[str]) -> list[str]:
-    """Return the keys without their group, where all have the same one."""
+    """Return the keys without their group, if all of them have the same group."""
     every = list(keys)
     groups = {key.rpartition(".")[0] for key in every}
     return [key.rpartition(".")[2] for key in every] if len(groups) == 1 else every
@@ -119,7 +119,7 @@ def _shown(search: Search, trial: FrozenTrial) -> Iterable[str]:
 
 
 def counts(study: Study) -> str:
-    """Say how many trials are in which state, and how many are wanted."""
+    """Say how many trials are in each state, and how many are wanted."""
     found = Counter(WORDS.get(trial.state, "running") for trial in study.trials)
     listed = ", ".join(f"{count} {state}" for state, count in found.items())
     return f"{len(study.trials)} of {study.search.n_trials} trials: {listed or 'none yet'}"

@@ -1,4 +1,4 @@
-"""What a search leaves behind: its trials as CSV, the best as experiments, Table 5 with it, and plots."""
+"""The results of a search: its trials as CSV, the best as experiments, Table 5 with the best, and plots."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ TABLE = 5  # the paper's table of manual weights against learned ones
 def write_trials(study: Study, path: Path) -> None:
     """Write all trials to a CSV file: number, state, objectives, values, runs, and the reason of a failure.
 
-    With several seeds the objectives are means, followed by the standard deviation of each and by the seeds'
-    own values.
+    With several seeds the objectives are means, followed by each objective's standard deviation and by the
+    values of the single seeds.
     """
     names = [objective.text for objective in study.search.objectives]
     keys = [one.key for one in study.search.space]
@@ -113,7 +113,7 @@ def _put(tree: dict[str, Any], keys: Sequence[str], value: Any) -> None:
 
 
 def write_table(study: Study, shipped: Path, path: Path) -> bool:
-    """Write the paper's Table 5 with the best trial as one more arm, where only loss weights were searched.
+    """Write the paper's Table 5 with the best trial as one more arm, if only loss weights were searched.
 
     Returns:
         Whether the table was written.
@@ -131,7 +131,7 @@ def write_table(study: Study, shipped: Path, path: Path) -> bool:
 def importances(study: Study) -> list[tuple[str, float]]:
     """Return each key's share in the variation of the first objective, the largest first (PED-ANOVA).
 
-    Empty with fewer than four complete trials or a single key.
+    The list is empty with fewer than four complete trials or a single key.
     """
     return study_importances(study.study)
 
@@ -153,10 +153,11 @@ def _first(trial: FrozenTrial) -> float:
 
 
 def at_an_end(study: optuna.Study) -> list[str]:
-    """Say of each key whose best value lies at an end of what was tried that better ones may lie beyond it.
+    """Return a warning for each key whose best value is at an end of its range: better ones may lie beyond.
 
-    Of a range, that is within a fiftieth of its width (of that of its logarithm, where this is searched).
-    Empty for several objectives, whose front reaches to the ends. Zero is an end that nothing lies beyond.
+    A value within a fiftieth of the range's width is at its end (of the logarithm's width, if that is
+    searched). There are no warnings for several objectives, whose front reaches the ends, and none at zero,
+    beyond which nothing lies.
     """
     complete = [t for t in study.get_trials(deepcopy=False) if t.state == TrialState.COMPLETE]
     if len(complete) < 2 or len(study.directions) > 1:
@@ -171,7 +172,7 @@ def at_an_end(study: optuna.Study) -> list[str]:
 
 
 def _end(value: Any, tried: BaseDistribution) -> str | None:
-    """Return at which end of what was tried a number lies, "smallest" or "largest"; None for at neither."""
+    """Return the end at which a value is among those searched, "smallest" or "largest"; None for neither."""
     if isinstance(tried, CategoricalDistribution):
         numbers = [one for one in tried.choices if isinstance(one, int | float) and not isinstance(one, bool)]
         low, high, margin = min(numbers, default=0), max(numbers, default=0), 0.0
@@ -189,7 +190,7 @@ def _end(value: Any, tried: BaseDistribution) -> str | None:
 
 
 def plots(study: Study) -> dict[str, dict[str, Any]]:
-    """Return the plots that a study can have, by name, with their arguments beside the study."""
+    """Return the plots that are possible for a study, by name, with their further arguments."""
     complete = [trial for trial in study.trials if trial.state == TrialState.COMPLETE]
     names = [objective.text for objective in study.search.objectives]
     if len(complete) < 2:
@@ -205,7 +206,7 @@ def plots(study: Study) -> dict[str, dict[str, Any]]:
 
 
 def write_plots(study: Study, folder: Path) -> list[Path]:
-    """Write the plots as PNG files, and all of them into study.html, which needs no network."""
+    """Write the plots as PNG files, and all of them into study.html, which works offline."""
     wanted = plots(study)
     files = [_png(study, name, keywords, folder / f"{name}.png") for name, keywords in wanted.items()]
     if wanted:

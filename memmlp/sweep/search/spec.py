@@ -49,7 +49,7 @@ class Range:
 
     Attributes:
         key: the dotted key.
-        low, high: the limits, inclusive; whole numbers alone are tried where both are whole.
+        low, high: the limits, inclusive; if both are whole numbers, only whole numbers are tried.
         log: whether values are uniform in their logarithm.
         step: the step of a grid that starts at `low`; None for no grid.
         choices: a list of values in place of a range; empty for a range.
@@ -77,7 +77,7 @@ class Range:
 
 @dataclass(frozen=True)
 class Objective:
-    """A weighted sum of validation metrics, to be lowered.
+    """A weighted sum of validation metrics, which is to be minimised.
 
     Attributes:
         text: the objective as it was written.
@@ -88,7 +88,7 @@ class Objective:
     terms: tuple[tuple[float, str], ...]
 
     def value(self, metrics: Mapping[str, float]) -> float:
-        """Return the objective's value for a validation's metrics. Raises InputError where one is missing."""
+        """Return the objective's value for a validation's metrics. Raises InputError if one is missing."""
         for _, name in self.terms:
             if name not in metrics:
                 known = ", ".join(metrics)
@@ -98,7 +98,7 @@ class Objective:
 
 @dataclass(frozen=True)
 class Search:
-    """A checked search; its fields are the keys of the config group `search` (see the module's text)."""
+    """A checked search; its fields are the keys of the config group `search` (see the module's docstring)."""
 
     name: str
     base: tuple[str, ...]
@@ -114,9 +114,9 @@ class Search:
     storage: str | None
 
     def first_trials(self) -> list[dict[str, Value]]:
-        """Return the values by key that the first trials are given; the sampler chooses the others.
+        """Return the values by key that the first trials get; the sampler chooses those of the other trials.
 
-        They are those of `first`, or of a grid all combinations, in order.
+        They are the values in `first`, or for a grid all combinations, in order.
         """
         if self.sampler == "grid":
             keys = [one.key for one in self.space]
@@ -131,12 +131,12 @@ class Search:
 
 
 def word(value: Value) -> str:
-    """Return a value as text in an override."""
+    """Return a value as the text that an override has for it."""
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def parse_search(content: Mapping[str, Any]) -> Search:
-    """Return the search that a config describes. Raises InputError, naming the key, where it is wrong."""
+    """Return the search that a config describes. Raises InputError, which names the key, if it is wrong."""
     for key in content:
         if key not in KEYS:
             raise InputError(f"search.{key}: no such key; allowed are {', '.join(KEYS)}")
@@ -182,7 +182,7 @@ def parse_search(content: Mapping[str, Any]) -> Search:
 
 
 def _check_grid(space: Sequence[Range], n_trials: Any) -> None:
-    """Raise InputError unless every key has choices alone, and there are as many trials as combinations."""
+    """Raise InputError unless every key has choices only, and there are as many trials as combinations."""
     for one in space:
         if not one.choices or one.first is not None:
             raise InputError(f"search.space.{one.key}: with search.sampler=grid allowed are choices alone")
@@ -218,7 +218,7 @@ def _range(key: str, node: Mapping[str, Any], where: str) -> Range:
 
 
 def _choices(key: str, node: Mapping[str, Any], where: str) -> Range:
-    """Return the range of a node with `choices`. Raises InputError where it is wrong."""
+    """Return the range of a node with `choices`. Raises InputError if the node is wrong."""
     choices = node["choices"]
     if isinstance(choices, list):
         choices = [_listed(item) if isinstance(item, list) else item for item in choices]
@@ -231,12 +231,12 @@ def _choices(key: str, node: Mapping[str, Any], where: str) -> Range:
 
 
 def _listed(items: list[Any]) -> str:
-    """Return a list among the choices as text in an override."""
+    """Return a choice that is a list as the text that an override has for it."""
     return f"[{','.join(word(item) for item in items)}]"
 
 
 def _interval(key: str, node: Mapping[str, Any], where: str) -> Range:
-    """Return the range of a node with `low` and `high`. Raises InputError where it is wrong."""
+    """Return the range of a node with `low` and `high`. Raises InputError if the node is wrong."""
     low, high = (_number(node.get(end), f"{where}.{end}") for end in ("low", "high"))
     log, step, first = node.get("log", False), node.get("step"), node.get("first")
     if not isinstance(log, bool):
@@ -263,7 +263,7 @@ def _objective(text: str) -> Objective:
 
 
 def _term(part: str, text: str) -> tuple[float, str]:
-    """Parse a term into its weight and metric; without a branch it is the rotation branch's."""
+    """Parse a term into weight and metric; a metric without a branch is the rotation branch's."""
     match = re.fullmatch(r"(?:(\d+\.?\d*(?:[eE][+-]?\d+)?)\s*\*\s*)?(?:(\w+)\s+)??(\w+(?: PE)?)", part)
     branch, metric = (match[2] or OBJECTIVE_BRANCHES[0], match[3]) if match else ("", "")
     if match is None or metric not in UNITS or branch not in OBJECTIVE_BRANCHES:

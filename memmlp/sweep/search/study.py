@@ -1,9 +1,9 @@
-"""The Optuna study of a search. A single process owns it: it asks for trials and tells how they ended.
+"""The Optuna study of a search. A single process owns it: it asks for trials and records how they ended.
 
-A trial has these user attributes: "runs" are the ids of its runs, one for each seed, as far as they were
-wanted; "values" are each seed's objectives, whose means over seeds are the trial's own values; "reason" says
-why it failed. At whatever moment the owner is killed, the next owner finds every trial either ended or
-running, and goes on with the running ones under their numbers.
+A trial has these user attributes: "runs" are the ids of its runs so far, one for each seed; "values" are each
+seed's objectives, whose means over seeds are the trial's own values; "reason" says why it failed. Whenever
+the owner is killed, the next owner finds every trial either ended or running, and continues the running ones
+under their numbers.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ class Study:
 
     @classmethod
     def opened(cls, search: Search, name: str, folder: Path) -> Study:
-        """Return the study of that name, new or as it was left, for its only owner.
+        """Return the study with that name, new or as it was left, for its only owner.
 
         Args:
             search: the search.
             name: the study's name in the storage.
-            folder: the folder of the journal, where the search names no storage.
+            folder: the folder of the journal, if the search names no storage.
 
         Raises:
-            InputError: where the storage can't be opened.
+            InputError: if the storage can't be opened.
         """
         if search.storage is None:
             mend(journal(folder))
@@ -70,7 +70,7 @@ class Study:
 
     @classmethod
     def view(cls, search: Search, name: str, folder: Path) -> Study | None:
-        """Return the study for looking at it while its owner works; None where there is none yet."""
+        """Return the study for reading while its owner works; None if it does not exist yet."""
         if search.storage is None and not journal(folder).exists():
             return None
         try:
@@ -80,7 +80,7 @@ class Study:
 
     @property
     def trials(self) -> list[FrozenTrial]:
-        """All trials that were asked for, by number."""
+        """All trials that were asked for, ordered by number."""
         trials = self.study.get_trials(deepcopy=False)
         return [trial for trial in trials if trial.state != TrialState.WAITING]
 
@@ -91,7 +91,7 @@ class Study:
                 yield self._taken_up(trial)
 
     def ask(self) -> Trial | None:
-        """Return a new trial; None when there are as many as the search wants."""
+        """Return a new trial; None if there are as many as the search wants."""
         number = len(self.trials)
         if number >= self.search.n_trials:
             return None
@@ -104,24 +104,24 @@ class Study:
         return self._suggested(Trial(self.study, trial._trial_id))
 
     def _suggested(self, trial: Trial) -> Trial:
-        """Return the trial with a value for every key; values that it already has stay."""
+        """Return the trial with a value for every key; existing values stay."""
         for one in self.search.space:
             suggest(trial, one)
         return trial
 
     def report(self, trial: Trial, step: int, value: float) -> None:
-        """Report the objective's value at one of a trial's validations, where there is one objective."""
+        """Report the objective's value at one of a trial's validations; for searches with one objective."""
         trial.report(value, step)
 
     def prune(self, trial: Trial) -> bool:
-        """End the trial if others were better at its step, and return whether that was so."""
+        """End the trial if other trials were better at its step, and return whether it was ended."""
         if self.search.pruner == "none" or not trial.should_prune():
             return False
         self.study.tell(trial.number, state=TrialState.PRUNED)
         return True
 
     def complete(self, trial: Trial, values: Sequence[Sequence[float]]) -> None:
-        """End the trial with the means over seeds of its objectives. A mean that is NaN makes it a failure.
+        """End the trial with its objectives' means over seeds. A mean that is NaN makes the trial a failure.
 
         `values` has a list for each seed, with the value of each objective.
         """
@@ -147,14 +147,14 @@ class Study:
 
 
 class FencedJournal(JournalFileBackend):
-    """A journal to which the present owner of its folder alone appends, so that it needs no lock."""
+    """A journal that needs no lock, since only its folder's present owner appends to it."""
 
     def __init__(self, path: Path):
         super().__init__(str(path))
         self.path = path
 
     def append_logs(self, logs: list[dict[str, Any]]) -> None:
-        """Append lines to the journal. Raises LeaseLost if its folder has another owner by now."""
+        """Append lines to the journal. Raises LeaseLost if its folder has another owner now."""
         lines = "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs)
         with open(self.path, "ab") as file:
             lease_fences.check_owner(self.path)  # after opening: `mend` gave a later owner another file
@@ -173,7 +173,10 @@ def storage(search: Search, folder: Path) -> BaseStorage:
 
 
 def open_storage(url: str | None, folder: Path) -> BaseStorage:
-    """Return the storage of a URL, or where that is None the journal in a folder. Raises InputError."""
+    """Return the storage of a URL, or for None the journal in a folder.
+
+    Raises InputError as `storage` does.
+    """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     if url:
         try:
@@ -192,16 +195,16 @@ def open_storage(url: str | None, folder: Path) -> BaseStorage:
 
 
 def journal(folder: Path) -> Path:
-    """Return the file of a search's study in its folder, which `optuna-dashboard` can read."""
+    """Return the journal file of a search's study, which `optuna-dashboard` can read."""
     return folder / "study.journal"
 
 
 def mend(path: Path) -> None:
     """Replace a journal by a copy without an incomplete last line, and remove its locks; only for the owner.
 
-    A process that was killed may leave both behind (locks if it was of an earlier version). Optuna takes a
-    line appended to an incomplete one for damage. An earlier owner that was frozen may append to the
-    file that it had open, which is this one no more, and so changes nothing.
+    A killed process may leave both behind (locks only in earlier versions). Optuna takes a line that is
+    appended to an incomplete one for damage. If an earlier owner was frozen and wakes up, it appends to the
+    file that it has open, which is no longer this one, so it changes nothing.
     """
     check_journal(path)
     for left in path.parent.glob(f"{path.name}.lock*"):
@@ -212,7 +215,7 @@ def mend(path: Path) -> None:
 
 
 def check_journal(path: Path) -> None:
-    """Refuse a file that is no journal, which Optuna would take for an empty one. Raises InputError."""
+    """Raise InputError for a file that is no journal, which Optuna would take for an empty one."""
     if path.exists():
         with open(path, "rb") as file:
             begins = file.read(len(BEGINNING))
@@ -227,7 +230,7 @@ def _damaged(path: Path, reason: object) -> InputError:
 def sampler(search: Search, number: int) -> optuna.samplers.BaseSampler:
     """Return the sampler of one trial, seeded by the search and the trial's number.
 
-    So a search that is resumed does not draw the random numbers of its earlier trials again.
+    So a resumed search does not repeat the random numbers of its earlier trials.
     """
     seed = int(np.random.SeedSequence([search.seed, number]).generate_state(1)[0])
     if search.startup is None or search.sampler != "tpe":  # a grid's trials have their values already
@@ -240,7 +243,7 @@ def sampler(search: Search, number: int) -> optuna.samplers.BaseSampler:
 
 
 def suggest(trial: Trial, one: Range) -> Value:
-    """Return a trial's value for a key: the one that it has already, or a new one."""
+    """Return a trial's value for a key: its existing value, or a new one."""
     if one.choices:
         return trial.suggest_categorical(one.key, one.choices)
     if isinstance(one.low, int) and isinstance(one.high, int):

@@ -9,8 +9,8 @@ m[s, g] give three variances, with these degrees of freedom:
     B = variance of the G groups' means x sum of w^2                          G - 1
     E = variance of what neither explains x sum of w^2 / S                    (S - 1) (G - 1)
 
-A + B - E estimates the variance of the mean, because the noise is in A and in B. (Where groups differ in
-size, and clips differ more than groups, B is larger than it should be; it is never smaller.)
+A + B - E estimates the variance of the mean, because the noise is contained in both A and B. (Where groups
+differ in size, and clips differ more than groups, B is larger than it should be; it is never smaller.)
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Groups = np.ndarray | Sequence[object] | None
 
 
 TRUST = 5.0
-"""How much of B may be taken as noise that is not skewed: at most TRUST x level x E.
+"""How much of B may count as noise that is not skewed: at most TRUST x level x E.
 
 It was measured by simulation; see `Error.half` and docs/statistics.md.
 """
@@ -34,15 +34,15 @@ It was measured by simulation; see `Error.half` and docs/statistics.md.
 
 @dataclass(frozen=True)
 class Error:
-    """What is known of the errors of K means.
+    """The estimated errors of K means.
 
     Args:
-        variances: A, B and E of the module's text, (3, K). Where there is a single seed or group, its
-            variance is 0, and so is E.
+        variances: A, B and E of the module's docstring, (3, K). With a single seed or group, its variance is
+            0, and so is E.
         seeds: degrees of freedom of A.
         groups: degrees of freedom of B.
-        conditional: what there is only one of, so that nothing can be said of others: "seeds", "clips",
-            "seeds and clips", or "" where there are several of both.
+        conditional: what there is only one of, so that nothing can be said about others: "seeds", "clips",
+            "seeds and clips", or "" if there are several of both.
     """
 
     variances: np.ndarray
@@ -54,8 +54,8 @@ class Error:
         """Return half the width (K,) of intervals that miss with at most the probability `level`, () or (K,).
 
         Each side, seeds and groups, has Student's quantile of its own degrees of freedom, and the squares add
-        (Banerjee 1960). So three seeds that happen to agree can't pass for many, as they do with
-        Satterthwaite's degrees of freedom. The noise is in both sides. It counts once, with the larger
+        (Banerjee 1960). So three seeds that happen to agree don't count as many, as they would with
+        Satterthwaite's degrees of freedom. The noise is in both sides; it counts once, with the larger
         quantile, and the result is no less than either side alone.
 
         Effects of groups may be `skewed`, noise is not. A value of B that is no larger than E may be noise,
@@ -73,8 +73,8 @@ class Error:
     def level(self, distance: np.ndarray) -> np.ndarray:
         """Return the level (K,) at which `half` is this distance (K,); 1 for distances of 0 and below.
 
-        It is NaN where distance or variances are no finite numbers: an error without a number, of a network
-        that diverged, is evidence of nothing.
+        It is NaN if the distance or the variances are not finite: the missing error of a network that
+        diverged is no evidence.
         """
         from scipy.optimize.elementwise import find_root  # slow to import
 
@@ -93,7 +93,7 @@ class Error:
         return np.where(np.isfinite(distance + self.variances.sum(0)), levels, np.nan)
 
     def _wider(self, distance: np.ndarray, groups: float) -> np.ndarray:
-        """Return the larger of the p-values (K,) that the two sides have by themselves."""
+        """Return the larger of the p-values (K,) that the two sides give separately."""
         sides = self.variances[:2]
         t = np.divide(distance, np.sqrt(sides), out=np.full(sides.shape, np.inf), where=sides > 0)
         return np.maximum(2 * stdtr(self.seeds, -t[0]), 2 * stdtr(groups, -t[1]))
@@ -109,12 +109,12 @@ def _squared(freedom: float, level: np.ndarray) -> np.ndarray:
 
 
 def skewed(freedom: float) -> float:
-    """Return the degrees of freedom with which Student's t has the tails of the t of skewed values.
+    """Return the degrees of freedom that give Student's t the tails of the t statistic of skewed values.
 
-    A mean of a few skewed values that all are small looks surer than it is. For 2 to 536 exponential values,
-    at levels from 0.05 to 0.0005, the degrees of freedom were measured to be 0.9 m^0.6 or a few more, with m
-    = n - 1 (docs/statistics.md). Clips may be like that. An effect of a seed is a sum of many small effects,
-    and is taken as normal.
+    The mean of a few skewed values that all happen to be small looks more certain than it is. For 2 to 536
+    exponential values, at levels from 0.05 to 0.0005, the degrees of freedom were measured to be 0.9 m^0.6 or
+    a few more, with m = n - 1 (docs/statistics.md). Clips may be skewed like that. The effect of a seed is a
+    sum of many small effects, and is taken as normal.
 
     Args:
         freedom: m, the degrees of freedom of normal values.

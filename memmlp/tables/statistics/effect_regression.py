@@ -4,24 +4,24 @@ The effect of cell i on the clips of group g is taken to be
 
     m[i, g] = x[i] . (beta + b[g]) + u[i] + noise,
 
-with x[i] the cell's covariates (1 and logarithms), beta what is wanted, b[g] what is the clips' own, and u[i]
-what is the cell's own: how far its expected effect is from a line, and the chance of its trainings. A cell's
-effect is the mean over groups, weighted by their shares w[g] of the clips. The coefficients are those of
-weighted least squares with 1 / (n[i] + tau^2), where n[i] is the variance of the mean's noise and tau^2 that
-of u, which is found where the weighted squares of the residuals are as many as their degrees of freedom
+where x[i] are the cell's covariates (1 and logarithms), beta is wanted, b[g] is the clips' own part, and u[i]
+is the cell's own part: how far its expected effect is from a line, and the randomness of its trainings. A
+cell's effect is the mean over groups, weighted by their shares w[g] of the clips. The coefficients are those
+of weighted least squares with 1 / (n[i] + tau^2), where n[i] is the variance of the mean's noise and tau^2
+that of u, which is found where the weighted squares of the residuals are as many as their degrees of freedom
 (Paule and Mandel 1982, "Consensus values and weighting factors"; for regression Berkey et al. 1995, "A
 random-effects regression model for meta-analysis").
 
-Every number asked of the line is a sum of the cells' effects with known factors c[i]. Its error has two
-sides, which are crossed as seeds and clips are (`memmlp.tables.statistics.crossed`), with cells in
-place of seeds:
+Every number that is read from the line is a sum of the cells' effects with known factors c[i]. Its error has
+two sides, which are crossed as seeds and clips are (`memmlp.tables.statistics.crossed`), with cells in place
+of seeds:
 
     A = sum of c^2 (n + tau^2)                                       K - P       (Knapp and Hartung 2003: t)
     B = variance of the groups' own sums x sum of w^2                G - 1
     E = sum of c^2 n, the noise, which is in both                    (K - P) (G - 1)
 
-A meta-analysis of cells with their own standard errors would have A alone, and count clips that all cells
-share as if each cell had other ones.
+A meta-analysis of cells with their own standard errors would use A alone, and would count the clips that all
+cells share as if each cell had different ones.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from memmlp.tables.statistics.crossed import Error, Groups, by_group
 from memmlp.tables.statistics.paired_differences import LEVEL
 
 LEAST = 2
-"""The least degrees of freedom of a fit: cells beyond as many as it has coefficients."""
+"""The least degrees of freedom of a fit: the number of cells minus the number of coefficients."""
 
 
 class Estimate(NamedTuple):
-    """Numbers (Q,) of a line with the ends of their intervals, and p-values, NaN with one group of clips."""
+    """Numbers (Q,) read from a line, the ends of their intervals, and p-values; NaN with one group."""
 
     mean: np.ndarray
     low: np.ndarray
@@ -55,9 +55,9 @@ class FittedLine:
     Attributes:
         means: the groups' means by cell (K, G).
         weights: each group's share of the clips (G,).
-        x: the cells' covariates (K, P), a column of ones among them.
+        x: the cells' covariates (K, P), which include a column of ones.
         noise: the variance n (K,) of the noise of each cell's effect.
-        tau2: the variance of the cells' own part.
+        tau2: the variance tau^2 of the cells' own part.
     """
 
     means: np.ndarray
@@ -86,8 +86,8 @@ class FittedLine:
         Args:
             x: the covariates; a unit vector asks for its coefficient.
             level: the probability.
-            another: whether the intervals are for the effect that one more cell would show there, which is
-                as far from the line, and as noisy, as these are; otherwise they are for the line.
+            another: whether the intervals are for the effect of one more cell at x, which is as far from the
+                line and as noisy as these cells are; otherwise they are for the line.
         """
         factors = self._factors(np.atleast_2d(x))
         mean, known = factors @ self.effects, self._error(factors, another)
@@ -115,14 +115,15 @@ class FittedLine:
         return Error(np.stack([cells, clips, noise]), self.freedom, groups, "" if several else "clips")
 
     def _spread(self, tau2: float) -> np.ndarray:
-        """Return n + tau^2 (K,); where nothing differs from the line at all, equal numbers next to 0."""
+        """Return n + tau^2 (K,); if no cell differs from the line at all, equal numbers close to 0."""
         spread = self.noise + tau2
         return np.maximum(spread, max(1e-9 * spread.max(), np.finfo(float).tiny))
 
     def _noise(self) -> np.ndarray:
-        """Return the variance n (K,) of what neither the clips' own lines nor the cell's mean explains.
+        """Return the variance n (K,) that neither the clips' own lines nor the cell's mean explains.
 
-        A residual of least squares has less variance than what it is of, by the cell's leverage.
+        A residual of least squares has less variance than the true deviation, by the cell's leverage; this is
+        corrected.
         """
         if self.means.shape[1] < 2:
             return np.zeros(len(self.means))
@@ -132,7 +133,7 @@ class FittedLine:
         return rest.var(1, ddof=1) * (self.weights @ self.weights) / left
 
     def _between(self) -> float:
-        """Return tau^2, 0 where the noise explains the residuals."""
+        """Return tau^2; 0 if the noise explains the residuals."""
         alike = self._residuals(np.ones(len(self.x)))
         most = float(alike @ alike) / self.freedom  # there is no more at this end than degrees of freedom
         if most <= 0 or (self.noise.min() > 0 and self._excess(0.0) <= 0):
@@ -158,11 +159,11 @@ def fit(differences: np.ndarray, x: np.ndarray, groups: Groups = None) -> Fitted
 
     Args:
         differences: the cells' differences from their controls.
-        x: the cells' covariates (K, P), a column of ones among them.
+        x: the cells' covariates (K, P), which include a column of ones.
         groups: the clips' groups (C,).
 
     Returns:
-        The line; None where the cells are too few, or differ in too little, for one.
+        The line; None if there are too few cells, or if they differ too little.
     """
     cells, coefficients = x.shape
     if cells - coefficients < LEAST or np.linalg.matrix_rank(x) < coefficients:

@@ -16,11 +16,11 @@ class Effects(NamedTuple):
 
     Attributes:
         mean: the mean difference (K,).
-        low, high: the ends of its 95 % interval (K,); NaN where there is none.
-        p: its p-value (K,); NaN where there is none.
-        conditional: what there is only one of, so that interval and mean don't speak of others: "seeds",
-            "clips" (one group of them), "seeds and clips", or "" where there are several of both. Unless it
-            is "", there are no p-values.
+        low, high: the ends of its 95 % interval (K,); NaN if there is none.
+        p: its p-value (K,); NaN if there is none.
+        conditional: what there is only one of, so that interval and mean don't cover others: "seeds", "clips"
+            (one group of them), "seeds and clips", or "" if there are several of both. Unless it is "", there
+            are no p-values.
     """
 
     mean: np.ndarray
@@ -33,7 +33,7 @@ class Effects(NamedTuple):
 def paired_effects(differences: np.ndarray, groups: Groups = None) -> Effects:
     """Return the effects of differences (K, S, C) over seeds and clips, whose groups are `groups` (C,).
 
-    Interval and p-value agree: 0 lies outside the interval exactly where p is below 0.05.
+    Interval and p-value agree: 0 is outside the interval exactly if p is below 0.05.
     """
     mean, known = differences.mean((1, 2)), error(differences, groups)
     nothing = np.full_like(mean, np.nan)
@@ -43,7 +43,7 @@ def paired_effects(differences: np.ndarray, groups: Groups = None) -> Effects:
 
 
 def seed_effects(differences: np.ndarray) -> Effects:
-    """Return the effects of differences (K, S) of what each seed has one of, such as a time."""
+    """Return the effects of differences (K, S) in something that each seed has once, such as a time."""
     alone = differences[:, :, None]
     effects, several = paired_effects(alone), differences.shape[1] > 1
     p = error(alone).level(np.abs(effects.mean)) if several else effects.p
@@ -54,9 +54,9 @@ def equivalence_p(differences: np.ndarray, margin: float | np.ndarray, groups: G
     """Return the p-values (K,) of the claim that means of differences (K, S, C) lie within +-margin.
 
     The margin is () or (K,), in the unit of the differences. A p-value is the level at which the interval
-    just lies within the margin. Two one-sided tests would allow the interval of twice that level (Schuirmann
-    1987). So this is on the safe side, and it agrees with the interval that is shown. NaN with one seed or
-    one group.
+    just lies within the margin. Two one-sided tests would use the interval of twice that level (Schuirmann
+    1987). So this test is on the safe side, and it agrees with the interval that is shown. The p-values are
+    NaN with one seed or one group.
     """
     known = error(differences, groups)
     if known.conditional:

@@ -1,4 +1,4 @@
-"""What a table could have seen: effects that are found in four of five tables, and the seeds that needs."""
+"""What a table could have found: effects that four of five tables find, and the seeds that they need."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def detectable(
 ) -> np.ndarray:
     """Return the effects (K,) that tables like these differences (K, S, C) would find with this power.
 
-    "Find" is to call significant at the first, strictest step of Holm's correction over `comparisons`. The
-    measured variances are taken for the true ones, and all effects for normal. NaN with one seed or one
-    group.
+    "Find" means to call significant at the first, strictest step of Holm's correction over `comparisons`. The
+    measured variances are taken as the true ones, and all effects as normal. The result is NaN with one seed
+    or one group.
     """
     known = error(differences, groups)
     if known.conditional:
@@ -37,12 +37,12 @@ def seeds_needed(
     power: float = 0.8,
     most: int = 1000,
 ) -> int | None:
-    """Return the fewest seeds with which this effect would be found, judged by differences (S, C).
+    """Return the fewest seeds with which this effect would be found, estimated from differences (S, C).
 
     It is computed as in `detectable`, with the parts of seeds and noise divided by the number of seeds.
 
     Args:
-        differences: of one comparison (S, C).
+        differences: the differences of one comparison (S, C).
         effect: the effect to be found, in the unit of the differences.
         comparisons: how many comparisons Holm's correction is over.
         groups: the group of each clip (C,).
@@ -50,8 +50,8 @@ def seeds_needed(
         most: the largest number of seeds to consider.
 
     Returns:
-        None where not even `most` seeds would do, because the groups of clips are too few or too unlike, and
-        with one seed or one group.
+        The number; None if not even `most` seeds are enough, because the groups of clips are too few or too
+        different, and with one seed or one group.
     """
     matrix = differences.reshape(1, *differences.shape[-2:])
     known = error(matrix, groups)
@@ -77,8 +77,8 @@ def components(known: Error) -> np.ndarray:
 def found(parts: np.ndarray, seeds: int, groups: float, level: float, power: float) -> np.ndarray:
     """Return the effects (K,) that are found at this level with this power.
 
-    An effect is found where it exceeds half the width of the interval less the error of the mean. So it is a
-    quantile of that difference over simulated tables.
+    An effect is found if it exceeds half the width of the interval minus the error of the mean. So the result
+    is a quantile of that difference over simulated tables.
 
     Args:
         parts: the true parts (3, K) of seeds, groups and noise in the variance of the mean.
@@ -96,11 +96,11 @@ def found(parts: np.ndarray, seeds: int, groups: float, level: float, power: flo
 
 @functools.cache
 def _draws(seeds: int, groups: float) -> tuple[np.ndarray, np.ndarray]:
-    """Draw what varies between tables.
+    """Draw the random quantities that vary between tables.
 
     Returns:
-        Standard normal errors of the mean (DRAWS,), and estimates of A, B and E over their expectations (3,
-        DRAWS), which are chi-squared over their degrees of freedom.
+        Standard normal errors of the mean (DRAWS,), and estimates of A, B and E divided by their expectations
+        (3, DRAWS), which are chi-squared over their degrees of freedom.
     """
     from scipy.stats import qmc  # slow to import, as is all of scipy.stats
 

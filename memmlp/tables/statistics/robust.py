@@ -1,7 +1,7 @@
-"""Descriptions of errors that a few extreme clips can't dominate, after rliable.
+"""Descriptions of errors that a few extreme clips can't dominate, as in the library rliable.
 
 Source: Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice". Errors
-are (S, C) of seeds on clips; lower is better.
+are (S, C), of S seeds on C clips; lower is better.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 
 
 def probability_of_improvement(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Return how often a run of ours (S, C) has a smaller error than one of theirs (T, C) on a clip.
+    """Return how often one of our runs (S, C) has a smaller error than one of theirs (T, C) on a clip.
 
     All pairs of seeds are compared on each clip; a tie counts half.
     """

@@ -49,7 +49,8 @@ def choices(cell: GridRow) -> dict[str, Shares]:
     """Return the shares that are simulated in a cell of the grid, by name.
 
     SHARES divide the variance of the mean. "values" instead gives every source the same variance in a single
-    value d[s, c], so that in the mean seeds count 1 / S, groups one over their number, and so on.
+    value d[s, c], so that in the variance of the mean seeds have 1 / S, groups 1 over their number, and so
+    on.
     """
     seeds, clips, size = cell
     values = Shares(seeds=1 / seeds, groups=size / clips, clips=1 / clips, noise=1 / seeds / clips)
@@ -70,19 +71,20 @@ class GridRow(NamedTuple):
 
     @property
     def capped(self) -> bool:
-        """Whether the promise that intervals are not too wide is made for this cell."""
+        """Whether this cell is included in the promise that intervals are not too wide."""
         return self.seeds >= 3 and self.groups[-1] >= 4
 
 
 class SimulatedLook(NamedTuple):
-    """What a look at the first seeds of K comparisons needs, for effects in any shares.
+    """What is needed for a look at the first seeds of K comparisons, for effects in any shares.
 
     Every kind of effect is scaled so that, with all seeds, it gives the mean a variance of 1.
 
     Attributes:
         noise: the means (K, S) of the noise over clips, by seed.
         variance: the variance E (K,) of the noise alone (`memmlp.tables.statistics.crossed`).
-        covariances: of the groups' means of the effects of groups, clips, skewed clips and noise (K, 4, 4).
+        covariances: covariances (K, 4, 4) between the groups' means of the effects of groups, clips, skewed
+            clips and noise.
     """
 
     noise: np.ndarray
@@ -93,8 +95,8 @@ class SimulatedLook(NamedTuple):
 class Simulated:
     """Simulated differences of K comparisons without a true effect.
 
-    Drawing is slow and there are many choices of shares. So each kind of effect is drawn once, and what is
-    kept of it is enough to mix the kinds in any shares afterwards.
+    Drawing is slow and there are many choices of shares. So each kind of effect is drawn once, and enough of
+    it is kept to mix the kinds in any shares later.
     """
 
     def __init__(self, rng: np.random.Generator, cell: GridRow, comparisons: int):
@@ -106,11 +108,11 @@ class Simulated:
         self.looks = {n: self._look(fixed, noise[:, :n], variances[:, :n]) for n in looks(cell.seeds)}
 
     def _look(self, fixed: np.ndarray, noise: np.ndarray, variances: np.ndarray) -> SimulatedLook:
-        """Return what a look needs at its seeds.
+        """Return what is needed for a look at its seeds.
 
         Args:
             fixed: the groups' means of the effects of groups, clips and skewed clips (K, 3, G).
-            noise: the groups' means of the noise (K, S, G), of the look's seeds.
+            noise: the groups' means of the noise (K, S, G), for the look's seeds.
             variances: the variance of each seed's noise over groups (K, S).
         """
         effects = np.concatenate([fixed, noise.mean(1, keepdims=True)], 1)
@@ -125,7 +127,7 @@ class Simulated:
 
         Args:
             shares: the shares of the kinds in the mean's variance, which is 1 with all seeds.
-            seeds: how many seeds, the first ones, are looked at.
+            seeds: how many seeds are looked at, from the first one on.
         """
         weights = np.sqrt(np.array(shares) / sum(shares))
         look = self.looks[seeds]
@@ -137,7 +139,7 @@ class Simulated:
 
 
 def draw(rng: np.random.Generator, cell: GridRow, comparisons: int) -> tuple[np.ndarray, ...]:
-    """Draw the effects that are not the seeds', scaled so that each kind gives the mean a variance of 1.
+    """Draw all effects except those of seeds, scaled so that each kind gives the mean a variance of 1.
 
     Returns:
         The groups' means of the effects of groups, clips and skewed clips (K, 3, G); the groups' means of the

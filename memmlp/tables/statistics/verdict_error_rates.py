@@ -1,4 +1,4 @@
-"""How often verdicts are wrong, counted in simulated tables: the promises that the statistics make.
+"""How often verdicts are wrong, counted in simulated tables: a check of the promises of the statistics.
 
 The arrays' axes are: K comparisons (T tables of TABLE each), S seeds, C clips, G groups of clips.
 """
@@ -42,14 +42,14 @@ def grid() -> list[GridRow]:
 
 
 class Counts(NamedTuple):
-    """What happened in simulated tables whose true differences are all zero.
+    """Outcomes in simulated tables whose true differences are all zero.
 
     Attributes:
         covered: whether the 95 % interval covers the truth (K,).
-        starred: whether a table has any star (T,), so a false one, with all seeds at once.
-        in_looks: the same where seeds are added in looks (T,).
+        starred: whether a table has any star (T,), which is then a false one, with all seeds at once.
+        in_looks: the same if seeds are added in looks (T,).
         found: the smallest true effect that would have been found (K,): half the interval's width at Holm's
-            first step, less the simulated mean.
+            first step, minus the simulated mean.
     """
 
     covered: np.ndarray
@@ -59,9 +59,9 @@ class Counts(NamedTuple):
 
 
 def count(sample: Simulated, shares: Shares) -> Counts:
-    """Count what happens in one sample with effects in these shares.
+    """Count the outcomes in one sample with effects in these shares.
 
-    All nulls are true, so that Holm has a star in a table exactly where its first step has one.
+    All nulls are true, so Holm gives a table a star exactly if its first step does.
     """
     in_looks = np.zeros(len(sample.seeds), bool)
     for seeds, level in spent(sample):
@@ -73,20 +73,20 @@ def count(sample: Simulated, shares: Shares) -> Counts:
 
 
 def spent(sample: Simulated) -> Iterator[tuple[int, float]]:
-    """Return the seeds of each look with the level that it may spend."""
+    """Return the number of seeds of each look, with the level that it may spend."""
     return zip(sample.looks, spending(len(sample.looks)), strict=True)
 
 
 def _any(claims: np.ndarray) -> np.ndarray:
-    """Return, of claims (K,), whether each table has any (T,)."""
+    """Return for each table (T,) whether any of its claims is made, given claims (K,)."""
     return np.any(claims.reshape(-1, TABLE), axis=1)
 
 
 def summary(counts: Sequence[Counts]) -> dict[str, float]:
     """Return the rates over all samples, and the power.
 
-    Power is the share of comparisons in which an effect is found that an oracle, who knows the variances,
-    finds in 80 % of tables. `effect_ratio` is the effect found in 80 % of tables, over the oracle's.
+    Power is the share of comparisons that find the effect which an oracle, who knows the variances, finds in
+    80 % of tables. `effect_ratio` is the effect found in 80 % of tables, divided by the oracle's.
     """
     from scipy.special import ndtri
 
@@ -102,10 +102,10 @@ def summary(counts: Sequence[Counts]) -> dict[str, float]:
 
 
 class Campaign(NamedTuple):
-    """What happened in simulated tables that spend seeds until all is decided.
+    """Outcomes in simulated tables that spend seeds until everything is decided.
 
     Attributes:
-        seeds: the seeds that each arm spent (T, ARMS).
+        seeds: the number of seeds that each arm spent (T, ARMS).
         decided: whether each comparison was decided in looks (T, TABLE).
         at_once: whether each is decided with all seeds at once (T, TABLE).
         false: whether a table made any false claim in looks (T,).
@@ -118,7 +118,7 @@ class Campaign(NamedTuple):
 
 
 def campaign(sample: Simulated, shares: Shares) -> Campaign:
-    """Simulate tables that spend seeds in looks, where half of the arms differ by EFFECT.
+    """Simulate tables that spend seeds in looks, in which half of the arms differ by EFFECT.
 
     An arm stops when all of its comparisons are decided.
     """
@@ -153,7 +153,7 @@ def _claimed(p: np.ndarray, before: np.ndarray, closed: np.ndarray, level: float
 
 
 def simulate(cell: GridRow, tables: int, seed: int) -> dict[str, Any]:
-    """Simulate a cell of the grid and return everything that is reported of it."""
+    """Simulate a cell of the grid, and return everything that is reported about it."""
     rng = np.random.default_rng([seed, *cell])
     size = max(1, CHUNK // (TABLE * cell.seeds * cell.clips))
     every = choices(cell)
@@ -175,7 +175,7 @@ def simulate(cell: GridRow, tables: int, seed: int) -> dict[str, Any]:
 
 
 def told(campaigns: Sequence[Campaign]) -> dict[str, float]:
-    """Return means over simulated tables that spend seeds until all is decided."""
+    """Return means over simulated tables that spend seeds until everything is decided."""
     names = ("seeds", "decided", "decided_at_once", "error")
     return {
         name: float(np.concatenate(part).mean())

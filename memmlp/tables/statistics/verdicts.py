@@ -1,4 +1,4 @@
-"""What may be claimed of many comparisons, at once or in several looks at a growing number of seeds."""
+"""What may be claimed about many comparisons, at once or in several looks at a growing number of seeds."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from memmlp.tables.statistics.paired_differences import LEVEL
 
 
 class Verdict(StrEnum):
-    """What is claimed of a comparison.
+    """What is claimed about a comparison.
 
-    HOLDS and OPPOSITE speak of the paper's effect, HIGHER and LOWER of the measured difference where the
-    paper has none. OPEN claims nothing.
+    HOLDS and OPPOSITE are about the paper's effect, HIGHER and LOWER about the measured difference if the
+    paper has no effect. OPEN claims nothing.
     """
 
     HOLDS = "holds"
@@ -44,15 +44,15 @@ def verdict(
     """Return the verdict on one comparison of a table.
 
     Claims of a difference and claims of equivalence are two families, each with 5 % for a wrong claim: they
-    answer different questions, and a mean can't be wrongly called both. An interval that lies within the
-    margin shows no effect of interest, even where it does not contain 0.
+    answer different questions, and a mean can't be wrongly called both. An interval within the margin shows
+    that there is no effect of interest, even if it does not contain 0.
 
     Args:
-        difference: the p-value of a difference, corrected over the table; NaN where there is none.
-        equivalence: the p-value of `equivalence_p`, corrected likewise.
+        difference: the p-value of a difference, corrected over the table; NaN if there is none.
+        equivalence: the p-value of `equivalence_p`, corrected in the same way.
         mean: the measured mean difference.
-        paper: the paper's difference; None or 0 where it claims no sign.
-        level: what either family may spend, less than 5 % where there are several looks.
+        paper: the paper's difference; None or 0 if the paper claims no sign.
+        level: the level that either family may spend, less than 5 % with several looks.
     """
     if equivalence <= level:
         return Verdict.EQUIVALENT
@@ -75,28 +75,28 @@ def looks(most: int) -> tuple[int, ...]:
 
 
 def spending(number: int) -> tuple[float, ...]:
-    """Return the level that each of so many looks may spend.
+    """Return the level that each of `number` looks may spend.
 
-    Together they are 5 %, so that nothing need be assumed of how the looks depend on each other. Each level
-    is twice the one before: of weights growing by a factor of 1, 2 and 3 these cost few decisions and few
-    seeds.
+    Together they are 5 %, so that nothing need be assumed about how the looks depend on each other. Each
+    level is twice the one before: among weights growing by a factor of 1, 2 or 3, these lose few decisions
+    and cost few seeds.
     """
     weights = 2.0 ** np.arange(number)
     return tuple(map(float, LEVEL * weights / weights.sum()))
 
 
 def sequential(p: np.ndarray, claimed: np.ndarray, closed: np.ndarray) -> np.ndarray:
-    """Correct p-values (K,) by Holm at a look after others; they compare with the look's share of the level.
+    """Correct p-values (K,) by Holm at a look after others; compare them with the look's share of the level.
 
-    What was decided stays so. Comparisons that this family has claimed leave the correction of the others.
-    Comparisons that are closed without such a claim, because the other family decided them or their arm has
-    stopped, stay in it as ones that can't be claimed any more. So a first wrong claim needs a true null whose
-    p-value is below the look's level over the number of nulls, at a look that was fixed beforehand: the
-    looks' levels add up.
+    What was decided stays decided. Comparisons that this family has claimed are removed from the correction
+    of the others. Comparisons that are closed without such a claim, because the other family decided them or
+    their arm has stopped, stay in the correction, but can no longer be claimed. So a first wrong claim needs
+    a true null whose p-value is below the look's level over the number of nulls, at a look that was fixed
+    beforehand: the looks' levels add up.
 
     Args:
-        p: p-values (K,) of this look; NaN where there is none, which never decides.
+        p: p-values (K,) of this look; NaN if there is none, which never decides.
         claimed: what this family claimed at earlier looks, (K,) bool.
-        closed: what was decided otherwise, (K,) bool.
+        closed: which comparisons are closed without such a claim, (K,) bool.
     """
     return holm(np.where(claimed, 0.0, np.where(closed, 1.0, p)))

@@ -1,4 +1,4 @@
-"""The losses of AGRoL and AvatarPoser, as published, and OwnLoss, a network's own losses alone."""
+"""The losses of AGRoL and AvatarPoser as published, and OwnLoss for networks that bring their own losses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from memmlp.training.losses.loss import Fixed, Loss, Terms, joints
 
 
 def joint_norms(error: Tensor) -> Tensor:
-    """Return the L2 norm of each joint's 6D error, mean over frames and joints, for errors (..., 132)."""
+    """Return the L2 norm of each joint's 6D error (..., 132), averaged over frames and joints."""
     return error.unflatten(-1, (N_JOINTS, 6)).norm(dim=-1).mean()
 
 
@@ -25,11 +25,11 @@ ERRORS: dict[str, Callable[[Tensor], Tensor]] = {"norm": joint_norms, "square": 
 
 
 class AGRoLLoss(Loss):
-    """AGRoL's error of the 6D rotations, in network space, where the diffusion model's noise lies too.
+    """AGRoL's error of the 6D rotations, in network space, as is the diffusion model's noise.
 
     Args:
-        error: "norm" as its released code trains both networks (`joint_norms`), or "square" for the mean
-            squared error that its paper can be read as (Du et al. 2023, L2).
+        error: "norm" for the error with which its released code trains both networks (`joint_norms`), or
+            "square" for the mean squared error, a possible reading of its paper (Du et al. 2023, L2).
     """
 
     def __init__(self, error: str = "norm"):
@@ -38,7 +38,7 @@ class AGRoLLoss(Loss):
         self.weighting = Fixed({"rotation": 1.0})
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return the one term, for motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
+        """Return the one term, from motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
         origin = normalizer.origin(sparse)
         error = normalizer.encode_motion(motion, origin) - normalizer.encode_motion(truth, origin)
         return {"rotation": self.error(error[..., ROTATION])}
@@ -50,7 +50,7 @@ def from_pelvis(positions: Tensor) -> Tensor:
 
 
 def from_origin(positions: Tensor) -> Tensor:
-    """Return joint positions (..., 22, 3) as they are, in the world."""
+    """Return joint positions (..., 22, 3) unchanged, in the world."""
     return positions
 
 
@@ -60,15 +60,15 @@ ANCHORS: dict[str, Callable[[Tensor], Tensor]] = {"pelvis": from_pelvis, "head":
 class AvatarPoserLoss(Loss):
     """Mean absolute errors of root orientation, local rotations and joint positions (Jiang et al. 2022).
 
-    The positions follow by forward kinematics. The mean is over the 22 joints; its authors' is over the
-    fingers too, which move with the wrists.
+    The positions follow by forward kinematics. The mean is over the 22 joints; the authors' mean includes the
+    fingers, which move with the wrists.
 
     Args:
         orientation: weight of the root orientation's error; 0.02 in the released code, 0.05 in the paper.
         rotation: weight of the local rotations' error.
         position: weight of the positions' error.
         anchor: the point at which predicted and true body are brought together: "pelvis" as in the released
-            code, which knows no translation, or "head", where the predicted head is put on its tracker.
+            code, which has no translation, or "head", which puts the predicted head on its tracker.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class AvatarPoserLoss(Loss):
 
 
 class OwnLoss(Loss):
-    """No loss of the motion: what a network trains with is its own (`Learned.losses`)."""
+    """No loss of the motion: a network trains with its own losses alone (`Learned.losses`)."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -21,14 +21,14 @@ def joints(motion: Tensor) -> Tensor:
 
 
 class Fixed(nn.Module):
-    """Fixed weights of the loss terms, by name."""
+    """Fixed weights of the loss terms, by the terms' names."""
 
     def __init__(self, values: Mapping[str, float]):
         super().__init__()
         self.values = values
 
     def build(self, names: list[str], own: Mapping[str, float] | None = None) -> None:
-        """Take the weights of terms of one's own, by name; there is nothing to learn.
+        """Check that every term has a weight, adding the weights of custom terms; there is nothing to learn.
 
         Raises:
             InputError: for a term that has no weight.
@@ -73,10 +73,10 @@ class Manual(Fixed):
 
 
 class Uncertainty(nn.Module):
-    """Weights by homoscedastic uncertainty (Kendall et al. 2018, reading 8): e^-s L + s with one s a term.
+    """Weights by homoscedastic uncertainty (Kendall et al. 2018, reading 8): e^-s L + s, with one s per term.
 
     Args:
-        lr: learning rate of the s; with the model's own they would be too slow to settle.
+        lr: learning rate of the s; with the model's learning rate they would settle too slowly.
     """
 
     def __init__(self, lr: float = 1e-2):
@@ -85,7 +85,7 @@ class Uncertainty(nn.Module):
         self.s = nn.ParameterDict()
 
     def build(self, names: list[str], own: Mapping[str, float] | None = None) -> None:
-        """Make a parameter s, starting at 0, for each term; `own` is of fixed weights, and not used."""
+        """Make a parameter s, starting at 0, for each term; `own` has fixed weights and is not used."""
         self.s = nn.ParameterDict({name: nn.Parameter(torch.zeros(())) for name in names})
 
     def parameter_groups(self) -> list[dict]:
@@ -149,7 +149,8 @@ class Loss(nn.Module):
     ) -> tuple[Tensor, Terms]:
         """Return the loss and its unweighted terms; the arguments are those of `terms`.
 
-        In float32, whatever precision made the motion: velocities and jerk are small differences.
+        The loss is computed in float32, whatever the motion's precision: velocities and jerk are small
+        differences.
         """
         with in_float32(truth.device):
             terms = self.terms(motion.to(truth.dtype), truth, sparse, normalizer)

@@ -1,7 +1,8 @@
 """Mem-MLP's loss: Eqs. 1-4 and the hand term, put together with a weighting (Eq. 5).
 
 The paper's terms are taken as printed: L1, summed over joints and components, mean over time and batch
-(reading 10). Everything is in the world: 6D components, metres, and both per frame for velocities.
+(reading 10). Everything is in the world: rotations in 6D components, positions in metres, and velocities in
+either per frame.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from memmlp.training.losses.loss import Loss, Terms, Weighting, joints
 
 
 def l1(error: Tensor) -> Tensor:
-    """Return the sum over components of an error's (B, T, ...) absolute values, mean over batch and time."""
+    """Return the sum of an error's (B, T, ...) absolute values over components, mean over batch and time."""
     return error.abs().flatten(2).sum(-1).mean()
 
 
 class NoHand:
-    """The choice of no hand term."""
+    """The choice to have no hand term."""
 
     branch = "position"
 
@@ -37,7 +38,7 @@ class HandPosition:
     branch = "position"
 
     def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return the term for motion and truth (B, T, 198)."""
+        """Return the hand term, from motion and truth (B, T, 198)."""
         hands = list(HANDS)
         return {"hand": l1((joints(motion) - joints(truth))[:, :, hands])}
 
@@ -45,13 +46,13 @@ class HandPosition:
 class HandFK:
     """The hand term as L1 on both wrists' positions by forward kinematics of the rotation branch.
 
-    The head of the predicted body stands where its tracker says.
+    The head of the predicted body is put on its tracker.
     """
 
     branch = "rotation"
 
     def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return the term for motion and truth (B, T, 198) and inputs (B, T, 54), all in the world."""
+        """Return the hand term, from motion and truth (B, T, 198) and inputs (B, T, 54), all in the world."""
         hands = list(HANDS)
         return {"hand": l1(normalizer.pose(motion, sparse)[:, :, hands] - joints(truth)[:, :, hands])}
 
@@ -60,13 +61,13 @@ Hand = NoHand | HandPosition | HandFK
 
 
 class Term:
-    """One more term of the loss, of one's own; the interface of the slot `term`. Here it is none.
+    """A custom term of the loss; the interface of the slot `term`. This base class adds none.
 
     Args:
-        weight: its weight with fixed weights (`loss=manual`); uncertainty weighting learns one.
+        weight: the term's weight with fixed weights (`loss=manual`); uncertainty weighting learns one.
 
     Attributes:
-        branch: the branch that it looks at; a network without it has no such term.
+        branch: the branch that the term compares; a network without this branch does not have the term.
     """
 
     branch = "position"
@@ -75,33 +76,33 @@ class Term:
         self.weight = weight
 
     def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return the term by its name, for motion and truth (B, T, 198), inputs (B, T, 54) in the world."""
+        """Return the term by its name, for motion and truth (B, T, 198) and inputs (B, T, 54), world."""
         return {}
 
 
 def rotation_terms(motion: Tensor, truth: Tensor) -> Terms:
-    """Return Eqs. 1 and 2 for motion and truth (B, T, 198)."""
+    """Return Eqs. 1 and 2, from motion and truth (B, T, 198)."""
     error = (motion - truth)[..., ROTATION]
     return {"rotation": l1(error), "rotation_velocity": l1(error.diff(dim=1))}
 
 
 def position_terms(motion: Tensor, truth: Tensor) -> Terms:
-    """Return Eqs. 3 and 4 (the latter on the lower body alone) for motion and truth (B, T, 198)."""
+    """Return Eqs. 3 and 4 (Eq. 4 on the lower body alone), from motion and truth (B, T, 198)."""
     error = joints(motion) - joints(truth)
     return {"position": l1(error), "velocity": l1(error[:, :, list(LOWER)].diff(dim=1))}
 
 
 class MotionLoss(Loss):
-    """Mem-MLP's loss (Eq. 5), of the terms of the branches that the predictor has.
+    """Mem-MLP's loss (Eq. 5), with the terms of those branches that the predictor has.
 
     Args:
         weighting: Manual or Uncertainty.
         hand: the hand term.
         branches: the predictor's branches.
-        term: one more term, of one's own.
+        term: one more, custom term.
 
     Raises:
-        InputError: where two terms have one name, or one has no weight.
+        InputError: if two terms have the same name, or a term has no weight.
     """
 
     def __init__(self, weighting: Weighting, hand: Hand, branches: frozenset[str], term: Term | None = None):
@@ -124,12 +125,12 @@ class MotionLoss(Loss):
         return paper | self._own(motion, truth, sparse, normalizer)
 
     def _own(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return the term of one's own, if the network has its branch."""
+        """Return the custom term, if the network has the branch that it compares."""
         given = self.term.branch in self.branches
         return self.term(motion, truth, sparse, normalizer) if given else {}
 
     def _paper(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return the paper's terms and the hand's."""
+        """Return the paper's terms and the hand term."""
         terms: Terms = {}
         if "rotation" in self.branches:
             terms |= rotation_terms(motion, truth)

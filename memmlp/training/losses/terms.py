@@ -1,6 +1,7 @@
-"""A library of loss terms, of which any network's loss can be made (`TermsLoss`).
+"""A library of loss terms, from which any network's loss can be put together (`TermsLoss`).
 
-All compare a predicted body with the true one in the world: metres, and metres a frame for velocities.
+All terms compare a predicted body with the true one in the world, in metres, and in metres per frame for
+velocities.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ STANDING = 0.01  # metres a frame, up to which a true foot stands
 
 
 class Body:
-    """A body of each frame, with what several terms need of it computed once, when first asked for.
+    """A body at each frame; values that several terms need are computed once, when first used.
 
     Args:
-        motion: world motion (B, T, 198), of which the rotations count.
+        motion: world motion (B, T, 198), of which only the rotations are used.
         normalizer: has the rest pose.
     """
 
@@ -52,7 +53,7 @@ class Body:
 
 
 class Comparison:
-    """A predicted motion beside the true one.
+    """A predicted motion and the true one, to be compared.
 
     Args:
         motion: predicted world motion (B, T, 198).
@@ -83,7 +84,7 @@ class Comparison:
 
     @cached_property
     def standing(self) -> Tensor:
-        """Which of the true feet stand (B, T - 1, 4), by how little they move to the next frame."""
+        """Which of the true feet stand (B, T - 1, 4): those that hardly move to the next frame."""
         return self.true_positions[:, :, list(FEET)].diff(dim=1).norm(dim=-1) <= STANDING
 
 
@@ -124,7 +125,7 @@ def sixd_velocity(pair: Comparison, error: Error) -> Tensor:
 
 
 def turn(pair: Comparison, error: Error) -> Tensor:
-    """Return the error of the joints' velocities on SO(3): the 6D rotations from frame to frame."""
+    """Return the error of the joints' velocities on SO(3): the rotations from frame to frame, in 6D."""
     return error(matrix_to_sixd(pair.made.turns) - matrix_to_sixd(pair.true.turns))
 
 
@@ -155,22 +156,22 @@ def acceleration(pair: Comparison, error: Error) -> Tensor:
 
 
 def jerk(pair: Comparison, error: Error) -> Tensor:
-    """Return the mean norm of the predicted joints' third differences in time, whatever the true ones'."""
+    """Return the mean norm of the predicted joints' third differences in time; the truth is not used."""
     return pair.positions.diff(3, dim=1).norm(dim=-1).mean()
 
 
 def contact(pair: Comparison, error: Error) -> Tensor:
-    """Return the predicted movement of feet while the true ones stand."""
+    """Return the error of the predicted feet's movement while the true feet stand still."""
     return error(pair.positions[:, :, list(FEET)].diff(dim=1) * pair.standing[..., None])
 
 
 def penetration(pair: Comparison, error: Error) -> Tensor:
-    """Return how far the lowest predicted joint is below the window's floor, mean over frames."""
+    """Return how far the lowest predicted joint is below the window's floor, averaged over frames."""
     return F.relu(pair.floor - pair.positions[..., 2].amin(-1)).mean()
 
 
 def foot_height(pair: Comparison, error: Error) -> Tensor:
-    """Return the mean distance of predicted toes from the window's floor while the true ones stand."""
+    """Return the mean distance of predicted toes from the window's floor while the true toes stand still."""
     standing = pair.standing[..., [FEET.index(toe) for toe in TOES]]
     return ((pair.positions[:, 1:, list(TOES), 2] - pair.floor[..., None]).abs() * standing).mean()
 
@@ -204,18 +205,18 @@ WEIGHTINGS: dict[str, Callable[[dict[str, float], float], Weighting]] = {
 
 
 class TermsLoss(Loss):
-    """A weighted sum of terms of the library; most baselines' losses are such sums.
+    """A weighted sum of the library's terms; most baselines' losses are such sums.
 
     Args:
         error: how differences become a number where a term leaves it open: "absolute" (mean absolute
             components), "square" (mean squared ones), "norm" (mean L2 norms of joints), "smooth" (Huber's, as
             torch's smooth L1).
-        weighting: "fixed" if the weights stay, "learned" if they are those that learned ones begin at.
+        weighting: "fixed" for weights that stay, "learned" for learned weights that begin at the given ones.
         lr: learning rate of the learned weights' s.
         weights: weights by the names of TERMS; None leaves a term out.
 
     Raises:
-        InputError: if no term has a weight, or a learned one is to begin at 0.
+        InputError: if no term has a weight, or a learned weight would begin at 0.
     """
 
     def __init__(
@@ -229,11 +230,11 @@ class TermsLoss(Loss):
         self.weighting = WEIGHTINGS[weighting](chosen, lr)
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54) in the world.
+        """Return each term by name, from motion and truth (B, T, 198) and inputs (B, T, 54) in the world.
 
         Raises:
-            InputError: if a term needs more frames than there are, as with networks that learn one frame a
-                window.
+            InputError: if a term needs more frames than the motion has, as with networks that learn one frame
+                per window.
         """
         pair, frames = Comparison(motion, truth, sparse, normalizer), motion.shape[1]
         found = {}
