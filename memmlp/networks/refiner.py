@@ -75,7 +75,7 @@ class Refined(MotionModel):
 
     @property
     def streams(self) -> bool:
-        """Whether a frame is made without later ones."""
+        """Whether the network predicts each frame without later ones."""
         return self.network.streams
 
     @property
@@ -84,7 +84,7 @@ class Refined(MotionModel):
         return True
 
     def count_parameters(self) -> int:
-        """Whether the network predicts each frame without later ones."""
+        """Return how many parameters the network uses, including those of the refiner."""
         own = (p.numel() for part in (self.layers, self.head) for p in part.parameters())
         return self.network.count_parameters() + sum(own)
 

@@ -49,7 +49,7 @@ def joint_features(encoded: Tensor) -> Tensor:
 
 
 def with_tracked(joints: Tensor, tracked: Tensor) -> Tensor:
-    """Return features of all joints (..., 22, n) with those of the trackers (..., 3, n) in their places."""
+    """Return features of all joints (..., 22, n), those of the tracked joints replaced by (..., 3, n)."""
     rows = list(joints.unbind(-2))
     for joint, row in zip(TRACKED, tracked.unbind(-2), strict=True):
         rows[joint] = row
@@ -57,7 +57,24 @@ def with_tracked(joints: Tensor, tracked: Tensor) -> Tensor:
 
 
 class AvatarJLM(WholeWindow):
-    """Return features of all joints (..., 22, n), those of the tracked joints replaced by (..., 3, n)."""
+    """A coarse pose of each frame, tokens of its joints, encoder layers, and a head on all tokens of a frame.
+
+    It has 63,807,240 parameters at the paper's sizes (T = 41, d = 512, 6 blocks). It predicts all frames of a
+    window; a live stream keeps the last one.
+
+    Args:
+        normalizer: converts between the world and network space.
+        frames: T, the window's length.
+        width: d, the width of a token; the layers of the coarse pose have 2 d.
+        depth: number of blocks: an encoder layer over a frame's tokens, and one over each token's frames.
+        heads: number of attention heads; it divides d.
+        feedforward: width of the encoders' hidden layers.
+        dropout: dropout rate of the encoders, while training.
+        coarse: weight of the loss of the coarse pose's joints.
+
+    Attributes:
+        outputs: how many numbers are read from the tokens of a frame.
+    """
 
     outputs: ClassVar[int] = ROTATION.stop
 

@@ -23,10 +23,7 @@ FRESH = 0.25  # of the training windows begin as a live stream does, without a p
 
 
 def sines(length: int, width: int) -> Tensor:
-    """Return sine and cosine position embeddings (length, d) of a sequence (Vaswani et al.
-
-    2017, Sec. 3.5).
-    """
+    """Return the position embeddings (length, d), sines and cosines (Vaswani et al. 2017, Sec. 3.5)."""
     rates = torch.exp(-math.log(10_000) * torch.arange(0, width, 2) / width)
     angles = torch.arange(length)[:, None] * rates
     return torch.stack([angles.sin(), angles.cos()], -1).flatten(-2)[:, :width]

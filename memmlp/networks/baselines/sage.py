@@ -106,9 +106,9 @@ class Stack(nn.Module):
 
 
 def places(h: Tensor) -> Tensor:
-    """Return sine position embeddings (T, d) for features (B, T, d), d even (Vaswani et al.
+    """Return position embeddings (T, d) for features (B, T, d), d even (Vaswani et al. 2017, Sec. 3.5).
 
-    2017, Sec. 3.5).
+    They are sines and cosines.
     """
     count, width = h.shape[-2:]
     rates = torch.exp(torch.arange(0, width, 2, device=h.device) * (-math.log(10_000) / width))

@@ -26,7 +26,7 @@ TRACKERS = sum(part.stop - part.start for part in POSES)  # no velocities
 
 
 class Residual(nn.Module):
-    """Two linear layers, each after a LeakyReLU; their output, times a learned share from 0 on, is added.
+    """Two linear layers, each after a LeakyReLU; a learned share of their output, at first 0, is added.
 
     Args:
         width: d, the width of inputs and outputs.
