@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -131,9 +132,15 @@ def _draw(*words: object) -> np.random.Generator:
     return np.random.default_rng(int.from_bytes(digest[:8], "big"))
 
 
+@functools.cache
+def _luck(word: str | int) -> float:
+    """The same for the same word in every run."""
+    return float(_draw(word).normal())
+
+
 def _clip(clip: str, seed: int, factor: float, name: str, branches: Sequence[str]) -> dict[str, Any]:
     """A row of clips.json: the clip's difficulty and the seed's luck, the same for every run, and noise."""
-    level = factor * np.exp(0.2 * _draw(clip).normal() + 0.01 * _draw(seed).normal())
+    level = factor * np.exp(0.2 * _luck(clip) + 0.01 * _luck(seed))
     noise = _draw(name, clip)
     row: dict[str, Any] = {"name": clip, "frames": 600}
     for mode, jumps in (("window", 1.3), ("stream", 1.0)):

@@ -7,6 +7,7 @@ import functools
 import hashlib
 import pickle
 import sys
+import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,14 @@ def _remember_signatures(module: Any) -> None:
         return known[key]
 
     module.OpSignature.from_op_schema = classmethod(from_op_schema)
+
+
+def _forget_who_seeds(module: Any) -> None:
+    """Of torch: who seeded an absent accelerator, said only if it were there and failed.
+
+    Each `torch.manual_seed` writes the whole stack down three times, milliseconds below pytest.
+    """
+    module.traceback = types.SimpleNamespace(format_stack=list)
 
 
 def _remember_interpolations(module: Any) -> None:
@@ -178,6 +187,7 @@ def _stamp(file: Path) -> tuple[int, int, int]:
 
 
 PATCHES = {
+    **dict.fromkeys(("torch.cuda", "torch.mtia", "torch.xpu"), _forget_who_seeds),
     "torch.onnx._internal.exporter._registration": _remember_exporter,
     "onnx_ir.schemas": _remember_signatures,
     "omegaconf.base": _remember_interpolations,

@@ -165,7 +165,8 @@ class Kept:
     @property
     def sources(self) -> tuple[str, ...]:
         """The names of the sources of the test clips; empty if there is only one source."""
-        return tuple(sorted({source for run in self.every for source in run.sources.values()}))
+        every = (run for runs in self.runs.values() for run in runs.values())
+        return tuple(sorted({source for run in every for source in run.sources.values()}))
 
     def of(self, sweep: Sweep) -> dict[str, RunsBySeed]:
         """Return the runs of the arms and seeds that the sweep has now.

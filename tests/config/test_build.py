@@ -26,7 +26,7 @@ from memmlp.pipeline.run_stages import upstream_run
 from memmlp.runs.run import Run
 
 TINY = [
-    "profile=tiny", "data.synth.minutes=0.2", "tracking=none", "threads=1", "optim.steps=2", "vqvae.steps=2",
+    "profile=tiny", "data.synth.minutes=0.1", "tracking=none", "threads=1", "optim.steps=2", "vqvae.steps=2",
     "optim.batch=4", "model.width=8", "memory.width=4", "vqvae.width=8", "evaluation.ik_iterations=2",
 ]  # fmt: skip
 SMALL = [

@@ -11,6 +11,7 @@ from fake_runs import fake_sweep, table_of
 from fake_table import SHIPPED, cell, printed
 
 from memmlp.sweep.parsing import load_sweep
+from memmlp.sweep.spec import Sweep
 from memmlp.tables.formats import FORMATS
 from memmlp.tables.table import Table
 
@@ -28,12 +29,18 @@ def test_long_labels_fold_so_that_four_metrics_fit(tmp_path: Path):
     assert printed(table_of(sweep, fake_sweep(tmp_path, sweep)), 100).count("Jitter ↓") == 2
 
 
+@pytest.fixture(scope="module", params=sorted(SHIPPED.glob("*.yaml")), ids=lambda path: path.stem)
+def shipped(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Sweep, Table]:
+    """A shipped sweep, and a table of runs of all its arms."""
+    sweep = load_sweep(request.param)
+    return sweep, table_of(sweep, fake_sweep(tmp_path_factory.mktemp("shipped"), sweep))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [80, 100])
-@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.yaml")), ids=lambda path: path.stem)
-def test_shipped_tables_fit_the_screen(tmp_path: Path, path: Path, width: int):
-    sweep = load_sweep(path)
-    text = printed(table_of(sweep, fake_sweep(tmp_path, sweep)), width)
+def test_shipped_tables_fit_the_screen(shipped: tuple[Sweep, Table], width: int):
+    sweep, table = shipped
+    text = printed(table, width)
     assert max(map(len, text.splitlines())) <= width
     for arm in sweep.arms:
         assert arm.label.split()[0] in text
