@@ -157,9 +157,13 @@ class Browser:
     def _pressed(self, selector: str) -> bool:
         """Whether a press of the mouse came to the element that it was meant for."""
         meant = f"event => {{ window.pressed = Boolean(event.target.closest({selector!r})); }}"
-        self.value(
-            f"window.pressed = null; addEventListener('click', {meant}, {{ once: true, capture: true }})"
-        )
+        # There is no click at all where the page replaced the element between press and release.
+        missed = "() => setTimeout(() => { window.pressed ??= false; })"
+        heard = {"click": meant, "mouseup": missed}
+        listen = [
+            f"addEventListener('{kind}', {do}, {{ once: true, capture: true }})" for kind, do in heard.items()
+        ]
+        self.value(f"window.pressed = null; {'; '.join(listen)}")
         box = f"document.querySelector({selector!r}).getBoundingClientRect()"
         x, y = self.value(f"(b => [b.x + b.width / 2, b.y + b.height / 2])({box})")
         for kind in ("mousePressed", "mouseReleased"):
