@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from memmlp.live.spaces import SpaceName
     from memmlp.live.stream import RotationFormat
     from memmlp.networks.motion_model import MotionModel
-    from memmlp.render.clip_piece import Take
+    from memmlp.render.clip_piece import ClipPiece
 
 StrPath = str | os.PathLike[str]
 Mode = Literal["stream", "window"]
@@ -347,14 +347,16 @@ class Prediction:
         write_motion(file, clip, self.rest, chosen)
         return file
 
-    def _take(self, branch: Branch, first: int = 0, last: int | None = None) -> Take:
+    def _take(self, branch: Branch, first: int = 0, last: int | None = None) -> ClipPiece:
         """Return the frames of a branch from one index up to another, for drawing."""
-        from memmlp.render.clip_piece import Take
+        from memmlp.render.clip_piece import ClipPiece
 
         _check("branch", branch, [name for name, joints in self._joints.items() if joints is not None])
         joints = self._joints[branch]
         assert joints is not None
-        return Take(self.clip, self.true_positions[first:last], {branch: joints[first:last]}, start=first)
+        return ClipPiece(
+            self.clip, self.true_positions[first:last], {branch: joints[first:last]}, start=first
+        )
 
     @property
     def _joints(self) -> dict[str, np.ndarray | None]:

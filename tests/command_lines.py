@@ -16,7 +16,7 @@ from memmlp.cli.workers import Workers, split_executor
 from memmlp.config.compose import VERSION_BASE, composed_plain, parse, preflight
 from memmlp.config.plan_sweep import find_sweep
 from memmlp.config.schema import register
-from memmlp.sweep.search.spec import parse_search
+from memmlp.sweep.search.search_file import parse_search
 
 ROOT = Path(__file__).parent.parent
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)

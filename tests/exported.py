@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import tiny
 
-from memmlp.motion.coordinates import Heading
+from memmlp.motion.network_coordinates import Heading
 from memmlp.networks.memory import CodeMemory, LSTMMemory, NoMemory
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.predictor import RotationOnly

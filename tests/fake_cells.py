@@ -9,8 +9,8 @@ from typing import Any
 
 from fake_runs import CLIPS, fake_sweep, runs_of
 
-from memmlp.sweep.parsing import parse_sweep
 from memmlp.sweep.spec import Sweep
+from memmlp.sweep.sweep_file import parse_sweep
 from memmlp.tables.effects import RunsBySeed
 
 STEPS = (500, 1000, 2000, 4000, 8000)

@@ -11,7 +11,7 @@ from memmlp.runs.identity import run_id
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan, RunTask
 from memmlp.sweep.search.director import Director
-from memmlp.sweep.search.spec import Search, Value, parse_search
+from memmlp.sweep.search.search_file import Search, Value, parse_search
 from memmlp.sweep.search.study import Study
 
 STEPS = 30

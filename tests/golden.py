@@ -24,9 +24,9 @@ from memmlp.evaluation import metrics
 from memmlp.evaluation import modes as evaluation
 from memmlp.evaluation.ik import IK, LBFGS, Arms
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.motion.coordinates import Heading, HeadRelative, World
 from memmlp.motion.dataset import WindowSampler
 from memmlp.motion.mirror import MirroredDataset
+from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import (
     CodeMemory,

@@ -10,10 +10,10 @@ from torch import Tensor, nn
 
 from memmlp.evaluation import modes as evaluation
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.motion.coordinates import World
 from memmlp.motion.dataset import MotionDataset
+from memmlp.motion.network_coordinates import World
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.baselines.sage import LATENT, ProductQuantiser
+from memmlp.networks.baselines.sage_parts import LATENT, ProductQuantiser
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import Learned, MotionModel
 from memmlp.networks.refiner import SAGERefiner

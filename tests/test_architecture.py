@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import tomllib
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
@@ -13,6 +15,7 @@ from memmlp.runs.environment import PACKAGE, WIRING, sources
 ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "docs" / "architecture.md"
 AS_A_WHOLE = ("schema", "synthetic", "memory", "baselines", "streaming")
+SUFFIXES = ("json", "jsonl", "npy", "onnx", "patch", "py", "safetensors", "toml", "yaml")
 FENCE = re.compile(r"^```\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
@@ -32,6 +35,23 @@ def test_page_names_files_that_exist():
     real |= {path.name for path in ROOT.joinpath("tests").rglob("*.py")}
     named = set(re.findall(r"\b\w+\.py\b", PAGE.read_text(encoding="utf-8")))
     assert named - real == set()
+
+
+def test_page_names_parts_of_modules_that_exist():
+    """Such as `tracker_frames.GAP` and `tables.statistics`; keys of the config have the same form."""
+    parts: dict[str, set[str]] = defaultdict(set)
+    for path in [*PACKAGE.rglob("*.py"), *(path for path in PACKAGE.rglob("*") if path.is_dir())]:
+        parts[path.parent.name].add(path.stem)
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef | ast.FunctionDef):
+                parts[path.stem].add(node.name)
+            elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+                parts[path.stem].add(node.id)
+    groups = {path.stem for path in (ROOT / "conf").iterdir()}
+    named = set(re.findall(r"`([a-z_]+)\.([A-Za-z_]+)`", PAGE.read_text(encoding="utf-8")))
+    asked = [(owner, name) for owner, name in named if name not in SUFFIXES and owner not in groups]
+    assert [f"{owner}.{name}" for owner, name in asked if name not in parts[owner]] == []
 
 
 def test_layout_has_every_file_of_the_package():

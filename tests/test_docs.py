@@ -21,9 +21,9 @@ from memmlp.config.build import build_loss
 from memmlp.config.compose import composed
 from memmlp.config.plugins import activate
 from memmlp.evaluation.units import SMALLEST, UNITS
-from memmlp.motion.importing.skeleton import SkeletonMap
+from memmlp.motion.importing.skeleton_map import SkeletonMap
 from memmlp.runs.identity import flatten
-from memmlp.sweep.parsing import load_sweep
+from memmlp.sweep.sweep_file import load_sweep
 
 DOCS = ROOT / "docs"
 MADE = ("reference", "earlier", "templates")  # by the code, kept for the record, or not yet pages

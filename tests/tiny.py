@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from memmlp.motion.body import FRAME_DIM, builtin_rest_joints
-from memmlp.motion.coordinates import Heading, HeadRelative, World
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.features import motion_frames
+from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP
 from memmlp.networks.baselines.avatar_jlm import AvatarJLM

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from memmlp.networks import checkpoint
-from memmlp.networks.baselines.sage import LOWER, UPPER
+from memmlp.networks.baselines.sage_parts import LOWER, UPPER
 from memmlp.networks.memory import JointCodeMemory
 from memmlp.networks.vqvae import VQVAE
 from memmlp.runs.run import Run

@@ -110,7 +110,7 @@ def machine(overrides: Sequence[str]) -> list[str]:
 
 
 def unentered() -> Path | None:
-    """Return the folder of this Python's environment if the shell does not find its commands, else None."""
+    """Return the folder of this Python's virtual environment if that is not activated, else None."""
     here = Path(sys.prefix)
     found = shutil.which("memmlp")
     inside = found is not None and Path(found).parent == here / "bin"

@@ -25,7 +25,7 @@ from memmlp.cli.options import (
 if TYPE_CHECKING:
     from memmlp.live.calibration_file import Calibration
     from memmlp.live.outputs.output import Output, Outputs
-    from memmlp.live.session.server import File
+    from memmlp.live.session.page_server import File
     from memmlp.live.session.sources import ClipSource, TrackedClip, TrackerSource
     from memmlp.live.spaces import SpaceName
     from memmlp.live.stream import Stream
@@ -267,8 +267,8 @@ def serve(given: InputOptions, shown: ShowOptions) -> None:
     import webbrowser
 
     from memmlp.common.termination import closed_in_peace
-    from memmlp.live.session.play import greeting, play, with_avatar
-    from memmlp.live.session.server import Hub, LiveServer
+    from memmlp.live.session.loop import greeting, play, with_avatar
+    from memmlp.live.session.page_server import Hub, LiveServer
     from memmlp.live.session.wearer_fitting import Fitting
 
     with contextlib.closing(source_of(given)) as source:
@@ -349,7 +349,7 @@ def outputs_of(shown: ShowOptions, stream: Stream) -> Outputs:
 
 def page_files(avatar: str | None, stream: Stream) -> Mapping[str, File]:
     """Return the page's files, with those of an avatar if one is asked for."""
-    from memmlp.live.session.server import FILES
+    from memmlp.live.session.page_server import FILES
 
     if avatar is None:
         return FILES

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from memmlp.config.open_run import OpenedRun
-    from memmlp.render.clip_piece import Take
+    from memmlp.render.clip_piece import ClipPiece
 
 POSITIONS = {"rotation": "predicted_positions", "position": "predicted_positions_of_position_branch"}
 
@@ -105,7 +105,7 @@ def taken(
     times: tuple[float, float | None],
     branch: str,
     mode: str,
-) -> Take:
+) -> ClipPiece:
     """Return the piece of a clip between two times, with these runs' predictions.
 
     Args:
@@ -123,7 +123,7 @@ def taken(
 
     from memmlp.common.errors import InputError
     from memmlp.config.open_run import clip_of
-    from memmlp.render.clip_piece import Take, span
+    from memmlp.render.clip_piece import ClipPiece, span
 
     names = labels or tuple(run.run.id[:8] for run in runs)
     if len(set(names)) < len(names):
@@ -139,7 +139,7 @@ def taken(
             raise InputError(
                 f"run {run.run.id}: {title} is another motion or body there than in the first run"
             )
-    return Take(title, truths[0], predictions, start=first)
+    return ClipPiece(title, truths[0], predictions, start=first)
 
 
 def predicted(run: OpenedRun, clip: str, last: int, branch: str, mode: str) -> tuple[np.ndarray, np.ndarray]:

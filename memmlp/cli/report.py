@@ -45,7 +45,7 @@ def report(
     from memmlp.config.package_data import packaged
     from memmlp.report.html import fragment, page, published
     from memmlp.runs.environment import environment
-    from memmlp.sweep.parsing import load_sweep
+    from memmlp.sweep.sweep_file import load_sweep
 
     chosen = [word for word in words if "=" not in word and not word.startswith("~")]
     chapters = chapters_of(chosen or EVERY, [word for word in words if word not in chosen], outputs)

@@ -15,7 +15,7 @@ from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
     from memmlp.report.kept_results import Kept
-    from memmlp.report.markdown import KeptTable
+    from memmlp.report.result_pages import KeptTable
     from memmlp.sweep.spec import Sweep
     from memmlp.tables.effects import RunsBySeed
     from memmlp.tables.effects_along_axes import Trends
@@ -85,7 +85,7 @@ def save_command(
     files: tuple[str, ...] = ()
     its_own = 0
     if also_kept:
-        from memmlp.config.runs_kept_elsewhere import with_kept
+        from memmlp.config.runs_of_other_results import with_kept
 
         # What the file itself has stands before the same runs of other files, whose costs were measured then.
         before = _count(found)
@@ -96,7 +96,7 @@ def save_command(
         for line in skipped:
             click.echo(line, err=True)
     if untrained:
-        from memmlp.config.network_costs import with_costs
+        from memmlp.config.untrained_costs import with_costs
 
         found, measured = with_costs(known.sweep, found)
         known = known._replace(flags=(*known.flags, *measured))
@@ -107,7 +107,7 @@ def save_command(
     if not kept.every:
         raise InputError(f"sweep {name}: no finished run to keep; make them with: {kept.command}")
     if sweep.scale:
-        from memmlp.config.flops_of_training import predicted_flops, with_flops
+        from memmlp.config.flops_of_configs import predicted_flops, with_flops
 
         kept = replace(kept, runs=with_flops(found), predicted=predicted_flops(sweep))
     ids = {(entry.label, entry.seed): entry.id for entry in known.plan.entries}
@@ -133,7 +133,7 @@ def docs(folder: Path, check: bool) -> None:
     take their numbers and verdicts from the tables. Prose that claims an effect by hand is refused, there and
     in README.md.
     """
-    from memmlp.report.markdown import check_claims, pages
+    from memmlp.report.result_pages import check_claims, pages
 
     found = sources(folder)
     made = pages(found, _templates(folder))
@@ -159,7 +159,7 @@ def docs(folder: Path, check: bool) -> None:
 def sources(folder: Path) -> dict[str, KeptTable]:
     """Return the tables of all results kept below a folder, by the stems of their files."""
     from memmlp.report.kept_results import load_kept
-    from memmlp.report.markdown import KeptTable
+    from memmlp.report.result_pages import KeptTable
     from memmlp.tables.build_table import titled
 
     if not (folder / "data").is_dir():
@@ -264,7 +264,7 @@ def _text(path: Path) -> str | None:
 
 def _stale(folder: Path, made: Mapping[str, str]) -> list[str]:
     """Return the generated pages whose data or template no longer exists."""
-    from memmlp.report.markdown import MARK
+    from memmlp.report.result_pages import MARK
 
     every = {path.name for path in folder.glob("*.md") if (_text(path) or "").startswith(MARK)}
     return sorted(every - made.keys())

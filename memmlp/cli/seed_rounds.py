@@ -1,4 +1,4 @@
-"""`memmlp sweep --until-decided`: seeds are added in rounds, for the arms whose verdicts are open."""
+"""The plan with which a sweep is run or shown: with seeds in rounds (`--until-decided`), or its own."""
 
 from __future__ import annotations
 

@@ -174,7 +174,7 @@ def gathered(
     for sweep, command in chosen(names, overrides):
         sweep = sweep.with_branch(branch) if branch else sweep
         if untrained:
-            from memmlp.config.network_costs import check_costs
+            from memmlp.config.untrained_costs import check_costs
 
             check_costs(sweep)
         try:
@@ -209,7 +209,7 @@ def table_of_plan(
         raise InputError(f"--source {source}: allowed for a fixed number of seeds, not for --until-decided")
     runs = finished_runs(sweep, finder(plan, read))
     if untrained:
-        from memmlp.config.network_costs import with_costs
+        from memmlp.config.untrained_costs import with_costs
 
         runs, measured = with_costs(sweep, runs)
         flags = (*flags, *measured)

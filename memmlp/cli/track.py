@@ -88,7 +88,7 @@ def show_in_trackers(plan: Plan, folder: Path, table: Table) -> None:
     from omegaconf import OmegaConf
 
     from memmlp.config.build import build_tracking
-    from memmlp.tables.sweep_folder_files import write_summary
+    from memmlp.tables.sweep_summary import write_summary
 
     write_summary(plan, table, folder)
     if plan.tasks:

@@ -18,7 +18,7 @@ from memmlp.common.lease import Lock
 if TYPE_CHECKING:
     from memmlp.pipeline.experiment import Experiment
     from memmlp.sweep.plan import RunTask
-    from memmlp.sweep.search.spec import Search, Value
+    from memmlp.sweep.search.search_file import Search, Value
     from memmlp.sweep.search.study import Study
 
 
@@ -97,7 +97,7 @@ def prepare_search(words: Sequence[str], config_dir: Path | None, outputs: Path)
     """
     from memmlp.common.files import digest
     from memmlp.config.plugins import activate, named
-    from memmlp.sweep.search.spec import parse_search
+    from memmlp.sweep.search.search_file import parse_search
 
     activate(named(words))
     own = [word for word in words if word.lstrip("+~").partition("=")[0].split(".")[0] == "search"]

@@ -91,7 +91,7 @@ def sharing() -> Iterator[None]:
 
 
 def shared() -> bool:
-    """Return whether this process is working on its share of a batch."""
+    """Return whether this process is working on its share of a batch, inside `sharing()`."""
     return _Step.shared
 
 

@@ -29,7 +29,7 @@ from memmlp.evaluation.ik import IK, LBFGS, Arms, NoIK
 from memmlp.evaluation.metrics import UserMetric
 from memmlp.experiment_tracking.feed import Tracking
 from memmlp.motion.body import builtin_rest_joints
-from memmlp.motion.coordinates import Coordinates, Heading, HeadRelative, World
+from memmlp.motion.network_coordinates import Coordinates, Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.architecture import (
     VQVAE_SETTINGS,

@@ -98,7 +98,10 @@ def _word(value: Any) -> str:
 
 @functools.lru_cache(maxsize=64)
 def _default(overrides: tuple[str, ...]) -> dict[str, Any]:
-    """Return the config of `memmlp train` with these overrides, without disturbing Hydra's present work."""
+    """Return the config of `memmlp train` with these overrides, less the keys that no name tells.
+
+    Hydra's present work is not disturbed.
+    """
     register()
     hydra = GlobalHydra.instance()
     before, hydra.hydra = hydra.hydra, None  # that of `memmlp train`, which has but one at a time

@@ -224,7 +224,7 @@ def local_rotations(motion: Tensor) -> Tensor:
 
 
 def joint_positions(motion: Tensor) -> Tensor:
-    """Return the joint positions (N, 22, 3) of motion (N, 198), metres, world."""
+    """Return the position branch's joints (N, 22, 3) in motion (N, 198), metres, world."""
     return motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
 
 

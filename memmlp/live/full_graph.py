@@ -1,4 +1,5 @@
-"""The whole way from trackers to a body as one ONNX file, for programs without Python (`--scope full`).
+"""The whole way from trackers to a body as one ONNX file, for programs without Python (`--scope full`);
+`memmlp.live.stream` is that way in Python.
 
 Inputs are one frame at 60 Hz: `tracker_positions` (1, 3, 3), metres, and `tracker_rotations` (1, 3, 3, 3),
 matrices, of head, left and right wrist; and the states `state.*`, all zeros for a fresh start.

@@ -276,7 +276,7 @@ class Solver:
     def __init__(self, ik: LBFGS, rest: np.ndarray):
         import torch
 
-        from memmlp.motion.coordinates import World
+        from memmlp.motion.network_coordinates import World
         from memmlp.motion.normalizer import Normalizer
 
         self.ik, self.normalizer = ik, Normalizer.raw(World(), torch.tensor(rest))

@@ -19,8 +19,8 @@ from memmlp.motion.body import (
     SPARSE_DIM,
     SPARSE_POSITION,
 )
-from memmlp.motion.coordinates import Coordinates
 from memmlp.motion.geometry import bone_chains, forward_kinematics, matrix_to_sixd, sixd_to_matrix
+from memmlp.motion.network_coordinates import Coordinates
 
 Change = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 """Maps a pose in the world, global rotations (..., 22, 3, 3) and joints (..., 22, 3), to another one. It is

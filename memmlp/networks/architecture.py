@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from memmlp.motion.coordinates import Coordinates
+from memmlp.motion.network_coordinates import Coordinates
 from memmlp.motion.normalizer import Normalizer
 from memmlp.motion.preparing.manifest import Manifest
 from memmlp.networks import checkpoint

@@ -76,12 +76,12 @@ class GRUCell(RecurrentCell):
         self.layer = nn.GRU(width, width, batch_first=True)
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Run over inputs (B, n, d) from a state (B, d); see Cell."""
+        """Run over inputs (B, n, d) from a state (B, d); see RecurrentCell."""
         made, after = self.layer(x, state[None].contiguous())
         return made, after[0]
 
     def step(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Take in one input (B, d) at a state (B, d); see Cell."""
+        """Take in one input (B, d) at a state (B, d); see RecurrentCell."""
         state = gru_step(self.layer.all_weights[0], x, state)
         return state, state
 
@@ -96,13 +96,13 @@ class LSTMCell(RecurrentCell):
         self.layer = nn.LSTM(width, width, batch_first=True)
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Run over inputs (B, n, d) from a state (B, 2 d); see Cell."""
+        """Run over inputs (B, n, d) from a state (B, 2 d); see RecurrentCell."""
         hidden, cell = (part[None].contiguous() for part in state.chunk(2, -1))
         made, after = self.layer(x, (hidden, cell))
         return made, torch.cat(after, -1)[0]
 
     def step(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Take in one input (B, d) at a state (B, 2 d); see Cell."""
+        """Take in one input (B, d) at a state (B, 2 d); see RecurrentCell."""
         hidden, cell = state.chunk(2, -1)
         entering, again = products(self.layer.all_weights[0], x, hidden)
         enter, keep, new, show = (entering + again).chunk(4, -1)
@@ -141,12 +141,12 @@ class LinearCell(RecurrentCell):
         raise NotImplementedError
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Run over inputs (B, n, d) from a state (B, d); see Cell."""
+        """Run over inputs (B, n, d) from a state (B, d); see RecurrentCell."""
         h = scan(*self.gates(x), state)
         return h, h[:, -1]
 
     def step(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Take in one input (B, d) at a state (B, d); see Cell."""
+        """Take in one input (B, d) at a state (B, d); see RecurrentCell."""
         keep, new = self.gates(x)
         state = keep * state + new
         return state, state

@@ -101,7 +101,7 @@ class Experiment:
 
     @property
     def stages(self) -> tuple[str, ...]:
-        """The identities of the evaluations and the deployment."""
+        """The identities of the stages after training: the evaluations and the deployment."""
         return (*self.evaluations.values(), *self.deployments)
 
     def upstream_identities(self, data: str) -> list[Identity]:

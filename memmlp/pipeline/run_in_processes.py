@@ -1,4 +1,4 @@
-"""One run, trained by several processes that torchrun started: the first leads, the others train along."""
+"""A run brought to its end in this process alone, or in those of torchrun, of which the first leads."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from memmlp.common.progress import tell
 from memmlp.evaluation.evaluation import picture
 from memmlp.evaluation.predictions import save_predictions
 from memmlp.experiment_tracking.feed import Tracking
-from memmlp.live.latency import measure_pose
+from memmlp.live.pose_time import measure_pose
 from memmlp.motion.motion_source import Prepared
 from memmlp.motion.preparing.amass import divided_subjects
 from memmlp.motion.preparing.groups import unfitting

@@ -10,7 +10,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import FPS, ROOT
-from memmlp.motion.limb_shapes import RADII
+from memmlp.motion.drawn_limbs import RADII
 from memmlp.render.error_colours import scale
 from memmlp.render.raster import Camera
 
@@ -42,7 +42,7 @@ def span(
 
 
 @dataclass(frozen=True)
-class Take:
+class ClipPiece:
     """A piece of a clip: the truth, and predictions by their labels.
 
     Attributes:

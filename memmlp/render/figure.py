@@ -9,7 +9,7 @@ import numpy as np
 from memmlp.common.files import atomic_write
 from memmlp.common.progress import progress_bar
 from memmlp.render.canvas import FAINT, Sheet, png
-from memmlp.render.clip_piece import Take
+from memmlp.render.clip_piece import ClipPiece
 from memmlp.render.raster import draw
 
 POSES = 6
@@ -17,7 +17,7 @@ WIDTH, HEIGHT = 230, 330  # size of a panel, pixels
 TOP, LEFT, RIGHT, CAPTION = 84, 40, 110, 26
 
 
-def heatmap_png(path: Path, take: Take, poses: int = POSES) -> None:
+def heatmap_png(path: Path, take: ClipPiece, poses: int = POSES) -> None:
     """Write a PNG: the truth's poses in a row, and below it a row for each prediction, coloured by error.
 
     Each pose is seen from the person's front, by the same camera in all rows. The mean error of its 22 joints
@@ -43,7 +43,7 @@ def heatmap_png(path: Path, take: Take, poses: int = POSES) -> None:
     atomic_write(path, png(sheet.pixels()))
 
 
-def views(take: Take, frame: int) -> list[np.ndarray]:
+def views(take: ClipPiece, frame: int) -> list[np.ndarray]:
     """Return the pictures of one column, the truth's first."""
     centre = take.truth[frame, 0, :2]
     camera = take.camera(take.azimuth(frame), centre, WIDTH, HEIGHT)
@@ -52,4 +52,4 @@ def views(take: Take, frame: int) -> list[np.ndarray]:
 
 def poses_png(path: Path, truth: np.ndarray, predicted: np.ndarray, title: str) -> None:
     """Write a PNG of truth and prediction: joint positions (N, 22, 3), metres, world (Z up)."""
-    heatmap_png(path, Take(title, truth, {"prediction": predicted}))
+    heatmap_png(path, ClipPiece(title, truth, {"prediction": predicted}))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from memmlp.common.errors import InputError
-from memmlp.render.clip_piece import Take
+from memmlp.render.clip_piece import ClipPiece
 from memmlp.render.figure import POSES, heatmap_png
 from memmlp.render.film import film, pyav
 
@@ -28,7 +28,7 @@ def check_picture(path: Path, key: str = "path", suffixes: tuple[str, ...] = SUF
         pyav()
 
 
-def write_picture(path: Path, take: Take, poses: int = POSES, key: str = "path") -> None:
+def write_picture(path: Path, take: ClipPiece, poses: int = POSES, key: str = "path") -> None:
     """Write a PNG of `poses` poses in a row, or a GIF or MP4 of all frames, completely or not at all.
 
     Raises InputError if the file can't be written.

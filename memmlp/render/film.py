@@ -15,7 +15,7 @@ from memmlp.common.files import atomic_write
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS
 from memmlp.render.canvas import FAINT, Sheet, indexed
-from memmlp.render.clip_piece import Take
+from memmlp.render.clip_piece import ClipPiece
 from memmlp.render.raster import draw
 
 RATE = 30  # pictures a second
@@ -25,7 +25,7 @@ TOP, RIGHT, BOTTOM = 88, 112, 44
 TICKS = (30, 30, 40)  # milliseconds of a GIF's pictures in turn, multiples of 10: 30 a second on average
 
 
-def film(path: Path, take: Take) -> None:
+def film(path: Path, take: ClipPiece) -> None:
     """Write a film at 30 pictures per second, completely or not at all: MP4 or GIF, by the path's suffix.
 
     Raises:
@@ -37,7 +37,7 @@ def film(path: Path, take: Take) -> None:
     atomic_write(path, encode(pictures(take)))
 
 
-def pictures(take: Take) -> Iterator[np.ndarray]:
+def pictures(take: ClipPiece) -> Iterator[np.ndarray]:
     """Yield the film's pictures (H, W, 3), uint8, with a progress bar."""
     labels = ["truth", *take.predictions]
     width = len(labels) * WIDTH + RIGHT

@@ -10,10 +10,10 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 from memmlp.common.files import atomic_write
+from memmlp.motion.drawn_limbs import RADII
 from memmlp.motion.importing.file_stance import FileStance
 from memmlp.motion.importing.names import without_namespace
-from memmlp.motion.importing.skeleton import Z_UP
-from memmlp.motion.limb_shapes import RADII
+from memmlp.motion.importing.skeleton_map import Z_UP
 from memmlp.render.canvas import DPI, FAINT, INK, Sheet, png
 from memmlp.render.raster import Camera, draw
 

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullFormatter, ScalarFormatter
 
 from memmlp.sweep.spec import COSTS
-from memmlp.tables.distributions import Distribution
+from memmlp.tables.error_distributions import Distribution
 from memmlp.tables.statistics import performance_profile
 from memmlp.tables.table import Cell, Table
 from memmlp.tables.table_text import heading

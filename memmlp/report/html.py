@@ -15,8 +15,8 @@ from memmlp.report.figures import Curve, SpeedAndError
 from memmlp.runs.identity import trained_by
 from memmlp.runs.metrics_log import Metrics
 from memmlp.sweep.spec import COSTS, Sweep
-from memmlp.tables.distributions import Distribution, distributions
 from memmlp.tables.effects import RunsBySeed
+from memmlp.tables.error_distributions import Distribution, distributions
 from memmlp.tables.formats import as_html
 from memmlp.tables.measured_run import Measured, as_deployed
 from memmlp.tables.table import Table

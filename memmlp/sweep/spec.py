@@ -1,4 +1,4 @@
-"""Sweeps: arms, seeds, and the overrides that train each arm (memmlp.sweep.parsing reads the files)."""
+"""Sweeps: arms, seeds, and the overrides that train each arm (memmlp.sweep.sweep_file reads the files)."""
 
 from __future__ import annotations
 

@@ -23,7 +23,9 @@ MODE = "stream"
 class TrendVerdict(StrEnum):
     """What may be claimed about how an effect changes along the axes.
 
-    RISES and FALLS are changes with a certain sign, while the sign of the effect is uncertain at both ends.
+    All but NONE have a slope that differs significantly from 0. An effect TURNS if its signs at the two ends
+    are certain and opposite, RISES or FALLS if its sign is certain at neither end, and otherwise GROWS or
+    FADES, by its size at the ends.
     """
 
     GROWS = "grows"

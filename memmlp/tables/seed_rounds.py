@@ -64,7 +64,10 @@ class Finding:
 
     @property
     def open(self) -> bool:
-        """Whether more seeds may decide the comparison."""
+        """Whether more seeds can decide the comparison: it is open, and was tested.
+
+        A comparison without a p-value, such as that of an arm with too few runs, waits for other reasons.
+        """
         return self.verdict is Verdict.OPEN and self.p is not None
 
 

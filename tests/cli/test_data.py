@@ -10,7 +10,7 @@ import pytest
 from bvh_samples import performed, person, tree, write
 from command_line import run
 
-from memmlp.motion.importing.skeleton import SKELETONS, load_skeleton
+from memmlp.motion.importing.skeleton_map import SKELETONS, load_skeleton
 from memmlp.motion.synthetic import synthesize_clip
 
 UNIT = "the legs are 0.32 m long, so the unit may be wrong"

@@ -11,9 +11,9 @@ from conftest import Memmlp, one_line
 from fake_runs import fake_sweep
 
 from memmlp.config import plan_sweep
-from memmlp.sweep.parsing import parse_sweep
 from memmlp.sweep.plan import Entry, Plan
 from memmlp.sweep.spec import Sweep
+from memmlp.sweep.sweep_file import parse_sweep
 from memmlp.tables.build_table import finished_runs
 from memmlp.tables.effects import RunsBySeed
 
@@ -72,8 +72,8 @@ def test_what_a_file_has_stands_before_the_same_runs_of_other_files(
     memmlp: Memmlp, planned: None, monkeypatch: pytest.MonkeyPatch
 ):
     """Their costs were measured at another time."""
-    monkeypatch.setattr("memmlp.config.runs_kept_elsewhere.outdated", lambda recipes: [])
-    monkeypatch.setattr("memmlp.config.runs_kept_elsewhere.plan_anew", plan_sweep.make_plan)
+    monkeypatch.setattr("memmlp.config.runs_of_other_results.outdated", lambda recipes: [])
+    monkeypatch.setattr("memmlp.config.runs_of_other_results.plan_anew", plan_sweep.make_plan)
     memmlp("results", "save", "14")
     path = Path("docs/results/data/table14.json")
     own = path.read_text()
@@ -99,11 +99,11 @@ def test_a_sweep_with_a_scale_has_a_figure_beside_its_page(
     sweep = parse_sweep("cells", fake_cells.content())
     steps = {arm.label: fake_cells.steps_of(arm.cell) for arm in sweep.arms}
     monkeypatch.setattr(
-        "memmlp.config.flops_of_training.with_flops",
+        "memmlp.config.flops_of_configs.with_flops",
         lambda found: {label: fake_cells.trained(runs, steps[label]) for label, runs in found.items()},
     )
     monkeypatch.setattr(
-        "memmlp.config.flops_of_training.predicted_flops", lambda sweep: {"profile=paper": 1e15}
+        "memmlp.config.flops_of_configs.predicted_flops", lambda sweep: {"profile=paper": 1e15}
     )
     Path("cells.yaml").write_text(json.dumps(fake_cells.content()))
     memmlp("results", "save", "cells.yaml", "--name", "small")

@@ -16,7 +16,7 @@ from filelock import FileLock
 from memmlp.cli.bench.chaos import examine
 from memmlp.cli.tune import prepare_search
 from memmlp.runs.run import Run
-from memmlp.sweep.search.spec import Range
+from memmlp.sweep.search.search_file import Range
 
 TINY = [*BASE, "optim.validate_every=3"]
 

@@ -24,7 +24,7 @@ from memmlp.config.schema import restored
 from memmlp.runs.environment import code_digest
 from memmlp.runs.identity import evaluation_id, evaluation_settings
 from memmlp.runs.run import Run
-from memmlp.sweep.search.spec import parse_search
+from memmlp.sweep.search.search_file import parse_search
 from memmlp.tables.table_text import heading
 
 OWN = [f"plugins=[{PACKAGE}]", "experiment=feet", "profile=tiny"]
@@ -232,7 +232,9 @@ def test_a_folder_of_configs_is_searched_while_a_command_runs(folder: Path):
 
 
 def test_coordinates_of_ones_own(folder: Path):
-    write(folder, {"mine.py": "from memmlp.motion.coordinates import World\nclass Floor(World): pass\n"})
+    write(
+        folder, {"mine.py": "from memmlp.motion.network_coordinates import World\nclass Floor(World): pass\n"}
+    )
     experiment = build_experiment(composed(["frame.coordinates=mine.Floor"]))
     assert type(experiment.architecture.coordinates).__name__ == "Floor"
     assert experiment.config["plugins"] == ["mine"]

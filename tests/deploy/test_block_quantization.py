@@ -17,7 +17,7 @@ from memmlp.deploy.deployment import lower
 from memmlp.deploy.export import export
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import streamed
-from memmlp.motion.coordinates import Heading
+from memmlp.motion.network_coordinates import Heading
 from memmlp.networks.streaming import streaming
 
 CLIP = tiny.clip(40)

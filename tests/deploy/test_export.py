@@ -14,7 +14,7 @@ from memmlp.deploy.export import export, save
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import TOLERANCE, parity
 from memmlp.motion.body import JOINTS, SPARSE_DIM
-from memmlp.motion.coordinates import Heading
+from memmlp.motion.network_coordinates import Heading
 from memmlp.networks.memory import NoMemory
 
 pytestmark = pytest.mark.slow

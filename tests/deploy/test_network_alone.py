@@ -7,7 +7,7 @@ import torch
 from memmlp.deploy.latency import macs
 from memmlp.deploy.network_alone import NoConversion, network_alone
 from memmlp.motion.body import POSITION, ROTATION, SPARSE_DIM
-from memmlp.motion.coordinates import Heading, World
+from memmlp.motion.network_coordinates import Heading, World
 from memmlp.motion.normalizer import Normalizer
 
 NETWORKS = {

@@ -12,7 +12,7 @@ from memmlp.common.errors import InputError
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import NoIK
 from memmlp.evaluation.modes import quick_stream
-from memmlp.motion.coordinates import Heading
+from memmlp.motion.network_coordinates import Heading
 from memmlp.networks.recurrent_poser import OUTPUTS
 
 STREAM = Evaluation(("stream",), batch=4, ik=NoIK(), seed=0)

@@ -11,8 +11,8 @@ from memmlp.evaluation.ik import LBFGS, Arms, JointDistance, NoIK, minimise
 from memmlp.evaluation.modes import clip_report, evaluate, local_rotations, stream
 from memmlp.evaluation.predictions import prediction_arrays
 from memmlp.motion.body import HEAD, N_JOINTS, POSITION, ROTATION, SPARSE_DIM
-from memmlp.motion.coordinates import Heading
 from memmlp.motion.geometry import axis_angle_to_matrix, matrix_to_sixd
+from memmlp.motion.network_coordinates import Heading
 
 NORMALIZER = tiny.normalizer()
 TRUTH = tiny.clip(40)

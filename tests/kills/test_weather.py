@@ -23,7 +23,7 @@ from memmlp.runs.evaluation_file import intact, write_report
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.search.director import objectives
-from memmlp.sweep.search.spec import Objective
+from memmlp.sweep.search.search_file import Objective
 from memmlp.sweep.worker import attempt
 from memmlp.tables.measured_run import load
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from memmlp.deploy.export import export
 from memmlp.live.stream import Pose, Stream
-from memmlp.motion.coordinates import Heading
+from memmlp.motion.network_coordinates import Heading
 from memmlp.motion.synthetic import synthesize_clip
 from memmlp.networks.memory import NoMemory
 from memmlp.networks.streaming import streaming

@@ -29,7 +29,7 @@ from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Offsets, Stream
 from memmlp.live.tracker_frames import t_pose
 from memmlp.motion.body import HEAD, N_JOINTS, SPARSE_DIM
-from memmlp.motion.coordinates import Heading
+from memmlp.motion.network_coordinates import Heading
 from memmlp.motion.synthetic import synthesize_clip
 from memmlp.networks.memory import NoMemory
 from memmlp.networks.predictor import RotationOnly

@@ -17,7 +17,7 @@ from memmlp.common.errors import InputError
 from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.bvh import END, Bvh, EndSite, read_bvh
-from memmlp.motion.importing.skeleton import Z_UP, SkeletonMap
+from memmlp.motion.importing.skeleton_map import Z_UP, SkeletonMap
 
 REST = builtin_rest_joints()
 # Joint, parent, offset; a * before an end site's joint, which comes with the offset only.

@@ -8,7 +8,7 @@ from dataclasses import replace
 from bvh_samples import TREES, ZXY, Sample, own_tree, performed, random_turns, tree
 
 from memmlp.motion.formats.bvh import Bvh
-from memmlp.motion.importing.skeleton import load_skeleton
+from memmlp.motion.importing.skeleton_map import load_skeleton
 from memmlp.motion.synthetic import synthesize_clip
 
 FINGERS = "{S}HandIndex1 {S}Hand {x}9 0 1; {S}HandIndex2 {S}HandIndex1 {x}4 0 0"

@@ -7,8 +7,8 @@ from torch import nn
 
 from memmlp.evaluation.modes import stream, window
 from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM, builtin_rest_joints
-from memmlp.motion.coordinates import Heading, HeadRelative, World
 from memmlp.motion.dataset import WindowSampler
+from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import CodeMemory, GRUMemory, JointCodeMemory, LSTMMemory, NoCodesMemory, NoMemory

@@ -13,7 +13,7 @@ from memmlp.deploy.parity import TOLERANCE, parity
 from memmlp.deploy.quantization import quantise
 from memmlp.evaluation import modes as evaluation
 from memmlp.motion.body import HANDS, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSITION
-from memmlp.motion.coordinates import Heading
+from memmlp.motion.network_coordinates import Heading
 from memmlp.networks import checkpoint
 from memmlp.networks.recurrent_cells import CELLS
 from memmlp.networks.recurrent_poser import OUTPUTS

@@ -15,9 +15,9 @@ from PIL import Image
 from memmlp.common.errors import InputError
 from memmlp.evaluation.modes import joint_positions
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.motion.limb_shapes import LIMBS, ends
+from memmlp.motion.drawn_limbs import LIMBS, ends
 from memmlp.render import figure, film
-from memmlp.render.clip_piece import Take
+from memmlp.render.clip_piece import ClipPiece
 from memmlp.render.error_colours import HEAT, heat, scale
 from memmlp.render.raster import Camera, draw
 
@@ -26,19 +26,21 @@ OFF = np.array([0.0, 0.0, 0.08])
 
 
 @pytest.fixture
-def take() -> Take:
+def take() -> ClipPiece:
     """Make a take of half a second, with a good and a bad prediction."""
-    return Take("clips/one", TRUTH, {"good": TRUTH + OFF / 8, "bad": TRUTH + OFF}, start=60)
+    return ClipPiece("clips/one", TRUTH, {"good": TRUTH + OFF / 8, "bad": TRUTH + OFF}, start=60)
 
 
 @pytest.fixture
-def short() -> Take:
+def short() -> ClipPiece:
     """Make a take of a sixth of a second, for films."""
-    return Take("clips/one", TRUTH[:11], {"good": TRUTH[:11] + OFF / 8, "bad": TRUTH[:11] + OFF}, start=60)
+    return ClipPiece(
+        "clips/one", TRUTH[:11], {"good": TRUTH[:11] + OFF / 8, "bad": TRUTH[:11] + OFF}, start=60
+    )
 
 
 @pytest.fixture
-def camera(take: Take) -> Camera:
+def camera(take: ClipPiece) -> Camera:
     return take.camera(take.azimuth(0), TRUTH[0, 0, :2], 120, 180)
 
 
@@ -113,14 +115,14 @@ def test_tips_go_on_from_their_joint():
         assert np.linalg.norm(end - start) == pytest.approx(limb.tip)
 
 
-def test_the_camera_goes_along(take: Take):
-    moving = Take("walk", TRUTH + np.linspace(0, 4, 31)[:, None, None] * [1, 0, 0], {"a": TRUTH})
+def test_the_camera_goes_along(take: ClipPiece):
+    moving = ClipPiece("walk", TRUTH + np.linspace(0, 4, 31)[:, None, None] * [1, 0, 0], {"a": TRUTH})
     apart = moving.path() - moving.truth[:, 0, :2]
     assert np.abs(apart[10:21]).max() < 0.8
     assert np.ptp(moving.path()[:, 0]) > 1.5
 
 
-def test_png(tmp_path: Path, take: Take):
+def test_png(tmp_path: Path, take: ClipPiece):
     figure.heatmap_png(tmp_path / "a.png", take, poses=2)
     with Image.open(tmp_path / "a.png") as image:
         assert image.size == (
@@ -139,7 +141,7 @@ def test_png(tmp_path: Path, take: Take):
 
 
 @pytest.mark.slow
-def test_gif(tmp_path: Path, short: Take):
+def test_gif(tmp_path: Path, short: ClipPiece):
     film.film(tmp_path / "a.gif", short)
     with Image.open(tmp_path / "a.gif") as image:
         assert image.n_frames == 6
@@ -153,7 +155,7 @@ def test_gif(tmp_path: Path, short: Take):
 
 
 @pytest.mark.slow
-def test_mp4(tmp_path: Path, short: Take):
+def test_mp4(tmp_path: Path, short: ClipPiece):
     av = pytest.importorskip("av")
     film.film(tmp_path / "a.mp4", short)
     with av.open(str(tmp_path / "a.mp4")) as container:
@@ -173,7 +175,7 @@ def test_nothing_is_left_of_a_film_that_was_broken_off(tmp_path, take, monkeypat
     if name.endswith("mp4"):
         pytest.importorskip("av")
 
-    def interrupted(take: Take):
+    def interrupted(take: ClipPiece):
         yield from itertools.islice(whole(take), 2)
         raise KeyboardInterrupt
 

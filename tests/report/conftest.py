@@ -8,8 +8,8 @@ import pytest
 from fake_runs import CLIPS, fake_sweep, runs_of
 
 from memmlp.report.kept_results import Kept, overrides_of
-from memmlp.sweep.parsing import load_sweep
 from memmlp.sweep.spec import Sweep
+from memmlp.sweep.sweep_file import load_sweep
 
 ROOT = Path(__file__).parent.parent.parent
 GROUPS = {clip: f"take {number // 2}" for number, clip in enumerate(CLIPS)}

@@ -18,11 +18,11 @@ from processes import finished
 from memmlp.common.errors import InputError
 from memmlp.report import figures
 from memmlp.report.html import Chapter, page, published
-from memmlp.sweep.parsing import load_sweep
 from memmlp.sweep.plan import Entry, Plan
 from memmlp.sweep.spec import Sweep
+from memmlp.sweep.sweep_file import load_sweep
 from memmlp.tables.build_table import make_table, without_runs
-from memmlp.tables.distributions import distributions
+from memmlp.tables.error_distributions import distributions
 from memmlp.tables.table_text import caption
 
 SHIPPED = Path(__file__).parent.parent.parent / "sweeps"
@@ -223,7 +223,7 @@ def test_latencies_are_those_of_the_file_that_was_asked_for(tmp_path: Path):
 def test_more_may_be_better(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Of a metric of one's own that counts what is right."""
     monkeypatch.setattr("memmlp.tables.table_text.HIGHER", {"MPJPE"})
-    monkeypatch.setattr("memmlp.tables.distributions.HIGHER", {"MPJPE"})
+    monkeypatch.setattr("memmlp.tables.error_distributions.HIGHER", {"MPJPE"})
     sweep = load_sweep(SHIPPED / "table14.yaml")
     find = fake_sweep(tmp_path, sweep, {"2": 2.0})
     runs = runs_of(sweep, find)

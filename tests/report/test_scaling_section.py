@@ -12,7 +12,7 @@ from fake_cells import STEP, cells
 from PIL import Image
 
 from memmlp.report.kept_results import Kept, dumps, load_kept, overrides_of, save
-from memmlp.report.markdown import KeptTable, Placeholders, pages
+from memmlp.report.result_pages import KeptTable, Placeholders, pages
 from memmlp.report.scaling_figure import figure_is_of, scaling_figure
 from memmlp.report.scaling_section import bounds_words, power, scaling_section
 from memmlp.tables.build_table import make_table

@@ -13,7 +13,7 @@ from fake_runs import CLIPS, ORIGIN, fake_run, fake_sweep, nothing, runs_of, tab
 from fake_table import cell, printed
 
 from memmlp.report.kept_results import Kept, dumps, load_kept
-from memmlp.report.markdown import origin_words
+from memmlp.report.result_pages import origin_words
 from memmlp.runs.evaluation_file import write_report
 from memmlp.sweep.spec import Sweep
 from memmlp.tables.build_table import make_table

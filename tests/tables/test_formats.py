@@ -10,8 +10,8 @@ import pytest
 from fake_runs import fake_sweep, table_of
 from fake_table import SHIPPED, cell, printed
 
-from memmlp.sweep.parsing import load_sweep
 from memmlp.sweep.spec import Sweep
+from memmlp.sweep.sweep_file import load_sweep
 from memmlp.tables.formats import FORMATS
 from memmlp.tables.table import Table
 

@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from memmlp.sweep.parsing import parse_sweep
 from memmlp.sweep.spec import Sweep
+from memmlp.sweep.sweep_file import parse_sweep
 from memmlp.tables.build_table import make_table
 from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.formats import markdown

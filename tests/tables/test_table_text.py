@@ -8,8 +8,8 @@ import pytest
 from fake_runs import fake_sweep, table_of
 from fake_table import SHIPPED, printed
 
-from memmlp.sweep.parsing import load_sweep
 from memmlp.sweep.spec import Sweep
+from memmlp.sweep.sweep_file import load_sweep
 from memmlp.tables.table import Cell, Effect, Table
 from memmlp.tables.table_text import effect_words, heading, value_words
 

@@ -7,7 +7,7 @@ import torch
 from plain_body import posed
 
 from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM, SPARSE_POSITION
-from memmlp.motion.coordinates import World
+from memmlp.motion.network_coordinates import World
 from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss
 
 CLIP = tiny.clip(40)

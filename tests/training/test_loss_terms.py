@@ -8,8 +8,8 @@ from plain_body import posed
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import PARENTS, ROTATION, SPARSE_DIM, SPARSE_POSITION
-from memmlp.motion.coordinates import World
 from memmlp.motion.geometry import axis_angle_to_matrix, matrix_to_sixd
+from memmlp.motion.network_coordinates import World
 from memmlp.training.losses import TermsLoss
 from memmlp.training.losses.terms import ERRORS, TERMS
 

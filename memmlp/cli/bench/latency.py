@@ -143,7 +143,7 @@ def export_all(models: list[str], overrides: tuple[str, ...], folder: Path) -> I
 
 def export_independently(overrides: tuple[str, ...], path: Path) -> Path:
     """Export an AvatarPoser made of torch's own layers, in the config's sizes, and return the file."""
-    from memmlp.cli.bench.stock_avatar_poser import TorchAvatarPoser, export_plainly
+    from memmlp.cli.bench.latency_check_network import TorchAvatarPoser, export_plainly
     from memmlp.config.compose import composed
 
     sizes = composed(["profile=paper", *overrides, *MODELS[CHECK[0]]]).model
@@ -164,7 +164,7 @@ def calibration_clips() -> list[Any]:
 def timed(paths: dict[Timed, Path], rounds: int, steps: int) -> list[dict[str, Any]]:
     """Time all files in turn: their steps, then the whole poses of those that make any; see `summary`."""
     from memmlp.deploy.latency import time_in_turn
-    from memmlp.live.latency import time_poses_in_turn
+    from memmlp.live.pose_time import time_poses_in_turn
 
     seconds = time_in_turn(paths, rounds, steps)
     deployed = {key: path for key, path in paths.items() if key[1] in DEPLOYED}

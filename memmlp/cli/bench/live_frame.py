@@ -54,7 +54,7 @@ def live_frame(
     import numpy as np
 
     from memmlp.deploy.onnx_stream import OnnxStream
-    from memmlp.live.latency import alternate
+    from memmlp.live.pose_time import alternate
     from memmlp.live.stream import Stream
     from memmlp.runs.lookup import find_run
 

@@ -56,7 +56,7 @@ def show(file: Path, which: str | None, out: Path) -> None:
     from memmlp.motion.body import load_rest_joints
     from memmlp.motion.importing.file_stance import find_stance
     from memmlp.motion.importing.importable_files import read_recording
-    from memmlp.motion.importing.skeleton import find_skeleton, load_skeleton
+    from memmlp.motion.importing.skeleton_map import find_skeleton, load_skeleton
     from memmlp.render.figure_or_film import check_picture
     from memmlp.render.skeleton_map import skeleton_png
 

@@ -116,9 +116,9 @@ class Writer:
         path, key, whole = made / "less.onnx", f"{network.key}-{precision}", None
         if precision == "fp16":
             lower(precision, _whole(made, "streaming"), path, stream, self.calibration)
-            whole = self.skeleton(f"{key}-whole", onnx.load(path))
+            whole = self.weightless(f"{key}-whole", onnx.load(path))
         lower(precision, made / "streaming.onnx", path, stream, self.calibration)
-        step = self.skeleton(key, onnx.load(path))
+        step = self.weightless(key, onnx.load(path))
         return {"graph": "streaming", "precision": precision, "step": step, "whole": whole}
 
     def _pair(
@@ -129,16 +129,19 @@ class Writer:
         made: Path,
         played: Entry | None,
     ) -> Entry:
-        """Write a graph in float32: the network's step, and the full graph from trackers to joints."""
+        """Write two files in float32: the network's step, and the full graph from trackers to joints.
+
+        The full graph is not written if `played` is given, which then stands for it.
+        """
         step, whole = made / f"{name}.onnx", _whole(made, name)
         export(graph, step, network.run)
         if played is None:
             export_full(graph, whole, network.run, SPACE.name)
-            played = self.skeleton(f"{network.key}-{name}-whole", onnx.load(whole))
-        alone = self.skeleton(f"{network.key}-{name}", onnx.load(step))
+            played = self.weightless(f"{network.key}-{name}-whole", onnx.load(whole))
+        alone = self.weightless(f"{network.key}-{name}", onnx.load(step))
         return {"graph": name, "precision": "fp32", "step": alone, "whole": played}
 
-    def skeleton(self, name: str, model: onnx.ModelProto) -> Entry:
+    def weightless(self, name: str, model: onnx.ModelProto) -> Entry:
         """Write a graph without its weights; return its address and the weights that the page has to draw."""
         drawn = without_weights(model)
         file = self._kept(name, model.SerializeToString())

@@ -20,12 +20,12 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import file_digest, now, read_json
 from memmlp.common.lease_fences import publish, temporary
 from memmlp.deploy.latency import yardstick
-from memmlp.live.session.play import TOP
+from memmlp.live.session.loop import TOP
 from memmlp.live.web.clips import SiteClip, write_clips
 from memmlp.live.web.networks import SiteNetwork, Writer
 from memmlp.live.web.packages import write_packages
 from memmlp.motion.body import JOINTS
-from memmlp.motion.limb_shapes import LIMBS
+from memmlp.motion.drawn_limbs import LIMBS
 from memmlp.render.error_colours import HEAT
 
 SHARED = {
@@ -90,7 +90,10 @@ class Site:
             "top": TOP,
         }
         if self.base is not None:
-            about |= {"base": writer.write(self.base), "yardstick": writer.skeleton("yardstick", yardstick())}
+            about |= {
+                "base": writer.write(self.base),
+                "yardstick": writer.weightless("yardstick", yardstick()),
+            }
         (folder / ABOUT).write_text(json.dumps(about, separators=(",", ":")) + "\n", encoding="utf-8")
         _worker(folder)
 

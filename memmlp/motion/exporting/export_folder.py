@@ -204,6 +204,6 @@ def export(
 
 
 def _motion(target: Target, fps: float | None) -> Clip:
-    """Read a target's clip, at its own frame rate or another."""
+    """Read the clip that is to be written to a target, resampled to `fps` if that is given."""
     clip = read_motion(target)
     return clip if fps is None else resample(clip, fps)[0]

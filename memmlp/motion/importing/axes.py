@@ -15,7 +15,7 @@ from memmlp.common.errors import InputError
 from memmlp.motion.body import HEAD, JOINTS
 from memmlp.motion.importing.anatomy import LEGS, why_no_stance
 from memmlp.motion.importing.recording_protocol import Recording
-from memmlp.motion.importing.skeleton import REQUIRED, UPRIGHT, SkeletonMap
+from memmlp.motion.importing.skeleton_map import REQUIRED, UPRIGHT, SkeletonMap
 
 UNITS = (1.0, 0.1, 0.0254 / 0.45, 0.0254, 0.01, 0.001)  # metres; 0.0254 / 0.45 is CMU's inch
 LEG = (0.55, 1.15)  # metres from hip to ankle, by which a unit is found

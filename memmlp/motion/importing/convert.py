@@ -13,7 +13,7 @@ from memmlp.motion.importing.floor import find_floor
 from memmlp.motion.importing.mapped_motion import MappedMotion, pick_joints
 from memmlp.motion.importing.recording_protocol import Recording
 from memmlp.motion.importing.retarget import fit, to_body
-from memmlp.motion.importing.skeleton import SkeletonMap
+from memmlp.motion.importing.skeleton_map import SkeletonMap
 
 AUTO, NONE = "auto", "none"  # what a floor may be beside a height
 

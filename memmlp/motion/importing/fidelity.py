@@ -30,7 +30,7 @@ from memmlp.motion.importing.anatomy import (
 )
 from memmlp.motion.importing.axes import LEG
 from memmlp.motion.importing.mapped_motion import MappedMotion
-from memmlp.motion.importing.skeleton import Z_UP
+from memmlp.motion.importing.skeleton_map import Z_UP
 from memmlp.motion.plausibility import implausible
 
 MOST_MM, MOST_DEGREES = 1.0, 3.0  # the largest errors that an import may have

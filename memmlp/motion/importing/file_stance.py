@@ -13,7 +13,7 @@ from memmlp.motion.importing.mapped_motion import MappedMotion, pick_joints
 from memmlp.motion.importing.recording_protocol import Recording
 from memmlp.motion.importing.rest_pose import RestPose, find_rest_pose
 from memmlp.motion.importing.retarget import fit
-from memmlp.motion.importing.skeleton import SkeletonMap
+from memmlp.motion.importing.skeleton_map import SkeletonMap
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from memmlp.common.errors import InputError
 from memmlp.motion.importing import anatomy
 from memmlp.motion.importing.mapped_motion import MappedMotion
 from memmlp.motion.importing.recording_protocol import Recording
-from memmlp.motion.importing.skeleton import SkeletonMap
+from memmlp.motion.importing.skeleton_map import SkeletonMap
 
 STRAIGHTEST = "the straightest"  # how a frame was chosen, beside a given one
 TRIED = 500  # frames of a file, evenly spread, among which a stance is looked for

@@ -23,7 +23,7 @@ from memmlp.motion.importing.anatomy import HINGES, HIPS, LEGS, LIMBS, Segment, 
 from memmlp.motion.importing.mapped_motion import MappedMotion
 from memmlp.motion.importing.recording_protocol import Recording
 from memmlp.motion.importing.rest_pose import RestPose, find_rest_pose
-from memmlp.motion.importing.skeleton import Z_UP, SkeletonMap
+from memmlp.motion.importing.skeleton_map import Z_UP, SkeletonMap
 
 POSITION_LIMIT = 1e4  # metres, as `read_clip` has it
 HIP_LINE = Segment(HIPS[1], HIPS[0])

@@ -14,7 +14,7 @@ from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.importing.convert import AUTO, convert
 from memmlp.motion.importing.fidelity import Fidelity, compare
 from memmlp.motion.importing.importable_files import find_recordings, read_recording
-from memmlp.motion.importing.skeleton import find_skeleton, load_skeleton
+from memmlp.motion.importing.skeleton_map import find_skeleton, load_skeleton
 from memmlp.motion.torch_threads import one_thread
 
 

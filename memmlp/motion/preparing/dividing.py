@@ -100,7 +100,7 @@ def _counts(total: int, fractions: Mapping[str, float]) -> dict[str, int]:
         wanted = ", ".join(["train", *(part for part, count in counts.items() if count)])
         raise InputError(
             f"data.split: {wanted} need at least {needed} clips or groups, and there are {total}; "
-            "add clips, loosen data.groups or set a fraction to 0"
+            "add clips, loosen data.split.groups or set a fraction to 0"
         )
     while sum(counts.values()) >= total:
         counts[max(counts, key=lambda part: counts[part])] -= 1

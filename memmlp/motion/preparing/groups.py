@@ -85,7 +85,9 @@ class Grouping:
         try:
             compiled = [re.compile(pattern) for pattern in self.patterns]
         except re.error as error:
-            raise InputError(f"data.groups: {error.pattern!r} is no regular expression ({error})") from error
+            raise InputError(
+                f"data.split.groups: {error.pattern!r} is no regular expression ({error})"
+            ) from error
         order = sorted(seen, key=lambda name: seen[name])
         parent: dict[object, object] = {}
         for name in order:

@@ -142,9 +142,9 @@ class AvatarJLM(WholeWindow):
 
     @staticmethod
     def renewed(h: Tensor, first: Tensor) -> Tensor:
-        """Return tokens (..., 45, d) with the last one, that of the inputs, as it was at first (..., 1, d).
+        """Return tokens (..., 45, d) with `first` (..., 1, d) in place of the last, the token of the inputs.
 
-        The first value is detached: no gradient flows through it.
+        `first` is that token before any block. It is detached: no gradient flows through it.
         """
         return torch.cat([h[..., :-1, :], first.detach()], -2)
 

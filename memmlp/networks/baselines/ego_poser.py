@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from memmlp.motion.body import SPARSE_DIM, SPARSE_POSITION, TRACKED
-from memmlp.motion.coordinates import HeadRelative
+from memmlp.motion.network_coordinates import HeadRelative
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
 
 PLACES = 2 * len(TRACKED)  # components of the trackers' places on the floor

@@ -28,8 +28,8 @@ from memmlp.motion.body import (
     SPARSE_ROTATION,
     TRACKED,
 )
-from memmlp.motion.coordinates import Heading
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
+from memmlp.motion.network_coordinates import Heading
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.avatar_jlm import AvatarJLM
 from memmlp.networks.baselines.avatar_poser import AvatarPoser, head

@@ -11,7 +11,7 @@ from torch import Tensor
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.avatar_poser import OwnWindows
 from memmlp.networks.baselines.diffusion import Diffusion
-from memmlp.networks.baselines.sage import LATENT, Decoder, HalfVQVAE, LowerDenoiser, UpperDenoiser
+from memmlp.networks.baselines.sage_parts import LATENT, Decoder, HalfVQVAE, LowerDenoiser, UpperDenoiser
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import Learned
 

@@ -1,4 +1,4 @@
-"""Streaming graphs: a trained network's live stream with nothing computed twice; same numbers, less work.
+"""Streaming graphs, from which the live step is exported: a network that computes nothing twice.
 
 What depends on one frame alone is computed when the frame enters the window, and carried in the state. The
 last layers compute only what the newest frame needs.
@@ -38,7 +38,7 @@ from memmlp.networks.streaming.graph import StreamingGraph
 from memmlp.networks.streaming.mem_mlp import MemMLPStream
 from memmlp.networks.streaming.recurrent_poser import RecurrentPoserStream
 from memmlp.networks.streaming.refined import RefinedStream
-from memmlp.networks.streaming.sage import SAGENetStream
+from memmlp.networks.streaming.sage_net import SAGENetStream
 
 __all__ = ["StreamingGraph", "has_stream", "streaming"]
 

@@ -64,7 +64,7 @@ class StreamingGraph(nn.Module):
 
     @classmethod
     def fits(cls, model: MotionModel) -> bool:
-        """Return whether the graph's class knows all parts of a network, whose class it fits."""
+        """Return whether this class of graph can stream a network of its class with these parts."""
         return True
 
     def build(self, model: MotionModel) -> None:

@@ -11,10 +11,10 @@ from memmlp.report.ui import runs
 from memmlp.report.ui.curves import Curves
 from memmlp.report.ui.index import Index
 from memmlp.report.ui.replay import Predict, Replays, body
-from memmlp.report.ui.run_places import places
 from memmlp.report.ui.runs import Rows
 from memmlp.report.ui.searches import Searches
 from memmlp.report.ui.sweeps import Sweeps
+from memmlp.report.ui.users_of_run import places
 from memmlp.runs.identity import ID
 
 MOST_CURVES = 60  # runs whose curves are told at once

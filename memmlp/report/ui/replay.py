@@ -15,7 +15,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
 from memmlp.live.spaces import SPACES
 from memmlp.motion.body import FPS, JOINTS
-from memmlp.motion.limb_shapes import LIMBS
+from memmlp.motion.drawn_limbs import LIMBS
 from memmlp.render.error_colours import HEAT, scale
 from memmlp.runs.run import Run
 
@@ -46,7 +46,7 @@ class Replays:
     def now(
         self, run_id: str, clip: str, mode: str, begin: float | None = None, seconds: float = SECONDS
     ) -> dict[str, Any]:
-        """Compute a piece of `seconds` of a replay, and return it in the form of `get`."""
+        """Compute a piece of `seconds` of a replay and return it as `get` does, but only once it is there."""
         try:
             motion = self._motion(Run.of(self.outputs, run_id), clip, mode)
         except Exception as error:

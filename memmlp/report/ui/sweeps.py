@@ -20,10 +20,10 @@ from memmlp.runs.identity import NETWORK, training_settings
 from memmlp.runs.run import STAGE_WORDS
 from memmlp.sweep.kept_sweep import NAME as SWEEP_FILE
 from memmlp.sweep.kept_sweep import kept
-from memmlp.sweep.parsing import parse_sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.progress_table import name as task_name
 from memmlp.sweep.spec import Arm, Sweep
+from memmlp.sweep.sweep_file import parse_sweep
 from memmlp.tables.build_table import finished_runs, make_table
 from memmlp.tables.formats import as_json
 from memmlp.tables.measured_run import Measured, load

@@ -23,7 +23,7 @@ from memmlp.sweep.controller import LOOK, Fleet
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
 from memmlp.sweep.progress_table import total_steps
 from memmlp.sweep.search.progress_table import SearchBoard
-from memmlp.sweep.search.spec import Objective, Value
+from memmlp.sweep.search.search_file import Objective, Value
 from memmlp.sweep.search.study import Study, values
 
 HOPELESS = 5  # so many trials that all fail end the search

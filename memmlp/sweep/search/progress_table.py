@@ -14,7 +14,7 @@ from rich.text import Text
 
 from memmlp.runs.run import Run
 from memmlp.sweep.progress_table import Screen, device_name, devices, progress_text
-from memmlp.sweep.search.spec import Search
+from memmlp.sweep.search.search_file import Search
 from memmlp.sweep.search.study import Study, deviations
 
 SHOWN = 5  # how many of the best trials are shown

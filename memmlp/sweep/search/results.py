@@ -18,7 +18,7 @@ from optuna.exceptions import ExperimentalWarning
 from optuna.trial import FrozenTrial, TrialState
 
 from memmlp.common.files import atomic_write
-from memmlp.sweep.search.spec import Search
+from memmlp.sweep.search.search_file import Search
 from memmlp.sweep.search.study import Study, deviations, values
 
 TABLE = 5  # the paper's table of manual weights against learned ones

@@ -27,7 +27,7 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 from memmlp.common import lease_fences
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
-from memmlp.sweep.search.spec import Range, Search, Value
+from memmlp.sweep.search.search_file import Range, Search, Value
 
 BEGINNING = b'{"op_code":'  # how every line of a journal begins
 

@@ -1,4 +1,4 @@
-"""Simulated differences without a true effect, whose variance comes from known sources.
+"""Simulated differences of arms that do not truly differ; the variances of seeds and clips are given.
 
 The arrays' axes are: K comparisons, S seeds, C clips, G groups of clips.
 """

@@ -118,7 +118,7 @@ class Campaign(NamedTuple):
 
 
 def campaign(sample: Simulated, shares: Shares) -> Campaign:
-    """Simulate tables that spend seeds in looks, in which half of the arms differ by EFFECT.
+    """Simulate tables that are looked at with more and more seeds; half of the arms differ by EFFECT.
 
     An arm stops when all of its comparisons are decided.
     """

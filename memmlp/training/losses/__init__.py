@@ -1,6 +1,6 @@
 """The training losses: Mem-MLP's, the baselines', and a library of terms that any network's loss can take."""
 
-from memmlp.training.losses.baselines import AGRoLLoss, AvatarPoserLoss, OwnLoss
+from memmlp.training.losses.authors_losses import AGRoLLoss, AvatarPoserLoss, OwnLoss
 from memmlp.training.losses.loss import (
     Fixed,
     LearnedWeights,

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import FRAME_DIM, HANDS, LOWER, N_JOINTS, ROTATION, SPARSE_DIM
-from memmlp.motion.coordinates import World
+from memmlp.motion.network_coordinates import World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.training.losses.loss import Loss, Terms, Weighting, joints
 

@@ -11,7 +11,7 @@ from skeleton_families import anonymous, walking
 
 from memmlp.cli.data import data
 from memmlp.common.errors import InputError
-from memmlp.motion.importing.skeleton import load_skeleton
+from memmlp.motion.importing.skeleton_map import load_skeleton
 
 
 @pytest.fixture

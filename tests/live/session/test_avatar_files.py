@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from memmlp.common.errors import InputError
 from memmlp.live.rotations import BodyTree
 from memmlp.live.session.avatar_files import avatar_files, mannequin_vrm, read_vrm
-from memmlp.live.session.play import UNIT, joints_message, millimetres, rotations_message, with_avatar
-from memmlp.live.session.server import FILES, Hub, LiveServer
+from memmlp.live.session.loop import UNIT, joints_message, millimetres, rotations_message, with_avatar
+from memmlp.live.session.page_server import FILES, Hub, LiveServer
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Pose
 from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints

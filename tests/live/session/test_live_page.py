@@ -11,8 +11,8 @@ import pytest
 from chromium import Browser
 from processes import PATIENCE, until
 
-from memmlp.live.session.play import greeting, play
-from memmlp.live.session.server import Hub, LiveServer
+from memmlp.live.session.loop import greeting, play
+from memmlp.live.session.page_server import Hub, LiveServer
 from memmlp.live.session.sources import ClipSource, TrackedClip
 from memmlp.live.session.wearer_fitting import Fitting
 from memmlp.live.stream import Stream

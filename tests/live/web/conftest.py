@@ -22,7 +22,7 @@ from memmlp.live.full_graph import export_full
 from memmlp.live.web.clips import packed
 from memmlp.live.web.networks import SiteNetwork
 from memmlp.live.web.site import Site
-from memmlp.motion.coordinates import World
+from memmlp.motion.network_coordinates import World
 from memmlp.networks.memory import NoMemory
 from memmlp.networks.motion_model import MotionModel
 

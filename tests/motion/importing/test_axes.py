@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.bvh import Bvh, read_bvh
 from memmlp.motion.importing.axes import UNITS, settle
-from memmlp.motion.importing.skeleton import SkeletonMap, load_skeleton
+from memmlp.motion.importing.skeleton_map import SkeletonMap, load_skeleton
 from memmlp.motion.synthetic import synthesize_clip
 
 TOLD = replace(load_skeleton("cmu_daz"), calibration_frame=False)

@@ -16,7 +16,7 @@ from memmlp.motion.clip import Clip
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.importing.convert import Converted, convert
 from memmlp.motion.importing.fidelity import compare
-from memmlp.motion.importing.skeleton import SkeletonMap, load_skeleton
+from memmlp.motion.importing.skeleton_map import SkeletonMap, load_skeleton
 from memmlp.motion.synthetic import synthesize_clip
 
 REST = builtin_rest_joints()

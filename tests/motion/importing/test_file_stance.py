@@ -12,7 +12,7 @@ from skeleton_families import walking
 from memmlp.motion.body import JOINTS, builtin_rest_joints
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.importing.file_stance import FileStance, find_stance
-from memmlp.motion.importing.skeleton import find_skeleton
+from memmlp.motion.importing.skeleton_map import find_skeleton
 
 REST = builtin_rest_joints()
 

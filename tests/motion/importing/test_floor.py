@@ -10,7 +10,7 @@ import pytest
 from memmlp.motion.body import JOINTS, builtin_rest_joints
 from memmlp.motion.importing.fidelity import pose
 from memmlp.motion.importing.floor import find_floor
-from memmlp.motion.importing.skeleton import Z_UP
+from memmlp.motion.importing.skeleton_map import Z_UP
 from memmlp.motion.synthetic import synthesize_clip
 
 REST = builtin_rest_joints()

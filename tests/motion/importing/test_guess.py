@@ -12,7 +12,7 @@ from skeleton_families import FAMILIES, anonymous, family, in_order, renamed, wa
 
 from memmlp.motion.formats.bvh import Bvh, read_bvh
 from memmlp.motion.importing.guess import as_yaml, check, guess, write_map
-from memmlp.motion.importing.skeleton import find_skeleton, load_skeleton
+from memmlp.motion.importing.skeleton_map import find_skeleton, load_skeleton
 
 
 @pytest.fixture(params=FAMILIES)

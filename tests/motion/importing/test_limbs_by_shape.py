@@ -10,7 +10,7 @@ from bvh_samples import Sample
 from skeleton_families import FAMILIES, family
 
 from memmlp.motion.importing.limbs_by_shape import find_limbs, middle, read_tree
-from memmlp.motion.importing.skeleton import load_skeleton
+from memmlp.motion.importing.skeleton_map import load_skeleton
 
 
 def tree(sample: Sample):

@@ -11,7 +11,7 @@ from bvh_samples import TREES, read, refuse
 
 from memmlp.motion.body import JOINTS
 from memmlp.motion.importing.mapped_motion import pick_joints
-from memmlp.motion.importing.skeleton import load_skeleton
+from memmlp.motion.importing.skeleton_map import load_skeleton
 
 
 @pytest.mark.parametrize("skeleton", TREES)

@@ -14,7 +14,7 @@ from memmlp.motion.clip import Clip
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.importing.mapped_motion import pick_joints
 from memmlp.motion.importing.rest_pose import RestPose, find_rest_pose
-from memmlp.motion.importing.skeleton import SkeletonMap, load_skeleton
+from memmlp.motion.importing.skeleton_map import SkeletonMap, load_skeleton
 from memmlp.motion.synthetic import synthesize_clip
 
 DAZ = replace(load_skeleton("cmu_daz"), calibration_frame=False)

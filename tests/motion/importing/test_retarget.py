@@ -19,7 +19,7 @@ from memmlp.motion.importing.anatomy import segments
 from memmlp.motion.importing.convert import NONE, convert
 from memmlp.motion.importing.mapped_motion import pick_joints
 from memmlp.motion.importing.retarget import Retargeting, fit
-from memmlp.motion.importing.skeleton import SkeletonMap, find_skeleton, load_skeleton
+from memmlp.motion.importing.skeleton_map import SkeletonMap, find_skeleton, load_skeleton
 from memmlp.motion.synthetic import synthesize_clip
 
 REST = builtin_rest_joints()

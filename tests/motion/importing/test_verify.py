@@ -11,7 +11,7 @@ from bvh_samples import performed, refuse, tree, write
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.importing.fidelity import Fidelity
-from memmlp.motion.importing.skeleton import load_skeleton
+from memmlp.motion.importing.skeleton_map import load_skeleton
 from memmlp.motion.importing.verify import Unusable, verify, verify_folder
 from memmlp.motion.synthetic import synthesize_clip
 

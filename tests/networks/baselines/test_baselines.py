@@ -6,7 +6,7 @@ import torch
 
 from memmlp.evaluation import modes as evaluation
 from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM
-from memmlp.motion.coordinates import Heading
+from memmlp.motion.network_coordinates import Heading
 
 NAMES = list(tiny.BASELINES)
 WINDOWED = [name for name in NAMES if name not in tiny.WINDOWLESS]

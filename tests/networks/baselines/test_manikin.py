@@ -10,8 +10,8 @@ from memmlp.common.errors import InputError
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import NoIK
 from memmlp.motion.body import N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM
-from memmlp.motion.coordinates import Heading, World
 from memmlp.motion.geometry import forward_kinematics, sixd_to_matrix
+from memmlp.motion.network_coordinates import Heading, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines import manikin
 from memmlp.networks.baselines.limb_solver import BASES, ENDS, MIDDLES

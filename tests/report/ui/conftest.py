@@ -10,9 +10,9 @@ from fake_runs import fake_run
 
 from memmlp.runs.run import Run
 from memmlp.sweep.kept_sweep import keep
-from memmlp.sweep.parsing import parse_sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.spec import Sweep
+from memmlp.sweep.sweep_file import parse_sweep
 
 ARMS = {"none": 1.0, "gru": 0.8}
 SEEDS = (0, 1, 2)

@@ -27,7 +27,7 @@ from memmlp.common.errors import InputError
 from memmlp.sweep.plan import RunTask
 from memmlp.sweep.search import study as study_module
 from memmlp.sweep.search.progress_table import figures
-from memmlp.sweep.search.spec import Value
+from memmlp.sweep.search.search_file import Value
 from memmlp.sweep.search.study import Study
 
 

@@ -21,7 +21,7 @@ from fake_search import (
 )
 
 from memmlp.sweep.search import results
-from memmlp.sweep.search.spec import Range
+from memmlp.sweep.search.search_file import Range
 from memmlp.sweep.search.study import suggest
 
 

@@ -136,7 +136,7 @@ class Lengthened(Stack):
         self.convolution = nn.ConvTranspose1d(width, width, 3, stride=2)
 
     def after(self, h: Tensor) -> Tensor:
-        """Return features (B, 2 T, d) of features (B, T, d)."""
+        """Return features (B, 2 T, d): a transposed convolution doubles the frames of features (B, T, d)."""
         return self.convolution(h.transpose(1, 2))[..., 1:].transpose(1, 2)
 
     def last(self, h: Tensor, at: Tensor) -> Tensor:

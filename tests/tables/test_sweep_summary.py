@@ -8,9 +8,9 @@ from fake_runs import fake_run, fake_sweep, table_of
 
 from memmlp.common.files import read_json
 from memmlp.experiment_tracking.logged_values import SweepFacts
-from memmlp.sweep.parsing import load_sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask
-from memmlp.tables.sweep_folder_files import write_summary
+from memmlp.sweep.sweep_file import load_sweep
+from memmlp.tables.sweep_summary import write_summary
 
 
 def written(folder: Path) -> Path:

@@ -11,7 +11,7 @@ import yaml
 
 from memmlp.common.errors import InputError, why_unreadable
 from memmlp.motion.clip import FRAME_RATE_RANGE
-from memmlp.motion.importing.skeleton import is_number
+from memmlp.motion.importing.skeleton_map import is_number
 
 SIDECAR = "motion.yaml"  # beside the files or in a folder above them; `fps: 60` is what it may hold
 HEADER = "the header's"

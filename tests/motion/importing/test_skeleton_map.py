@@ -13,7 +13,7 @@ from memmlp.common.errors import InputError
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.importing.import_folder import ImportSettings, import_folder
 from memmlp.motion.importing.mapped_motion import pick_joints
-from memmlp.motion.importing.skeleton import SKELETONS, find_skeleton, load_skeleton, shipped_skeletons
+from memmlp.motion.importing.skeleton_map import SKELETONS, find_skeleton, load_skeleton, shipped_skeletons
 
 
 def test_shipped_maps() -> None:
@@ -44,7 +44,7 @@ def test_unknown_skeleton_lists_joints_and_maps(tmp_path: Path) -> None:
 def test_a_file_of_two_skeletons_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("one", "two"):
         (tmp_path / f"{name}.yaml").write_text((SKELETONS / "cmu_daz.yaml").read_text())
-    monkeypatch.setattr("memmlp.motion.importing.skeleton.SKELETONS", tmp_path)
+    monkeypatch.setattr("memmlp.motion.importing.skeleton_map.SKELETONS", tmp_path)
     with refuse(tmp_path, "more than one"):
         find_skeleton(read(tmp_path, "cmu_daz"))
 

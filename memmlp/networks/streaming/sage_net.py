@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.networks.baselines.bodiffusion import DiTBlock
-from memmlp.networks.baselines.sage import LATENT, UpperDenoiser, places
 from memmlp.networks.baselines.sage_net import SAGENet
+from memmlp.networks.baselines.sage_parts import LATENT, UpperDenoiser, places
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.streaming.bodiffusion import linear

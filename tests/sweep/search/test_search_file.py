@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.sweep.search.spec import Range, parse_search
+from memmlp.sweep.search.search_file import Range, parse_search
 
 GOOD: dict[str, Any] = {
     "name": "mine",

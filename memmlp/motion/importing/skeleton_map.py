@@ -56,7 +56,7 @@ class SkeletonMap:
 
     @property
     def upright(self) -> np.ndarray:
-        """The rotation (3, 3) from the file's axes to Y-up axes; the up axis is known by now."""
+        """The rotation (3, 3) from the file's axes to Y-up axes. `up` must be set."""
         return UPRIGHT[str(self.up)]
 
 

@@ -10,10 +10,10 @@ from fake_runs import fake_run
 
 from memmlp.common.errors import InputError
 from memmlp.config.build import untrained
-from memmlp.config.network_costs import with_costs
+from memmlp.config.untrained_costs import with_costs
 from memmlp.report.kept_results import Kept
-from memmlp.report.markdown import origin_words
-from memmlp.sweep.parsing import parse_sweep
+from memmlp.report.result_pages import origin_words
+from memmlp.sweep.sweep_file import parse_sweep
 from memmlp.tables.build_table import make_table
 from memmlp.tables.measured_run import load
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from bvh_samples import refuse, write
 
-from memmlp.motion.importing.rates import SIDECAR, Rate, true_rate
+from memmlp.motion.importing.true_rate import SIDECAR, Rate, true_rate
 
 KNOWN = "e54cdd79f5457acf" + 48 * "0"  # a file of CMU's salsa
 

@@ -10,9 +10,9 @@ import yaml
 
 from memmlp.common.errors import InputError
 from memmlp.config.compose import composed
-from memmlp.config.flops_of_training import flops_of, predicted_flops, with_flops
+from memmlp.config.flops_of_configs import flops_of, predicted_flops, with_flops
 from memmlp.runs.lookup import list_runs
-from memmlp.sweep.parsing import parse_sweep
+from memmlp.sweep.sweep_file import parse_sweep
 from memmlp.tables.measured_run import load
 
 TINY = ["profile=tiny", "memory=none"]

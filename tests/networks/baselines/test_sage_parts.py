@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 import torch
 
-from memmlp.networks.baselines import sage
+from memmlp.networks.baselines import sage_parts
 from memmlp.networks.layers import undivided
 
 SIZES = {
-    "upper codes": (lambda: sage.HalfVQVAE(sage.UPPER), 7_239_436),
-    "lower codes": (lambda: sage.HalfVQVAE(sage.LOWER), 7_200_986),
-    "upper diffusion": (sage.UpperDenoiser, 57_969_432),
-    "lower diffusion": (sage.LowerDenoiser, 58_264_728),
-    "decoder": (sage.Decoder, 4_035_374),
+    "upper codes": (lambda: sage_parts.HalfVQVAE(sage_parts.UPPER), 7_239_436),
+    "lower codes": (lambda: sage_parts.HalfVQVAE(sage_parts.LOWER), 7_200_986),
+    "upper diffusion": (sage_parts.UpperDenoiser, 57_969_432),
+    "lower diffusion": (sage_parts.LowerDenoiser, 58_264_728),
+    "decoder": (sage_parts.Decoder, 4_035_374),
 }
 
 
@@ -31,23 +31,23 @@ def test_table_16_counts_diffusion_and_decoder():
 def test_the_way_of_a_window():
     x, rotation = torch.randn(2, 20, 54), torch.randn(2, 20, 132)
     small = {"width": 16, "depth": 1, "heads": 2}
-    codes = [sage.HalfVQVAE(joints, **small).eval() for joints in (sage.UPPER, sage.LOWER)]
+    codes = [sage_parts.HalfVQVAE(joints, **small).eval() for joints in (sage_parts.UPPER, sage_parts.LOWER)]
     (upper, _), (lower, _) = (one.encode(rotation, x) for one in codes)
     assert [tuple(one.decode(z).shape) for one, z in zip(codes, (upper, lower), strict=True)] == [
         (2, 20, 84),
         (2, 20, 54),
     ]
     time = torch.tensor([3, 5])
-    assert sage.UpperDenoiser(**small)(upper, time, x).shape == (2, 10, 384)
-    denoiser = sage.LowerDenoiser(**small)
+    assert sage_parts.UpperDenoiser(**small)(upper, time, x).shape == (2, 10, 384)
+    denoiser = sage_parts.LowerDenoiser(**small)
     assert denoiser(denoiser.joined(lower, upper), time, x).shape == (2, 10, 384)
-    assert sage.Decoder(**small)(upper, lower, x).shape == (2, 20, 132)
-    assert sorted({*sage.UPPER, *sage.LOWER}) == list(range(22))
+    assert sage_parts.Decoder(**small)(upper, lower, x).shape == (2, 20, 132)
+    assert sorted({*sage_parts.UPPER, *sage_parts.LOWER}) == list(range(22))
 
 
 @torch.no_grad()
 def test_the_nearest_code_of_each_book_stands_for_its_part():
-    quantiser, z = sage.ProductQuantiser().eval(), torch.randn(2, 5, 384)
+    quantiser, z = sage_parts.ProductQuantiser().eval(), torch.randn(2, 5, 384)
     found, loss = quantiser(z)
     expected = np.zeros((10, 384), dtype=np.float32)
     for row, latent in enumerate(z.flatten(0, 1).numpy()):
@@ -61,7 +61,7 @@ def test_the_nearest_code_of_each_book_stands_for_its_part():
 
 
 def test_codes_that_nothing_uses_come_alive_and_gradients_pass_straight_through():
-    quantiser, z = sage.ProductQuantiser(), (10 + torch.randn(4, 16, 384)).requires_grad_()
+    quantiser, z = sage_parts.ProductQuantiser(), (10 + torch.randn(4, 16, 384)).requires_grad_()
     before = quantiser.vectors.detach().clone()
     found, loss = quantiser(z)
     found.sum().backward(retain_graph=True)
@@ -73,5 +73,5 @@ def test_codes_that_nothing_uses_come_alive_and_gradients_pass_straight_through(
 
 def test_several_processes_would_count_codes_each_by_itself():
     small = {"width": 16, "depth": 1, "heads": 2}
-    assert undivided(sage.HalfVQVAE(sage.LOWER, **small)) == ["ProductQuantiser"]
-    assert undivided(sage.LowerDenoiser(**small)) == []
+    assert undivided(sage_parts.HalfVQVAE(sage_parts.LOWER, **small)) == ["ProductQuantiser"]
+    assert undivided(sage_parts.LowerDenoiser(**small)) == []

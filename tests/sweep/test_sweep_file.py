@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from memmlp.common.errors import InputError
 from memmlp.evaluation.units import SMALLEST, UNITS
-from memmlp.sweep import parsing
-from memmlp.sweep.parsing import load_sweep, parse_sweep
+from memmlp.sweep import sweep_file
+from memmlp.sweep.sweep_file import load_sweep, parse_sweep
 
 SCALED = {
     "arms": {"full": [], "none": {"overrides": ["memory=none"], "against": "full"}},
@@ -99,7 +99,7 @@ def test_a_file_that_is_no_yaml_is_named(tmp_path: Path, text: bytes):
         load_sweep(tmp_path / "absent.yaml")
 
 
-KEYS = st.sampled_from([*parsing.KEYS, "x"])
+KEYS = st.sampled_from([*sweep_file.KEYS, "x"])
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
