@@ -12,13 +12,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import command_line
-import exported
 import processes
 import pytest
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
-from own_package import on_path  # noqa: F401
 from remembered import keep_exports, remember
 
 from memmlp.common.python_gc import collect_seldom
@@ -152,6 +149,8 @@ def tiny_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with FileLock(f"{folder}.lock"), pytest.MonkeyPatch.context() as monkeypatch:
         clean(monkeypatch)
         if not said.exists():
+            import command_line  # with torch, which the process that only distributes the tests does without
+
             said.write_text(command_line.run(folder, "train", *command_line.TINY, INT8))
     return folder
 
@@ -165,10 +164,23 @@ def step_files(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path
         path = folder / f"{name}.onnx"
         with FileLock(f"{path}.lock"):
             if not path.exists():
+                import exported
+
                 exported.write(name, path)
         return path
 
     return step_file
+
+
+@pytest.fixture
+def on_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The example package on the path of this process and of those that it starts; not in use yet."""
+    from own_package import EXAMPLE, registers_kept
+
+    monkeypatch.syspath_prepend(EXAMPLE)
+    monkeypatch.setenv("PYTHONPATH", str(EXAMPLE), prepend=":")
+    with registers_kept():
+        yield EXAMPLE
 
 
 @pytest.fixture
@@ -186,6 +198,8 @@ def home(tiny_home: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def memmlp(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Memmlp:
     """Run `memmlp ARGUMENTS` in this process, in an empty folder."""
+    import command_line
+
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", ["memmlp"])
 

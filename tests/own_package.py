@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import pytest
 from command_line import SMALL
 
 from memmlp.common.plugin import METRICS
@@ -38,12 +37,3 @@ def registers_kept() -> Iterator[None]:
         for name in set(sys.modules) - modules:
             if name.split(".")[0] in (PACKAGE, "mine", "other"):
                 del sys.modules[name]
-
-
-@pytest.fixture
-def on_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The example package on the path of this process and of those that it starts; not in use yet."""
-    monkeypatch.syspath_prepend(EXAMPLE)
-    monkeypatch.setenv("PYTHONPATH", str(EXAMPLE), prepend=":")
-    with registers_kept():
-        yield EXAMPLE
