@@ -22,19 +22,20 @@ from memmlp.common.termination import termination_interrupts
 
 
 class Command(NamedTuple):
-    """The place of a sub-command's implementation, and its line in the help."""
+    """The place of a sub-command's implementation, its line in the help, and whether it can be resumed."""
 
     module: str
     attribute: str
     help: str
+    resumes: bool = False
 
 
 COMMANDS = {
-    "demo": Command("demo", "demo", "The whole way on embedded data, in minutes."),
-    "train": Command("train", "command", "Train, evaluate, export and time one configuration (Hydra)."),
+    "demo": Command("demo", "demo", "The whole way on embedded data, in minutes.", True),
+    "train": Command("train", "command", "Train, evaluate, export and time one configuration (Hydra).", True),
     "data": Command("data", "data", "Make, import, prepare, inspect and export motion data."),
-    "sweep": Command("sweep", "sweep", "Run what is missing of a table or of a sweep of your own."),
-    "tune": Command("tune", "tune", "Search loss weights, or other keys, by the errors on validation."),
+    "sweep": Command("sweep", "sweep", "Run what is missing of a table or of a sweep of your own.", True),
+    "tune": Command("tune", "tune", "Search loss weights, or other keys, by the errors on validation.", True),
     "table": Command("table", "table", "The paper's tables beside measured numbers."),
     "results": Command("results", "results", "Keep runs' results with the code; make pages of them."),
     "report": Command("report", "report", "The page of some sweeps, tables and figures, in one file."),
@@ -126,7 +127,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         code = _exit_code(error)
         if code is None or os.environ.get("MEMMLP_TRACEBACK") == "1":
             raise
-        _fail(_line(error), code)
+        _fail(_line(error, arguments), code)
 
 
 def _run(arguments: list[str]) -> None:
@@ -150,10 +151,12 @@ def _exit_code(error: Exception) -> int | None:
     return {InputError: 2, TrainingDiverged: 1, LeaseLost: 1}.get(type(error))
 
 
-def _line(error: Exception) -> str:
-    """Return the error in one line."""
+def _line(error: Exception, arguments: Sequence[str]) -> str:
+    """Return the error of a command line in one line."""
     if isinstance(error, click.Abort):
-        return "interrupted; the same command goes on where it was left"
+        command = COMMANDS.get(arguments[0]) if arguments else None
+        resumed = "; the same command goes on where it was left" if command and command.resumes else ""
+        return f"interrupted{resumed}"
     if isinstance(error, click.UsageError):
         path = error.ctx.command_path if error.ctx else "memmlp"
         return f"{error.format_message()} (see {path} --help)"

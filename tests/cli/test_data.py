@@ -42,14 +42,14 @@ def test_verify_goes_on_and_names_file_joint_and_frame(source: Path) -> None:
     assert [line for line in lines if line.startswith(changes) and "(most in frame 31)" in line]
     assert [line for line in lines if line.startswith("c.bvh: no MOTION")]
     assert [line for line in lines if line.startswith("d.bvh: has an unknown skeleton")]
-    assert "1 files without a fault" in said
+    assert "1 file without a fault" in said
     assert "3 faults" in said
     assert "Traceback" not in said
 
 
 def test_verify_of_sound_files_succeeds(source: Path) -> None:
     said = run(source.parent, "data", "verify", "source/a.bvh")
-    assert said.startswith("1 files without a fault")
+    assert said.startswith("1 file without a fault")
     assert "a.bvh" in run(source.parent, "data", "verify", "source/a.bvh", "--all")
 
 

@@ -52,6 +52,17 @@ def test_a_request_to_end_is_a_ctrl_c(monkeypatch: pytest.MonkeyPatch, capsys: p
     assert seen == [before]
 
 
+def test_only_what_is_resumed_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("memmlp.runs.lookup.list_runs", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        main(["runs", "list"])
+    assert ended.value.code == 130
+    assert capsys.readouterr().err.strip() == "memmlp: interrupted"
+
+
 QUICK = """
 import sys
 before = set(sys.modules)

@@ -144,7 +144,7 @@ def test_diff_cuts_no_number(memmlp: Memmlp, outputs: Path, monkeypatch: pytest.
     """Half a number is another number: keys get narrow first."""
     numbers = ["1.7190123e+05", "3.9876543e+05", "+2.2686e+05", "10^2 m/s^3"]
     rows = [("deployment.onnx.parameters_with_vq_and_more", *numbers)]
-    monkeypatch.setattr("memmlp.cli.runs.diff.result_rows", lambda first, second: rows)
+    monkeypatch.setattr("memmlp.cli.runs.differences.result_rows", lambda first, second: rows)
     said = memmlp("runs", "diff", A, B).out
     assert all(number in said for number in [*numbers, A[:8], B[:8]])
     assert "".join(word for word in said.split() if word in rows[0][0]) == rows[0][0]
@@ -209,6 +209,21 @@ def test_list_shows_what_differs_as_far_as_there_is_room(
     for said in ("MPJPE [cm]", "Jitter [", "ms: a frame"):  # a legend of the columns that are shown
         assert said in seen["120"]
         assert (said in seen["70"]) == (said == "MPJPE [cm]")
+
+
+def test_data_stay_in_a_narrow_list_since_errors_on_others_do_not_compare(
+    memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch
+):
+    for digit, data in (("d", "mine"), ("e", "yours")):
+        config = {
+            "seed": 1,
+            "memory": {"layers": [2]},
+            "optim": {"lr": int(digit, 16)},
+            "data": {"name": data},
+        }
+        Run.of(outputs, digit * 16).begin("memmlp", config, data=digit * 64, upstream=None)
+    monkeypatch.setenv("COLUMNS", "40")
+    assert "data" in heads(memmlp("runs", "list").out)
 
 
 def test_no_word_of_the_columns_that_were_asked_for_is_broken(memmlp: Memmlp, outputs: Path):

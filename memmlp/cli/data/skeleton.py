@@ -40,7 +40,7 @@ def guess(file: Path, out: Path | None) -> None:
         raise click.ClickException(f"the map does not do yet: {error}") from None
     for fault in faults:
         click.echo(f"warning: {fault}", err=True)
-    click.echo(f"imports from {stance}, with {len(faults)} faults", err=True)
+    click.echo(f"imports from {stance}, with {len(faults)} fault{'s' * (len(faults) != 1)}", err=True)
     click.echo(f"next: memmlp data skeleton show {file} --skeleton {out or 'MAP'} --out PNG", err=True)
 
 

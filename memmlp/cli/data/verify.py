@@ -35,11 +35,12 @@ def verify(source: Path, skeleton: str | None, body: str, up: str | None, every:
     for name in ("frames", "worst\nmm", "worst\ndegrees"):
         table.add_column(name, justify="right")
     table.add_column("at")
-    sound, bad, worst = 0, [], (0.0, 0.0)
+    measured, sound, bad, worst = 0, 0, [], (0.0, 0.0)
     for row in verify_folder(source, skeleton=skeleton, body=body, up=up):
         if isinstance(row, Unusable):
             bad.append(f"{row.name}: {row.reason}")
             continue
+        measured += 1
         worst = max(worst[0], row.mm.value), max(worst[1], row.degrees.value)
         sound += not row.faults
         bad += [f"{row.name}: {fault}" for fault in row.faults]
@@ -50,6 +51,7 @@ def verify(source: Path, skeleton: str | None, body: str, up: str | None, every:
         Console(highlight=False).print(table)
     for line in bad:
         click.echo(line)
-    click.echo(f"{sound} files without a fault; worst {worst[0]:.4f} mm, {worst[1]:.4f} degrees")
+    deviation = f"; worst {worst[0]:.4f} mm, {worst[1]:.4f} degrees" if measured else ""
+    click.echo(f"{sound} file{'s' * (sound != 1)} without a fault{deviation}")
     if bad:
-        raise click.ClickException(f"{len(bad)} faults")
+        raise click.ClickException(f"{len(bad)} fault{'s' * (len(bad) != 1)}")

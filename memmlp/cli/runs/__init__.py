@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from memmlp.cli.runs.diff import diff
+from memmlp.cli.runs.differences import diff
 from memmlp.cli.runs.listing import list_runs
 from memmlp.cli.runs.notes import note, tag
 from memmlp.cli.runs.show import show

@@ -149,7 +149,7 @@ def show_runs(records: Sequence[Record], keys: Sequence[str], asked: bool) -> li
     """
     columns = list(_columns(records, keys, {} if asked else SHOWN))
     spare = [name for name in SPARED if name not in keys]
-    spare += [] if asked else [*reversed(keys[1:]), "data", "name"]
+    spare += [] if asked else [*reversed(keys[1:]), "name"]  # never the data: errors on others do not compare
     while spare and _width(columns) > console().width:
         columns = [column for column in columns if column.name != spare[0]]
         del spare[0]

@@ -120,7 +120,10 @@ def unfitting(split: Mapping[str, Any], names: Collection[str]) -> str:
         said += [f"{source}: {one}"] if (one := unfitting(own, below)) else []
     patterns = split.get("groups", ())
     if patterns and not any(re.search(one, unpacked(name)) for one in patterns for name in names):
-        said += [f"no clip fits any of the {len(patterns)} patterns of groups (the first is {patterns[0]})"]
+        said += [
+            f"no clip fits any of the {len(patterns)} patterns of groups, data.split.groups (the first is "
+            f"{patterns[0]}): each clip is a group of its own, which may lie in any part"
+        ]
     return "; ".join(said)
 
 

@@ -55,7 +55,8 @@ def test_a_group_is_named_by_the_file_else_after_its_first_clip(tmp_path):
 def test_patterns_that_fit_no_clip_are_told():
     split = {"groups": ["^(S[0-9])_", "^([^/]+/[^/]+)/take"]}
     assert unfitting(split, ["ann/1", "ben/2"]) == (
-        "no clip fits any of the 2 patterns of groups (the first is ^(S[0-9])_)"
+        "no clip fits any of the 2 patterns of groups, data.split.groups (the first is ^(S[0-9])_): "
+        "each clip is a group of its own, which may lie in any part"
     )
     assert unfitting(split, ["ann/1", "S1_2"]) == unfitting({"groups": []}, ["ann/1"]) == ""
     assert unfitting(split, ["CMU/CMU/01/take1"]) == ""
