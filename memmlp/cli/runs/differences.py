@@ -47,7 +47,7 @@ def diff(a: str, b: str, outputs: Path) -> None:
             click.echo(f"{title}: no difference")
             continue
         ids = (first.id, second.id) if title == "config" else (first.id[:SHORT], second.id[:SHORT])
-        table = plain_table(title, *ids, *(["B - A", "unit"] if title == "results" else []))
+        table = plain_table(title, *ids, *(["change", "unit"] if title == "results" else []))
         for column in table.columns[1:] if title == "results" else table.columns[:1]:
             column.no_wrap = True  # a number in two lines is none, and half of one is another
         for row in rows:
@@ -87,7 +87,7 @@ def config_rows(first: Run, second: Run) -> list[tuple[str, ...]]:
 
 
 def result_rows(first: Run, second: Run) -> list[tuple[str, ...]]:
-    """Return a row for each measured number that differs: its key, both values, B - A, and its unit."""
+    """Return a row for each measured number that differs: its key, both values, the change from the first to the second, and its unit."""
     a, b = measured_numbers(first.results), measured_numbers(second.results)
     keys = [key for key in a | b if a.get(key) != b.get(key)]
     return [
