@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors import SafetensorError
+from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from memmlp.common.errors import InputError
@@ -30,9 +29,10 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         InputError: if the file is missing or damaged; the message names it.
     """
     try:
-        with safe_open(os.fspath(path), framework="pt") as file:
-            values = json.loads(file.metadata()["memmlp"])
-            return {name: file.get_tensor(name) for name in file.keys()}, values  # noqa: SIM118
+        content = path.read_bytes()  # opened once, since a training may replace the file meanwhile
+        tensors = load(content)
+        header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
+        return tensors, json.loads(header["__metadata__"]["memmlp"])
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: not a checkpoint of memmlp ({error})") from error
 

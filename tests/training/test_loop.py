@@ -221,6 +221,21 @@ def test_a_checkpoint_survives_a_torn_write_and_refuses_damage(tmp_path):
         checkpoint.read(path)
 
 
+def test_a_checkpoint_that_is_replaced_while_it_is_read_is_the_old_one(tmp_path, monkeypatch):
+    """It was opened twice: once for its header, and once for its tensors, which were another file's by then."""
+    path, load = tmp_path / "checkpoint.safetensors", checkpoint.load
+    checkpoint.write(path, {"a": torch.arange(30)}, {"step": 3})
+
+    def replaced(content: bytes) -> dict[str, torch.Tensor]:
+        checkpoint.write(path, {"a": torch.arange(3)}, {"step": 4})
+        return load(content)
+
+    monkeypatch.setattr(checkpoint, "load", replaced)
+    tensors, values = checkpoint.read(path)
+    assert values == {"step": 3}
+    assert torch.equal(tensors["a"], torch.arange(30))
+
+
 def test_what_is_counted_in_a_validation_says_so(monkeypatch: pytest.MonkeyPatch):
     told: list[str] = []
     monkeypatch.setattr(progress, "EVERY", 0.0)

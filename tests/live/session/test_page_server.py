@@ -13,7 +13,7 @@ import pytest
 from processes import PATIENCE
 
 from memmlp.common.errors import InputError
-from memmlp.live.session import server as module
+from memmlp.live.session import page_server as module
 from memmlp.live.session.loop import JUMPS, Jumps, greeting, play
 from memmlp.live.session.page_server import FILES, Hub, LiveServer
 from memmlp.live.session.sources import ClipSource, SourceSample, TrackedClip
