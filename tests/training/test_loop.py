@@ -222,7 +222,7 @@ def test_a_checkpoint_survives_a_torn_write_and_refuses_damage(tmp_path):
 
 
 def test_a_checkpoint_that_is_replaced_while_it_is_read_is_the_old_one(tmp_path, monkeypatch):
-    """It was opened twice: once for its header, and once for its tensors, which were another file's by then."""
+    """It was opened twice, for its header and for its tensors, which were another file's by then."""
     path, load = tmp_path / "checkpoint.safetensors", checkpoint.load
     checkpoint.write(path, {"a": torch.arange(30)}, {"step": 3})
 
