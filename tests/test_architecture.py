@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from memmlp.runs.environment import PACKAGE, WIRING, sources
+from memmlp.runs.environment import NOT_NUMBERS, PACKAGE, WIRING, sources
 
 ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "docs" / "architecture.md"
@@ -60,6 +60,11 @@ def test_layout_has_every_file_of_the_package():
     files = [path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py") if path.name != "__init__.py"]
     told = [path for path in files if path.parts[0] != "cli" and path.parent.name not in AS_A_WHOLE]
     assert [str(path) for path in told if not re.search(rf"\b{path.stem}\.py\b", text)] == []
+
+
+def test_rooms_that_make_no_numbers_are_there():
+    """A renamed room must not begin to count, so that a tracker's new code would flag finished runs."""
+    assert [room for room in NOT_NUMBERS if not (PACKAGE / room).exists()] == []
 
 
 def test_wiring_counts_among_the_sources_of_a_run():

@@ -22,12 +22,12 @@ PACKAGE = Path(memmlp.__file__).parent
 NOT_NUMBERS = (
     "cli",
     "config",
+    "experiment_tracking",
     "live",
     "render",
     "report",
     "sweep",
     "tables",
-    "tracking",
 )
 """Folders of the package whose code no result comes from, but for the times of whole poses (`live`)."""
 WIRING = ("config/build.py", "config/instantiate.py")  # they decide what reaches the constructors

@@ -183,7 +183,9 @@ def test_the_licence_of_three_is_there():
     assert "MIT" in (Path(module.__file__).parent / "page/three/LICENSE").read_text()
 
 
-@pytest.mark.parametrize("path", ["/../server.py", "/three/LICENSE/..", "/%2e%2e/server.py", "/main"])
+@pytest.mark.parametrize(
+    "path", ["/../page_server.py", "/three/LICENSE/..", "/%2e%2e/page_server.py", "/main"]
+)
 def test_nothing_else_is_served(server: LiveServer, path: str):
     assert get(server, path).status == 404
 
