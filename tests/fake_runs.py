@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -140,17 +141,18 @@ def _luck(word: str | int) -> float:
 
 def _clip(clip: str, seed: int, factor: float, name: str, branches: Sequence[str]) -> dict[str, Any]:
     """A row of clips.json: the clip's difficulty and the seed's luck, the same for every run, and noise."""
-    level = factor * np.exp(0.2 * _luck(clip) + 0.01 * _luck(seed))
-    noise = _draw(name, clip)
+    level = factor * math.exp(0.2 * _luck(clip) + 0.01 * _luck(seed))
+    noise = iter(np.exp(0.01 * _draw(name, clip).normal(size=2 * len(branches) * len(BASE))).tolist())
     row: dict[str, Any] = {"name": clip, "frames": 600}
     for mode, jumps in (("window", 1.3), ("stream", 1.0)):
-        row[mode] = {branch: {} for branch in branches}
-        for branch in branches:
-            for metric, base in BASE.items():
-                if branch == "position" and metric in NO_POSITIONS:
-                    continue
-                value = base * level * (jumps if metric == "Jitter" else 1) * np.exp(0.01 * noise.normal())
-                row[mode][branch][metric] = round(float(value), 6)
+        row[mode] = {
+            branch: {
+                metric: round(base * level * (jumps if metric == "Jitter" else 1) * next(noise), 6)
+                for metric, base in BASE.items()
+                if branch != "position" or metric not in NO_POSITIONS
+            }
+            for branch in branches
+        }
     return row
 
 

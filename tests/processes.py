@@ -31,10 +31,16 @@ def mark() -> None:
     """
     os.environ[MARK] = f"{os.environ.get(MARK, '')}/{uuid.uuid4().hex}"
     OLDER.update(_entries())
+    FOREIGN.clear()
 
 
 OLDER: set[tuple[str, int]] = set()
 """The processes from before the mark, which they cannot have. A number given anew has a new inode."""
+
+FOREIGN: dict[tuple[str, int], float] = {}
+"""Since when a process is known that does not have the mark. It gets it if it is about to start another program."""
+
+SETTLED = 30.0  # seconds after which a process without the mark is taken for somebody else's
 
 
 def _entries() -> set[tuple[str, int]]:
@@ -49,13 +55,17 @@ def marked() -> list[int]:
 
     None where there is no /proc.
     """
-    wanted = f"{MARK}={os.environ[MARK]}".encode()
+    wanted, now = f"\0{MARK}={os.environ[MARK]}".encode(), time.monotonic()
     found = []
-    for folder in (PROC / number for number, _ in _entries() - OLDER):
+    for entry in _entries() - OLDER:
+        folder = PROC / entry[0]
         with contextlib.suppress(OSError):  # it has ended, or is somebody else's
-            begins = any(entry.startswith(wanted) for entry in (folder / "environ").read_bytes().split(b"\0"))
+            if wanted not in b"\0" + (folder / "environ").read_bytes():
+                if now - FOREIGN.setdefault(entry, now) > SETTLED:
+                    OLDER.add(entry)
+                continue
             command = (folder / "cmdline").read_bytes()
-            if begins and not any(name in command for name in SERVANTS):
+            if not any(name in command for name in SERVANTS):
                 found.append(int(folder.name))
     return [pid for pid in found if pid != os.getpid()]
 

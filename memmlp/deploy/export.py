@@ -149,6 +149,19 @@ def simplify(model: onnx_ir.Model) -> None:
     common.InlinePass()(model)
     fold_constants(model, onnx_shape_inference=True)
     SIMPLER(model)
+    remove_notes(model.graph)
+
+
+def remove_notes(graph: onnx_ir.Graph) -> None:
+    """Remove what the exporter notes about the origin of each node and value.
+
+    The notes hold paths of the machine that exports, and lines of the source code; a file is given to others.
+    Of a small network's file they were more than half.
+    """
+    graph.metadata_props.clear()
+    made = (value for node in graph for value in node.outputs)
+    for noted in (*graph, *made, *graph.inputs, *graph.outputs, *graph.initializers.values()):
+        noted.metadata_props.clear()
 
 
 def metadata(model: MotionModel | StreamingGraph, run_id: str) -> dict[str, str]:

@@ -82,6 +82,14 @@ def test_inner_layers_are_int8_and_the_ends_are_not(step_files, tmp_path, networ
     assert {kinds[name] for name in ends} == {onnx.TensorProto.FLOAT}
 
 
+def test_a_file_tells_nothing_of_where_it_was_made(pair):
+    """Nor does it hold lines of the code, which an exporter notes on each node."""
+    for path in pair:
+        written = path.read_bytes()
+        for told in (str(Path(package.__file__).parent), str(Path.home()), "stack_trace", "torch.export"):
+            assert told.encode() not in written
+
+
 def test_int8_is_near_and_keeps_the_metadata(pair):
     exact, quantised = pair
     before, after = (streamed(OnnxStream(path), CLIPS[0]) for path in pair)
