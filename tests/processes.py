@@ -38,7 +38,7 @@ OLDER: set[tuple[str, int]] = set()
 """The processes from before the mark, which they cannot have. A number given anew has a new inode."""
 
 FOREIGN: dict[tuple[str, int], float] = {}
-"""Since when each process is known that does not have the mark. It may get it, by starting another program."""
+"""Since when a process is known that does not have the mark. It may get it by starting another program."""
 
 SETTLED = 30.0  # seconds after which a process without the mark is taken for somebody else's
 
