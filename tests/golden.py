@@ -28,6 +28,7 @@ from memmlp.motion.dataset import WindowSampler
 from memmlp.motion.mirror import MirroredDataset
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.baselines.still_pose import StillPose
 from memmlp.networks.memory import (
     CodeMemory,
     GRUMemory,
@@ -217,6 +218,7 @@ CASES: dict[str, Callable[[], Numbers]] = {
         f"model.{name}": partial(lambda name: network(tiny.baseline(name)), name)
         for name in tiny.BASELINES
     },
+    "model.still_pose": lambda: network(StillPose(tiny.normalizer(Heading()), frames=7)),
     "model.recurrent_poser": lambda: {
         f"{cell}{' ' + output if output != 'local' else ''} {name}": value
         for cell, output in [*((cell, "local") for cell in CELLS), ("gru", "global"), ("gru", "reaching")]

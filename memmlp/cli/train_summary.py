@@ -80,11 +80,12 @@ def show_latency(console: Console, record: Mapping[str, Any]) -> None:
 
 
 def size(measured: Mapping[str, Any]) -> str:
-    """Describe the network's size, with and without the frozen VQ-VAE if it has one."""
+    """Describe the network's size, with a frozen VQ-VAE and parts for training alone if it has any."""
     own, whole = measured["parameters"], measured["parameters_with_vqvae"]
-    frozen = f" ({whole / 1e6:.2f} M with the frozen VQ-VAE)" if whole != own else ""
+    others = "parts that are frozen or for training alone"
+    beside = f" ({whole / 1e6:.2f} M with {others})" if whole != own else ""
     return (
-        f"{own / 1e6:.2f} M parameters{frozen}, {measured['macs'] / 1e6:.3g} MMAC a frame, "
+        f"{own / 1e6:.2f} M parameters{beside}, {measured['macs'] / 1e6:.3g} MMAC a frame, "
         f"ONNX file {measured['onnx_bytes'] / 1e6:.1f} MB, graph included"
     )
 

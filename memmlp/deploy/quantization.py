@@ -18,6 +18,7 @@ import onnx
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 from torch import Tensor
 
+from memmlp.common.errors import InputError
 from memmlp.common.lease_fences import publish, temporary
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.motion.body import SPARSE_DIM
@@ -57,7 +58,11 @@ def quantise(source: Path, path: Path, kept: Sequence[str], clips: Sequence[Tens
         path: the file to write.
         kept: names of the graph's modules that stay in float32.
         clips: training clips (N, 252), from which the activations' ranges are found.
+
+    Raises:
+        InputError: for a graph without inner layers.
     """
+    inner = inner_layers(onnx.load(source), kept)
     unfinished, quiet = temporary(path), logging.getLogger()
     level = quiet.level
     quiet.setLevel(logging.ERROR)  # it advises to prepare the graph, which torch's exporter has done already
@@ -67,7 +72,7 @@ def quantise(source: Path, path: Path, kept: Sequence[str], clips: Sequence[Tens
             unfinished,
             ActivationSamples(source, clips),
             quant_format=QuantFormat.QDQ,
-            nodes_to_quantize=inner_layers(onnx.load(source), kept),
+            nodes_to_quantize=inner,
             op_types_to_quantize=["Gemm", "MatMul"],
             per_channel=True,
             reduce_range=True,  # seven bits
@@ -82,10 +87,15 @@ def quantise(source: Path, path: Path, kept: Sequence[str], clips: Sequence[Tens
 
 
 def inner_layers(graph: onnx.ModelProto, kept: Sequence[str]) -> list[str]:
-    """Return the names of the nodes that multiply by a layer's weight, except those in the kept modules."""
+    """Return the names of the nodes that multiply by a layer's weight, except those in the kept modules.
+
+    Raises:
+        InputError: if there is none. A file in a lower precision would be the float32 one by another name,
+            and where ONNX Runtime is told no names, it takes all nodes.
+    """
     weights = {tensor.name for tensor in graph.graph.initializer}
     beginnings = tuple(f"model.{name}." for name in kept)
-    return [
+    inner = [
         node.name
         for node in graph.graph.node
         if node.op_type in ("Gemm", "MatMul")
@@ -93,3 +103,6 @@ def inner_layers(graph: onnx.ModelProto, kept: Sequence[str]) -> list[str]:
         and node.input[1].startswith("model.")
         and not node.input[1].startswith(beginnings)
     ]
+    if not inner:
+        raise InputError("export.precision: no layer lies between the network's ends; allowed is fp32")
+    return inner

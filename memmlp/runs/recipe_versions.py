@@ -32,6 +32,7 @@ RECIPES: dict[str, int] = {
     "model.sage": 1,
     "model.manikin_s": 3,
     "model.manikin_l": 2,
+    "model.still_pose": 1,
     "memory.vq": 1,
     "memory.vq_joint": 1,
     "memory.no_codes": 1,

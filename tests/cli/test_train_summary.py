@@ -16,11 +16,12 @@ MEASURED = {"parameters": 19_238, "parameters_with_vqvae": 27_050, "macs": 218_0
 
 
 def test_a_small_network_has_operations_and_its_vqvae():
-    assert size(MEASURED).startswith("0.02 M parameters (0.03 M with the frozen VQ-VAE), 0.218 MMAC a frame")
+    both = "0.02 M parameters (0.03 M with parts that are frozen or for training alone), 0.218 MMAC a frame"
+    assert size(MEASURED).startswith(both)
 
 
 def test_a_network_without_a_vqvae_has_none():
-    assert "VQ-VAE" not in size(MEASURED | {"parameters_with_vqvae": 19_238})
+    assert "frozen" not in size(MEASURED | {"parameters_with_vqvae": 19_238})
 
 
 def test_tables_of_sources_are_of_the_evaluation_that_is_shown(tmp_path: Path):

@@ -21,6 +21,7 @@ from memmlp.config.schema.data import (
 from memmlp.config.schema.network import (
     AGRoLDiffusionConfig,
     AGRoLMLPConfig,
+    AnyModelConfig,
     AvatarJLMConfig,
     AvatarPoserConfig,
     BoDiffusionConfig,
@@ -46,6 +47,7 @@ from memmlp.config.schema.network import (
     SAGEConfig,
     SAGERefinerConfig,
     SAGEUpstreamConfig,
+    StillPoseConfig,
     TwoBranchConfig,
     TwoBranchMemoryConfig,
     UpstreamConfig,
@@ -254,7 +256,7 @@ class Config:
     profile: ProfileConfig = field(default_factory=ProfileConfig)
     data: DataConfig = field(default_factory=DataConfig)
     frame: FrameConfig = field(default_factory=FrameConfig)
-    model: ModelConfig = field(default_factory=ModelConfig)
+    model: AnyModelConfig = field(default_factory=AnyModelConfig)
     memory: Optional[MemoryConfig] = None
     predictor: Optional[PredictorConfig] = None
     vqvae: VQVAEConfig = field(default_factory=VQVAEConfig)
@@ -288,6 +290,7 @@ SCHEMAS: dict[str, type] = {
     "model_rpm": RPMConfig,
     "model_avatar_jlm": AvatarJLMConfig,
     "model_vae_hmd": VAEHMDConfig,
+    "model_still_pose": StillPoseConfig,
     "model_recurrent_poser": RecurrentPoserConfig,
     "model_sage": SAGEConfig,
     "model_manikin_s": ManikinSConfig,

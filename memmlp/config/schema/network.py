@@ -38,32 +38,52 @@ class FrameConfig:
 
 
 @dataclass
-class ModelConfig:
+class AnyModelConfig:
+    """What every network has (conf/model)."""
+
+    name: str = key(Text())
+    frames: int = at_least(2)
+
+
+@dataclass
+class ModelConfig(AnyModelConfig):
     """Mem-MLP's backbone (conf/model)."""
 
     name: str = called("mem_mlp")
-    frames: int = at_least(2)
     width: int = at_least(1)
     depth: int = at_least(1)
 
 
 @dataclass
-class BaselineConfig(ModelConfig):
+class BaselineConfig(AnyModelConfig):
     """A baseline network, which has no slots: memory, predictor and hand are null with it."""
 
-    name: str = key(Text())
     _target_: str = MISSING
     _partial_: bool = True
 
 
 @dataclass
-class AGRoLMLPConfig(BaselineConfig):
+class LayeredConfig(BaselineConfig):
+    """A baseline with layers of a width."""
+
+    width: int = at_least(1)
+    depth: int = at_least(1)
+
+
+@dataclass
+class StillPoseConfig(BaselineConfig):
+    name: str = called("still_pose")
+    _target_: str = target("memmlp.networks.baselines.still_pose.StillPose")
+
+
+@dataclass
+class AGRoLMLPConfig(LayeredConfig):
     name: str = called("agrol_mlp")
     _target_: str = target("memmlp.networks.baselines.agrol.AGRoLMLP")
 
 
 @dataclass
-class AGRoLDiffusionConfig(BaselineConfig):
+class AGRoLDiffusionConfig(LayeredConfig):
     name: str = called("agrol_diffusion")
     _target_: str = target("memmlp.networks.baselines.agrol.AGRoLDiffusion")
     width: int = at_least(2)
@@ -83,7 +103,7 @@ class BoDiffusionConfig(AGRoLDiffusionConfig):
 
 
 @dataclass
-class AvatarPoserConfig(BaselineConfig):
+class AvatarPoserConfig(LayeredConfig):
     name: str = called("avatar_poser")
     _target_: str = target("memmlp.networks.baselines.avatar_poser.AvatarPoser")
     heads: int = at_least(1)
@@ -107,7 +127,7 @@ class HMDPoserConfig(AvatarPoserConfig):
 
 
 @dataclass
-class VAEHMDConfig(BaselineConfig):
+class VAEHMDConfig(LayeredConfig):
     name: str = called("vae_hmd")
     _target_: str = target("memmlp.networks.baselines.vae_hmd.VAEHMD")
     latent: int = at_least(1)
@@ -132,7 +152,7 @@ class AvatarJLMConfig(AvatarPoserConfig):
 
 
 @dataclass
-class RecurrentPoserConfig(BaselineConfig):
+class RecurrentPoserConfig(LayeredConfig):
     """This project's own network, which has no slots either."""
 
     name: str = called("recurrent_poser")
@@ -144,7 +164,7 @@ class RecurrentPoserConfig(BaselineConfig):
 
 
 @dataclass
-class SAGEConfig(BaselineConfig):
+class SAGEConfig(LayeredConfig):
     name: str = called("sage")
     _target_: str = target("memmlp.networks.baselines.sage_net.SAGENet")
     width: int = at_least(1)

@@ -16,6 +16,7 @@ from memmlp.networks.baselines.hmd_poser import HMDPoser
 from memmlp.networks.baselines.manikin import ManikinL, ManikinS
 from memmlp.networks.baselines.rpm import RPM
 from memmlp.networks.baselines.sage_net import SAGENet
+from memmlp.networks.baselines.still_pose import StillPose
 from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.motion_model import MotionModel
@@ -31,6 +32,7 @@ from memmlp.networks.streaming.baselines import (
     ManikinLStream,
     ManikinSStream,
     RPMStream,
+    StillPoseStream,
     VAEHMDStream,
 )
 from memmlp.networks.streaming.bodiffusion import BoDiffusionStream
@@ -50,6 +52,7 @@ STREAMS: dict[type[MotionModel], type[StreamingGraph]] = {
     AvatarJLM: AvatarJLMStream,
     RPM: RPMStream,
     VAEHMD: VAEHMDStream,
+    StillPose: StillPoseStream,
     RecurrentPoser: RecurrentPoserStream,
     ManikinS: ManikinSStream,
     ManikinL: ManikinLStream,

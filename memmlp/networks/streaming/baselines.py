@@ -21,6 +21,7 @@ from memmlp.networks.baselines.encoder import EncoderLayer
 from memmlp.networks.baselines.hmd_poser import HMDPoser
 from memmlp.networks.baselines.manikin import ManikinL, ManikinS
 from memmlp.networks.baselines.rpm import RPM
+from memmlp.networks.baselines.still_pose import StillPose
 from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.layers import MLPBlock
 from memmlp.networks.memory import State
@@ -262,6 +263,13 @@ class VAEHMDStream(FrameStream):
         """Map world inputs (1, 54) to world motion (1, 198); nothing is carried on."""
         mean = self.model.latent(sparse).chunk(2, -1)[0]
         return self.normalizer.posed(self.model.decoder(mean), sparse), {}
+
+
+class StillPoseStream(FrameStream):
+    """The streaming graph of one pose, in which nothing can be quantised."""
+
+    float32_modules = ()
+    model: StillPose
 
 
 class RPMStream(FrameStream):
