@@ -55,6 +55,13 @@ def test_a_right_import_has_no_fault(walk: Converted) -> None:
     assert again == walk.fidelity
 
 
+@pytest.mark.parametrize("place", [(60, 0, 0), (-60, 0, 0), (0, 60, 0), (0, -60, 0)], ids=str)
+def test_feet_point_forward_wherever_the_walk_is(walk: Converted, place: tuple[float, float, float]) -> None:
+    elsewhere = replace(walk.clip, trans=walk.clip.trans + np.array(place))
+    faults = compare(elsewhere, walk.mapped_motion, REST, "cmu_daz").faults
+    assert not any("feet" in fault for fault in faults)
+
+
 def bent(clip: Clip, joint: str, frame: int | slice, vector: list[float]) -> Clip:
     poses = clip.poses.copy()
     poses[frame, JOINT[joint]] += vector
