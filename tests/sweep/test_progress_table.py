@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from memmlp.runs.metrics_log import Metrics
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Entry, Plan, RunTask
-from memmlp.sweep.progress_table import device_name, progress_text, render
+from memmlp.sweep.progress_table import device_name, progress_text, render, time_left
 
 CARD = {"device": "cuda", "gpu": "A card", "gpu_index": "1"}
 
@@ -71,3 +72,14 @@ def test_a_name_is_not_broken_into_letters_where_there_are_many_seeds(
     states = dict.fromkeys([task.key for task in plan.tasks], "trained")
     Console(width=80).print(render(wide, states))
     assert "AvatarPoser +" in capsys.readouterr().out
+
+
+def test_the_time_left_follows_from_the_last_five_entries(monkeypatch: pytest.MonkeyPatch):
+    """Earlier steps took a hundred times as long: of a training's beginning, or of a busier machine."""
+    slow = [(100 * n, 1000.0 * n) for n in range(10)]
+    quick = [(900 + 100 * n, 9000 + 10.0 * n) for n in range(1, 5)]
+    log = [Metrics(step, "train", {"loss": 1.0}, time) for step, time in slow + quick]
+    monkeypatch.setattr("time.time", lambda: 9043.0)
+    assert time_left(log, 1900) == pytest.approx(600 * 0.1 - 3)
+    assert time_left(log[:1], 1900) is None
+    assert time_left(log, 1300) == 0
