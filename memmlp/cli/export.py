@@ -286,7 +286,9 @@ def write_less_precise(
         lower(precision, exact, other, network, train)
         cost = compared(exact, other, precision, network.normalizer, test)
         said = ", ".join(
-            f"{name} {cost['fp32'][name]:.2f} -> {cost[precision][name]:.2f}" for name in ("MPJPE", "Jitter")
+            f"{name} {cost['fp32'][name]:.2f} -> {cost[precision][name]:.2f}"
+            for name in ("MPJPE", "position MPJPE", "Jitter")
+            if name != "position MPJPE" or "position" in model.branches
         )
         if not cost["growth"] <= max_growth:
             raise click.ClickException(f"{said}: more than --max-growth {100 * max_growth:g} %, not written")

@@ -11,9 +11,11 @@ from rich.table import Table
 
 from memmlp.evaluation.units import UNITS
 from memmlp.pipeline.run_stages import Outcome
+from memmlp.runs.deployment_folder import as_deployed, deployed_precision
 from memmlp.runs.run import Run
 from memmlp.sweep.spec import BRANCHES
-from memmlp.tables.measured_run import Errors, as_deployed, deployed_precision, load
+from memmlp.tables.flags_of_runs import CORE
+from memmlp.tables.measured_run import Errors, load
 
 STAGES = ("training", "evaluation", "deployment")
 COLUMNS = [(mode, branch) for mode in ("stream", "window") for branch in BRANCHES]
@@ -53,7 +55,7 @@ def show_side_by_side(outcomes: Mapping[str, Outcome]) -> None:
         values = [results[mode]["rotation"].get(metric) for results in found.values()]
         if None not in values:
             table.add_row(metric, unit, *(f"{value:.2f}" for value in values))
-    costs = [results["latency"] for results in found.values() if "latency" in results]
+    costs = [as_deployed(results["latency"]) for results in found.values() if "latency" in results]
     if len(costs) == len(found):
         table.add_row("a frame", "ms", *(f"{cost['median_ms']:.2f}" for cost in costs))
         table.add_row("parameters", "M", *(f"{cost['parameters'] / 1e6:.2f}" for cost in costs))
@@ -70,6 +72,9 @@ def show_latency(console: Console, record: Mapping[str, Any]) -> None:
         f"({measured['ratio_to_yardstick']:.2f} x the yardstick)",
         soft_wrap=True,
     )
+    if (share := measured.get("core_share", 1.0)) < CORE:
+        busy = f"the machine was busy: it had a core for {share:.0%} of the time, and its times are too long"
+        console.print(busy, style="yellow", soft_wrap=True)
     if "pose_median_ms" in measured:  # runs of earlier versions lack it
         console.print(
             f"a whole pose, trackers to joints: {measured['pose_median_ms']:.2f} ms median, "

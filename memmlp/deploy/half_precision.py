@@ -22,6 +22,7 @@ from memmlp.deploy.graph_constants import Constants
 from memmlp.deploy.quantization import inner_layers
 
 LARGEST = float(np.finfo(np.float16).max)
+CAST = ".cast"  # how the names of the casts around products end
 
 
 def halve(source: Path, path: Path, kept: Sequence[str]) -> None:
@@ -64,8 +65,31 @@ def halved(model: ModelProto, kept: Sequence[str]) -> ModelProto:
     return model
 
 
+def rounded(model: ModelProto) -> ModelProto:
+    """Return a graph in fp16 that a CPU rounds where a GPU does: at the inputs and outputs of its products.
+
+    ONNX Runtime's CPU provider has no product in fp16. It computes in float32, and leaves out casts to fp16
+    and back, so that nothing but the weights would be rounded, and nothing could overflow. Here a maximum of
+    the value with itself, which it does have in fp16, stands behind each cast to fp16, and before each cast
+    from it. Sums within a product are float32's, as a GPU's tensor cores make them.
+    """
+    nodes = list[NodeProto]()
+    for node in model.graph.node:
+        if node.op_type != "Cast" or not node.name.endswith(CAST):
+            nodes.append(node)
+        elif onnx.helper.get_node_attr_value(node, "to") == TensorProto.FLOAT16:
+            output, node.output[0] = node.output[0], f"{node.output[0]}.unrounded"
+            nodes += [node, helper.make_node("Max", [node.output[0]] * 2, [output])]
+        else:
+            value, node.input[0] = node.input[0], f"{node.input[0]}.rounded"
+            nodes += [helper.make_node("Max", [value] * 2, [node.input[0]]), node]
+    del model.graph.node[:]
+    model.graph.node.extend(nodes)
+    return model
+
+
 def _cast(name: str, output: str, kind: int) -> NodeProto:
-    return helper.make_node("Cast", [name], [output], f"{output}.cast", to=kind)
+    return helper.make_node("Cast", [name], [output], f"{output}{CAST}", to=kind)
 
 
 def _half(name: str, weight: np.ndarray) -> np.ndarray:

@@ -12,13 +12,14 @@ from typing import Any
 
 from memmlp.report import figures
 from memmlp.report.figures import Curve, SpeedAndError
+from memmlp.runs.deployment_folder import as_deployed
 from memmlp.runs.identity import trained_by
 from memmlp.runs.metrics_log import Metrics
 from memmlp.sweep.spec import COSTS, Sweep
 from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.error_distributions import Distribution, distributions
 from memmlp.tables.formats import as_html
-from memmlp.tables.measured_run import Measured, as_deployed
+from memmlp.tables.measured_run import Measured
 from memmlp.tables.table import Table
 from memmlp.tables.table_text import better, caption
 

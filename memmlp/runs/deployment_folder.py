@@ -19,7 +19,7 @@ ONNX_FILES = {
 }
 """The name of the ONNX file of each precision (`export.precision`)."""
 INT8_PRECISIONS = ("int8", "int8_blocks")
-"""The precisions that are used live where they are accurate enough, for they are quicker than float32."""
+"""The precisions that are used live where they are accurate enough. At the paper's sizes they are quicker."""
 
 LATENCY = "latency.json"
 FILES = (LATENCY, *ONNX_FILES.values())
@@ -91,6 +91,17 @@ class DeploymentFolder:
         record = self.record
         accurate = [name for name in INT8_PRECISIONS if record.get(name, {}).get("default")]
         return next((self.file(name) for name in accurate if self.file(name).exists()), None)
+
+
+def deployed_precision(latency: Mapping[str, Any]) -> str:
+    """Return the precision that was asked for in a deployment, if it has that file; else fp32."""
+    precision = str((latency.get("settings") or {}).get("precision", "fp32"))
+    return precision if precision in latency else "fp32"
+
+
+def as_deployed(latency: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the measurements of a streaming step, with size and times of the file that was asked for."""
+    return {**latency, **latency.get(deployed_precision(latency), {})}
 
 
 def _current(record: Mapping[str, Any]) -> dict[str, Any]:

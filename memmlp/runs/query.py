@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError
+from memmlp.runs.deployment_folder import as_deployed
 from memmlp.runs.identity import SLOTS, chosen, flatten, trained_by
 from memmlp.runs.notes import read_notes
 from memmlp.runs.run import STATUSES, Run
@@ -39,10 +40,12 @@ def record(run: Run) -> dict[str, Any]:
     These are its id, kind, status, name, started, upstream, user, tag and note; its data by name (`data`) and
     by digest (`data_digest`); the keys of its config, with slots also under their name alone (`memory` for
     `memory.name`); and its results, with those of the rotation branch also without the branch (`stream.MPJPE`
-    for `stream.rotation.MPJPE`).
+    for `stream.rotation.MPJPE`). Times and size are those of the file in the precision that was asked for.
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
-    results = {key: _measured(value) for key, value in flatten(run.results).items()}
+    found = run.results
+    results = flatten(found) | flatten({"latency": _times_as_deployed(found.get("latency", {}))})
+    results = {key: _measured(value) for key, value in results.items()}
     flat = flatten(config)
     short = {key.replace(".rotation.", "."): value for key, value in results.items()}
     slots = {slot: chosen(config, slot) for slot in SLOTS if slot in config}
@@ -52,6 +55,12 @@ def record(run: Run) -> dict[str, Any]:
     facts |= {"id": run.id, "name": run_name(manifest, flat), "status": run.status}
     facts |= {"tag": notes.tags, "note": notes.note}
     return {**flat, **slots, **short, **results, **facts}
+
+
+def _times_as_deployed(latency: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a deployment's own numbers, with those of the file that was asked for in float32's place."""
+    deployed = as_deployed(latency)
+    return {key: deployed[key] for key, value in latency.items() if isinstance(value, int | float)}
 
 
 def _measured(value: Any) -> Any:

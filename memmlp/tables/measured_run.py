@@ -13,6 +13,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
+from memmlp.runs.deployment_folder import as_deployed, deployed_precision
 from memmlp.runs.evaluation_file import intact
 from memmlp.runs.run import Run
 
@@ -266,17 +267,6 @@ def _read(path: Path) -> dict[str, Any]:
     if not content or ("digest" in content and not intact(path)):
         raise InputError(f"{path}: cannot be read; do the run again with force=true, or remove its folder")
     return content
-
-
-def deployed_precision(latency: Mapping[str, Any]) -> str:
-    """Return the precision that was asked for in a deployment, if it has that file; else fp32."""
-    precision = str((latency.get("settings") or {}).get("precision", "fp32"))
-    return precision if precision in latency else "fp32"
-
-
-def as_deployed(latency: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the measurements of a streaming step, with size and times of the file that was asked for."""
-    return {**latency, **latency.get(deployed_precision(latency), {})}
 
 
 def _costs(latency: Mapping[str, Any]) -> dict[str, float]:

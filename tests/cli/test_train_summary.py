@@ -1,15 +1,19 @@
-"""What `memmlp train` says of a network's size."""
+"""What `memmlp train` says of a network's size and times."""
 
 from __future__ import annotations
 
 import io
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
+import pytest
 from fake_runs import fake_run
 from rich.console import Console
 
-from memmlp.cli.train_summary import show_latency, size, source_tables
+from memmlp.cli.train_summary import show_latency, show_side_by_side, size, source_tables
+from memmlp.pipeline.run_stages import Outcome
 from memmlp.runs.evaluation_file import write_report
 
 MEASURED = {"parameters": 19_238, "parameters_with_vqvae": 27_050, "macs": 218_048, "onnx_bytes": 995_047}
@@ -52,3 +56,18 @@ def test_times_and_size_are_those_of_the_file_that_was_asked_for():
     first, last = said.getvalue().splitlines()
     assert first.startswith("a frame on one CPU core in int8: 1.27 ms median, 1.40 ms p95 (0.45 x")
     assert "ONNX file 0.6 MB" in last
+    assert "busy" not in said.getvalue()
+
+
+def test_times_of_a_busy_machine_say_so():
+    times = {"median_ms": 3.39, "p95_ms": 3.5, "ratio_to_yardstick": 1.2, "core_share": 0.31}
+    said = io.StringIO()
+    show_latency(Console(file=said), MEASURED | times)
+    assert "it had a core for 31% of the time" in said.getvalue()
+
+
+def test_side_by_side_has_the_times_of_the_files_that_were_asked_for(capsys: pytest.CaptureFixture[str]):
+    deployed = {"median_ms": 3.39, "settings": {"precision": "int8"}, "int8": {"median_ms": 1.27}}
+    outcome = SimpleNamespace(results={"stream": {"rotation": {}}, "latency": MEASURED | deployed})
+    show_side_by_side({"one": cast(Outcome, outcome)})
+    assert "1.27" in capsys.readouterr().out

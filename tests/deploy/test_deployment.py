@@ -161,7 +161,8 @@ def test_a_deployment_in_fp16_and_an_older_opset(tmp_path):
     assert (deployment.precision, deployment.opset, deployment.alone) == ("fp16", 15, True)
     record = deployment.deploy(model, place, "0" * 16, CLIPS, CLIPS)
     cost = record["fp16"]
-    assert cost["growth"] == pytest.approx(cost["fp16"]["MPJPE"] / cost["fp32"]["MPJPE"] - 1)
+    grown = [cost["fp16"][name] / cost["fp32"][name] - 1 for name in ("MPJPE", "position MPJPE")]
+    assert cost["growth"] == pytest.approx(max(grown))
     assert cost["jitter_growth"] == pytest.approx(cost["fp16"]["Jitter"] / cost["fp32"]["Jitter"] - 1)
     assert cost["onnx_bytes"] == place.file("fp16").stat().st_size
     assert cost["median_ms"] > 0

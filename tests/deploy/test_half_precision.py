@@ -10,10 +10,11 @@ import onnx
 import pytest
 import tiny
 from onnx import TensorProto, numpy_helper
+from onnxruntime import InferenceSession
 
 from memmlp.common.errors import InputError
 from memmlp.deploy.export import export
-from memmlp.deploy.half_precision import halve, halved
+from memmlp.deploy.half_precision import halve, halved, rounded
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import streamed
 from memmlp.deploy.quantization import inner_layers
@@ -40,6 +41,26 @@ def test_the_products_of_inner_layers_are_fp16(step_files, tmp_path: Path, netwo
     assert path.stat().st_size < source.stat().st_size + 200 * len(made.graph.node)
     apart = (streamed(OnnxStream(source), CLIP) - streamed(OnnxStream(path), CLIP)).abs()
     assert 1e-7 < float(apart.mean()) < 1e-3
+
+
+@pytest.mark.parametrize("size", [1.0, 5000.0])
+def test_rounded_is_fp16_s_arithmetic(tmp_path: Path, size: float):
+    """Of small products, and of some that sixteen bits do not hold."""
+    values = size * np.random.default_rng(0).normal(size=(3, 8)).astype(np.float32)
+    weight = np.random.default_rng(1).normal(size=(8, 4)).astype(np.float32) * 10
+    node = onnx.helper.make_node("MatMul", ["x", "model.inner.weight"], ["y"], "product")
+    ends = [onnx.helper.make_tensor_value_info(*end) for end in (("x", 1, [3, 8]), ("y", 1, [3, 4]))]
+    stored = [numpy_helper.from_array(weight, "model.inner.weight")]
+    graph = onnx.helper.make_graph([node], "one", [ends[0]], [ends[1]], stored)
+    opsets = [onnx.helper.make_opsetid("", 18)]
+    made = rounded(halved(onnx.helper.make_model(graph, opset_imports=opsets, ir_version=10), []))
+    onnx.checker.check_model(made, full_check=True)
+    (found,) = InferenceSession(made.SerializeToString()).run(None, {"x": values})
+    halves = values.astype(np.float16).astype(np.float32) @ weight.astype(np.float16).astype(np.float32)
+    with np.errstate(over="ignore"):
+        expected = halves.astype(np.float16).astype(np.float32)
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
+    assert np.isinf(found).any() == (size > 1)
 
 
 def test_states_stay_float32(tmp_path: Path):

@@ -120,6 +120,16 @@ def test_a_run_may_be_asked_for_slots_results_and_facts(tmp_path: Path):
     assert parse(f"{text} and status=stopped and id={run.id} and stream.rotation.MPJPE<7").of([one]) == [True]
 
 
+def test_times_are_those_of_the_file_that_was_asked_for(tmp_path: Path):
+    run = begun(tmp_path, {"seed": 3})
+    latency = {"median_ms": 3.0, "pose_median_ms": 3.5, "settings": {"precision": "int8"}}
+    latency["int8"] = {"median_ms": 1.0, "int8": {"MPJPE": 6.0}}
+    write_json(run.results_path, {"latency": latency})
+    one = record(run)
+    assert (one["latency.median_ms"], one["latency.pose_median_ms"]) == (1.0, 3.5)
+    assert (one["latency.int8.median_ms"], one["latency.int8.int8.MPJPE"]) == (1.0, 6.0)
+
+
 def test_the_keys_that_differ_without_neutral_ones():
     first = {"seed": 0, "paths": {"outputs": "a"}, "memory": {"name": "vq", "width": 5, "codes": 3}}
     second = {"seed": 0, "paths": {"outputs": "b"}, "memory": {"name": "gru", "width": 6}}

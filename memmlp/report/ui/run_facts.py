@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 
 from memmlp.common.files import plain, read_json
+from memmlp.runs.deployment_folder import as_deployed
 from memmlp.runs.evaluation_file import current
 from memmlp.runs.identity import INFERENCE, flatten, training_settings, used_as_configured
 from memmlp.runs.run import Run
@@ -182,7 +183,7 @@ def _metrics(run: Run, config: Mapping[str, Any], reports: Iterable[Mapping[str,
     found: dict[str, Any] = {}
     for report in reports:
         found |= flatten(report["mean"], f"{report.get('mode')}.")
-    record = run.deployment_used(config).record
+    record = as_deployed(run.deployment_used(config).record)
     found |= {f"latency.{key}": record[key] for key in COSTS if key in record}
     if run.results_path.exists():
         found |= flatten(read_json(run.results_path), "vqvae.")

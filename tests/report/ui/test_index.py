@@ -27,6 +27,17 @@ def test_facts_of_a_finished_run(outputs: Path):
     assert found["recent"][-1][0] == 2000
 
 
+def test_times_of_a_run_are_those_of_the_file_that_was_asked_for(outputs: Path):
+    run = run_of(outputs, "gru", 1)
+    path = run.deployment("fp32-0").latency
+    record = json.loads(path.read_text())
+    changes = {"settings": {"precision": "int8"}, "int8": {"median_ms": 0.32, "onnx_bytes": 7}}
+    path.write_text(json.dumps(record | changes))
+    found = facts(run.folder)["metrics"]
+    assert (found["latency.median_ms"], found["latency.onnx_bytes"]) == (0.32, 7)
+    assert found["latency.parameters"] == record["parameters"]
+
+
 @pytest.mark.parametrize(
     ("name", "content", "damaged"),
     [
