@@ -39,6 +39,10 @@ class Form(NamedTuple):
     full: tuple[str, str] | None
 
 
+EXPORTING = ("out", "graph", "precision", "max_growth", "opset", "scope", "space", "rotations", "clips")
+"""The options that say how a file is written."""
+
+
 @click.command("export")
 @click.argument("run", metavar="RUN|FILE.onnx")
 @click.option("--out", type=click.Path(path_type=Path), help="ONNX file to write; not needed with --check.")
@@ -93,6 +97,7 @@ class Form(NamedTuple):
     "--clips",
     default=1,
     show_default=True,
+    type=click.IntRange(0),
     help="How many test clips a float32 file is checked on; 0 for all.",
 )
 @click.option(
@@ -128,7 +133,7 @@ def export(
     from memmlp.common.errors import InputError
 
     if run.endswith(".onnx"):
-        if out or not targets:
+        if given(*EXPORTING) or not targets:
             raise InputError(f"{run}: is an ONNX file already; allowed with it is --check alone")
         check(Path(run), targets)
         return
@@ -301,6 +306,12 @@ def write_less_precise(
                 raise click.ClickException(f"{said}, more than {FULL_TOLERANCE:g}: not written")
         other.replace(out)
     click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB, on test clips {said}")
+
+
+def given(*names: str) -> list[str]:
+    """Return those of the running command's parameters with these names that were typed."""
+    context, typed = click.get_current_context(), click.core.ParameterSource.COMMANDLINE
+    return [name for name in names if context.get_parameter_source(name) is typed]
 
 
 def check(path: Path, targets: tuple[str, ...]) -> None:

@@ -39,6 +39,17 @@ def test_a_file_is_checked_without_a_run(memmlp: Memmlp, tmp_path: Path):
     assert "other.onnx: outside of what unity publishes" in said.err
 
 
+def test_no_number_of_clips_is_below_zero(memmlp: Memmlp):
+    assert one_line(memmlp("export", "0123", "--out", "a.onnx", "--clips", "-1"), "--clips", "-1")
+
+
+def test_a_live_frame_is_of_one_thing(memmlp: Memmlp, tmp_path: Path):
+    write(tmp_path / "step.onnx", "Relu")
+    line = ["bench", "live-frame", "--onnx", "step.onnx"]
+    for other in (["--run", "0123"], ["model=sage"]):
+        assert one_line(memmlp(*line, *other), "--run, --onnx, overrides", "allowed is one of them")
+
+
 def test_web_is_all_of_its_backends(memmlp: Memmlp, tmp_path: Path):
     write(tmp_path / "step.onnx", "Relu", "Sign")
     said = memmlp("export", str(tmp_path / "step.onnx"), "--check", "web")
@@ -56,6 +67,7 @@ def test_web_is_all_of_its_backends(memmlp: Memmlp, tmp_path: Path):
     [
         (["step.onnx"], "allowed with it is --check alone"),
         (["step.onnx", "--check", "unity", "--out", "other.onnx"], "allowed with it is --check alone"),
+        (["step.onnx", "--check", "unity", "--precision", "int8"], "allowed with it is --check alone"),
         (["none.onnx", "--check", "unity"], "none.onnx: no such file"),
         (["0123"], "--out: is missing; it may be left out with --check alone"),
         (["0123", "--out", "none/step.onnx"], "there is no folder none"),
@@ -67,7 +79,7 @@ def test_what_does_not_go_together_is_refused(
 ):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "step.onnx", "Relu")
-    one_line(memmlp("export", *line), words)
+    assert one_line(memmlp("export", *line), words)
     assert [path.name for path in tmp_path.iterdir()] == ["step.onnx"]
 
 
@@ -93,7 +105,7 @@ def test_a_run_in_fp16_for_unity(home: Path, memmlp: Memmlp, monkeypatch: pytest
     assert {TensorProto.FLOAT, TensorProto.FLOAT16} <= kinds
     shapes = {o.name: [d.dim_value for d in o.type.tensor_type.shape.dim] for o in model.graph.output}
     assert shapes["rotations"] == [1, 22, 4]
-    one_line(memmlp("export", run, "--out", "a.onnx", *whole, "--precision", "int8"), "--scope step")
+    assert one_line(memmlp("export", run, "--out", "a.onnx", *whole, "--precision", "int8"), "--scope step")
     said = memmlp("export", run, "--check", "unity")
     assert said.code == 1
     assert f"{run}.onnx: outside of what unity publishes" in said.err

@@ -24,11 +24,11 @@ CHECK = ("avatar_poser", "torch")
 
 MODELS: dict[str, tuple[str, ...]] = {
     "avatar_poser": ("model=avatar_poser",),
-    "agrol_mlp_196": ("model=agrol_mlp",),
+    "agrol_mlp_196": ("model=agrol_mlp", "model.frames=196"),
     "agrol_mlp_41": ("model=agrol_mlp", "model.frames=41"),
     "agrol_diffusion": ("model=agrol_diffusion", "model.sampling_steps=5"),
     "bodiffusion": ("model=bodiffusion",),
-    "mem_mlp_41": (),
+    "mem_mlp_41": ("model.frames=41",),
     "mem_mlp_60": ("model.frames=60",),
     "ego_poser": ("model=ego_poser",),
     "hmd_poser": ("model=hmd_poser",),
@@ -69,7 +69,10 @@ VARIANTS = ("network", *DEPLOYED)
     help=f"Networks to time, separated by commas; {' and '.join(SLOW)} take minutes, and can be named.",
 )
 @click.option(
-    "--json", "file", type=click.Path(path_type=Path), help="File to write the measured rows into, as JSON."
+    "--json",
+    "file",
+    type=click.Path(path_type=Path),
+    help="File to write the measured rows into, as JSON, with the overrides and the machine.",
 )
 @click.option(
     "--breakdown",
@@ -101,6 +104,8 @@ def latency(
         )
     if breakdown and breakdown not in allowed:
         raise InputError(f"--breakdown {breakdown}: allowed are {', '.join(allowed)}")
+    if named := [word for word in overrides if word.lstrip("+").startswith(("model=", "model.frames="))]:
+        raise InputError(f"{named[0]}: --models names the networks and their windows; allowed are other keys")
     if file and not file.absolute().parent.is_dir():
         raise InputError(f"--json {file}: there is no folder {file.parent}")
     with tempfile.TemporaryDirectory() as folder:
@@ -109,8 +114,9 @@ def latency(
         show(rows, rounds)
         if file:
             from memmlp.common.files import write_json
+            from memmlp.runs.environment import environment
 
-            write_json(file, rows)
+            write_json(file, {"overrides": list(overrides), "made_by": environment(), "rows": rows})
         if breakdown:
             name, variant = breakdown.split(":")
             show_breakdown(paths[name, variant])

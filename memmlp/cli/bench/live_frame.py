@@ -53,11 +53,14 @@ def live_frame(
 
     import numpy as np
 
+    from memmlp.common.errors import InputError
     from memmlp.deploy.onnx_stream import OnnxStream
     from memmlp.live.pose_time import alternate
     from memmlp.live.stream import Stream
     from memmlp.runs.lookup import find_run
 
+    if sum([run is not None, onnx is not None, bool(overrides)]) > 1:
+        raise InputError("--run, --onnx, overrides: each says what is timed; allowed is one of them")
     with tempfile.TemporaryDirectory() as folder:
         if run is not None:
             onnx = find_run(outputs, run).onnx

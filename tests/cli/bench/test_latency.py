@@ -73,7 +73,10 @@ def test_every_graph_is_timed_and_compared(memmlp: Memmlp, tmp_path):
     said = memmlp(
         "bench", "latency", "profile=tiny", "--models", "avatar_poser", "--steps", "2", "--json", file
     )
-    rows = {(row["model"], row["variant"]): row for row in json.loads(file.read_text())}
+    written = json.loads(file.read_text())
+    rows = {(row["model"], row["variant"]): row for row in written["rows"]}
+    assert written["overrides"] == ["profile=tiny"]
+    assert written["made_by"]["cores"] > 0
     assert said.code == 0
     assert list(rows) == [*(("avatar_poser", variant) for variant in VARIANTS), CHECK]
     assert rows["avatar_poser", "network"]["ratio_to_avatar_poser"] == 1
@@ -87,3 +90,5 @@ def test_every_graph_is_timed_and_compared(memmlp: Memmlp, tmp_path):
 
 def test_the_control_can_not_be_left_out(memmlp: Memmlp):
     assert one_line(memmlp("bench", "latency", "--models", "mem_mlp_41"), "avatar_poser")
+    for word in ("model=rpm", "model.frames=9"):
+        assert one_line(memmlp("bench", "latency", word), word, "--models names the networks")
