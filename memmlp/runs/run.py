@@ -124,13 +124,18 @@ class Run:
         """The ONNX file to use: int8 if that is accurate enough (`export.precision`), else float32.
 
         Raises:
-            InputError: if the run is finished and has no ONNX file (`export.graph=off`).
+            InputError: if the run is finished and has no ONNX file (`export.graph=off`), or the file was
+                changed since it was made.
         """
         deployment = self.preferred_deployment
         if self.done and not self.deployments.is_dir():
             make = f"memmlp eval {self.folder} export.graph=auto"
             raise InputError(f"{self.folder}: has no step.onnx; make one with {make}")
-        return deployment.accurate_int8 or deployment.onnx
+        file = deployment.accurate_int8 or deployment.onnx
+        digest = deployment.record.get("artifacts", {}).get(file.name)
+        if digest and not self._same(str(file.relative_to(self.folder)), digest):
+            raise InputError(f"{file}: not the file that was exported; do the run again with force=true")
+        return file
 
     @property
     def onnx(self) -> Path:

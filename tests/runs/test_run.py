@@ -60,6 +60,13 @@ def test_an_evaluation_of_another_run_or_name_is_refused(tmp_path: Path, name: s
     assert other.verify() == [f"evaluations/{name}.json"]
 
 
+def test_an_onnx_file_that_is_not_the_exported_one_is_refused(tmp_path: Path):
+    run = complete(tmp_path)
+    run.deployment("int8-0").int8.write_bytes(b"another network's")
+    with pytest.raises(InputError, match=r"int8\.onnx: not the file that was exported"):
+        _ = run.preferred_onnx
+
+
 def test_a_deployment_that_lost_a_file_is_made_again(tmp_path: Path):
     """And is not, in silence, the float32 one."""
     run = complete(tmp_path)
