@@ -44,7 +44,7 @@ def record(run: Run) -> dict[str, Any]:
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
     found = run.results
-    results = flatten(found) | flatten({"latency": _times_as_deployed(found.get("latency", {}))})
+    results = flatten(found) | flatten(_times_as_deployed(found.get("latency", {})), "latency.")
     results = {key: _measured(value) for key, value in results.items()}
     flat = flatten(config)
     short = {key.replace(".rotation.", "."): value for key, value in results.items()}

@@ -128,6 +128,8 @@ def test_times_are_those_of_the_file_that_was_asked_for(tmp_path: Path):
     one = record(run)
     assert (one["latency.median_ms"], one["latency.pose_median_ms"]) == (1.0, 3.5)
     assert (one["latency.int8.median_ms"], one["latency.int8.int8.MPJPE"]) == (1.0, 6.0)
+    write_json(run.results_path, {"stream": {"rotation": {"MPJPE": 6.5}}})
+    assert not [key for key in record(run) if key.startswith("latency")]
 
 
 def test_the_keys_that_differ_without_neutral_ones():
