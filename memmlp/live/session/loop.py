@@ -163,7 +163,8 @@ class Clock:
     def take(self, time: float) -> None:
         """Take a sample's time, seconds."""
         later = math.inf if self.last is None else time - self.last
-        single = np.float32(time)
+        with np.errstate(over="ignore"):  # of a time that no clock has
+            single = np.float32(time)
         found = {
             "jump": GAP < abs(later) < math.inf,
             "still": -GAP <= later <= 0,

@@ -126,8 +126,9 @@ def told_of(times: Iterable[float]) -> list[str]:
         [float(np.float32(1000 + n / 60)) for n in range(200)],  # single precision, which is fine so early
         [time for n in range(100) for time in (n / 60, n / 60)],  # each twice
         [7.0] * (STILL - 1),
+        [1e300],
     ],
-    ids=["pauses", "steady", "epoch", "single", "twice", "a while"],
+    ids=["pauses", "steady", "epoch", "single", "twice", "a while", "beyond"],
 )
 def test_of_other_times_nothing_is_said(times: list[float]):
     assert told_of(times) == []
