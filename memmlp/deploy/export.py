@@ -147,9 +147,22 @@ def simplify(model: onnx_ir.Model) -> None:
     in these graphs and take up to half of an export's time.
     """
     common.InlinePass()(model)
+    name_transposed(model.graph)
     fold_constants(model, onnx_shape_inference=True)
     SIMPLER(model)
     remove_notes(model.graph)
+
+
+def name_transposed(graph: onnx_ir.Graph) -> None:
+    """Begin the name of each transposed weight with the weight's, by which lower precisions find layers.
+
+    Some layers are exported as a transpose and a product. The transpose is folded to a constant, whose name
+    would otherwise say nothing.
+    """
+    for node in graph:
+        weight = node.inputs[0] if node.op_type == "Transpose" else None
+        if weight and weight.is_initializer() and str(weight.name).endswith("weight"):
+            node.outputs[0].name = f"{weight.name}.{node.outputs[0].name}"
 
 
 def remove_notes(graph: onnx_ir.Graph) -> None:

@@ -83,9 +83,9 @@ RECIPES: dict[str, int] = {
     "export": 1,
     "graph.streaming": 1,
     "graph.naive": 1,
-    "int8": 2,
-    "int8_blocks": 2,
-    "fp16": 2,
+    "int8": 3,
+    "int8_blocks": 3,
+    "fp16": 3,
     "latency": 1,
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import exported
@@ -14,6 +15,7 @@ from onnxruntime import InferenceSession
 
 from memmlp.common.errors import InputError
 from memmlp.deploy.export import export
+from memmlp.deploy.graph_constants import Constants
 from memmlp.deploy.half_precision import halve, halved, rounded
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import streamed
@@ -41,6 +43,31 @@ def test_the_products_of_inner_layers_are_fp16(step_files, tmp_path: Path, netwo
     assert path.stat().st_size < source.stat().st_size + 200 * len(made.graph.node)
     apart = (streamed(OnnxStream(source), CLIP) - streamed(OnnxStream(path), CLIP)).abs()
     assert 1e-7 < float(apart.mean()) < 1e-3
+
+
+@pytest.mark.parametrize("network", exported.NETWORKS)
+def test_every_layer_between_the_ends_is_an_inner_one(step_files, network: str):
+    """By the weights' values, whatever the exporter calls them, and whether it transposes them or not."""
+    stream, graph = streaming(exported.NETWORKS[network]()), onnx.load(step_files(network))
+    weights = {
+        name: weight.detach().numpy()
+        for name, weight in stream.named_parameters()
+        if name.endswith("weight") and weight.ndim == 2
+    }
+    ends = [weight for name, weight in weights.items() if name.startswith(stream.float32_modules)]
+    inner, constants = set(inner_layers(graph, stream.float32_modules)), Constants(graph.graph)
+    left = [
+        node.name
+        for node in graph.graph.node
+        if node.op_type in ("Gemm", "MatMul") and node.name not in inner and node.input[1] in constants
+        if _is_of(constants.value(node.input[1]), weights.values())
+        and not _is_of(constants.value(node.input[1]), ends)
+    ]
+    assert left == []
+
+
+def _is_of(constant: np.ndarray, weights: Iterable[np.ndarray]) -> bool:
+    return any(np.array_equal(constant, one) or np.array_equal(constant, one.T) for one in weights)
 
 
 @pytest.mark.parametrize("size", [1.0, 5000.0])
