@@ -12,6 +12,7 @@ from pathlib import Path
 
 import torch
 from processes import forked
+from small_pictures import draw_small
 
 from memmlp.cli.main import main
 
@@ -51,6 +52,7 @@ def exit_code(arguments: Sequence[str]) -> int:
 
 def in_folder(folder: Path, *arguments: str) -> None:
     """What `processes.forked` does for a command line in that folder."""
+    draw_small()
     os.chdir(folder)
     sys.exit(exit_code(arguments))
 

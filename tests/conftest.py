@@ -17,17 +17,29 @@ import pytest
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 from remembered import keep_exports, remember
+from small_pictures import draw_large, draw_small
 
 from memmlp.common.python_gc import collect_seldom
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector: pytest.Collector) -> Iterator[None]:
+    """Each test process begins elsewhere, so that what one rewrites and compiles, the others find."""
+    report = yield
+    if isinstance(collector, pytest.Dir) and (worker := os.environ.get("PYTEST_XDIST_WORKER")):
+        share = len(report.result) / int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+        first = round(share * int(worker.removeprefix("gw")))
+        report.result = report.result[first:] + report.result[:first]
+    return report
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest files first, the others as they were; what needs a trained run is slow."""
+    """The longest files first, the others by their names; what needs a trained run is slow."""
     here = Path(__file__).parent
     ranks = {here / f"{name}.py": rank for rank, name in enumerate(LONGEST)}
     if gone := [path for path in ranks if not path.is_file()]:
         raise pytest.UsageError(f"LONGEST names files that are not there: {', '.join(map(str, gone))}")
-    items.sort(key=lambda item: ranks.get(item.path, len(ranks)))
+    items.sort(key=lambda item: (ranks.get(item.path, len(ranks)), item.path))
     for item in items:
         if "home" in item.fixturenames or "tiny_home" in item.fixturenames:
             item.add_marker(pytest.mark.slow)
@@ -134,6 +146,11 @@ def shared(factory: pytest.TempPathFactory, name: str) -> Path:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def _pictures_are_small() -> None:
+    draw_small()
+
+
+@pytest.fixture(scope="session", autouse=True)
 def _exports_are_kept(tmp_path_factory: pytest.TempPathFactory) -> None:
     keep_exports(shared(tmp_path_factory, "exports"))
 
@@ -151,7 +168,9 @@ def tiny_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if not said.exists():
             import command_line  # with torch, which the process that only distributes the tests does without
 
+            draw_large()
             said.write_text(command_line.run(folder, "train", *command_line.TINY, INT8))
+            draw_small()
     return folder
 
 
@@ -184,9 +203,11 @@ def on_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 @pytest.fixture
-def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs in this process draw no picture, a third of a tiny evaluation; tests/pipeline looks at some."""
-    monkeypatch.setattr("memmlp.pipeline.run_stages.picture", lambda model, test, path: None)
+def large_pictures() -> Iterator[None]:
+    """Runs in this process have the picture that they have for users."""
+    draw_large()
+    yield
+    draw_small()
 
 
 @pytest.fixture

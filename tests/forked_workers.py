@@ -2,7 +2,7 @@
 
 Each would start two interpreters and import torch, which is most of what a sweep of six steps takes. All else
 is as it is: the same functions, environment, logs and signals. Workers of processes that were started as
-users start them (bench chaos; tests/sweep/executors) are submitit's own.
+users start them (tests/cli/test_sweep, tests/sweep/executors) are submitit's own.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ from collections.abc import Mapping, Sequence
 from multiprocessing import forkserver, process
 from pathlib import Path
 from typing import IO, Any
+
+from small_pictures import draw_small
 
 
 def address() -> str:
@@ -84,6 +86,7 @@ def _worked(
     module, *arguments = command[list(command).index("-m") + 1 :]
     sys.argv = [module, *arguments]
     fork_workers(server)
+    draw_small()
     if module == "submitit.local._local":
         from submitit.local.local import Controller
 

@@ -24,7 +24,7 @@ WORDS = ["sweep", "trial.yaml", *TINY, *SETTINGS]
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:unclosed file .*DEBUG:ResourceWarning")  # submitit leaves its logs open
-def test_rounds_go_on_after_a_kill(tmp_path: Path, no_picture: None):
+def test_rounds_go_on_after_a_kill(tmp_path: Path):
     """Of two arms that hardly differ, which three seeds show."""
     hardly = ["memory=none", "optim.weight_decay=1.001e-4"]
     content = {"metrics": ["MPJPE"], "arms": {"one": ["memory=none"], "other": hardly}}

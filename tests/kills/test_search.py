@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from command_line import SMALL, in_folder, run
-from processes import Forked
+from command_line import SMALL, run
+from kills.storms import forked_controllers
 
 
 @pytest.mark.slow
@@ -16,12 +15,7 @@ def test_every_trial_is_there_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     """With two seeds a trial, so that some kills come between a trial's runs, which are short here."""
     chaos = importlib.import_module("memmlp.cli.bench.chaos")  # in its package the name is the command's
     monkeypatch.setattr(chaos, "LONG_PAUSES", (1.0, 4.0))
-
-    def start(words: Sequence[str], outputs: Path, workers: int) -> Forked:
-        """What `chaos.start` does, without importing torch for each controller (test_sweep does that)."""
-        return Forked(in_folder, tmp_path, *words, "--workers", str(workers), "--outputs", str(outputs))
-
-    monkeypatch.setattr(chaos, "start", start)
+    forked_controllers(tmp_path, monkeypatch)
     words = ["--trials", "2", "--kills", "3", *SMALL, "search.seeds=2"]
     said = run(tmp_path, "bench", "chaos-tune", *words)
     assert "2 trials with 3 kills" in said

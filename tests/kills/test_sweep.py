@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from command_line import SMALL, run
+from kills.storms import forked_controllers
 
 from memmlp.cli.bench.chaos import check, compare
 from memmlp.common.lease import Lock
@@ -15,7 +16,8 @@ from memmlp.runs.run import Run
 
 
 @pytest.mark.slow
-def test_a_sweep_under_kills_ends_as_an_undisturbed_one(tmp_path: Path):
+def test_a_sweep_under_kills_ends_as_an_undisturbed_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    forked_controllers(tmp_path, monkeypatch)
     words = ["--runs", "2", "--kills", "3", "--controllers", "2", "--trials", "0"]
     words += [*SMALL, "export.graph=off"]
     said = run(tmp_path, "bench", "chaos", *words)

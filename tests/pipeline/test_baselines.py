@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import tiny
+from PIL import Image
 
 from memmlp.config.build import build_experiment, config_of
 from memmlp.deploy.parity import TOLERANCE, parity
@@ -23,7 +24,7 @@ SHORT = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_one_command_trains_evaluates_and_finds_it_again(name, memmlp, no_picture):
+def test_one_command_trains_evaluates_and_finds_it_again(name, memmlp):
     """What is exported of each is compared in tests/deploy and tests/live; a picture is drawn below."""
     ran = memmlp("train", f"model={name}", *SHORT, "export.graph=off")
     assert ran.code == 0, ran.err
@@ -36,12 +37,13 @@ def test_one_command_trains_evaluates_and_finds_it_again(name, memmlp, no_pictur
 
 
 @pytest.mark.slow
-def test_one_command_exports_it(memmlp):
+def test_one_command_exports_it(memmlp, large_pictures):
     words = ["model=avatar_poser", *SHORT]
     assert memmlp("train", *words).code == 0
     (run,) = list_runs(Path("outputs"))
     assert run.results["latency"]["onnx_parity"] <= TOLERANCE
     assert run.results["latency"]["macs"] > 0
-    assert run.picture.stat().st_size > 0
+    with Image.open(run.picture) as picture:
+        assert picture.size[0] > 600
     loaded = build_experiment(config_of(run)).architecture.load(run.model)
     assert parity(loaded, run.onnx, CLIP) <= TOLERANCE

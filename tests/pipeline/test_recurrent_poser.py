@@ -17,7 +17,7 @@ SHORT = [
 
 
 @pytest.mark.slow
-def test_one_command_trains_and_evaluates_it_and_a_mirror_makes_another_run(memmlp, no_picture):
+def test_one_command_trains_and_evaluates_it_and_a_mirror_makes_another_run(memmlp):
     ran = memmlp("train", "model=recurrent_poser", *SHORT)
     assert ran.code == 0, ran.err
     (plain,) = list_runs(Path("outputs"))

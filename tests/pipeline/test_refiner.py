@@ -23,7 +23,7 @@ SHORT = [
 
 
 @pytest.mark.slow
-def test_one_command_trains_the_network_and_then_its_refiner(memmlp, no_picture):
+def test_one_command_trains_the_network_and_then_its_refiner(memmlp):
     assert memmlp("train", *SHORT, "evaluation.modes=[stream]").code == 0
     (bare,) = list_runs(Path("outputs"))
     weights = bare.model.read_bytes()

@@ -36,7 +36,7 @@ def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
 
 
 @pytest.mark.slow
-def test_one_command_trains_each_part_and_then_the_whole(memmlp, no_picture):
+def test_one_command_trains_each_part_and_then_the_whole(memmlp):
     ran = memmlp("train", *SHORT)
     assert ran.code == 0, ran.err
     runs = {run.manifest["kind"]: run for run in list_runs(Path("outputs"))}

@@ -1,0 +1,25 @@
+"""What `memmlp bench chaos` and `chaos-tune` start, without importing torch for each process."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from command_line import in_folder
+from processes import Forked
+
+
+def forked_controllers(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Controllers and their workers are forked from now on, in a folder.
+
+    That sweeps live and end as users start them is tests/cli/test_sweep.py's.
+    """
+    chaos = importlib.import_module("memmlp.cli.bench.chaos")  # in its package the name is the command's
+
+    def start(words: Sequence[str], outputs: Path, workers: int) -> Forked:
+        """What `chaos.start` does."""
+        return Forked(in_folder, folder, *words, "--workers", str(workers), "--outputs", str(outputs))
+
+    monkeypatch.setattr(chaos, "start", start)
