@@ -12,7 +12,7 @@ import tiny
 from memmlp.motion.network_coordinates import Heading
 from memmlp.networks.memory import CodeMemory, LSTMMemory, NoMemory
 from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.predictor import RotationOnly
+from memmlp.networks.predictor_slot import RotationOnly
 
 if TYPE_CHECKING:
     from onnx import GraphProto

@@ -38,7 +38,7 @@ from memmlp.networks.memory import (
     NoMemory,
 )
 from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.predictor import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
+from memmlp.networks.predictor_slot import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
 from memmlp.networks.recurrent_cells import CELLS
 from memmlp.runs.recipe_versions import RECIPES
 from memmlp.training.loop import seed_step

@@ -93,7 +93,7 @@ def started(line: Sequence[str], **options: Any) -> Iterator[subprocess.Popen]:
 
 PRELOADED = [
     "memmlp.config.build", "memmlp.pipeline.run_stages", "memmlp.deploy.export", "memmlp.motion.synthetic",
-    "memmlp.render.figure", "torch.onnx", "torch._dynamo", "submitit.local.local",
+    "memmlp.render.heatmap", "torch.onnx", "torch._dynamo", "submitit.local.local",
 ]  # fmt: skip
 """What a training imports, its optimiser, its export and its picture included."""
 

@@ -27,7 +27,7 @@ from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import CodeMemory, JointCodeMemory, Memory, NoMemory, RecurrentMemory
 from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.predictor import Predictor, TwoBranch
+from memmlp.networks.predictor_slot import Predictor, TwoBranch
 from memmlp.networks.recurrent_poser import RecurrentPoser
 from memmlp.networks.refiner import Refined
 from memmlp.networks.vqvae import VQVAE

@@ -79,7 +79,7 @@ def check_positions(network: str, rows: Sequence[dict[str, Any]]) -> None:
 def picture(model: MotionModel, test: MotionDataset, path: Path) -> None:
     """Draw the start of the first test clip, streamed, beside the truth, as a PNG."""
     # Imported here, since it imports matplotlib: half a second that planning a sweep need not spend.
-    from memmlp.render.figure import poses_png
+    from memmlp.render.heatmap import poses_png
 
     device = model.normalizer.rest.device
     clip = test.clip(0)[:PICTURE_FRAMES].to(device)

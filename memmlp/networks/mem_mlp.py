@@ -8,7 +8,7 @@ from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import Memory, State
 from memmlp.networks.motion_model import Learned, MotionModel
-from memmlp.networks.predictor import Predictor
+from memmlp.networks.predictor_slot import Predictor
 
 
 class MemMLP(MotionModel):

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from memmlp.common.errors import InputError
 from memmlp.render.clip_piece import ClipPiece
-from memmlp.render.figure import POSES, heatmap_png
 from memmlp.render.film import film, pyav
+from memmlp.render.heatmap import POSES, heatmap_png
 
 SUFFIXES = (".png", ".gif", ".mp4")
 

@@ -32,7 +32,7 @@ from memmlp.motion.body import HEAD, N_JOINTS, SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading
 from memmlp.motion.synthetic import synthesize_clip
 from memmlp.networks.memory import NoMemory
-from memmlp.networks.predictor import RotationOnly
+from memmlp.networks.predictor_slot import RotationOnly
 from memmlp.networks.streaming import streaming
 from memmlp.runs.run import Run
 

@@ -12,7 +12,7 @@ from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import CodeMemory, GRUMemory, JointCodeMemory, LSTMMemory, NoCodesMemory, NoMemory
-from memmlp.networks.predictor import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
+from memmlp.networks.predictor_slot import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
 from memmlp.networks.vqvae import VQVAE
 from memmlp.training.rollout import TeacherForcing
 

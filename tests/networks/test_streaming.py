@@ -17,7 +17,7 @@ from memmlp.deploy.parity import parity
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.networks.memory import CodeMemory, GRUMemory, JointCodeMemory, LSTMMemory, NoCodesMemory, NoMemory
-from memmlp.networks.predictor import RotationOnly, TwoBranch, TwoBranchMemory
+from memmlp.networks.predictor_slot import RotationOnly, TwoBranch, TwoBranchMemory
 from memmlp.networks.streaming import StreamingGraph, streaming
 
 MEMORIES = [

@@ -16,7 +16,7 @@ from memmlp.common.errors import InputError
 from memmlp.evaluation.modes import joint_positions
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.drawn_limbs import LIMBS, ends
-from memmlp.render import figure, film
+from memmlp.render import film, heatmap
 from memmlp.render.clip_piece import ClipPiece
 from memmlp.render.error_colours import HEAT, heat, scale
 from memmlp.render.raster import Camera, draw
@@ -123,16 +123,17 @@ def test_the_camera_goes_along(take: ClipPiece):
 
 
 def test_png(tmp_path: Path, take: ClipPiece):
-    figure.heatmap_png(tmp_path / "a.png", take, poses=2)
+    heatmap.heatmap_png(tmp_path / "a.png", take, poses=2)
     with Image.open(tmp_path / "a.png") as image:
         assert image.size == (
-            figure.LEFT + 2 * figure.WIDTH + figure.RIGHT,
-            figure.TOP + 3 * (figure.HEIGHT + figure.CAPTION) + 8,
+            heatmap.LEFT + 2 * heatmap.WIDTH + heatmap.RIGHT,
+            heatmap.TOP + 3 * (heatmap.HEIGHT + heatmap.CAPTION) + 8,
         )
         pixels = np.asarray(image.convert("RGB"))
-    step = figure.HEIGHT + figure.CAPTION
+    step = heatmap.HEIGHT + heatmap.CAPTION
     rows = [
-        pixels[figure.TOP + row * step :][: figure.HEIGHT, figure.LEFT : -figure.RIGHT] for row in range(3)
+        pixels[heatmap.TOP + row * step :][: heatmap.HEIGHT, heatmap.LEFT : -heatmap.RIGHT]
+        for row in range(3)
     ]
     vivid = [(row.max(-1).astype(int) - row.min(-1) > 60).mean() for row in rows]
     assert vivid[0] < 0.001 < vivid[1]
@@ -197,5 +198,5 @@ def test_without_pyav_a_line_says_what_to_install(tmp_path, take, monkeypatch):
 
 @pytest.mark.slow
 def test_the_demos_picture(tmp_path: Path):
-    figure.poses_png(tmp_path / "poses.png", TRUTH, TRUTH + OFF, "one")
+    heatmap.poses_png(tmp_path / "poses.png", TRUTH, TRUTH + OFF, "one")
     assert Image.open(io.BytesIO((tmp_path / "poses.png").read_bytes())).size[0] > 1200

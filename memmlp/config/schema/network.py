@@ -209,26 +209,26 @@ class PredictorConfig:
 @dataclass
 class TwoBranchConfig(PredictorConfig):
     name: str = called("two_branch")
-    _target_: str = target("memmlp.networks.predictor.TwoBranch")
+    _target_: str = target("memmlp.networks.predictor_slot.TwoBranch")
 
 
 @dataclass
 class RotationOnlyConfig(PredictorConfig):
     name: str = called("rotation_only")
-    _target_: str = target("memmlp.networks.predictor.RotationOnly")
+    _target_: str = target("memmlp.networks.predictor_slot.RotationOnly")
 
 
 @dataclass
 class TwoBranchMemoryConfig(PredictorConfig):
     name: str = called("two_branch_memory")
-    _target_: str = target("memmlp.networks.predictor.TwoBranchMemory")
+    _target_: str = target("memmlp.networks.predictor_slot.TwoBranchMemory")
     depth: int = at_least(1)
 
 
 @dataclass
 class RotationOnlyMemoryConfig(PredictorConfig):
     name: str = called("rotation_only_memory")
-    _target_: str = target("memmlp.networks.predictor.RotationOnlyMemory")
+    _target_: str = target("memmlp.networks.predictor_slot.RotationOnlyMemory")
     depth: int = at_least(1)
 
 

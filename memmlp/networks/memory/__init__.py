@@ -14,6 +14,7 @@ from memmlp.networks.memory.memory_block import (
     Recurred,
     State,
 )
+from memmlp.networks.memory.memory_slot import Memory, NoMemory
 from memmlp.networks.memory.own_past import (
     CodeMemory,
     JointCodeMemory,
@@ -22,7 +23,6 @@ from memmlp.networks.memory.own_past import (
     VQMemory,
 )
 from memmlp.networks.memory.recurrent import GRUMemory, LSTMMemory, RecurrentMemory
-from memmlp.networks.memory.slot import Memory, NoMemory
 
 __all__ = [
     "Blend",

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from memmlp.motion.body import MOTION_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory.memory_block import Blend, CodeFeature, NoCodesFeature, Past, Recurred, State
-from memmlp.networks.memory.slot import FeatureMemory
+from memmlp.networks.memory.memory_slot import FeatureMemory
 from memmlp.networks.vqvae import VQVAE, straight_through
 
 

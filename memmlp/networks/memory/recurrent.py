@@ -13,7 +13,7 @@ from torch.utils.flop_counter import register_flop_formula
 from memmlp.common.float32_regions import in_float32
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.networks.memory.memory_block import Past, Recurred, RecurredFeature, State
-from memmlp.networks.memory.slot import FeatureMemory
+from memmlp.networks.memory.memory_slot import FeatureMemory
 from memmlp.networks.vqvae import VQVAE
 
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from memmlp.networks.layers import MLPBlock, PlainFusion, ResidualFusion
 from memmlp.networks.memory import MemoryBlock
-from memmlp.networks.predictor import Branch
+from memmlp.networks.predictor_slot import Branch
 from memmlp.networks.recurrent_cells import gru_step
 
 Selection = Callable[[Tensor], Tensor]

@@ -14,7 +14,7 @@ from memmlp.motion.body import SPARSE_DIM
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.predictor import Branch
+from memmlp.networks.predictor_slot import Branch
 from memmlp.networks.streaming.blocks import Converter
 from memmlp.networks.streaming.graph import StreamingGraph, filled, slid
 from memmlp.networks.streaming.one_frame_normalizer import OneFrameNormalizer
