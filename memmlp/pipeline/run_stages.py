@@ -24,6 +24,7 @@ from memmlp.evaluation.evaluation import picture
 from memmlp.evaluation.predictions import save_predictions
 from memmlp.experiment_tracking.feed import Tracking
 from memmlp.live.pose_time import measure_pose
+from memmlp.motion.clip import Skipped
 from memmlp.motion.motion_source import Prepared
 from memmlp.motion.preparing.amass import divided_subjects
 from memmlp.motion.preparing.groups import unfitting
@@ -81,6 +82,15 @@ def of_subjects(config: Mapping[str, Any], clips: Sequence[ClipRecord]) -> str:
     return f"clips of {divided[0]}{more} are in training and in test; data=amass_s3 keeps subjects apart"
 
 
+def of_skipped(skipped: Sequence[Skipped]) -> str | None:
+    """Return what to say of files that are no usable clips; None if there are none."""
+    if not skipped:
+        return None
+    files = "1 file was" if len(skipped) == 1 else f"{len(skipped)} files were"
+    first = skipped[0]
+    return f"{files} skipped, first {first.file} ({first.reason}); data.strict=true stops there"
+
+
 def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     """Bring the experiment's run to its end, doing only what is missing.
 
@@ -92,7 +102,8 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     clips = data.manifest.clips
     tell(f"data: {len(clips)} clips ({of_tests(clips)}), prepared in {data.cache}")
     untied = unfitting(data.manifest.split, [clip.name for clip in clips])
-    for said in filter(None, (of_subjects(experiment.config["data"], clips), untied)):
+    skipped = of_skipped(data.manifest.skipped)
+    for said in filter(None, (skipped, of_subjects(experiment.config["data"], clips), untied)):
         tell(f"data: {said}")
     run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
     if not run.done:

@@ -4,6 +4,7 @@ import itertools
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,6 +25,7 @@ from memmlp.config.compose import composed
 from memmlp.config.package_data import packaged
 from memmlp.experiment_tracking.feed import Tracking
 from memmlp.live.stream import Stream
+from memmlp.motion.clip import Skipped
 from memmlp.motion.dataset import MotionDataset
 from memmlp.pipeline import run_stages
 from memmlp.pipeline.run_stages import recording_outcome, upstream_run
@@ -63,6 +65,14 @@ def test_a_run_leaves_everything(home):
     out = (home / "out.txt").read_text()
     assert "MPJPE" in out
     assert str(run.folder.relative_to(home)) in out
+
+
+def test_what_was_skipped_of_the_data_is_said():
+    bad = Skipped("b.npz", "NaN or Inf in 1 frames, first in frame 3")
+    assert run_stages.of_skipped([]) is None
+    said = run_stages.of_skipped([bad, replace(bad, file="c.npz")])
+    assert said.startswith("2 files were skipped, first b.npz (NaN or Inf in 1 frames, first in frame 3); ")
+    assert run_stages.of_skipped([bad]).startswith("1 file was skipped, first b.npz (")
 
 
 def test_the_same_command_finds_the_run_and_others_share_the_vqvae(home, monkeypatch):

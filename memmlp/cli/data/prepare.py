@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     "--split", default="seeded", show_default=True, help="seeded, s2, or lists:FOLDER (AGRoL's format)."
 )
 @click.option("--val", default=0.1, show_default=True, help="Fraction for validation.")
-@click.option("--test", default=0.1, show_default=True, help="Fraction for testing (seeded).")
+@click.option("--test", type=float, help="Fraction for testing, with --split seeded.  [default: 0.1]")
 @click.option("--seed", default=0, show_default=True)
 @click.option(
     "--group", multiple=True, metavar="REGEX", help="Clips that match stay on one side; repeatable."
@@ -36,7 +36,7 @@ def prepare(
     body: str,
     split: str,
     val: float,
-    test: float,
+    test: float | None,
     seed: int,
     group: tuple[str, ...],
     min_frames: int,
@@ -54,13 +54,19 @@ def prepare(
     show_manifest(run(ClipFolder(root, chosen, body, min_frames, strict), out))
 
 
-def _split(name: str, val: float, test: float, seed: int, groups: tuple[str, ...]) -> Split:
-    """Return the split that --split names. Raises InputError for an unknown name."""
+def _split(name: str, val: float, test: float | None, seed: int, groups: tuple[str, ...]) -> Split:
+    """Return the split that --split names.
+
+    Raises:
+        InputError: for an unknown name, or a fraction for testing where a list says what is tested on.
+    """
     from memmlp.motion.preparing.amass import S2_TEST, S2_TRAIN
     from memmlp.motion.preparing.splits import ListSplit, SeededSplit, SubsetSplit
 
     if name == "seeded":
-        return SeededSplit(test, val, seed, groups)
+        return SeededSplit(0.1 if test is None else test, val, seed, groups)
+    if test is not None:
+        raise InputError(f"--test {test:g}: goes with --split seeded; with --split {name} allowed is none")
     if name == "s2":
         return SubsetSplit(S2_TRAIN, S2_TEST, val, seed, groups)
     if name.startswith("lists:"):

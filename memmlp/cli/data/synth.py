@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from memmlp.cli.options import PATH
+from memmlp.common.errors import InputError
 
 
 @click.command("synth")
@@ -21,5 +22,7 @@ def synth(out: Path, minutes: float, seed: int, fps: float) -> None:
     """
     from memmlp.motion.synthetic import synthesize
 
+    if next(out.rglob("*.npz"), None):
+        raise InputError(f"--out {out}: has clips already; allowed is a new folder, or one without npz")
     paths = synthesize(out, minutes=minutes, seed=seed, fps=fps)
     click.echo(f"{len(paths)} clips, {minutes:g} minutes, in {out}")

@@ -14,7 +14,7 @@ import math
 import os
 import warnings
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +27,6 @@ from memmlp.common.errors import InputError
 BLOCK = 2**23  # the most bytes in a read; the zip's directory must fit into one
 MAX_HEADER = 10_000  # bytes of an npy header, as in np.load
 MAX_ROWS = 500_000  # frames: an hour at 120 Hz is 432,000
-MAX_WIDTH = 1_000  # numbers in a frame: SMPL-X has 165
 MAX_SCALAR = 1_024  # bytes of an array that is one number or word
 MAGIC = b"PK"
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # NumPy's; others unpack without a bound
@@ -89,16 +88,16 @@ class Npz:
         with self._entry(name, header) as entry:
             return np.frombuffer(entry.read(), header.dtype).reshape(header.shape)
 
-    def columns(self, name: str, count: int, *, exact: bool = False) -> np.ndarray:
+    def columns(self, name: str, count: int, widths: Collection[int]) -> np.ndarray:
         """Read the first `count` columns of an array of numbers (N, >= count), or (N, J, 3), as float64.
 
-        With `exact`, the array must not have further columns.
+        The array must have as many columns as `widths` allow.
 
         Raises:
             InputError: for other shapes or types, no rows, or more rows or columns than allowed.
         """
         header = self.header(name)
-        rows, width = self._check(name, header, count, exact)
+        rows, width = self._check(name, header, widths)
         columns = np.empty((rows, count))
         with self._entry(name, header) as entry:
             if header.fortran:
@@ -110,18 +109,18 @@ class Npz:
                     columns[start : start + len(block)] = block[:, :count]
         return columns
 
-    def _check(self, name: str, header: Header, count: int, exact: bool) -> tuple[int, int]:
+    def _check(self, name: str, header: Header, widths: Collection[int]) -> tuple[int, int]:
         """Return rows and width of an array, after a check that it may be read."""
         shape = header.shape
         flat = len(shape) == 2 or (len(shape) == 3 and shape[2] == 3 and not header.fortran)
         rows, width = (shape[0], math.prod(shape[1:])) if flat else (0, 0)
-        if header.dtype.kind != "f" or width < count or (exact and width > count):
-            allowed = f"(N, {count})" if exact else f"(N, >= {count})"
+        if header.dtype.kind != "f" or width not in widths:
+            allowed = " or ".join(f"(N, {width})" for width in widths)
             raise InputError(f"{self.path}: {name} is {header}, not floats {allowed}")
         if rows == 0:
             raise InputError(f"{self.path}: no frames")
-        if rows > MAX_ROWS or width > MAX_WIDTH:
-            raise InputError(f"{self.path}: {name} is {header}; allowed: up to ({MAX_ROWS}, {MAX_WIDTH})")
+        if rows > MAX_ROWS:
+            raise InputError(f"{self.path}: {name} is {header}; allowed: up to {MAX_ROWS} frames")
         return rows, width
 
     @contextmanager

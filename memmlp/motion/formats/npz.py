@@ -30,11 +30,12 @@ from memmlp.motion.formats.bounded_npz import Npz, brief, open_npz
 
 SMPLH_POSE_DIM = 156
 BODY_DIM = 3 * N_JOINTS
-# Arrays that hold the rotations, side by side, and how many of their columns are read.
-LAYOUTS: tuple[dict[str, int], ...] = (
-    {"poses": BODY_DIM},
-    {"root_orient": 3, "pose_body": BODY_DIM - 3},
-    {"global_orient": 3, "body_pose": BODY_DIM - 3},
+# Arrays that hold the rotations, side by side, and how many columns each may have; the body's are read.
+# Rotations in another form (matrices, quaternions, 6D) have other numbers of columns.
+LAYOUTS: tuple[dict[str, tuple[int, ...]], ...] = (
+    {"poses": (BODY_DIM, 72, SMPLH_POSE_DIM, 165)},
+    {"root_orient": (3,), "pose_body": (BODY_DIM - 3,)},
+    {"global_orient": (3,), "body_pose": (BODY_DIM - 3, 69)},
 )
 TRANSLATIONS = ("trans", "transl")
 FRAME_RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
@@ -59,9 +60,10 @@ def read_clip(path: Path, name: str) -> Clip:
     """
     with open_npz(path) as file:
         layout, trans_key, rate_key = _keys(file)
-        parts = [file.columns(key, count, exact=count == 3) for key, count in layout.items()]
-        trans = file.columns(trans_key, 3, exact=True)
+        parts = [file.columns(key, widths[0], widths) for key, widths in layout.items()]
+        trans = file.columns(trans_key, 3, (3,))
         fps = _frame_rate(path, file.scalar(rate_key))
+        _check_rates(file, fps)
     lengths = {len(part) for part in (*parts, trans)}
     if len(lengths) > 1:
         keys = ", ".join((*layout, trans_key))
@@ -71,7 +73,7 @@ def read_clip(path: Path, name: str) -> Clip:
     return Clip(name, body.reshape(-1, N_JOINTS, 3), trans, fps)
 
 
-def _keys(file: Npz) -> tuple[dict[str, int], str, str]:
+def _keys(file: Npz) -> tuple[dict[str, tuple[int, ...]], str, str]:
     """Return the layout of a file, and its keys of translation and frame rate."""
     if not any(key in file.names for layout in LAYOUTS for key in layout):
         raise NoMotion(f"{file.path}: no poses in it, so it is no motion")
@@ -83,6 +85,13 @@ def _keys(file: Npz) -> tuple[dict[str, int], str, str]:
         missing = ", ".join(key for key, value in found.items() if value is None)
         raise InputError(f"{file.path}: no {missing} in it, so it is no AMASS motion")
     return layout, trans, rate
+
+
+def _check_rates(file: Npz, fps: float) -> None:
+    """Raise InputError if the file has a frame rate under another name, too, and it is another one."""
+    for key in FRAME_RATES:
+        if key in file.names and (other := _frame_rate(file.path, file.scalar(key))) != fps:
+            raise InputError(f"{file.path}: has two frame rates, {fps:g} and {key}={other:g}; allowed is one")
 
 
 def _check_numbers(path: Path, body: np.ndarray, trans: np.ndarray) -> None:

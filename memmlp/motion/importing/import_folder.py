@@ -26,9 +26,8 @@ from memmlp.motion.importing.rest_pose import STRAIGHTEST
 from memmlp.motion.importing.skeleton_map import SkeletonMap, find_skeleton, is_number, load_skeleton
 from memmlp.motion.importing.true_rate import HEADER, SIDECAR, folder_key, true_rate
 from memmlp.motion.preparing.groups import Grouping
+from memmlp.motion.preparing.imported_body import RECORD, body_record
 from memmlp.motion.torch_threads import one_thread
-
-RECORD = "import.json"
 
 
 @dataclass(frozen=True)
@@ -150,7 +149,7 @@ def import_folder(source: Path, out: Path, how: ImportSettings | None = None) ->
             raise InputError(f"{source}: no usable file of {len(files)}; {first}")
         clips = _one_floor_a_take(clips, takes, folder)
         report = ImportReport(tuple(clips), tuple(_notes(clips, maps, how)), tuple(skipped))
-        _publish(folder, out, report, Path(how.body).name)
+        _publish(folder, out, report, body_record(how.body, rest))
     return report
 
 
@@ -280,13 +279,13 @@ def _rate_notes(clips: Sequence[Imported]) -> Iterator[str]:
         yield f"{told} ({', '.join(names[:3])}{more})"
 
 
-def _publish(staging: Path, out: Path, report: ImportReport, body: str) -> None:
+def _publish(staging: Path, out: Path, report: ImportReport, body: Mapping[str, str]) -> None:
     """Move clips and record from staging to `out`, and remove earlier clips of the files skipped now.
 
     A new folder `out` appears with all files at once. In the folder of an earlier import, the old record is
     removed first and the new one is written last, so a folder without a record may hold clips of two imports.
     """
-    record = {"body": body, **asdict(report)}
+    record = {**body, **asdict(report)}
     (staging / RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     try:
         if not out.exists():

@@ -31,6 +31,7 @@ from memmlp.motion.preparing.duplicates import assign
 from memmlp.motion.preparing.find import clip_name
 from memmlp.motion.preparing.folder_survey import Survey, survey
 from memmlp.motion.preparing.folders import Folders, Root, find_all
+from memmlp.motion.preparing.imported_body import check_imported_body
 from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manifest, write_manifest
 from memmlp.motion.preparing.splits import PARTS, Split
 from memmlp.motion.torch_threads import one_thread
@@ -75,6 +76,7 @@ def prepare(source: ClipFolder, out: Path) -> Manifest:
             f"data.min_frames: {source.min_frames}; allowed: 2 or more (one frame has no velocity)"
         )
     rest = load_rest_joints(source.body)
+    check_imported_body(source.root, str(source.body), rest)
     try:
         out.mkdir(parents=True, exist_ok=True)
         with Lock(out).hold():
@@ -228,19 +230,22 @@ def _digest(clips: Sequence[ClipRecord], rest: np.ndarray, min_frames: int) -> s
 
 
 def _request(source: ClipFolder, rest: np.ndarray) -> str:
-    """Return a digest of the settings and of each source's path, size and time, without opening any file."""
+    """Return a digest of the settings and of each source's path, size and times, without opening any file."""
     files = [(file, *_stamp(source.root / file)) for file in find_all(source.root).files]
     code = [FORMAT, FRAMES_VERSION, RECIPES["features"]]
     return _hash([*code, source.min_frames, rest.tolist(), source.split.describe(), files])
 
 
-def _stamp(path: Path) -> tuple[int, int]:
-    """Return size and time of a file; zeros for a dangling link, which reading will skip."""
+def _stamp(path: Path) -> tuple[int, int, int]:
+    """Return size and times of a file; zeros for a dangling link, which reading will skip.
+
+    Its time may have been set, as archives do, to the same for every file; that of its last change cannot be.
+    """
     try:
         stat = path.stat()
     except OSError:
-        return 0, 0
-    return stat.st_size, stat.st_mtime_ns
+        return 0, 0, 0
+    return stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns
 
 
 def _hash(value: Any) -> str:

@@ -64,13 +64,17 @@ def clip_name(file: str) -> str:
 
 
 def _entries(root: Path, folder: str, found: FoundFiles) -> list[tuple[str, bool]]:
-    """Return the paths in a folder with whether each is a folder itself: sorted, real ones before links."""
+    """Return the paths in a folder with whether each is a folder itself: sorted, real ones before links.
+
+    Hidden ones are left out: an import that was killed leaves its unfinished clips in a hidden folder.
+    """
     try:
         with os.scandir(root / folder) as listing:
-            entries = sorted(listing, key=lambda entry: (entry.is_symlink(), entry.name))
+            shown = [entry for entry in listing if not entry.name.startswith(".")]
     except OSError as error:
         found.unreadable[folder] = f"cannot be listed ({error.strerror})"
         return []
+    entries = sorted(shown, key=lambda entry: (entry.is_symlink(), entry.name))
     return [((Path(folder) / entry.name).as_posix(), _is_folder(entry)) for entry in entries]
 
 

@@ -57,7 +57,7 @@ class Manifest:
     Attributes:
         digest: sha256 over everything that determines the frames and their split. Groups are not included,
             since training does not use them.
-        request: sha256 over the settings and each source's path, size and time, by which a finished cache is
+        request: sha256 over the settings and each source's path, size and times, by which a finished cache is
             recognised.
         body: "builtin", or the model file's name and a digest of its rest pose: "model.npz 0a1b2c3d".
         rest_joints: rest positions (22, 3), metres.

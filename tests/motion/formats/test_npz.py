@@ -246,14 +246,33 @@ def peak_of_refusal(path: Path, match: str) -> int:
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("shape", [(5000, 156), (100, 8000)])
-def test_a_small_file_that_unpacks_to_much_is_refused_before_it_does(shape, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("shape", "allowed"), [((5000, 156), "allowed: up to 500 frames"), ((100, 8000), "not floats")]
+)
+def test_a_small_file_that_unpacks_to_much_is_refused_before_it_does(shape, allowed, tmp_path, monkeypatch):
     """It says so itself; the bound is lowered, so that the test need not pack gigabytes."""
     monkeypatch.setattr(bounded_npz, "MAX_ROWS", 500)
     path = tmp_path / "a.npz"
     np.savez_compressed(path, **(arrays() | {"poses": np.zeros(shape)}))
     assert path.stat().st_size < 100_000
-    assert peak_of_refusal(path, r"poses is float64 .*; allowed: up to \(500, 1000\)") < 500_000
+    assert peak_of_refusal(path, f"poses is float64 .*{allowed}") < 500_000
+
+
+@pytest.mark.parametrize("width", [88, 132, 176, 198])
+def test_rotations_in_another_form_are_refused(width, tmp_path):
+    """Quaternions, 6D, and matrices of 22 joints would be read as rotation vectors of another motion."""
+    np.savez(tmp_path / "a.npz", **(arrays() | {"poses": np.zeros((50, width))}))
+    with pytest.raises(InputError, match=rf"a\.npz: poses is .*{width}.* not floats \(N, 66\) or \(N, 72\)"):
+        read_clip(tmp_path / "a.npz", "a")
+
+
+def test_two_frame_rates_must_be_one(tmp_path):
+    given = arrays() | {"mocap_framerate": np.array(120.0)}
+    np.savez(tmp_path / "a.npz", **given, fps=np.array(60.0))
+    with pytest.raises(InputError, match=r"a\.npz: has two frame rates, 120 and fps=60; allowed is one"):
+        read_clip(tmp_path / "a.npz", "a")
+    np.savez(tmp_path / "a.npz", **given, fps=np.array(120))
+    assert read_clip(tmp_path / "a.npz", "a").fps == 120
 
 
 def test_a_file_that_unpacks_to_more_than_it_says_is_refused(tmp_path):

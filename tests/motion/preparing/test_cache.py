@@ -2,6 +2,7 @@
 
 import json
 import multiprocessing
+import os
 import re
 import shutil
 from dataclasses import replace
@@ -16,10 +17,11 @@ from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.features import motion_frames
-from memmlp.motion.formats.npz import write_clip
+from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.preparing import cache as module
 from memmlp.motion.preparing import folder_survey
 from memmlp.motion.preparing.cache import ClipFolder, prepare
+from memmlp.motion.preparing.imported_body import RECORD, body_record
 from memmlp.motion.preparing.manifest import Manifest
 from memmlp.motion.preparing.splits import SeededSplit
 from memmlp.runs.recipe_versions import RECIPES
@@ -89,6 +91,34 @@ def test_unchanged_sources_are_not_read_again(root, tmp_path, monkeypatch):
         assert prepare(source(root), tmp_path / "cache") == first
     write_clip(root / "a" / "3.npz", motion(90, 77))
     assert prepare(source(root), tmp_path / "cache").digest != first.digest
+
+
+def test_other_clips_of_the_same_sizes_and_times_are_read(root, tmp_path):
+    """As an archive lays them down that sets every file's time."""
+    before = prepare(source(root), tmp_path / "cache")
+    path = next(root.rglob("*.npz"))
+    stat = path.stat()
+    clip = read_clip(path, "a")
+    write_clip(path, replace(clip, poses=clip.poses[::-1].copy()))
+    os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    assert path.stat().st_size == stat.st_size
+    assert prepare(source(root), tmp_path / "cache").digest != before.digest
+
+
+def test_clips_are_prepared_on_the_body_of_their_import(root, tmp_path):
+    rest = builtin_rest_joints()
+    model = tmp_path / "model.npz"
+    other = body_record(str(model), 1.1 * rest)
+    for folder in (root, root / "below"):
+        folder.mkdir(exist_ok=True)
+        (folder / RECORD).write_text(json.dumps({**body_record("builtin", rest), "clips": []}))
+        prepare(source(root), tmp_path / "cache")
+        for record in (other, {"body": "model.npz"}):  # the second as until version 0.2
+            (folder / RECORD).write_text(json.dumps(record))
+            with pytest.raises(InputError, match=r"imported onto the body model\.npz; allowed is data\.body"):
+                prepare(source(root), tmp_path / "cache")
+        (folder / RECORD).write_text("[]")  # somebody else's
+        prepare(source(root), tmp_path / "cache")
 
 
 def test_the_digest_knows_every_ingredient(root, tmp_path):

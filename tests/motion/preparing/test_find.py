@@ -25,6 +25,15 @@ def test_any_case_of_the_suffix_is_found_and_the_rest_is_counted(root):
     assert [clip_name(file) for file in found.files] == ["a/1", "a/2", "b/UP"]
 
 
+def test_hidden_folders_and_files_are_no_data(root):
+    """Such as the unfinished clips of an import that was killed, and a server's snapshots."""
+    hidden = root / ".cmu-4stpviek" / "clips"
+    hidden.mkdir(parents=True)
+    (hidden / "1.npz").write_text("unfinished")
+    (root / "a" / ".3.npz").write_text("unfinished")
+    assert find_clips(root).files == ["a/1.npz", "a/2.npz", "b/UP.NPZ"]
+
+
 def test_links_in_circles_are_followed_once(root):
     (root / "a" / "loop").symlink_to("..")
     (root / "self").symlink_to(".")
