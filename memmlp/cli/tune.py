@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -16,6 +17,8 @@ from memmlp.common.errors import InputError
 from memmlp.common.lease import Lock
 
 if TYPE_CHECKING:
+    from optuna.trial import FrozenTrial
+
     from memmlp.pipeline.experiment import Experiment
     from memmlp.sweep.plan import RunTask
     from memmlp.sweep.search.search_file import Search, Value
@@ -127,15 +130,16 @@ def _check_space(setup: Setup) -> str:
     """Check the ranges of a search, and describe what a trial's numbers depend on.
 
     Returns:
-        A text that names the first trial's run, its interval of validations, and how its network is used. It
-        is part of the digest in the name of the search's folder, so that another config or other data makes
-        another search.
+        A text that names the first trial's run, its interval of validations, how its network is used, and
+        with what the ends of the space are trained. It is part of the digest in the name of the search's
+        folder, so that another config or other data makes another search.
 
     Raises:
         InputError: if a searched key is set on the command line or does not change the training, or if the
             config refuses a value.
     """
-    from memmlp.runs.identity import inference, trained_with
+    from memmlp.common.files import digest
+    from memmlp.runs.identity import inference, trained_by, trained_with
 
     space = setup.search.space
     for word in setup.words:
@@ -154,7 +158,8 @@ def _check_space(setup: Setup) -> str:
             raise InputError(f"search.space: {one.key}: changes no training; allowed are keys that do")
     first = _tasks(setup, next(iter(setup.search.first_trials()), {}))[0][-1]
     often = f"validated every {first.config['optim']['validate_every']} steps"  # when trials may be pruned
-    return f"{first.id}, {often}, used with {inference(first.config)}"
+    trained = digest([trained_by(config) for config in configs])  # what the first trial need not have
+    return f"{first.id}, {often}, used with {inference(first.config)}, trained with {trained}"
 
 
 def _tasks(setup: Setup, values: Mapping[str, Value]) -> list[Sequence[RunTask]]:
@@ -246,11 +251,40 @@ def summary(setup: Setup, study: Study) -> None:
         click.echo(f"on a part of the data: {part}")
     click.echo(f"in {setup.folder}")
     if best:
-        words = " ".join(setup.words)
-        click.echo(f"next: memmlp train --config-dir {setup.folder} experiment=best {words}".rstrip())
+        click.echo(f"next: memmlp train {shlex.join(training(setup, best[0]))}")
     else:
         reasons = [trial.user_attrs["reason"] for trial in study.trials if "reason" in trial.user_attrs]
         click.echo(
             f"no trial is complete; the last failure: {(reasons or ['errors that are no numbers'])[-1]}"
         )
         raise SystemExit(1)
+
+
+def training(setup: Setup, trial: FrozenTrial) -> list[str]:
+    """Return what `memmlp train` needs to make a trial's run.
+
+    That is the experiment that was written of it, or, where that makes another run (an experiment of the
+    base's or of the command line's chooses something else), its settings word by word.
+    """
+    from memmlp.sweep.search.study import values
+
+    short = ["--config-dir", str(setup.folder), "experiment=best", *setup.words]
+    if _makes(setup, short, trial.user_attrs["runs"][0]):
+        return short
+    own = ["--config-dir", str(setup.config_dir)] if setup.config_dir else []
+    return [*own, *setup.overrides(values(trial, setup.search))[1:]]
+
+
+def _makes(setup: Setup, words: Sequence[str], run_id: str) -> bool:
+    """Return whether `memmlp train` with these words makes the run with that id."""
+    from memmlp.config.build import build_experiment
+    from memmlp.config.compose import composed
+    from memmlp.config.plan_sweep import tasks_of
+
+    try:
+        cfg = composed(words)
+        cfg.paths.outputs = str(setup.outputs)
+        experiment = build_experiment(cfg, elsewhere=True)
+        return tasks_of(experiment, experiment.data.prepare().digest)[-1].id == run_id
+    except InputError:
+        return False

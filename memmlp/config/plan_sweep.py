@@ -8,6 +8,7 @@ long as the sweep, the configs, the code and the data are unchanged.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -219,13 +220,20 @@ def _fresh(data: dict[str, Any], prepare: bool) -> bool:
 def _stamp(sweep: Sweep, outputs: Path) -> str:
     """Return a digest of everything except the data on which a plan depends.
 
-    That is the sweep, the outputs folder, the configs, and the code of memmlp and of users' packages.
+    That is the sweep, the outputs folder, the configs, and the code of memmlp and of users' packages. A plan
+    that depends on folders or on the environment in another way has a digest of its own each time.
     """
     package = Path(__file__).parent.parent
     files = [*packaged("conf").rglob("*.yaml"), *package.rglob("*.py")]
     ours = [(str(file), file.read_text(encoding="utf-8")) for file in sorted(files)]
     own = texts()
-    return digest([asdict(sweep), str(outputs), ours, *([own] if own else [])])
+    elsewhere = any(sign in repr((asdict(sweep), own)) for sign in ELSEWHERE)
+    anew = [time.time_ns()] if elsewhere else []
+    return digest([asdict(sweep), str(outputs), ours, *([own] if own else []), *anew])
+
+
+ELSEWHERE = ("oc.env", "hydra.searchpath")
+"""What an override or a user's config holds that takes values from the environment, or from other folders."""
 
 
 def _remember(sweep: Sweep, plan: Plan, path: Path) -> None:

@@ -232,7 +232,7 @@ def trained_by(config: Mapping[str, Any]) -> dict[str, Any]:
     later = (*EVALUATION, *DEPLOYMENT, *(() if _rolls_out(config) else INFERENCE))
     out = (*NEUTRAL, *FORMER, *later, *_unused(config))
     flat = {key: _canonical(value) for key, value in flatten(config).items() if value is not None}
-    counting = {key: flat[key] for key in flat if not _below(key, out) and not _is_path(key, flat[key])}
+    counting = {key: flat[key] for key in flat if not _below(key, out) and not _is_path(key, flat)}
     return counting | _draws(config)
 
 
@@ -309,9 +309,14 @@ def _below(key: str, names: Iterable[str]) -> bool:
     return any(key == name or key.startswith(f"{name}.") for name in names)
 
 
-def _is_path(key: str, value: Any) -> bool:
-    """Return whether a key is the path of a class of this package; a foreign class has no other name."""
-    return key.rsplit(".", 1)[-1] in PATHS and (value is True or str(value).startswith("memmlp."))
+def _is_path(key: str, flat: Mapping[str, Any]) -> bool:
+    """Return whether a key is the path of a class of this package that has another name.
+
+    That is a slot's class, and what stands deeper and is named. A foreign class has no other name.
+    """
+    node, _, last = key.rpartition(".")
+    named = "." not in node or f"{node}.name" in flat
+    return last in PATHS and named and (flat[key] is True or str(flat[key]).startswith("memmlp."))
 
 
 def _digest(what: Mapping[str, Any]) -> str:

@@ -155,8 +155,13 @@ class Sweep:
         """
         if any(_key(word) == "paths.outputs" for word in overrides):
             raise InputError("paths.outputs: allowed here is --outputs FOLDER, or MEMMLP_OUTPUTS")
-        seeds = [word.partition("=")[2] for word in overrides if word.startswith("seed=")]
-        others = tuple(word for word in overrides if not word.startswith("seed="))
+        if any(_key(word) == "save_predictions" for word in overrides):
+            raise InputError(
+                "save_predictions: a sweep's runs would write over each other's; allowed is memmlp eval RUN "
+                "--save-predictions FOLDER"
+            )
+        seeds = [word.partition("=")[2] for word in overrides if _key(word) == "seed"]
+        others = tuple(word for word in overrides if _key(word) != "seed")
         self._check_keys_of_arms(others)
         chosen = parse_seeds(seeds[-1].split(","), "seed") if seeds else self.seeds
         return replace(self, command_line=(*self.command_line, *others), seeds=chosen)

@@ -192,6 +192,7 @@ def _over_cells(arms: Sequence[Arm], cells: Sequence[tuple[str, ...]]) -> Iterab
         if arm.overrides is None:
             yield arm
             continue
+        _check_free(arm, cells)
         for words in cells:
             label = ", ".join([arm.label, *words] if arm.label else words)
             control = f"{arm.against}, {', '.join(words)}" if arm.against else None
@@ -199,6 +200,14 @@ def _over_cells(arms: Sequence[Arm], cells: Sequence[tuple[str, ...]]) -> Iterab
             yield replace(
                 arm, label=label, overrides=overrides, against=control, series=arm.label, cell=words
             )
+
+
+def _check_free(arm: Arm, cells: Iterable[Sequence[str]]) -> None:
+    """Raise InputError if an arm sets a key of an axis, whose values would win over the arm's."""
+    own = {word.partition("=")[0].lstrip("+~") for word in arm.overrides or ()}
+    axes = {word.partition("=")[0] for words in cells for word in words}
+    if both := sorted(own & axes):
+        raise InputError(f"arm '{arm.label}': sets {both[0]}, which is an axis; allowed is one of both")
 
 
 def _scale(value: Any, grids: Sequence[Mapping[str, Any]], arms: Sequence[Arm]) -> Scale:

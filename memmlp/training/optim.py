@@ -117,6 +117,13 @@ class Muon(Optim):
     momentum: float = 0.95
     rest_lr: float | None = None
 
+    def at(self, lr: float | None) -> Self:
+        """As of any optimisation; the learning rate of what is no matrix changes in proportion."""
+        other = super().at(lr)
+        if lr is None or self.rest_lr is None:
+            return other
+        return replace(other, rest_lr=self.rest_lr * lr / self.lr)
+
     def check_installed(self) -> None:
         """Raise InputError if torch has no Muon."""
         if not hasattr(torch.optim, "Muon"):

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import re
+import shlex
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from command_line import TINY as BASE
@@ -14,7 +16,7 @@ from command_line import run_apart
 from filelock import FileLock
 
 from memmlp.cli.bench.chaos import examine
-from memmlp.cli.tune import prepare_search
+from memmlp.cli.tune import _makes, _tasks, prepare_search, training
 from memmlp.runs.run import Run
 from memmlp.sweep.search.search_file import Range
 
@@ -42,7 +44,7 @@ def test_a_search_ends_with_its_best_trial_and_the_command_for_it(home: Path):
     assert examine(home / "outputs", 3) == []
     best = min(rows, key=lambda row: float(row["MPJPE"]))
     (words,) = re.findall(r"next: memmlp (.*)", said)
-    trained = command(home, *words.split(), "export.graph=off")
+    trained = command(home, *shlex.split(words), "export.graph=off")
     assert f"outputs/runs/{best['run']}" in trained
     assert len(list((home / "outputs/runs").iterdir())) == 4  # a VQ-VAE and three trials, none made anew
 
@@ -142,6 +144,37 @@ def test_a_search_is_named_after_what_its_trials_follow_from(tmp_path: Path, mon
         folder("memory.blend=0"),
     ]  # fmt: skip
     assert len({base, *others}) == 11
+
+
+def test_a_search_is_named_after_what_later_trials_follow_from_too(tmp_path: Path):
+    """The first trial has no memory, and so no VQ-VAE."""
+    space = ["search.space.loss=null", "+search.space.memory={choices: [none, vq], first: none}"]
+
+    def folder(*words: str) -> str:
+        return prepare_search([*TINY, *space, *words], None, tmp_path).folder.name
+
+    assert folder("vqvae.lr=1e-3") != folder("vqvae.lr=1e-1")
+
+
+@pytest.mark.parametrize("words", [["experiment=no_codes"], ["search.base=['experiment=no_codes']"]], ids=str)
+def test_beside_an_experiment_the_best_trial_is_told_word_by_word(tmp_path: Path, words: list[str]):
+    space = ["search.space.loss=null", "+search.space.optim={lr: {choices: [1e-3, 2e-3]}}"]
+    setup = prepare_search([*TINY, *words, *space], None, tmp_path)
+    found = {"optim.lr": 2e-3}
+    task = _tasks(setup, found)[0][-1]
+    write_best(setup.folder, "optim: {lr: 2.0e-3}")
+    trial = SimpleNamespace(params=found, user_attrs={"runs": [task.id]})
+    told = training(setup, trial)
+    assert "experiment=best" not in told
+    assert "experiment=no_codes" in told
+    assert _makes(setup, told, task.id)
+
+
+def write_best(folder: Path, content: str) -> None:
+    """Write what a search leaves of its best trial."""
+    path = folder / "experiment/best.yaml"
+    path.parent.mkdir(parents=True)
+    path.write_text(f"# @package _global_\n{content}\n")
 
 
 def test_a_folder_of_ones_own_searches(tmp_path: Path):

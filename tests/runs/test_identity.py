@@ -61,6 +61,17 @@ def test_where_a_class_lies_does_not_count():
     assert len({of("memmlp.a.B"), of("mine.B"), of("theirs.B")}) == 3  # a name alone tells no foreign class
 
 
+def test_what_a_slot_s_class_is_made_of_counts_unless_it_is_named():
+    """Such as the loss that a loss of one's own wraps."""
+
+    def of(inner: dict) -> str:
+        return identity({**CONFIG, "loss": {"name": "mine", "_target_": "mine.Loss", "inner": inner}})
+
+    assert of({"_target_": "memmlp.a.B"}) != of({"_target_": "memmlp.a.C"})
+    named = [of({"_target_": f"memmlp.{path}", "name": "b"}) for path in ("a.B", "c.d.B")]
+    assert named[0] == named[1]
+
+
 def test_stages_have_identities_of_what_changes_them_alone():
     def of(**changes: object) -> tuple[str, str, str]:
         config = {**CONFIG, "evaluation": {"ik": "off", "ik_iterations": 15, "batch": 4}, "export": {"a": 1}}

@@ -50,6 +50,24 @@ def test_the_outputs_folder_is_an_option_and_no_override():
         sweep.with_overrides(["profile=tiny", "paths.outputs=elsewhere"])
 
 
+@pytest.mark.parametrize("word", ["++seed=7", "+seed=7"])
+def test_a_seed_that_is_added_is_one(word: str):
+    assert parse_sweep("s", {"seeds": [0, 1], "arms": ARMS}).with_overrides([word]).seeds == (7,)
+
+
+def test_runs_of_a_sweep_do_not_write_predictions_over_each_other():
+    sweep = parse_sweep("s", {"seeds": [0], "arms": ARMS})
+    with pytest.raises(InputError, match="save_predictions: a sweep's runs would write over each other's"):
+        sweep.with_overrides(["save_predictions=all"])
+
+
+def test_an_axis_over_what_an_arm_sets_is_refused():
+    """Its values would win, and the arm's label be wrong."""
+    content = {"arms": {"slow": ["optim.lr=1e-4"], "none": []}, "axes": {"optim.lr": [1e-3, 2e-3]}}
+    with pytest.raises(InputError, match=r"arm 'slow': sets optim\.lr, which is an axis; allowed is one"):
+        parse_sweep("s", content)
+
+
 def test_axes_are_a_grid_over_every_arm():
     axes = {"model.frames": [11, 21], "memory.layers": [[2], [2, 4]], "seed": [3, 4]}
     sweep = parse_sweep("s", {"arms": {"a": ["loss=manual"]}, "axes": axes})

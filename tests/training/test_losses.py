@@ -84,3 +84,10 @@ def test_uncertainty_settles_where_the_weight_is_one_over_the_loss():
 def test_a_loss_without_terms_is_none():
     with pytest.raises(NotImplementedError):
         Loss()(MOTION, TRUTH[..., SPARSE_DIM:], SPARSE, NORMALIZER)
+
+
+def test_a_custom_term_has_its_own_weight_also_under_the_name_of_a_term_that_is_not_there():
+    weighting = Manual()
+    weighting.build(["rotation", "hand"], {"hand": 7.0})
+    terms = {"rotation": torch.tensor(1.0), "hand": torch.tensor(1.0)}
+    assert float(weighting(terms)) == pytest.approx(1 + 7)

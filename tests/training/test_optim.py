@@ -128,6 +128,10 @@ def test_at_another_rate_the_course_is_the_same():
     assert (other.lr, other.final_lr) == (1.0, pytest.approx(0.1))
     assert [other.factor(step) for step in range(10)] == pytest.approx([plain.factor(n) for n in range(10)])
     assert plain.at(None) == plain
+    muon = replace(OPTIMS["muon"], lr=8e-3, rest_lr=4e-3)
+    assert muon.at(1e-4).rest_lr == pytest.approx(5e-5)
+    assert muon.at(None) == muon
+    assert replace(muon, rest_lr=None).at(1e-4).rest_lr is None
 
 
 def test_a_library_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch):

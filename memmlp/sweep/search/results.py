@@ -82,7 +82,10 @@ def write_experiments(study: Study, folder: Path, groups: Collection[str]) -> li
 
 
 def experiment(study: Study, trial: FrozenTrial, groups: Collection[str]) -> str:
-    """Return a trial as the text of a file for the config group `experiment`."""
+    """Return a trial as the text of a file for the config group `experiment`.
+
+    It lacks an experiment of the search's base, and does not stand against one of a command line.
+    """
     search = study.search
     tree: dict[str, Any] = {}
     options: list[dict[str, str]] = []
@@ -100,10 +103,13 @@ def experiment(study: Study, trial: FrozenTrial, groups: Collection[str]) -> str
 
 
 def _words(search: Search, trial: FrozenTrial) -> Iterator[tuple[str, str]]:
-    """Yield the keys of the search's base and of the trial, with their values as they are typed."""
-    for override in (*search.base, *search.overrides(values(trial, search))):
-        key, _, value = override.partition("=")
-        yield key.lstrip("+"), value
+    """Yield the keys of the search's base and of the trial, each once, with their values as they are typed.
+
+    The base's experiment is not among them, since none can choose another.
+    """
+    words = (*search.base, *search.overrides(values(trial, search)))
+    last = {key.lstrip("+"): value for key, _, value in (word.partition("=") for word in words)}
+    yield from ((key, value) for key, value in last.items() if key != "experiment")
 
 
 def _put(tree: dict[str, Any], keys: Sequence[str], value: Any) -> None:

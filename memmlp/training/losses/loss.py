@@ -30,10 +30,12 @@ class Fixed(nn.Module):
     def build(self, names: list[str], own: Mapping[str, float] | None = None) -> None:
         """Check that every term has a weight, adding the weights of custom terms; there is nothing to learn.
 
+        A custom term's own weight counts, also where this has one for a term of that name which is not there.
+
         Raises:
             InputError: for a term that has no weight.
         """
-        self.values = {**(own or {}), **self.values}
+        self.values = {**self.values, **(own or {})}
         if lacking := [name for name in names if name not in self.values]:
             raise InputError(f"loss: term '{lacking[0]}' has no weight; allowed are {', '.join(self.values)}")
 

@@ -116,6 +116,20 @@ def test_a_best_trial_of_groups_lists_and_plain_keys_is_a_config(tmp_path: Path)
     assert content["seed"] in range(3, 10)
 
 
+def test_of_a_key_in_the_base_and_the_trial_the_trials_value_is_written(tmp_path: Path):
+    """And no experiment, since none can choose another."""
+    space = {"hand": {"choices": ["fk", "position"]}}
+    study = open_study(tmp_path, space=space, n_trials=1, base=["hand=off", "experiment=manual_weights"])
+    one = director(study, tmp_path)
+    run = begun(one.look(1))
+    log(run, STEPS, 1.0)
+    run.finish([])
+    one.look(1)
+    (path,) = results.write_experiments(study, tmp_path, ["hand", "experiment"])
+    (hand, itself) = yaml.safe_load(path.read_text())["defaults"]
+    assert (hand["override /hand"] in ("fk", "position"), itself) == (True, "_self_")
+
+
 @pytest.mark.parametrize(
     ("tried", "values", "said"),
     [
