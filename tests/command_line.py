@@ -22,7 +22,7 @@ MAIN = [sys.executable, "-c", f"{INTERRUPTIBLE}; from memmlp.cli.main import mai
 SMALL = [
     "profile.depth=2",
     "profile.memory_layers=[2]",
-    "data.synth.minutes=0.1",
+    "data.synth.minutes=0.2",
 ]  # smaller than profile=tiny
 TINY = ["profile=tiny", *SMALL, "tracking=none", "threads=1", "optim.steps=6", "vqvae.steps=6"]
 
