@@ -22,7 +22,7 @@ from fake_search import (
 
 from memmlp.sweep.search import results
 from memmlp.sweep.search.search_file import Range
-from memmlp.sweep.search.study import suggest
+from memmlp.sweep.search.study import Study, suggest
 
 
 def test_trials_of_several_seeds_as_csv(tmp_path: Path):
@@ -100,15 +100,21 @@ def test_table_5_takes_only_loss_weights(tmp_path: Path):
     assert not results.write_table(study, tmp_path / "none", tmp_path / "table05.yaml")
 
 
-def test_a_best_trial_of_groups_lists_and_plain_keys_is_a_config(tmp_path: Path):
-    space = {"hand": {"choices": ["off", "fk"]}, "memory": {"layers": {"choices": [[2], [2, 4]]}}}
-    space |= {"seed": {"low": 3, "high": 9}}
-    study = open_study(tmp_path, space=space, n_trials=1, base=[])
-    one = director(study, tmp_path)
+def after_one_trial(folder: Path, space: dict, base: list[str]) -> Study:
+    """A study whose one trial is complete."""
+    study = open_study(folder, space=space, n_trials=1, base=base)
+    one = director(study, folder)
     run = begun(one.look(1))
     log(run, STEPS, 1.0)
     run.finish([])
     one.look(1)
+    return study
+
+
+def test_a_best_trial_of_groups_lists_and_plain_keys_is_a_config(tmp_path: Path):
+    space = {"hand": {"choices": ["off", "fk"]}, "memory": {"layers": {"choices": [[2], [2, 4]]}}}
+    space |= {"seed": {"low": 3, "high": 9}}
+    study = after_one_trial(tmp_path, space, [])
     (path,) = results.write_experiments(study, tmp_path, ["hand", "memory"])
     content = yaml.safe_load(path.read_text())
     assert content["defaults"][0]["override /hand"] in ("off", "fk")
@@ -119,12 +125,7 @@ def test_a_best_trial_of_groups_lists_and_plain_keys_is_a_config(tmp_path: Path)
 def test_of_a_key_in_the_base_and_the_trial_the_trials_value_is_written(tmp_path: Path):
     """And no experiment, since none can choose another."""
     space = {"hand": {"choices": ["fk", "position"]}}
-    study = open_study(tmp_path, space=space, n_trials=1, base=["hand=off", "experiment=manual_weights"])
-    one = director(study, tmp_path)
-    run = begun(one.look(1))
-    log(run, STEPS, 1.0)
-    run.finish([])
-    one.look(1)
+    study = after_one_trial(tmp_path, space, ["hand=off", "experiment=manual_weights"])
     (path,) = results.write_experiments(study, tmp_path, ["hand", "experiment"])
     (hand, itself) = yaml.safe_load(path.read_text())["defaults"]
     assert (hand["override /hand"] in ("fk", "position"), itself) == (True, "_self_")
