@@ -30,7 +30,7 @@ from memmlp.motion.formats.bounded_npz import Npz, brief, open_npz
 
 SMPLH_POSE_DIM = 156
 BODY_DIM = 3 * N_JOINTS
-# Arrays that hold the rotations, side by side, and how many columns each may have: the first as many are read.
+# Arrays that hold the rotations, side by side, and how many columns each may have; the first number is read.
 # Rotations in another form (matrices, quaternions, 6D) have other numbers of columns.
 LAYOUTS: tuple[dict[str, tuple[int, ...]], ...] = (
     {"poses": (BODY_DIM, 72, SMPLH_POSE_DIM, 165)},
