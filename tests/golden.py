@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
+import tempfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -24,10 +25,13 @@ from memmlp.evaluation import metrics
 from memmlp.evaluation import modes as evaluation
 from memmlp.evaluation.ik import IK, LBFGS, Arms
 from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.clip import Clip
 from memmlp.motion.dataset import WindowSampler
+from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.mirror import MirroredDataset
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
+from memmlp.motion.synthetic import ACTIVITIES, synthesize, synthesize_clip
 from memmlp.networks.baselines.still_pose import StillPose
 from memmlp.networks.memory import (
     CodeMemory,
@@ -66,6 +70,24 @@ BOTH = frozenset({"rotation", "position"})
 def pair() -> tuple[Tensor, Tensor]:
     """A prediction and the truth (B, T, 252), two windows of nine frames each."""
     return tuple(torch.stack([tiny.clip(9, seed), tiny.clip(9, seed + 1)]) for seed in (1, 5))  # type: ignore[return-value]
+
+
+def synthetic() -> Numbers:
+    """Each activity's motion, and the lengths of a folder's clips."""
+    clips = {name: synthesize_clip(name, 3, seconds=1.0) for name in ACTIVITIES}
+    with tempfile.TemporaryDirectory() as folder:
+        paths = synthesize(Path(folder), minutes=0.05, seed=1)
+        lengths = torch.tensor([len(read_clip(path, path.stem)) for path in paths])
+    return {
+        **summary("lengths", lengths),
+        **{name: value for kind, clip in clips.items() for name, value in _clip(kind, clip).items()},
+    }
+
+
+def _clip(name: str, clip: Clip) -> Numbers:
+    """The numbers of a clip's rotations and of its place."""
+    rotations, place = torch.from_numpy(clip.poses), torch.from_numpy(clip.trans)
+    return summary(f"{name} rotations", rotations) | summary(f"{name} place", place)
 
 
 def features() -> Numbers:
@@ -208,6 +230,7 @@ def ik(solver: IK) -> Numbers:
 
 
 CASES: dict[str, Callable[[], Numbers]] = {
+    "synthetic": synthetic,
     "features": features,
     **{
         f"coordinates.{name}": partial(coordinates, kind)

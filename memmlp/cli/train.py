@@ -56,6 +56,7 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
     jobs = preflight(args) if _runs(args) else []
     if len(jobs) > 1 and distributed.size() > 1:
         raise InputError("torchrun: several processes train one run; allowed is no multirun")
+    _check_predictions(jobs)
     failures: list[Exception] = []
     with _raising(args.overrides):
         _run_hydra(
@@ -75,6 +76,17 @@ def _runs(args: argparse.Namespace) -> bool:
     """Return whether the arguments ask to train, rather than only to show something."""
     shows = (args.help, args.hydra_help, args.cfg, args.info, args.shell_completion)
     return not any(shows)
+
+
+def _check_predictions(jobs: Sequence[DictConfig]) -> None:
+    """Raise InputError if several jobs of a multirun would save their predictions in one folder."""
+    folders = [cfg.save_predictions for cfg in jobs if cfg.save_predictions]
+    for folder in folders:
+        if folders.count(folder) > 1:
+            raise InputError(
+                f"save_predictions={folder}: {folders.count(folder)} jobs would write over each other's; "
+                "allowed is a folder of its own for each, such as predictions/${seed}"
+            )
 
 
 @contextmanager

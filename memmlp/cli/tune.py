@@ -152,6 +152,7 @@ def _check_space(setup: Setup) -> str:
             configs.append(_experiments(setup, corner)[0].config)
         except InputError as error:
             raise InputError(f"search.space: {error}") from None
+    _check_validation(configs)
     for one in space:
         counts = any(trained_with(one.key, config) for config in configs)  # some do at other values than 0
         if not isinstance(configs[0].get(one.key), Mapping) and not counts:
@@ -160,6 +161,21 @@ def _check_space(setup: Setup) -> str:
     often = f"validated every {first.config['optim']['validate_every']} steps"  # when trials may be pruned
     trained = digest([trained_by(config) for config in configs])  # what the first trial need not have
     return f"{first.id}, {often}, used with {inference(first.config)}, trained with {trained}"
+
+
+def _check_validation(configs: Sequence[Mapping[str, Any]]) -> None:
+    """Raise InputError if the trials of a space would be judged by different validation clips."""
+    from memmlp.runs.identity import validated_on
+
+    first = validated_on(configs[0])
+    for config in configs[1:]:
+        other = validated_on(config)
+        for key in sorted(first.keys() | other.keys()):
+            if first.get(key) != other.get(key):
+                raise InputError(
+                    f"search.space: {key} changes which clips the trials are judged by; allowed of data are "
+                    "weighting, mirror, split.train_fraction and sources.NAME.weight"
+                )
 
 
 def _tasks(setup: Setup, values: Mapping[str, Value]) -> list[Sequence[RunTask]]:
@@ -211,13 +227,16 @@ def search(setup: Setup, study: Study, workers: Workers) -> None:
 def leave(setup: Setup, study: Study) -> None:
     """Write the results of the search into its folder."""
     from memmlp.config.package_data import packaged
+    from memmlp.runs.identity import chosen
+    from memmlp.runs.shown_name import USUAL
     from memmlp.sweep.search import results
 
     results.write_trials(study, setup.folder / "trials.csv")
     groups = [path.name for path in packaged("conf").iterdir() if path.is_dir()]
     results.write_experiments(study, setup.folder, groups)
-    table = f"table{results.TABLE:02d}.yaml"
-    results.write_table(study, packaged("sweeps") / table, setup.folder / table)
+    if chosen(_experiments(setup, {})[0].config, "model") == USUAL["model"]:  # Table 5 is of no other network
+        table = f"table{results.TABLE:02d}.yaml"
+        results.write_table(study, packaged("sweeps") / table, setup.folder / table)
     results.write_plots(study, setup.folder)
 
 

@@ -16,13 +16,15 @@ from memmlp.motion.motion_source import MotionSource
 from memmlp.motion.preparing.cache import ClipFolder
 from memmlp.motion.preparing.folders import Folders, Root
 from memmlp.motion.preparing.splits import MixedSplit, SeededSplit, Split
+from memmlp.runs.recipe_versions import RECIPES
 
 
 def build_motion(cfg: DictConfig) -> MotionSource:
     """Build the source of an experiment's motion.
 
-    A synthetic folder's name contains its length and seed, or the path and settings of a custom generator, so
-    that other settings and generators never find stale files.
+    A synthetic folder's name contains its length and seed, and the generator's recipe version after the
+    first, or the path and settings of a custom generator, so that other settings and generators never find
+    stale files.
 
     Raises:
         InputError: if a list of groups can't be read, two folders of a list have the same name, or the
@@ -37,7 +39,9 @@ def build_motion(cfg: DictConfig) -> MotionSource:
         root = Path(data.root) / "-".join([path, *(f"{key}{value}" for key, value in settings.items())])
         generate = partial(located(path, "data.synth"), **settings)
     elif data.synth is not None:
-        root = Path(data.root) / f"{data.synth.minutes:g}min-seed{data.synth.seed}"
+        version = RECIPES["synthetic"]
+        made = f"{data.synth.minutes:g}min-seed{data.synth.seed}" + (f"-v{version}" if version > 1 else "")
+        root = Path(data.root) / made
         generate = partial(_synthesize, minutes=data.synth.minutes, seed=data.synth.seed)
 
     source = ClipFolder(root, split, str(data.body), data.min_frames, data.strict)

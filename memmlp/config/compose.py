@@ -95,6 +95,7 @@ def preflight(args: argparse.Namespace) -> list[DictConfig]:
                 configs.append(_compose(args, overrides))
             check(configs[-1])
             _check_plugins(configs[-1])
+            _check_fractions(configs[-1], overrides)
     return configs
 
 
@@ -136,6 +137,16 @@ def _check_plugins(cfg: DictConfig) -> None:
                 f"plugins=[{name}]: a config file tells it too late; allowed is on the command line, "
                 f"in the base of a sweep or search, or {plugins.VARIABLE}={name}"
             )
+
+
+def _check_fractions(cfg: DictConfig, overrides: Sequence[str]) -> None:
+    """Raise InputError for a fraction of the split that changes nothing, as each source has its own."""
+    sources = (cfg.data.get("sources") or {}).values()
+    for word in overrides:
+        key = word.partition("=")[0].lstrip("+")
+        part = key.removeprefix("data.split.")
+        if key != part and part in ("test", "val") and sources and all(one.get(part) for one in sources):
+            raise InputError(f"{word}: each source has its own; allowed is data.sources.NAME.{part}")
 
 
 HELP = """memmlp train trains, evaluates, exports and times one configuration.

@@ -59,6 +59,9 @@ ID = re.compile(r"[0-9a-f]{16}")
 DATA_PATH = re.compile(r"data\.(root|body|split\.folder|sources\..+\.root)")
 """The keys that say where data lies."""
 
+DRAWS = re.compile(r"data\.(weighting|mirror|split\.train_fraction|sources\..+\.weight)")
+"""The keys of the data that change what is trained on alone, not what is validated and tested."""
+
 SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term", "refiner", "upstream", "optim")
 
 UNNAMED = {"optim": "adamw"}
@@ -255,6 +258,12 @@ def _training(kind: str, config: Mapping[str, Any], data: str, upstream: str | N
 def trained_with(key: str, config: Mapping[str, Any]) -> bool:
     """Return whether a dotted key can change the training of this config, or its data."""
     return key.startswith("data.") or any(_below(name, [key]) for name in trained_by(config))
+
+
+def validated_on(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the config values that decide on which clips a training is validated, by dotted key."""
+    flat = flatten({"data": config.get("data") or {}})
+    return {key: _canonical(value) for key, value in flat.items() if not DRAWS.fullmatch(key)}
 
 
 def is_data_path(key: str) -> bool:

@@ -12,6 +12,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 RECIPES: dict[str, int] = {
+    # the motion that is made, which is known by the data's digest; the number names its folder
+    "synthetic": 1,
     # what the network sees, and how its space lies in the world (memmlp.motion)
     "features": 1,
     "coordinates.heading": 1,

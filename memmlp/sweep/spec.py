@@ -153,24 +153,24 @@ class Sweep:
             InputError: for an override of the outputs folder, which an option of the command sets, and for a
                 key that an arm sets itself, since the arm's value would win.
         """
-        if any(_key(word) == "paths.outputs" for word in overrides):
+        if any(key_of(word) == "paths.outputs" for word in overrides):
             raise InputError("paths.outputs: allowed here is --outputs FOLDER, or MEMMLP_OUTPUTS")
-        if any(_key(word) == "save_predictions" for word in overrides):
+        if any(key_of(word) == "save_predictions" for word in overrides):
             raise InputError(
                 "save_predictions: a sweep's runs would write over each other's; allowed is memmlp eval RUN "
                 "--save-predictions FOLDER"
             )
-        seeds = [word.partition("=")[2] for word in overrides if _key(word) == "seed"]
-        others = tuple(word for word in overrides if _key(word) != "seed")
+        seeds = [word.partition("=")[2] for word in overrides if key_of(word) == "seed"]
+        others = tuple(word for word in overrides if key_of(word) != "seed")
         self._check_keys_of_arms(others)
         chosen = parse_seeds(seeds[-1].split(","), "seed") if seeds else self.seeds
         return replace(self, command_line=(*self.command_line, *others), seeds=chosen)
 
     def _check_keys_of_arms(self, overrides: Iterable[str]) -> None:
         """Raise InputError for an override of a key that an arm sets itself."""
-        setters = {_key(word): arm.label for arm in self.runnable() for word in arm.overrides or ()}
+        setters = {key_of(word): arm.label for arm in self.runnable() for word in arm.overrides or ()}
         for word in overrides:
-            if (key := _key(word)) in setters:
+            if (key := key_of(word)) in setters:
                 raise InputError(
                     f"{word}: arm '{setters[key]}' of sweep {self.name} sets {key} itself; "
                     "allowed are keys that no arm sets"
@@ -179,7 +179,7 @@ class Sweep:
     def overrides(self, arm: Arm) -> tuple[str, ...]:
         """Return an arm's overrides: the base's, the command line's, its own; the last one of a key wins."""
         words = (*self.base, *self.command_line, *(arm.overrides or ()))
-        return tuple({_key(word): word for word in words}.values())
+        return tuple({key_of(word): word for word in words}.values())
 
     def runnable(self) -> tuple[Arm, ...]:
         """Return the arms that can be run: all except those with only the paper's values."""
@@ -194,7 +194,7 @@ class Sweep:
         ]
 
 
-def _key(override: str) -> str:
+def key_of(override: str) -> str:
     """Return the key or group that an override sets, adds (+) or removes (~)."""
     return override.partition("=")[0].lstrip("+~")
 

@@ -33,7 +33,7 @@ import yaml
 
 from memmlp.common.errors import InputError, why_unreadable
 from memmlp.evaluation.units import SMALLEST, UNITS
-from memmlp.sweep.spec import BRANCHES, COMPUTE, COSTS, Arm, Scale, Sweep, parse_branch, parse_seeds
+from memmlp.sweep.spec import BRANCHES, COMPUTE, COSTS, Arm, Scale, Sweep, key_of, parse_branch, parse_seeds
 
 KEYS = (
     "title", "table", "notes", "base", "seeds", "control", "metrics", "branch", "branch_source", "smallest",
@@ -204,8 +204,8 @@ def _over_cells(arms: Sequence[Arm], cells: Sequence[tuple[str, ...]]) -> Iterab
 
 def _check_free(arm: Arm, cells: Iterable[Sequence[str]]) -> None:
     """Raise InputError if an arm sets a key of an axis, whose values would win over the arm's."""
-    own = {word.partition("=")[0].lstrip("+~") for word in arm.overrides or ()}
-    axes = {word.partition("=")[0] for words in cells for word in words}
+    own = {key_of(word) for word in arm.overrides or ()}
+    axes = {key_of(word) for words in cells for word in words}
     if both := sorted(own & axes):
         raise InputError(f"arm '{arm.label}': sets {both[0]}, which is an axis; allowed is one of both")
 

@@ -85,6 +85,7 @@ def test_a_wrong_unit_is_said_by_both(source: Path) -> None:
     [
         (("--fps", "fast"), "--fps fast: no frame rate"),
         (("--fps", "waltz=60"), "fps: 60.0 for 'waltz'"),
+        (("--fps", "60", "--fps", "30"), "--fps: all twice"),
         (("--floor", "low"), "--floor low: no height"),
         (("--ground", "nan"), "--floor nan: no height"),
         (("--take", "("), "take: '('"),

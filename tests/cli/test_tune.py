@@ -16,8 +16,9 @@ from command_line import run_apart
 from filelock import FileLock
 
 from memmlp.cli.bench.chaos import examine
-from memmlp.cli.tune import _makes, _tasks, prepare_search, training
+from memmlp.cli.tune import _makes, _tasks, leave, prepare_search, training
 from memmlp.runs.run import Run
+from memmlp.sweep.search import results
 from memmlp.sweep.search.search_file import Range
 
 TINY = [*BASE, "optim.validate_every=3"]
@@ -112,6 +113,11 @@ def test_a_second_owner_is_refused(home: Path):
             "+search.space.memory.blend={low: 0.0, high: 1.0}",
             "search.space: memory.blend: changes no training",
         ),
+        (
+            "+search.space.data.split.seed={low: 0, high: 9}",
+            "search.space: data.split.seed changes which clips the trials are judged by",
+        ),
+        ("+search.space.data={choices: [synth, mocap], first: synth}", "search.space: "),
         ("~search", "search: has no value"),
         ("~search.n_trials", "search.n_trials: has no value"),
         ("+search.nonsense=1", "search.nonsense: no such key; allowed are name"),
@@ -144,6 +150,22 @@ def test_a_search_is_named_after_what_its_trials_follow_from(tmp_path: Path, mon
         folder("memory.blend=0"),
     ]  # fmt: skip
     assert len({base, *others}) == 11
+
+
+def test_what_is_trained_on_alone_may_be_searched(tmp_path: Path):
+    space = ["search.space.loss=null", "+search.space.data.split.train_fraction={low: 0.5, high: 1.0}"]
+    assert prepare_search([*TINY, *space], None, tmp_path).search.space[0].key == "data.split.train_fraction"
+
+
+def test_table_5_is_of_mem_mlp_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    written: list[Path] = []
+    for name in ("write_trials", "write_experiments", "write_plots"):
+        monkeypatch.setattr(results, name, lambda *_: None)
+    monkeypatch.setattr(results, "write_table", lambda _study, _shipped, path: written.append(path))
+    space = ["search.base=[]", "search.space.loss=null", "+search.space.optim.lr={low: 1e-4, high: 1e-2}"]
+    for words in ([], [*space, "model=avatar_poser"]):
+        leave(prepare_search([*TINY, *words], None, tmp_path), None)
+    assert [path.name for path in written] == ["table05.yaml"]
 
 
 def test_a_search_is_named_after_what_later_trials_follow_from_too(tmp_path: Path):

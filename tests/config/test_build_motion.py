@@ -15,6 +15,7 @@ from memmlp.config.compose import composed
 from memmlp.config.schema import restored
 from memmlp.motion.preparing.folders import Folders
 from memmlp.motion.preparing.splits import MixedSplit, SeededSplit
+from memmlp.runs.recipe_versions import RECIPES
 
 MIX = {
     "defaults": ["mocap", {"grouping@sources.bandai": "bandai_namco"}, "_self_"],
@@ -63,6 +64,14 @@ def test_named_sources_have_fractions_of_their_own():
     assert held_out == {"cmu": (0.35, 0.05), "bandai": (0.1, 0.05)}
     with pytest.raises(InputError, match=r"data\.sources\.cmu: .* add up to 1 or more"):
         build_motion(mix(with_source(val=0.95)))
+
+
+def test_a_fraction_that_each_source_has_itself_is_refused():
+    both = {"sources": {name: {**one, "test": 0.3} for name, one in MIX["sources"].items()}}
+    with pytest.raises(InputError, match=r"^data\.split\.test=0\.5: each source has its own"):
+        mix(both, "data.split.test=0.5")
+    assert mix(both, "data.split.val=0.2").data.split.val == 0.2
+    assert mix(with_source(test=0.3), "data.split.test=0.5").data.split.test == 0.5  # which is bandai's
 
 
 def test_named_sources_have_groups_of_their_own():
@@ -144,3 +153,9 @@ def test_a_run_on_a_mix_is_restored():
     cfg = mix()
     record = OmegaConf.to_container(cfg, resolve=True)
     assert build_motion(restored(record)) == build_motion(cfg)
+
+
+def test_another_generator_never_finds_the_motion_of_an_older_one(monkeypatch: pytest.MonkeyPatch):
+    before = build_motion(composed(["profile=tiny"])).source.root
+    monkeypatch.setitem(RECIPES, "synthetic", 7)
+    assert build_motion(composed(["profile=tiny"])).source.root == before.with_name(f"{before.name}-v7")

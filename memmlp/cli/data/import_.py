@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
@@ -54,7 +56,7 @@ def import_(
     """
     from memmlp.motion.importing.import_folder import ImportSettings, import_folder
 
-    rates = dict(map(_rate, fps))
+    rates = _rates(fps)
     how = ImportSettings(skeleton, rates, body, _height(floor), take, strict, sound, up)
     report = import_folder(source, out, how)
     for note in report.notes:
@@ -66,6 +68,14 @@ def import_(
     maps = ", ".join(sorted({clip.skeleton for clip in report.clips}))
     click.echo(f"{len(report.clips)} clips, {minutes:.1f} minutes, skeleton {maps}, in {out}")
     click.echo(f"next: memmlp train data=mocap data.root={out}")
+
+
+def _rates(texts: Sequence[str]) -> dict[str, float]:
+    """Parse all rates by folder. Raises InputError for a folder that has two."""
+    rates = [_rate(text) for text in texts]
+    if twice := [folder for folder, count in Counter(folder for folder, _ in rates).items() if count > 1]:
+        raise InputError(f"--fps: {twice[0] or 'all'} twice; allowed: one rate for each folder")
+    return dict(rates)
 
 
 def _rate(text: str) -> tuple[str, float]:

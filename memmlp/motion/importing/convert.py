@@ -28,6 +28,7 @@ class Converted:
         fidelity: how far the clip is from that motion, and what is wrong with it.
         floor: height of the floor in the recording, metres on the body's scale, which was subtracted; None if
             it is unknown or was not asked for.
+        scale: the body's size, as a multiple of the recording's.
         rest_pose: the pose from which the skeleton was read, in words.
         unit: the file's unit, metres, given or found.
         up: the file's up axis, given or found.
@@ -37,6 +38,7 @@ class Converted:
     mapped_motion: MappedMotion
     fidelity: Fidelity
     floor: float | None
+    scale: float
     rest_pose: str
     unit: float
     up: str
@@ -78,6 +80,7 @@ def convert(
         mapped_motion=mapped_motion,
         fidelity=compare(clip, mapped_motion, rest, skeleton.name),
         floor=height,
+        scale=fitted.scale,
         rest_pose=fitted.rest_pose,
         unit=float(settled.unit or 1.0),
         up=str(settled.up),

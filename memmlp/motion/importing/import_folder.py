@@ -48,6 +48,7 @@ class Imported:
         fps_reason: where the clip's frame rate is from.
         floor: height of the floor that was subtracted, metres at the body's size; None if none was found or
             asked for.
+        scale: the body's size, as a multiple of the file's.
         faults: what is wrong with the clip, one sentence each (`fidelity.compare`).
     """
 
@@ -63,6 +64,7 @@ class Imported:
     fps: float
     fps_reason: str
     floor: float | None
+    scale: float
     faults: tuple[str, ...]
 
 
@@ -93,8 +95,8 @@ class ImportSettings:
         body: `builtin`, or an SMPL-H model.npz.
         floor: `auto`: the lowest stable contact of the feet is at 0; `none`: left as the file has it; or the
             floor's height in the files, metres.
-        takes: patterns (regular expressions); clips that match a pattern with the same captured groups were
-            recorded together, and share a floor.
+        takes: patterns (regular expressions) of clips' names, which are paths without suffix; clips that
+            match a pattern with the same captured groups were recorded together, and share a floor.
         strict: whether a bad file raises; otherwise it is skipped and reported.
         sound: whether a clip with faults is skipped, too; otherwise it is written and its faults are
             reported.
@@ -128,8 +130,8 @@ def import_folder(source: Path, out: Path, how: ImportSettings | None = None) ->
     _check_import(files, out, how)
     rest, clips, skipped = load_rest_joints(how.body), [], []
     chosen = None if how.skeleton is None else load_skeleton(how.skeleton)
-    sources = [relative.as_posix() for relative in files]
-    takes = Grouping(how.takes).names(dict(zip(sources, sources, strict=True)))
+    names = {relative.as_posix(): relative.with_suffix("").as_posix() for relative in files}
+    takes = Grouping(how.takes).names(names)
     maps: dict[str, SkeletonMap] = {}
     with _staging(out) as staging, one_thread():
         folder = Path(staging) / "clips"
@@ -148,20 +150,26 @@ def import_folder(source: Path, out: Path, how: ImportSettings | None = None) ->
             first = f"the first: {skipped[0].file}: {skipped[0].reason}"
             raise InputError(f"{source}: no usable file of {len(files)}; {first}")
         clips = _one_floor_a_take(clips, takes, folder)
-        report = ImportReport(tuple(clips), tuple(_notes(clips, maps, how)), tuple(skipped))
+        notes = (*_take_notes(names, how.takes), *_notes(clips, maps, how))
+        report = ImportReport(tuple(clips), notes, tuple(skipped))
         _publish(folder, out, report, body_record(how.body, rest))
     return report
 
 
 def _one_floor_a_take(clips: list[Imported], takes: Mapping[str, str], staging: Path) -> list[Imported]:
-    """Lower the clips of a take by the take's lowest floor, instead of each clip by its own."""
+    """Lower the clips of a take by the take's lowest floor, instead of each clip by its own.
+
+    A floor is one at the files' size, which of two persons is not one at the body's.
+    """
     floors: dict[str, float] = {}
     for clip in clips:
         if clip.floor is not None:
-            floors[takes[clip.source]] = min(clip.floor, floors.get(takes[clip.source], clip.floor))
+            height = clip.floor / clip.scale
+            floors[takes[clip.source]] = min(height, floors.get(takes[clip.source], height))
     for index, clip in enumerate(clips):
-        floor = floors.get(takes[clip.source])
-        if floor is not None and floor != clip.floor:
+        lowest = floors.get(takes[clip.source])
+        if lowest is not None and (clip.floor is None or lowest != clip.floor / clip.scale):
+            floor = lowest * clip.scale
             path = staging / clip.clip
             write_clip(path, lowered(read_clip(path, clip.clip), floor - (clip.floor or 0.0)))
             clips[index] = replace(clip, floor=floor)
@@ -213,9 +221,9 @@ def _import_file(
     source: Path,
 ) -> Imported:
     """Write one clip below the staging folder."""
-    sha256 = hashlib.sha256(recording.path.read_bytes()).hexdigest()
+    content = recording.path.read_bytes()
     top = source if source.is_dir() else source.parent
-    rate = true_rate(recording.fps, relative, sha256, top, how.fps)
+    rate = true_rate(recording.fps, relative, content, top, how.fps)
     if rate.reason == HEADER and not tells_rate(recording.path):
         allowed = f"--fps HZ, {recording.fps:g} for the published files, or {SIDECAR}"
         raise InputError(f"{recording.path}: this format tells no frame rate; allowed: {allowed}")
@@ -228,7 +236,7 @@ def _import_file(
     write_clip(folder / _npz(relative), converted.clip)
     return Imported(
         source=relative.as_posix(),
-        sha256=sha256,
+        sha256=hashlib.sha256(content).hexdigest(),
         clip=_npz(relative).as_posix(),
         skeleton=skeleton.name,
         unit=converted.unit,
@@ -239,8 +247,16 @@ def _import_file(
         fps=rate.fps,
         fps_reason=rate.reason,
         floor=converted.floor,
+        scale=converted.scale,
         faults=converted.fidelity.faults,
     )
+
+
+def _take_notes(names: Mapping[str, str], takes: Sequence[str]) -> Iterator[str]:
+    """Yield a line for each pattern of takes that ties no two clips."""
+    for pattern in takes:
+        if len(set(Grouping([pattern]).names(names).values())) == len(names):
+            yield f"--take {pattern}: ties no two clips; it sees names such as {min(names.values())}"
 
 
 def _notes(clips: Sequence[Imported], maps: Mapping[str, SkeletonMap], how: ImportSettings) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -30,13 +31,13 @@ class Rate(NamedTuple):
     reason: str
 
 
-def true_rate(header: float, relative: Path, sha256: str, top: Path, told: Mapping[str, float]) -> Rate:
+def true_rate(header: float, relative: Path, content: bytes, top: Path, told: Mapping[str, float]) -> Rate:
     """Return a file's frame rate.
 
     Args:
         header: the rate in the file's header, Hz.
         relative: the file's path below `top`.
-        sha256: the file's digest.
+        content: the file's bytes.
         top: the folder that is imported.
         told: rates by folder below `top` ("" for all), which override everything else.
 
@@ -50,8 +51,13 @@ def true_rate(header: float, relative: Path, sha256: str, top: Path, told: Mappi
         fps = _sidecar(top / folder / SIDECAR)
         if fps is not None:
             return Rate(fps, f"in {(folder / SIDECAR).as_posix()}")
-    known = _known().get(sha256[:DIGITS])
+    known = _known().get(_digest(content))
     return Rate(header, HEADER) if known is None else Rate(known, "known of this file")
+
+
+def _digest(content: bytes) -> str:
+    """Return the first digits of a file's digest, the same whatever ends of lines a tool gave the file."""
+    return hashlib.sha256(content.replace(b"\r\n", b"\n")).hexdigest()[:DIGITS]
 
 
 def folder_key(folder: Path) -> str:

@@ -257,6 +257,24 @@ def test_clips_of_a_take_share_its_lowest_floor(takes: Path, tmp_path: Path) -> 
     assert heights["2a"] == pytest.approx(0.02, abs=0.01)
 
 
+def test_a_takes_floor_is_one_of_the_files_whose_persons_differ_in_size(takes: Path, tmp_path: Path) -> None:
+    """Of two persons in one room the floor is as high, whatever the body's size is in multiples of theirs."""
+    chosen, walk = load_skeleton("cmu_daz"), synthesize_clip("walking", 1, seconds=2.0)
+    tall = tree("cmu_daz")
+    tall = replace(tall, offsets=(1.25 * np.array(tall.offsets)).tolist())
+    raised = replace(walk, trans=walk.trans + np.array([0, 0, 0.5]))
+    write(takes, performed(chosen, raised, sample=tall).text(dt="0.0166667"), "1c.bvh")
+    report = import_folder(takes, tmp_path / "out", ImportSettings(takes=[r"^(\d)"]))
+    floors = [float(clip.floor or 0) / clip.scale for clip in report.clips]
+    assert floors[:3] == pytest.approx([floors[0]] * 3)
+    assert report.clips[0].scale != pytest.approx(report.clips[2].scale)
+
+
+def test_takes_that_tie_nothing_are_noted(takes: Path, tmp_path: Path) -> None:
+    report = import_folder(takes, tmp_path / "out", ImportSettings(takes=[r"^(\d)", r"(\d)a.bvh$"]))
+    assert report.notes == (r"--take (\d)a.bvh$: ties no two clips; it sees names such as 1a",)
+
+
 def test_floors_as_told(takes: Path, tmp_path: Path) -> None:
     left = import_folder(takes, tmp_path / "left", ImportSettings(floor=NONE))
     told = import_folder(takes, tmp_path / "told", ImportSettings(floor=0.3))
