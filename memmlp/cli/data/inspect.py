@@ -26,7 +26,7 @@ def inspect(path: Path) -> None:
     found = survey(path)
     show_skipped([f"{file.file}: {file.reason}" for file in found.skipped])
     show_files(found.ignored, found.found.passed_over, found.found.links, found.unusual)
-    show_pairs("the same frames", found.duplicates)
+    show_pairs("the same frames, or some of them", found.duplicates)
     show_rates(found.clips)
     frames = sum(clip.length for clip in found.clips)
     click.echo(f"{len(found.clips)} clips, {frames / 216000:.2f} h, {len(found.skipped)} bad files")

@@ -37,7 +37,7 @@ def show_manifest(manifest: Manifest) -> None:
     show_rates(manifest.clips)
     show_skipped([f"{file.file}: {file.reason}" for file in manifest.skipped])
     show_files(manifest.ignored, manifest.passed_over, manifest.links, manifest.unusual)
-    show_pairs("left out, since another part has the same frames", manifest.duplicates)
+    show_pairs("left out, since another part has the same frames or some of them", manifest.duplicates)
     left_out = sum(manifest.left_out.values())
     click.echo(
         f"{len(manifest.clips)} clips; skipped {len(manifest.skipped)}, left out by the split {left_out}, "

@@ -1,20 +1,39 @@
 """Clips with the same frames: they are never in two parts of a split, and form one group.
 
-Copies are found by their frames, so a file that was saved again is a copy, and so is one at another frame
-rate (`resampled_copies`). Clips without any motion can't be told apart, so they do not count as copies. If
-the split divides all clips in the folder, copies are drawn together, like any group. If it is a published
-list with copies in several parts, those in training give way to those in validation, and both to those in
-test: the test set stays as published, and nothing in it was seen in training. Copies within one part stay, as
-in the list; statistics count their group once.
+Copies are found by their frames, so a file that was saved again is a copy, and so are one at another frame
+rate (`resampled_duplicates`) and one that has some of the frames (`shared_stretches`). Clips without any
+motion can't be told apart, so they do not count as copies. If the split divides all clips in the folder,
+copies are drawn together, like any group. If it is a published list with copies in several parts, those in
+training give way to those in validation, and both to those in test: the test set stays as published, and
+nothing in it was seen in training. Copies within one part stay, as in the list; statistics count their group
+once.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
 from memmlp.motion.preparing.splits import PARTS, Split
+
+
+def one_content(
+    clips: Sequence[ClipRecord], pairs: Iterable[tuple[ClipRecord, ClipRecord]]
+) -> list[ClipRecord]:
+    """Return the clips such that those of a pair have one content, the first one's; pairs are transitive."""
+    content: dict[str, str] = {}  # of a copy -> of what it is a copy of
+
+    def original(of: str) -> str:
+        while of in content:
+            of = content[of]
+        return of
+
+    for one, other in pairs:
+        if (first := original(one.content)) != (second := original(other.content)):
+            content[second] = first
+    return [replace(clip, content=original(clip.content)) for clip in clips]
 
 
 def assign(

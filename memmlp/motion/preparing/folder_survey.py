@@ -15,10 +15,12 @@ from memmlp.motion.body import FPS
 from memmlp.motion.clip import Clip, Skipped, resample
 from memmlp.motion.formats.npz import NoMotion, read_clip
 from memmlp.motion.plausibility import check_plausible, unusual
+from memmlp.motion.preparing.duplicates import one_content
 from memmlp.motion.preparing.find import FoundFiles, clip_name
 from memmlp.motion.preparing.folders import Root, find_all
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
-from memmlp.motion.preparing.resampled_duplicates import copies_alike, first_frame
+from memmlp.motion.preparing.resampled_duplicates import first_frame, resampled_copies
+from memmlp.motion.preparing.shared_stretches import Marks, marks, sharing
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class Survey:
 
     @property
     def duplicates(self) -> dict[str, str]:
-        """Clip -> the first clip with the same frames, at whatever rate."""
+        """Clip -> the first clip with the same frames, or some of them, at whatever rate."""
         firsts: dict[str, str] = {}
         moving = [clip for clip in self.clips if clip.content != STILL]
         pairs = {clip.name: firsts.setdefault(clip.content, clip.name) for clip in moving}
@@ -67,6 +69,7 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
     """
     clips: dict[str, ClipRecord] = {}
     firsts: dict[str, np.ndarray] = {}
+    marked: dict[str, Marks] = {}
     odd: dict[str, str] = {}
     short, ignored, found = [], 0, find_all(root)
     skipped = [Skipped(folder, reason) for folder, reason in found.unreadable.items()]
@@ -75,7 +78,7 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
         try:
             _check_name(root / file, file, clips)
             clip = read_clip(root / file, name)
-            clips[name] = _inspect(root / file, file, clip, min_frames)
+            clips[name], resampled = _inspect(root / file, file, clip, min_frames)
         except NoMotion:
             ignored += 1
         except InputError as error:
@@ -84,10 +87,12 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
             skipped.append(Skipped(one_line(file), str(error).removeprefix(one_line(f"{root / file}: "))))
             short += [name] if isinstance(error, TooShort) else []
         else:
-            firsts[name] = first_frame(clip)
+            firsts[name], marked[name] = first_frame(clip), marks(resampled)
             odd |= {name: reason} if (reason := unusual(clip)) else {}
-    alike = copies_alike(root, list(clips.values()), firsts)
-    return Survey(alike, tuple(skipped), ignored, tuple(short), odd, found)
+    records = list(clips.values())
+    records = one_content(records, resampled_copies(root, records, firsts))
+    records = one_content(records, sharing(root, records, marked))
+    return Survey(tuple(records), tuple(skipped), ignored, tuple(short), odd, found)
 
 
 def _check_name(path: Path, file: str, clips: dict[str, ClipRecord]) -> None:
@@ -100,15 +105,19 @@ def _check_name(path: Path, file: str, clips: dict[str, ClipRecord]) -> None:
         raise InputError(f"{path}: no regular file")
 
 
-def _inspect(path: Path, file: str, clip: Clip, min_frames: int) -> ClipRecord:
-    """Return the record of a sound clip, without split and start; raise InputError for any other clip."""
+def _inspect(path: Path, file: str, clip: Clip, min_frames: int) -> tuple[ClipRecord, Clip]:
+    """Return the record of a sound clip, without split and start, and the clip at 60 Hz.
+
+    Raises:
+        InputError: for any other clip.
+    """
     check_plausible(path, clip)
     resampled, how = resample(clip)
     if len(resampled) < min_frames:
         few = f"{len(resampled)} frames at {FPS} Hz"
         raise TooShort(f"{path}: {few}, fewer than {min_frames} (data.min_frames)")
     length, digests = len(resampled) - 1, (file_digest(path), _content(clip))
-    return ClipRecord(clip.name, file, "", "", 0, length, *digests, clip.fps, how)
+    return ClipRecord(clip.name, file, "", "", 0, length, *digests, clip.fps, how), resampled
 
 
 def _content(clip: Clip) -> str:

@@ -15,7 +15,7 @@ from memmlp.common.files import atomic_write
 from memmlp.motion.clip import Skipped
 from memmlp.motion.preparing.coverage import Coverage
 
-FORMAT = 5  # number of the cache's format; a new one makes every cache again
+FORMAT = 6  # number of the cache's format; a new one makes every cache again
 MANIFEST = "manifest.json"
 STILL = "still"  # the content of every clip without motion
 
@@ -32,8 +32,9 @@ class ClipRecord:
         start: the clip's first frame in its part's array.
         length: the clip's number of frames in that array.
         sha256: digest of the source file.
-        content: digest of the frames in single precision, the same for every copy of the clip, even at
-            another frame rate (`resampled_copies`); `STILL` for a clip without motion.
+        content: digest of the frames in single precision, the same for every copy of the clip, at another
+            frame rate, too, and for every clip that has some of its frames; `STILL` for a clip without
+            motion.
         fps: frame rate of the source, Hz.
         resampling: how the clip was resampled to 60 Hz.
     """
@@ -72,7 +73,8 @@ class Manifest:
         missing: entries of the split for which there is no file.
         damaged: entries of the split whose file is no sound clip; a clip that is too short is not among them.
         totals: part -> clips, frames, hours.
-        duplicates: clip that was left out -> the clip with the same frames in another part, which was kept.
+        duplicates: clip that was left out -> the clip with the same frames, or some of them, in another part,
+            which was kept.
         links: other path of a file or folder -> the path by which it was read.
         unusual: clip -> what is odd about it, though it may be sound.
         passed_over: number of files that are no npz, by suffix.

@@ -8,7 +8,6 @@ clip's frames.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -28,28 +27,19 @@ def first_frame(clip: Clip) -> np.ndarray:
     return np.concatenate([rotations.ravel(), clip.trans[0]]).astype(np.float32)
 
 
-def copies_alike(
+def resampled_copies(
     root: Root, clips: Sequence[ClipRecord], firsts: Mapping[str, np.ndarray]
-) -> tuple[ClipRecord, ...]:
-    """Return the clips; each copy of a clip at another frame rate gets the original's content digest.
+) -> Iterator[tuple[ClipRecord, ClipRecord]]:
+    """Yield pairs of clips that are one motion at two frame rates.
 
     Args:
         root: the folder of their files.
         clips: records of sound clips.
         firsts: clip -> its first frame (`first_frame`).
     """
-    content: dict[str, str] = {}  # of a copy -> of what it is a copy of
-
-    def original(of: str) -> str:
-        while of in content:
-            of = content[of]
-        return of
-
-    for one, other in _candidates(clips, firsts):
-        first, second = original(one.content), original(other.content)
-        if first != second and _same_motion(*(read_clip(root / c.file, c.name) for c in (one, other))):
-            content[second] = first
-    return tuple(replace(clip, content=original(clip.content)) for clip in clips)
+    for pair in _candidates(clips, firsts):
+        if _same_motion(*(read_clip(root / clip.file, clip.name) for clip in pair)):
+            yield pair
 
 
 def _candidates(
