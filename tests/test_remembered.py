@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from onnx_ir import schemas
 
 from memmlp.config import compose
+from memmlp.motion import synthetic
 
 REMEMBERED = [
     (ConfigLoaderImpl, "_load_single_config"),
@@ -71,3 +72,19 @@ def test_signatures_of_operators_are_those_that_onnx_makes():
         anew = made.__wrapped__(schemas.OpSignature, schema)
         assert repr(made(schema)) == repr(anew)
         assert made(schema) is made(schema)
+
+
+def test_motion_is_made_once_and_is_that_of_its_seed(monkeypatch: pytest.MonkeyPatch):
+    cases = [("walking", 1, 60.0), ("walking", 2, 60.0), ("walking", 1, 30.0), ("waving", 1, 60.0)]
+
+    def clips() -> list[bytes]:
+        made = (synthetic.synthesize_clip(kind, seed, seconds=1.0, fps=fps) for kind, seed, fps in cases)
+        return [clip.poses.tobytes() + clip.trans.tobytes() for clip in made]
+
+    twice = clips(), clips()
+    changed = synthetic.synthesize_clip("walking", 1, seconds=1.0)
+    changed.poses[:] = 0.0
+    again = clips()
+    monkeypatch.setattr(synthetic, "solve", synthetic.solve.__wrapped__)
+    assert clips() == twice[0] == twice[1] == again
+    assert len(set(again)) == len(cases)
