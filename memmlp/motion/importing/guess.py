@@ -18,6 +18,7 @@ from memmlp.common.errors import InputError
 from memmlp.motion.body import JOINTS, load_rest_joints
 from memmlp.motion.importing.anatomy import CHAINS, unit
 from memmlp.motion.importing.axes import settle
+from memmlp.motion.importing.calibration_frame import JUMP, MAYBE, first_step
 from memmlp.motion.importing.convert import convert
 from memmlp.motion.importing.limbs_by_shape import Limbs, Pair, Tree, find_limbs, middle, read_tree
 from memmlp.motion.importing.names import NodeWords, without_namespace, words
@@ -44,8 +45,6 @@ KNOWN = frozenset(
 ) | {"hipjoint", "fingers", "thumb"}  # fmt: skip
 TOES, SKULL = 0.02, 0.17  # least lengths of a foot, and of a bone to the tip of the head, to a leg's
 FEET, KNEES = 0.3, 0.03  # least mean cosine of the feet to forward, mean sine of the knees, that tell sides
-MAYBE, JUMP = 1.5, 4.0  # frame 0 may be, and is, a calibration pose if so many times further from frame 1
-JUMPED = 0.05  # than other frames are from their next, and by so much of the skeleton's size
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ def guess(recording: Recording, name: str) -> Guess:
     Raises:
         InputError: if the tree is not that of a person with two legs, two arms and a head.
     """
-    calibration = (jump := _first_step(recording)) > JUMP
+    calibration = (jump := first_step(recording)) > JUMP
     tree = read_tree(recording, calibration)
     said = [words(plain, KNOWN) for plain in without_namespace(tree.nodes)]
     limbs = find_limbs(recording.path, tree, _head_by_name(tree, said))
@@ -254,22 +253,6 @@ def _same_side(tree: Tree, shape: Found, leg: int) -> int:
         for part in ("hip", "shoulder")
     )
     return leg if (hips * shoulders).sum(-1).mean() > 0 else 1 - leg
-
-
-def _first_step(recording: Recording) -> float:
-    """Return the step from frame 0 to frame 1, divided by the 90 % quantile of all later steps.
-
-    A step is the largest distance by which a node moves relative to the root. The result is 0 for a short
-    recording, or if the first step is small compared with the body.
-    """
-    if len(recording) < 4:
-        return 0.0
-    positions = recording.kinematics()[1]
-    pose = positions - positions[:, :1]
-    steps = np.linalg.norm(np.diff(pose, axis=0), axis=-1).max(-1)
-    if steps[0] <= JUMPED * np.linalg.norm(pose[0], axis=-1).max():
-        return 0.0
-    return float(steps[0] / max(np.quantile(steps[1:], 0.9), 1e-9))
 
 
 # The proposal on paper, and whether it holds

@@ -19,6 +19,7 @@ from memmlp.common.progress import progress_bar
 from memmlp.motion.body import load_rest_joints
 from memmlp.motion.clip import FRAME_RATE_RANGE, Skipped
 from memmlp.motion.formats.npz import read_clip, write_clip
+from memmlp.motion.importing.calibration_frame import JUMP, first_step
 from memmlp.motion.importing.convert import AUTO, convert, lowered
 from memmlp.motion.importing.importable_files import find_recordings, read_recording, tells_rate
 from memmlp.motion.importing.recording_protocol import Recording
@@ -49,6 +50,8 @@ class Imported:
         floor: height of the floor that was subtracted, metres at the body's size; None if none was found or
             asked for.
         scale: the body's size, as a multiple of the file's.
+        first_step: how far frame 0 of the clip is from frame 1, in multiples of other frames' steps
+            (`calibration_frame.first_step`); None where the map leaves frame 0 of the file out.
         faults: what is wrong with the clip, one sentence each (`fidelity.compare`).
     """
 
@@ -65,6 +68,7 @@ class Imported:
     fps_reason: str
     floor: float | None
     scale: float
+    first_step: float | None
     faults: tuple[str, ...]
 
 
@@ -248,6 +252,7 @@ def _import_file(
         fps_reason=rate.reason,
         floor=converted.floor,
         scale=converted.scale,
+        first_step=None if skeleton.calibration_frame else first_step(recording),
         faults=converted.fidelity.faults,
     )
 
@@ -265,6 +270,12 @@ def _notes(clips: Sequence[Imported], maps: Mapping[str, SkeletonMap], how: Impo
     yield from (f"{skeleton.name}: {skeleton.note}" for skeleton in maps.values() if skeleton.note)
     for name in maps:
         yield from _family_notes(name, [clip for clip in clips if clip.skeleton == name])
+    if begun := [clip.source for clip in clips if (clip.first_step or 0.0) > JUMP]:
+        more = f" and {len(begun) - 1} more" if len(begun) > 1 else ""
+        yield (
+            f"{begun[0]}{more}: frame 0 is far from frame 1, as a T-pose is before the motion; "
+            "calibration_frame: true in a map of your own leaves it out"
+        )
     floorless = [clip.source for clip in clips if clip.floor is None]
     if how.floor == AUTO and floorless:
         more = f" and {len(floorless) - 1} more" if len(floorless) > 1 else ""

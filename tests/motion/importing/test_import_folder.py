@@ -294,6 +294,14 @@ def test_a_clip_without_a_floor_says_so(takes: Path, tmp_path: Path) -> None:
     assert {clip.source: clip.floor for clip in report.clips}["flying.bvh"] is None
 
 
+def test_a_calibration_pose_that_the_map_keeps_is_noted(takes: Path, tmp_path: Path) -> None:
+    kept = tmp_path / "kept.yaml"
+    kept.write_text((SKELETONS / "cmu_daz.yaml").read_text().replace("calibration_frame: true", ""))
+    (note,) = import_folder(takes, tmp_path / "out", ImportSettings(str(kept), floor=NONE)).notes
+    assert note.startswith("1a.bvh and 2 more: frame 0 is far from frame 1")
+    assert import_folder(takes, tmp_path / "left", ImportSettings(floor=NONE)).notes == ()
+
+
 def test_patterns_of_takes_are_checked(takes: Path, tmp_path: Path) -> None:
     with refuse("take: '('"):
         import_folder(takes, tmp_path / "out", ImportSettings(takes=["("]))
