@@ -19,7 +19,7 @@ class Finite(click.FloatRange):
     """A number in a range, without NaN and infinity."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the number; click itself accepts NaN and infinity."""
+        """Return the number; refuse NaN and infinity, which click would accept."""
         number = super().convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value} is no finite number", param, ctx)

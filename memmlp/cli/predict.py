@@ -60,7 +60,7 @@ def predict(
     SOURCE is an AMASS npz file, a folder of such, or else a test clip's name. Predictions are at 60 Hz on the
     body that the network was trained on; their first frame is the clip's second.
     """
-    from memmlp.cli.data.texts import show_exported
+    from memmlp.cli.data.printing import show_exported
     from memmlp.config.open_run import OpenedRun, data_of, experiment_of, trained_network
     from memmlp.evaluation.predictions import ClipPredictor
     from memmlp.motion.exporting.export_folder import plan_export

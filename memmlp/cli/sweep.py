@@ -152,7 +152,7 @@ def unprepared(chosen: Sweep, plan: Plan) -> int:
 def show_forecast(chosen: Sweep, plan: Plan, workers: int) -> None:
     """Print how long the remaining runs may take.
 
-    The VQ-VAEs that are needed, too, are known only for runs whose data is prepared.
+    VQ-VAEs are counted only for runs whose data is prepared.
     """
     from memmlp.sweep.forecast import forecast
 

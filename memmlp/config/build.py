@@ -27,11 +27,13 @@ from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import IK, LBFGS, Arms, NoIK
 from memmlp.evaluation.metrics import UserMetric
-from memmlp.experiment_tracking.feed import Tracking
+from memmlp.experiment_tracking.follower_pipe import Tracking
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.network_coordinates import Coordinates, Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.architecture import (
+from memmlp.networks.memory import Memory
+from memmlp.networks.motion_model import MotionModel
+from memmlp.networks.network_families import (
     VQVAE_SETTINGS,
     Architecture,
     MemMLPArchitecture,
@@ -39,8 +41,6 @@ from memmlp.networks.architecture import (
     PlainArchitecture,
     RefinedArchitecture,
 )
-from memmlp.networks.memory import Memory
-from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.vqvae import VQVAE
 from memmlp.pipeline.devices import device
 from memmlp.pipeline.experiment import Experiment, UpstreamTraining

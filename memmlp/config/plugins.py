@@ -207,7 +207,7 @@ def foreign(config: Mapping[str, Any]) -> list[str]:
 
 
 def owner(path: str) -> str:
-    """Return the package in use that contains a path, or else the path's first name."""
+    """Return the active package that a dotted path belongs to; otherwise the path's first part."""
     fits = [name for name in _active if path.startswith(f"{name}.")]
     return max(fits, key=len, default=path.split(".")[0])
 

@@ -22,7 +22,7 @@ from memmlp.common.files import write_json
 from memmlp.common.progress import tell
 from memmlp.evaluation.evaluation import picture
 from memmlp.evaluation.predictions import save_predictions
-from memmlp.experiment_tracking.feed import Tracking
+from memmlp.experiment_tracking.follower_pipe import Tracking
 from memmlp.live.pose_time import measure_pose
 from memmlp.motion.clip import Skipped
 from memmlp.motion.motion_source import Prepared

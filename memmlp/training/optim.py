@@ -118,7 +118,7 @@ class Muon(Optim):
     rest_lr: float | None = None
 
     def at(self, lr: float | None) -> Self:
-        """As of any optimisation; the learning rate of what is no matrix changes in proportion."""
+        """Return these settings with another learning rate; `rest_lr` is scaled by the same factor."""
         other = super().at(lr)
         if lr is None or self.rest_lr is None:
             return other

@@ -12,7 +12,7 @@ from memmlp.config.compose import composed
 from memmlp.evaluation import modes
 from memmlp.motion.body import POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading
-from memmlp.networks.architecture import RefinedArchitecture
+from memmlp.networks.network_families import RefinedArchitecture
 from memmlp.networks.refiner import HIDDEN, Refined
 from memmlp.networks.streaming import has_stream, streaming
 

@@ -19,7 +19,7 @@ from memmlp.config.compose import composed
 from memmlp.config.schema import restored
 from memmlp.deploy.deployment import GRAPHS
 from memmlp.evaluation import modes as evaluation
-from memmlp.experiment_tracking.feed import Tracking
+from memmlp.experiment_tracking.follower_pipe import Tracking
 from memmlp.motion.dataset import MotionDataset
 from memmlp.pipeline.experiment import Experiment
 from memmlp.pipeline.run_stages import upstream_run

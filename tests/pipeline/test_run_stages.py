@@ -23,7 +23,7 @@ from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.config.package_data import packaged
-from memmlp.experiment_tracking.feed import Tracking
+from memmlp.experiment_tracking.follower_pipe import Tracking
 from memmlp.live.stream import Stream
 from memmlp.motion.clip import Skipped
 from memmlp.motion.dataset import MotionDataset

@@ -149,7 +149,7 @@ def export_all(models: list[str], overrides: tuple[str, ...], folder: Path) -> I
 
 def export_independently(overrides: tuple[str, ...], path: Path) -> Path:
     """Export an AvatarPoser made of torch's own layers, in the config's sizes, and return the file."""
-    from memmlp.cli.bench.latency_check_network import TorchAvatarPoser, export_plainly
+    from memmlp.cli.bench.torch_avatar_poser import TorchAvatarPoser, export_plainly
     from memmlp.config.compose import composed
 
     sizes = composed(["profile=paper", *overrides, *MODELS[CHECK[0]]]).model

@@ -31,7 +31,7 @@ def tracking(blocks: int, steps: int, uri: str | None, overrides: tuple[str, ...
 
     from memmlp.config.build import build_experiment
     from memmlp.config.compose import composed
-    from memmlp.experiment_tracking.feed import feed_of
+    from memmlp.experiment_tracking.follower_pipe import feed_of
     from memmlp.pipeline.run_stages import train_run
 
     address = [f"tracking.mlflow.uri={uri}"] if uri else []

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from memmlp.cli.data.texts import show_exported
+from memmlp.cli.data.printing import show_exported
 from memmlp.cli.options import PATH, Finite, format_option, strict_option
 
 

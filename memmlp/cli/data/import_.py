@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from memmlp.cli.data.texts import show_skipped, show_some
+from memmlp.cli.data.printing import show_skipped, show_some
 from memmlp.cli.options import PATH
 from memmlp.common.errors import InputError
 

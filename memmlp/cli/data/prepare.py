@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.data.texts import show_manifest
+from memmlp.cli.data.printing import show_manifest
 from memmlp.cli.options import PATH
 from memmlp.common.errors import InputError
 

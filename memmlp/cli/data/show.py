@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from memmlp.cli.data.texts import show_skipped
+from memmlp.cli.data.printing import show_skipped
 from memmlp.cli.options import PATH
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from memmlp.cli.options import outputs_option
-from memmlp.cli.runs.texts import console, measured_numbers, plain_table, recorded, text_of, value_text
+from memmlp.cli.runs.printing import console, measured_numbers, plain_table, recorded, text_of, value_text
 from memmlp.evaluation.units import UNITS
 
 if TYPE_CHECKING:

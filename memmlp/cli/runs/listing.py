@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from memmlp.cli.options import outputs_option
-from memmlp.cli.runs.texts import age, console, number_text, plain_table, recorded, value_text
+from memmlp.cli.runs.printing import age, console, number_text, plain_table, recorded, value_text
 from memmlp.evaluation.units import UNITS
 from memmlp.runs.identity import NETWORK
 from memmlp.runs.shown_name import kind_words
@@ -53,7 +53,7 @@ NAME = 36  # characters of a run's name in a line
 @click.option("--columns", help="Show these keys, separated by commas.  [default: config keys that differ]")
 @outputs_option
 def list_runs(every: bool, where: str | None, sort: str | None, columns: str | None, outputs: Path) -> None:
-    """List the runs, the newest first, without finished VQ-VAEs and parts of networks.
+    """List the runs, the newest first; finished runs of VQ-VAEs and of networks' parts are hidden (--all).
 
     Shown are their names and data, what differs between their configs, the MPJPE of the rotation branch in
     both modes, Jitter, and the latency of a frame. Keys are those of the config (`memory`, `optim.lr`),

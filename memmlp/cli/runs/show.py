@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from memmlp.cli.options import outputs_option
-from memmlp.cli.runs.texts import console, measured_numbers, pairs, recorded
+from memmlp.cli.runs.printing import console, measured_numbers, pairs, recorded
 
 if TYPE_CHECKING:
     from memmlp.runs.run import Run

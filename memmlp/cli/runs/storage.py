@@ -10,7 +10,7 @@ import click
 from rich.table import Table
 
 from memmlp.cli.options import PATH, Finite, outputs_option
-from memmlp.cli.runs.texts import age, console, plain_table
+from memmlp.cli.runs.printing import age, console, plain_table
 
 if TYPE_CHECKING:
     from memmlp.runs.unneeded import Garbage

@@ -14,7 +14,7 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.motion.body import HEAD, JOINTS
 from memmlp.motion.importing.anatomy import LEGS, why_no_stance
-from memmlp.motion.importing.recording_protocol import Recording
+from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.skeleton_map import REQUIRED, UPRIGHT, SkeletonMap
 
 UNITS = (1.0, 0.1, 0.0254 / 0.45, 0.0254, 0.01, 0.001)  # metres; 0.0254 / 0.45 is CMU's inch

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from memmlp.motion.importing.recording_protocol import Recording
+from memmlp.motion.importing.recording import Recording
 
 MAYBE, JUMP = 1.5, 4.0  # first steps from which on frame 0 may be, and is, a calibration pose
 JUMPED = 0.05  # a smaller step, in multiples of the skeleton's size, is none

@@ -11,7 +11,7 @@ from memmlp.motion.importing.axes import settle
 from memmlp.motion.importing.fidelity import Fidelity, compare, pose
 from memmlp.motion.importing.floor import find_floor
 from memmlp.motion.importing.mapped_motion import MappedMotion, pick_joints
-from memmlp.motion.importing.recording_protocol import Recording
+from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.retarget import fit, to_body
 from memmlp.motion.importing.skeleton_map import SkeletonMap
 

@@ -10,7 +10,7 @@ from memmlp.motion.body import JOINTS, PARENTS
 from memmlp.motion.importing import anatomy
 from memmlp.motion.importing.axes import settle
 from memmlp.motion.importing.mapped_motion import MappedMotion, pick_joints
-from memmlp.motion.importing.recording_protocol import Recording
+from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.rest_pose import RestPose, find_rest_pose
 from memmlp.motion.importing.retarget import fit
 from memmlp.motion.importing.skeleton_map import SkeletonMap

@@ -22,7 +22,7 @@ from memmlp.motion.importing.calibration_frame import JUMP, MAYBE, first_step
 from memmlp.motion.importing.convert import convert
 from memmlp.motion.importing.limbs_by_shape import Limbs, Pair, Tree, find_limbs, middle, read_tree
 from memmlp.motion.importing.names import NodeWords, without_namespace, words
-from memmlp.motion.importing.recording_protocol import Recording
+from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.skeleton_map import SkeletonMap
 
 Found = dict[str, int | None]  # joint -> node; None where no node stands for it

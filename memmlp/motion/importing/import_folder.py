@@ -22,7 +22,7 @@ from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.importing.calibration_frame import JUMP, first_step
 from memmlp.motion.importing.convert import AUTO, convert, lowered
 from memmlp.motion.importing.importable_files import find_recordings, read_recording, tells_rate
-from memmlp.motion.importing.recording_protocol import Recording
+from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.rest_pose import STRAIGHTEST
 from memmlp.motion.importing.skeleton_map import SkeletonMap, find_skeleton, is_number, load_skeleton
 from memmlp.motion.importing.true_rate import HEADER, SIDECAR, folder_key, true_rate

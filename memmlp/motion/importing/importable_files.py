@@ -7,7 +7,7 @@ from pathlib import Path
 from memmlp.common.errors import InputError
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.expmap import PUBLISHED_FPS, read_expmap
-from memmlp.motion.importing.recording_protocol import Recording
+from memmlp.motion.importing.recording import Recording
 
 BVH, EXPMAP = ".bvh", ".txt"
 COLUMNS = 90  # numbers in a first line that only exponential maps have; other text files are passed over

@@ -16,7 +16,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.motion.formats.bvh import END
-from memmlp.motion.importing.recording_protocol import Recording
+from memmlp.motion.importing.recording import Recording
 
 Chains = tuple[tuple[int, ...], tuple[int, ...]]
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import JOINTS, PARENTS
-from memmlp.motion.importing.recording_protocol import Recording
+from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.skeleton_map import SkeletonMap
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.motion.importing import anatomy
 from memmlp.motion.importing.mapped_motion import MappedMotion
-from memmlp.motion.importing.recording_protocol import Recording
+from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.skeleton_map import SkeletonMap
 
 STRAIGHTEST = "the straightest"  # how a frame was chosen, beside a given one

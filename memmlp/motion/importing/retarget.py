@@ -21,7 +21,7 @@ from memmlp.motion.clip import Clip
 from memmlp.motion.importing import anatomy
 from memmlp.motion.importing.anatomy import HINGES, HIPS, LEGS, LIMBS, Segment, least_rotation, segments
 from memmlp.motion.importing.mapped_motion import MappedMotion
-from memmlp.motion.importing.recording_protocol import Recording
+from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.rest_pose import RestPose, find_rest_pose
 from memmlp.motion.importing.skeleton_map import Z_UP, SkeletonMap
 

@@ -14,7 +14,7 @@ import yaml
 from memmlp.common.errors import InputError, why_unreadable
 from memmlp.motion.body import JOINTS
 from memmlp.motion.importing.names import find_nodes
-from memmlp.motion.importing.recording_protocol import Recording
+from memmlp.motion.importing.recording import Recording
 
 SKELETONS = Path(__file__).parent / "skeletons"
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # Y-up axes to the world's: y becomes z

@@ -93,7 +93,10 @@ def rank(name: str, seed: int) -> str:
 
 
 def _counts(total: int, fractions: Mapping[str, float]) -> dict[str, int]:
-    """Return how many groups each part gets: its rounded share, at least one, leaving one for train."""
+    """Return how many groups each part gets, leaving one for train.
+
+    That is its rounded share: none for a fraction of 0, otherwise at least one.
+    """
     counts = {part: max(1, round(share * total)) if share > 0 else 0 for part, share in fractions.items()}
     needed = 1 + sum(count > 0 for count in counts.values())
     if total < needed:

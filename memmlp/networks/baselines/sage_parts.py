@@ -129,7 +129,7 @@ class Shortened(Stack):
 
 
 class Lengthened(Stack):
-    """Blocks before a transposed convolution over time: T to 2 T frames."""
+    """Blocks, then a transposed convolution over time that doubles the frames (T to 2T)."""
 
     def __init__(self, width: int, depth: int, heads: int, dropout: float):
         super().__init__(width, depth, heads, dropout)

@@ -11,7 +11,7 @@ import torch
 from conftest import Memmlp, one_line
 
 from memmlp.cli.bench.latency import CHECK, VARIANTS, summary
-from memmlp.cli.bench.latency_check_network import TorchAvatarPoser, export_plainly
+from memmlp.cli.bench.torch_avatar_poser import TorchAvatarPoser, export_plainly
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
 

@@ -13,8 +13,8 @@ import processes
 import pytest
 from fake_tracker import FileTracker, a_run
 
-from memmlp.experiment_tracking import feed
-from memmlp.experiment_tracking.feed import Tracking, feed_of
+from memmlp.experiment_tracking import follower_pipe
+from memmlp.experiment_tracking.follower_pipe import Tracking, feed_of
 from memmlp.runs.run import Run
 
 PATIENCE = 300.0  # seconds; nothing comes near
@@ -24,13 +24,13 @@ PATIENCE = 300.0  # seconds; nothing comes near
 def _closed() -> Iterator[None]:
     """No feed is left to the next test."""
     yield
-    for one in feed._FEEDS.values():
+    for one in follower_pipe._FEEDS.values():
         one.close()
         if one.process is not None:
             one.process.kill()
             one.process.wait()
             one.listener.join()
-    feed._FEEDS.clear()
+    follower_pipe._FEEDS.clear()
 
 
 def test_without_trackers_there_is_no_process_and_no_file(tmp_path: Path):
@@ -68,13 +68,13 @@ def test_runs_are_followed_by_one_process_to_their_ends(tmp_path: Path):
 @pytest.mark.slow
 def test_a_tracker_that_hangs_costs_a_share_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     waited: list[float] = []
-    monkeypatch.setattr(feed.Feed, "wait", lambda self, folder, seconds: waited.append(seconds))
-    monkeypatch.setattr(feed.time, "monotonic", iter([0.0, 50.0, 1000.0, 90_000.0]).__next__)
+    monkeypatch.setattr(follower_pipe.Feed, "wait", lambda self, folder, seconds: waited.append(seconds))
+    monkeypatch.setattr(follower_pipe.time, "monotonic", iter([0.0, 50.0, 1000.0, 90_000.0]).__next__)
     tracking, run = Tracking((FileTracker(tmp_path / "shown", hangs=True),), tmp_path), a_run(tmp_path)
     for _ in range(2):
         with tracking.following(run):
             run.log(9, {"loss": 1.0})
-    assert waited == [0.5, feed.MOST]
+    assert waited == [0.5, follower_pipe.MOST]
 
 
 @pytest.mark.slow
@@ -125,7 +125,7 @@ KILLED = """
 import sys, os, signal
 from pathlib import Path
 from fake_tracker import FileTracker, a_run
-from memmlp.experiment_tracking.feed import Tracking
+from memmlp.experiment_tracking.follower_pipe import Tracking
 outputs = Path(sys.argv[1])
 with Tracking((FileTracker(outputs / "shown"),), outputs).following(a_run(outputs)):
     os.kill(os.getpid(), signal.SIGKILL)

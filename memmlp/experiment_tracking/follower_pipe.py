@@ -49,7 +49,7 @@ class Tracking:
             feed.wait(run.folder, min(SHARE * (time.monotonic() - begun), MOST))
 
     def sweep(self, folder: Path, seconds: float = MOST) -> None:
-        """Show a sweep's runs as one group, from its folder's record, and wait at most `seconds` for it."""
+        """Show a sweep's runs as one group, read from its folder; wait at most `seconds` for it."""
         feed = feed_of(self)
         feed.tell("sweep", folder)
         feed.wait(folder, seconds)
