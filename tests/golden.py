@@ -56,6 +56,7 @@ from memmlp.training.losses import (
     MotionLoss,
     NoHand,
     OwnLoss,
+    RPMLoss,
     TermsLoss,
     Uncertainty,
 )
@@ -289,6 +290,7 @@ CASES: dict[str, Callable[[], Numbers]] = {
         for anchor in ("pelvis", "head")
         for name, value in loss(partial(AvatarPoserLoss, anchor=anchor)).items()
     },
+    "loss.rpm": lambda: loss(RPMLoss),
     "loss.own": lambda: {
         "total": float(OwnLoss()(*(torch.ones(1, 1, n) for n in (198, 198, 54)), tiny.normalizer())[0])
     },

@@ -23,7 +23,7 @@ from memmlp.training.losses import Fixed, Loss, Terms
 from memmlp.training.optim import Optim, vqvae_optim
 from memmlp.training.rollout import TeacherForcing
 from memmlp.training.train_network import MotionTask
-from memmlp.training.train_refiner import RefinerTask, RefinerTraining, sage_loss
+from memmlp.training.train_refiner import LOSSES, RefinerTask, RefinerTraining
 from memmlp.training.train_sage import PARTS, DroppingOptim, PartTask
 from memmlp.training.train_vqvae import VQVAETask
 
@@ -107,11 +107,16 @@ def optimised(kind: type[Optim] = Optim, **changes: float) -> Numbers:
 
 
 def refiner() -> Numbers:
-    """Three steps of its training behind a network, and what both then stream."""
-    model, split, optim = tiny.refined(), frames(), Optim(steps=3, batch=4, lr=1e-2)
-    pieces = RefinerTraining(0, SAGERefiner(6, 2, 20, 6), optim, "frames").drawn(split)
-    task = RefinerTask(model, sage_loss(), split, pieces, optim, validate=lambda: {})
-    return _trained(task, optim) | summary("stream", evaluation.stream(model.eval(), [tiny.clip(25)])[0])
+    """Three steps of its training behind a network with each of its losses, and what both then stream."""
+    found = {}
+    for kind, loss in LOSSES.items():
+        model, split, optim = tiny.refined(), frames(), Optim(steps=3, batch=4, lr=1e-2)
+        pieces = RefinerTraining(0, SAGERefiner(6, 2, 20, 6), optim, "frames").drawn(split)
+        task = RefinerTask(model, loss(), split, pieces, optim, validate=lambda: {})
+        numbers = _trained(task, optim)
+        numbers |= summary("stream", evaluation.stream(model.eval(), [tiny.clip(25)])[0])
+        found |= {name if kind == "joints" else f"{kind} {name}": value for name, value in numbers.items()}
+    return found
 
 
 def parts() -> Numbers:

@@ -31,7 +31,7 @@ from memmlp.networks.predictor_slot import Predictor, TwoBranch
 from memmlp.networks.recurrent_poser import RecurrentPoser
 from memmlp.networks.refiner import Refined
 from memmlp.networks.vqvae import VQVAE
-from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, Loss, OwnLoss, TermsLoss
+from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, Loss, OwnLoss, RPMLoss, TermsLoss
 
 SIZES = {"hidden": 16, "frames": 7}
 DEPTH = 4
@@ -149,7 +149,7 @@ BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
     ),
     "vae_hmd": partial(TermsLoss, "square", rotation=1.0, position=20.0, angle=0.1),
     "avatar_jlm": partial(TermsLoss, rotation=2.0, position=5.0, velocity_3=16.0, contact=20.0, hand=5.0),
-    "rpm": partial(TermsLoss, rotation=1.0, sixd_velocity=1.0, world_position=1.0, velocity=1.0),
+    "rpm": RPMLoss,
     "sage": partial(TermsLoss, "norm", orientation=0.02, rotation=1.0, world_position=5.0),
     "manikin_s": partial(TermsLoss, orientation=0.02),
     "manikin_l": partial(TermsLoss, orientation=0.02, world_position=40.0, velocity=50.0, hand=5.0),

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from memmlp.live.stream import Stream
 
 OWN = "own"  # the avatar that is the project's own
+SPACE, HZ = "amass", 60.0  # of clips, and of packets where nothing else is told
 
 
 @click.command("live")
@@ -59,12 +60,12 @@ OWN = "own"  # the avatar that is the project's own
     help="Take packets of this other machine, too. May be given several times.  [default: this machine's]",
 )
 @click.option(
-    "--space", default="amass", show_default=True, type=click.Choice(["amass", "openxr", "unity"]),
+    "--space", default=SPACE, show_default=True, type=click.Choice(["amass", "openxr", "unity"]),
     help="Frame of reference of the packets, also of those that --send sends.",
 )  # fmt: skip
 @click.option(
     "--hz",
-    default=60.0,
+    default=HZ,
     show_default=True,
     type=Finite(10, 1000),
     help="How many samples of a clip are played a second, Hz.",
@@ -193,6 +194,10 @@ def check_options(given: InputOptions, shown: ShowOptions, send: bool) -> None:
         raise InputError(
             f"{alone[0]}: goes with --udp PORT or --osc PORT, whose packets somebody's devices send"
         )
+    if given.space != SPACE and not ports:
+        raise InputError(f"--space {given.space}: is of packets; allowed with a clip is --space {SPACE}")
+    if given.hz != HZ and ports and not send:
+        raise InputError("--hz: is of a clip; packets come at whatever rate; allowed is a clip, or --send")
     if send and (shown.vmc or shown.vrchat or shown.record or shown.avatar):
         raise InputError(
             "--send: sends a clip's trackers alone; allowed with it is no --vmc, --vrchat or --record"

@@ -69,7 +69,7 @@ def save_command(
     They are the per-clip results of its finished runs. SWEEP and OVERRIDES are those of `memmlp sweep`.
     Results that the file already has of other arms and seeds stay.
     """
-    from memmlp.cli.seed_rounds import sweep_to_show
+    from memmlp.cli.sweep_to_show import sweep_to_show
     from memmlp.common.files import plain
     from memmlp.config.plan_sweep import find_sweep, is_path
     from memmlp.report.kept_results import Kept, load_kept, overrides_of, save, without_paths
@@ -204,7 +204,7 @@ def _table(kept: Kept, source: str | None = None) -> Table:
 
     With a source's name, it is the table of that source's test clips alone.
     """
-    from memmlp.cli.seed_rounds import of_another
+    from memmlp.cli.sweep_to_show import of_another
     from memmlp.config.plan_sweep import find_sweep
     from memmlp.tables.build_table import make_table, on_source
     from memmlp.tables.seed_rounds import of_json

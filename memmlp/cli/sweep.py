@@ -16,7 +16,7 @@ from memmlp.common.errors import InputError
 from memmlp.runs.identity import NETWORK
 
 if TYPE_CHECKING:
-    from memmlp.cli.seed_rounds import SweepToShow
+    from memmlp.cli.sweep_to_show import SweepToShow
     from memmlp.sweep.plan import Plan
     from memmlp.sweep.spec import Sweep
 
@@ -69,6 +69,7 @@ def sweep(
     controls, get more, up to --max-seeds.
     """
     from memmlp.cli import seed_rounds
+    from memmlp.cli.sweep_to_show import SweepToShow, spent_before
     from memmlp.config.plan_sweep import find_sweep, make_plan, sweep_folder
 
     seed_rounds.check(overrides, until_decided, max_seeds)
@@ -95,13 +96,13 @@ def sweep(
     work = partial(run_workers, workers=workers)
     if known:
         known, plan = seed_rounds.run_until_decided(chosen, outputs, known, work, fail_fast)
-        show_outcome(seed_rounds.SweepToShow(known.spent(chosen), plan, known), [name, *overrides], chosen)
+        show_outcome(SweepToShow(known.spent(chosen), plan, known), [name, *overrides], chosen)
         return
     plan = replace(plan, fail_fast=fail_fast)
     if plan.left():
         work(chosen, plan)
     show_outcome(
-        seed_rounds.SweepToShow(chosen, plan, None, seed_rounds.spent_before(chosen, outputs)),
+        SweepToShow(chosen, plan, None, spent_before(chosen, outputs)),
         [name, *overrides],
         chosen,
     )

@@ -17,7 +17,7 @@ from memmlp.common.errors import InputError
 from memmlp.sweep.spec import BRANCHES
 
 if TYPE_CHECKING:
-    from memmlp.cli.seed_rounds import SweepToShow
+    from memmlp.cli.sweep_to_show import SweepToShow
     from memmlp.sweep.spec import Sweep
     from memmlp.tables.effects import RunsBySeed
     from memmlp.tables.runs_of_plan import Read
@@ -167,7 +167,7 @@ def gathered(
     Raises:
         InputError: if none of them can be composed with the command line's overrides.
     """
-    from memmlp.cli.seed_rounds import sweep_to_show
+    from memmlp.cli.sweep_to_show import sweep_to_show
     from memmlp.tables.build_table import without_runs
 
     found, failures = [], []

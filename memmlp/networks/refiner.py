@@ -32,6 +32,7 @@ class SAGERefiner:
             start.
         pieces: how many pieces are drawn from the training clips.
         lr: learning rate at the start; None for the network's learning rate.
+        velocities: whose movement its loss compares, "rotations" as in the released code, or "joints".
     """
 
     width: int
@@ -39,6 +40,7 @@ class SAGERefiner:
     frames: int
     pieces: int
     lr: float | None = None
+    velocities: str = "rotations"
 
     def around(self, network: MotionModel) -> Refined:
         """Return a network with a refiner of fresh weights behind it."""

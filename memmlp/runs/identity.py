@@ -306,6 +306,8 @@ def _unused(config: Mapping[str, Any]) -> Iterable[str]:
         yield "optim.warmup"
     if config.get("vqvae", {}).get("codebook", "ema") != "ema":
         yield "vqvae.decay"
+    if (config.get("refiner") or {}).get("velocities") == "joints":
+        yield "refiner.velocities"  # those of runs before this key
     loss = config.get("loss") or {}
     if loss.get("name") == "uncertainty":
         yield "term.weight"  # it is learned

@@ -21,15 +21,18 @@ from memmlp.networks.network_families import Architecture, RefinedArchitecture
 from memmlp.networks.refiner import HIDDEN, Refined, SAGERefiner
 from memmlp.runs.run import Run
 from memmlp.training.loop import StepResult, Watch, train, unwatched
-from memmlp.training.losses import Loss, TermsLoss
+from memmlp.training.losses import Loss, SAGERefinerLoss, TermsLoss
 from memmlp.training.optim import Optim
 from memmlp.training.train_network import VALIDATION_PIECE
 
 TOGETHER = 64  # pieces that the network streams through side by side
 
 
-def sage_loss() -> Loss:
-    """Return the loss that SAGE-Net's refiner is trained with, made from the library's terms."""
+def joints_loss() -> Loss:
+    """Return the loss that compares how joints move, where that of SAGE-Net's authors does so with rotations.
+
+    Its weights are theirs. Refiners were trained with it before their code was followed.
+    """
     return TermsLoss(
         "smooth",
         orientation=0.01,
@@ -40,6 +43,10 @@ def sage_loss() -> Loss:
         velocity_3=20.0,
         jerk=0.03,
     )
+
+
+LOSSES: dict[str, Callable[[], Loss]] = {"rotations": SAGERefinerLoss, "joints": joints_loss}
+"""The losses of a refiner, by what they compare the movement of."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +103,7 @@ class RefinerTraining:
         validation = modes.chunks(data.open("val").to(device), VALIDATION_PIECE, least=60)
         task = RefinerTask(
             model,
-            sage_loss(),
+            LOSSES[self.refiner.velocities](),
             dataset,
             self.drawn(dataset),
             self.optim,

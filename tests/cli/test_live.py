@@ -30,6 +30,8 @@ from memmlp.motion.synthetic import synthesize_clip
     ("words", "told"),
     [
         (["--height", "180"], "--height: goes with --udp PORT or --osc PORT"),
+        (["--space", "unity"], "--space unity: is of packets; allowed with a clip is --space amass"),
+        (["--hz", "90", "--udp", "9000"], "--hz: is of a clip"),
         (["--from", "192.168.1.9"], "--from: goes with --udp PORT"),
         (["--udp", "9001", "--from", "nowhere"], "nowhere"),
         (["--udp", "9001", "--send", "--vmc", "127.0.0.1"], "--send: sends a clip's trackers alone"),

@@ -125,9 +125,10 @@ def test_published_work():
 
 
 def test_baselines_see_what_their_authors_give_them():
-    """World coordinates, and z-scores of the diffusion model alone; what is asked for wins."""
+    """World coordinates, and z-scores of the diffusion model and of RPM alone; what is asked for wins."""
     features = {name: tuple(composed([f"model={name}"]).frame.values()) for name in NAMES}
-    assert features == dict.fromkeys(NAMES, ("world", False)) | {"agrol_diffusion": ("world", True)}
+    scored = dict.fromkeys(("agrol_diffusion", "rpm"), ("world", True))
+    assert features == dict.fromkeys(NAMES, ("world", False)) | scored
     asked = composed(["model=agrol_mlp", "frame.coordinates=heading", "frame.normalize=true"]).frame
     assert tuple(asked.values()) == ("heading", True)
     assert tuple(composed([]).frame.values()) == ("heading", True)

@@ -14,8 +14,9 @@ from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.networks.refiner import SAGERefiner
 from memmlp.runs.run import Run
 from memmlp.training.loop import train
+from memmlp.training.losses import SAGERefinerLoss
 from memmlp.training.optim import Optim
-from memmlp.training.train_refiner import RefinerTask, RefinerTraining, sage_loss, streamed
+from memmlp.training.train_refiner import RefinerTask, RefinerTraining, streamed
 
 OPTIM = Optim(steps=12, batch=4, lr=1e-2, final_lr=1e-3, schedule="cosine", checkpoint_every=5, log_every=4)
 REFINER = SAGERefiner(width=6, depth=2, frames=20, pieces=6)
@@ -24,7 +25,7 @@ REFINER = SAGERefiner(width=6, depth=2, frames=20, pieces=6)
 def task(optim: Optim = OPTIM) -> RefinerTask:
     dataset, model = tiny.frames(), tiny.refined(tiny.baseline("avatar_poser"))
     training = RefinerTraining(0, REFINER, optim, "frames")
-    return RefinerTask(model, sage_loss(), dataset, training.drawn(dataset), optim, validate=lambda: {})
+    return RefinerTask(model, SAGERefinerLoss(), dataset, training.drawn(dataset), optim, validate=lambda: {})
 
 
 def test_pieces_are_of_the_training_clips_and_the_network_streams_through_each():
@@ -102,7 +103,7 @@ def test_the_network_streams_without_slopes_and_without_dropout():
     model = tiny.baseline("avatar_poser").train()
     refined = tiny.refined(model)
     pieces = torch.stack([tiny.clip(12, seed) for seed in (1, 2)])
-    RefinerTask(refined, sage_loss(), tiny.frames(), (pieces, torch.tensor([0, 1])), OPTIM, lambda: {})
+    RefinerTask(refined, SAGERefinerLoss(), tiny.frames(), (pieces, torch.tensor([0, 1])), OPTIM, lambda: {})
     found = streamed(model, pieces)
     assert not any(motion.requires_grad for motion in found)
     torch.testing.assert_close(found[0][:, ROTATION], streamed(model, pieces)[0][:, ROTATION])

@@ -315,6 +315,7 @@ class SAGERefinerConfig(RefinerConfig):
     frames: int = at_least(4)
     pieces: int = at_least(1)
     lr: Optional[float] = optional(Within(0, strict=True))
+    velocities: str = standing("joints", OneOf(("rotations", "joints")))
 
 
 @dataclass

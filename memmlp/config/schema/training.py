@@ -104,6 +104,16 @@ class AvatarPoserLossConfig(BaselineLossConfig):
 
 
 @dataclass
+class RPMLossConfig(BaselineLossConfig):
+    name: str = called("rpm")
+    _target_: str = target("memmlp.training.losses.RPMLoss")
+    rotation: float = at_least(0)
+    rotation_velocity: float = at_least(0)
+    position: float = at_least(0)
+    velocity: float = at_least(0)
+
+
+@dataclass
 class OwnLossConfig(BaselineLossConfig):
     """No loss besides the network's own, for networks that define a loss on their outputs (BoDiffusion)."""
 

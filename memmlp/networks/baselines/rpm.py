@@ -167,9 +167,12 @@ class RPM(WindowlessModel):
         encoded = self.encoded(sparse)
         past = slice(begin - self.context, begin)
         state = self.begun(state, encoded[:, past], truth[:, past])
+        training = self.training
+        self.eval()  # its own past is made as in use, without dropout
         with torch.no_grad():
             for index in range(begin, now):
                 _, state = self.rolled(encoded[:, index : index + 1], state)
+        self.train(training)
         torch.clear_autocast_cache()  # weights that were cast without a gradient would have none below
         made, state = self.rolled(encoded[:, now : now + 1], state)
         return Learned(self.normalizer.posed(made, sparse[:, now:]), state, {})

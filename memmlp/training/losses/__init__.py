@@ -1,6 +1,12 @@
 """The training losses: Mem-MLP's, the baselines', and a library of terms that any network's loss can take."""
 
-from memmlp.training.losses.authors_losses import AGRoLLoss, AvatarPoserLoss, OwnLoss
+from memmlp.training.losses.authors_losses import (
+    AGRoLLoss,
+    AvatarPoserLoss,
+    OwnLoss,
+    RPMLoss,
+    SAGERefinerLoss,
+)
 from memmlp.training.losses.loss import (
     Fixed,
     LearnedWeights,
@@ -26,6 +32,8 @@ __all__ = [
     "MotionLoss",
     "NoHand",
     "OwnLoss",
+    "RPMLoss",
+    "SAGERefinerLoss",
     "Term",
     "Terms",
     "TermsLoss",

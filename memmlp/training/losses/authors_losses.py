@@ -1,14 +1,16 @@
-"""The losses of AGRoL and AvatarPoser as published, and OwnLoss for networks that bring their own losses."""
+"""Losses of baselines as in their released codes, and OwnLoss for networks that bring their own losses."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
+import torch.nn.functional as F
 from torch import Tensor
 
-from memmlp.motion.body import N_JOINTS, ROOT, ROTATION
+from memmlp.motion.body import HANDS, HEAD, N_JOINTS, ROOT, ROTATION
 from memmlp.motion.normalizer import Normalizer
 from memmlp.training.losses.loss import Fixed, Loss, Terms, joints
+from memmlp.training.losses.terms import Comparison, jerk_of
 
 
 def joint_norms(error: Tensor) -> Tensor:
@@ -87,6 +89,87 @@ class AvatarPoserLoss(Loss):
             "rotation": error[..., 6:].mean(),
             "position": position.abs().mean(),
         }
+
+
+def joint_sums(error: Tensor) -> Tensor:
+    """Return the L1 norm of each joint's error (B, T, 22 n), averaged over frames and joints."""
+    return error.unflatten(-1, (N_JOINTS, -1)).abs().sum(-1).mean()
+
+
+def joint_sums_of_steps(error: Tensor) -> Tensor:
+    """Return the same of an error's steps between frames; the last frame, which has none, counts as right."""
+    frames = error.shape[1]
+    return joint_sums(error.diff(dim=1)) * (frames - 1) / frames
+
+
+class RPMLoss(Loss):
+    """L1 norms of joints' errors in rotations and positions, and in how both move (CVPR 2025, released code).
+
+    Rotations are compared in network space, so as z-scores where the network has them; positions by forward
+    kinematics with the head on its tracker, metres in the world.
+
+    Args:
+        rotation: weight of the 6D rotations' error.
+        rotation_velocity: weight of their differences between frames.
+        position: weight of the positions' error.
+        velocity: weight of their differences between frames.
+    """
+
+    def __init__(
+        self,
+        rotation: float = 1.0,
+        rotation_velocity: float = 1.0,
+        position: float = 1.0,
+        velocity: float = 1.0,
+    ):
+        super().__init__()
+        weights = {"rotation": rotation, "rotation_velocity": rotation_velocity}
+        self.weighting = Fixed({**weights, "position": position, "velocity": velocity})
+
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
+        """Return each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
+        origin = normalizer.origin(sparse)
+        error = normalizer.encode_motion(motion, origin) - normalizer.encode_motion(truth, origin)
+        rotations, pair = error[..., ROTATION], Comparison(motion, truth, sparse, normalizer)
+        positions = (pair.positions - pair.true_positions).flatten(-2)
+        return {
+            "rotation": joint_sums(rotations),
+            "rotation_velocity": joint_sums_of_steps(rotations),
+            "position": joint_sums(positions),
+            "velocity": joint_sums_of_steps(positions),
+        }
+
+
+class SAGERefinerLoss(Loss):
+    """What SAGE-Net's refiner is trained with (CVPR 2024, released code): mostly how rotations move.
+
+    Errors of 6D rotations, and of their movement over one frame and over three, are smooth L1 over all
+    components; positions are by forward kinematics from the pelvis, and those of head and hands with the head
+    on its tracker.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        weights = {"rotation": 0.01, "rotation_velocity": 60.0, "rotation_velocity_3": 20.0}
+        self.weighting = Fixed({**weights, "position": 0.01, "trackers": 0.01, "jerk": 0.03})
+
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
+        """Return each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
+        error, pair = (motion - truth)[..., ROTATION], Comparison(motion, truth, sparse, normalizer)
+        tracked = [HEAD, *HANDS]
+        return {
+            "rotation": _smooth(error),
+            "rotation_velocity": _smooth(error.diff(dim=1)),
+            "rotation_velocity_3": _smooth(error[:, ::3].diff(dim=1)),
+            "position": (pair.made.posed[1] - from_pelvis(pair.true_positions)).norm(dim=-1).mean(),
+            "trackers": _smooth((pair.positions - pair.true_positions)[..., tracked, :]),
+            "jerk": jerk_of(pair.made.posed[1]),
+        }
+
+
+def _smooth(error: Tensor) -> Tensor:
+    """Return Huber's mean error, as torch's smooth L1."""
+    return F.smooth_l1_loss(error, error.new_zeros(()).expand_as(error))
 
 
 class OwnLoss(Loss):

@@ -157,7 +157,12 @@ def acceleration(pair: Comparison, error: Error) -> Tensor:
 
 def jerk(pair: Comparison, error: Error) -> Tensor:
     """Return the mean norm of the predicted joints' third differences in time; the truth is not used."""
-    return pair.positions.diff(3, dim=1).norm(dim=-1).mean()
+    return jerk_of(pair.positions)
+
+
+def jerk_of(positions: Tensor) -> Tensor:
+    """Return the mean norm of the third differences in time of positions (B, T, 22, 3)."""
+    return positions.diff(3, dim=1).norm(dim=-1).mean()
 
 
 def contact(pair: Comparison, error: Error) -> Tensor:

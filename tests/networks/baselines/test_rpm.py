@@ -48,9 +48,11 @@ def test_before_the_first_frame_are_its_inputs():
 
 def test_training_predicts_the_last_frames_after_free_running(monkeypatch):
     """The one step with gradient sees the inputs up to its own frame, and motion that has no gradient."""
-    model, steps = tiny.baseline("rpm"), []
+    model, steps, training = tiny.baseline("rpm").train(), [], []
     rolled = model.rolled
     model.rolled = lambda *given: (steps.append((torch.is_grad_enabled(), given)), rolled(*given))[1]
+    predicted = model.predicted
+    model.predicted = lambda *given: (training.append(model.layers[0].training), predicted(*given))[1]
     monkeypatch.setattr(torch, "rand_like", lambda like: torch.tensor([[0.1], [0.9]]))
     for running in range(3):
         steps.clear()
@@ -58,6 +60,7 @@ def test_training_predicts_the_last_frames_after_free_running(monkeypatch):
         motion, *_ = model.learn(SPARSE, model.initial_state(2), TRUTH)
         assert motion.shape[:2] == (2, 4)
         assert [grad for grad, _ in steps] == [False] * running + [True]
+        assert training[-running - 1 :] == [False] * running + [True]  # dropout, in the last alone
         encoded = model.encoded(SPARSE)
         for index, (_, (frame, _)) in enumerate(steps):
             torch.testing.assert_close(frame, encoded[:, 5 - running + index, None])

@@ -1,0 +1,98 @@
+"""The part of a sweep that a table shows: its own seeds, or those that rounds spent on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from memmlp.common.errors import InputError
+
+if TYPE_CHECKING:
+    from memmlp.sweep.plan import Plan
+    from memmlp.sweep.spec import Sweep
+    from memmlp.tables.seed_rounds import Rounds
+
+
+class SweepToShow(NamedTuple):
+    """The part of a sweep that a table shows, if seeds may have been spent in rounds.
+
+    Attributes:
+        sweep: the sweep with the seeds that were spent.
+        plan: the plan of its runs.
+        rounds: the rounds that decided the verdicts; None if no rounds did.
+        flags: what a reader has to know if rounds were taken of something else.
+    """
+
+    sweep: Sweep
+    plan: Plan
+    rounds: Rounds | None
+    flags: tuple[str, ...] = ()
+
+
+def sweep_to_show(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> SweepToShow:
+    """Return the sweep with its rounds, if rounds were taken and fit the sweep's present form.
+
+    Otherwise the sweep is shown with its own seeds; if rounds were taken, a flag says so.
+    """
+    from memmlp.config.plan_sweep import make_plan
+    from memmlp.tables.seed_rounds_file import read, same_runs
+
+    path = rounds_path(sweep, outputs)
+    kept = read(path)
+    if kept is None or not kept.taken:
+        return SweepToShow(sweep, make_plan(sweep, outputs), None)
+    chosen = any(word.startswith("seed=") for word in overrides)
+    if flag := of_another(kept, sweep, chosen):
+        return SweepToShow(sweep, make_plan(sweep, outputs), None, (flag,))
+    spent = kept.spent(sweep)
+    plan = make_plan(spent, outputs)
+    try:
+        same_runs(kept, sweep, plan, path)
+    except InputError as error:
+        return SweepToShow(
+            spent, plan, None, (f"seeds were spent in rounds, but not of these runs: {error}",)
+        )
+    return SweepToShow(spent, plan, kept)
+
+
+def of_another(kept: Rounds, sweep: Sweep, chosen: bool = False) -> str | None:
+    """Return a flag if the sweep has changed since the kept looks were taken; else None.
+
+    `chosen` says that the sweep's seeds were chosen by hand.
+    """
+    from memmlp.tables.seed_rounds import begin
+
+    other = "seeds" if chosen else difference(kept, begin(sweep, len(kept.seeds)))
+    return (
+        f"seeds were spent in rounds with other {other}: these verdicts do not keep the 5 %"
+        if other
+        else None
+    )
+
+
+def spent_before(sweep: Sweep, outputs: Path) -> tuple[str, ...]:
+    """Return a flag for a table with a fixed number of seeds if rounds were taken of the sweep before."""
+    from memmlp.tables.seed_rounds_file import read
+
+    kept = read(rounds_path(sweep, outputs))
+    if kept is None or not kept.taken:
+        return ()
+    return ("seeds were spent in rounds before; memmlp table has their verdicts, these do not keep the 5 %",)
+
+
+def rounds_path(sweep: Sweep, outputs: Path) -> Path:
+    """Return the file in which a sweep's rounds are kept."""
+    from memmlp.config.plan_sweep import sweep_folder
+    from memmlp.tables.seed_rounds_file import NAME
+
+    return sweep_folder(sweep, outputs) / NAME
+
+
+def difference(kept: Rounds, wanted: Rounds) -> str | None:
+    """Name in a word what differs between two rounds of a sweep; None if nothing does."""
+    if kept.seeds != wanted.seeds:
+        return "seeds"
+    if (kept.looks, kept.levels) != (wanted.looks, wanted.levels):
+        return "looks"
+    return next((key for key, value in wanted.subject.items() if kept.subject.get(key) != value), None)
