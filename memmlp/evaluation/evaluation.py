@@ -77,13 +77,13 @@ def check_positions(network: str, rows: Sequence[dict[str, Any]]) -> None:
 
 
 def picture(model: MotionModel, test: MotionDataset, path: Path) -> None:
-    """Draw the start of the first test clip, streamed, beside the truth, as a PNG."""
+    """Draw the start of the first test clip beside the truth, as a PNG: streamed, where the network can."""
     # Imported here, since it imports matplotlib: half a second that planning a sweep need not spend.
     from memmlp.render.heatmap import poses_png
 
     device = model.normalizer.rest.device
     clip = test.clip(0)[:PICTURE_FRAMES].to(device)
-    motion = modes.stream(model, [clip])[0]
+    motion = modes.MODE_FUNCTIONS["stream" if model.streams else "window"](model, [clip])[0]
     predicted = model.normalizer.pose(motion, clip[:, :SPARSE_DIM])
     truth = modes.joint_positions(clip[:, SPARSE_DIM:])
     poses_png(path, truth.cpu().numpy(), predicted.cpu().numpy(), test.names[0])

@@ -47,11 +47,21 @@ def predict_clip(model: MotionModel, clip: Tensor, mode: str) -> dict[str, np.nd
     """Return a network's prediction of a clip's frames (N, 252), beside the truth (`prediction_arrays`).
 
     A network that draws random numbers draws the same ones for a clip each time.
+
+    Raises:
+        InputError: for the stream of a network that has none.
     """
+    check_mode(model, mode)
     with torch.random.fork_rng():
         torch.manual_seed(0)
         motion = modes.MODE_FUNCTIONS[mode](model, [clip])[0]
     return prediction_arrays(model.normalizer, clip, motion, NoIK())
+
+
+def check_mode(model: MotionModel, mode: str) -> None:
+    """Raise InputError for the stream of a network that makes frames with later ones."""
+    if mode == "stream" and not model.streams:
+        raise InputError("mode stream: this network makes a frame with later ones; allowed is mode window")
 
 
 def prediction_arrays(normalizer: Normalizer, clip: Tensor, motion: Tensor, ik: IK) -> dict[str, np.ndarray]:
@@ -103,12 +113,18 @@ class ClipPredictor:
         branch: one of KINDS_OF_POSES: the rotation branch with the head on its tracker, the result of the
             evaluation's inverse kinematics, or the truth, which is the recorded clip itself.
         evaluation: how the network is evaluated: batches, inverse kinematics, seed.
+
+    Raises:
+        InputError: for the stream of a network that has none.
     """
 
     model: MotionModel
     mode: str
     branch: str
     evaluation: Evaluation
+
+    def __post_init__(self) -> None:
+        check_mode(self.model, self.mode)
 
     @property
     def rest(self) -> np.ndarray:

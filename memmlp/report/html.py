@@ -19,7 +19,7 @@ from memmlp.sweep.spec import COSTS, Sweep
 from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.error_distributions import Distribution, distributions
 from memmlp.tables.formats import as_html
-from memmlp.tables.measured_run import Measured
+from memmlp.tables.measured_run import UNKNOWN, Measured, Origin
 from memmlp.tables.table import Table
 from memmlp.tables.table_text import better, caption
 
@@ -308,10 +308,15 @@ def _latency(entries: Sequence[ReportedRun]) -> str:
             )
         ]  # fmt: skip
         origin = entry.measured.origin
-        rows.append([entry.measured.id, origin.deployed, *numbers, origin.hardware, "; ".join(entry.places)])
+        rows.append([entry.measured.id, origin.deployed, *numbers, _machine(origin), "; ".join(entry.places)])
     return _rows(
         head, rows, "One streaming step on one CPU core; the yardstick is a fixed stack of matrix products."
     )
+
+
+def _machine(origin: Origin) -> str:
+    """Return the machine of the times, which is not always that of the training."""
+    return origin.hardware if origin.timed_on == UNKNOWN else origin.timed_on
 
 
 def _number(values: Mapping[str, float], key: str, scale: float, form: str) -> str:

@@ -29,6 +29,7 @@ LATER_FACTS = (
     "processes",
     "offline",
     "deployed",
+    "timed_on",
     "divided",
 )  # the origins of older files have none of these
 OLDER_NAMES = {"vqvae": "upstream"}  # what the origins of older files call otherwise

@@ -308,6 +308,8 @@ def _unused(config: Mapping[str, Any]) -> Iterable[str]:
         yield "vqvae.decay"
     if (config.get("refiner") or {}).get("velocities") == "joints":
         yield "refiner.velocities"  # those of runs before this key
+    if (config.get("model") or {}).get("own_dropout"):
+        yield "model.own_dropout"  # as in runs before this key
     loss = config.get("loss") or {}
     if loss.get("name") == "uncertainty":
         yield "term.weight"  # it is learned

@@ -28,7 +28,7 @@ RECIPES: dict[str, int] = {
     "model.ego_poser": 2,
     "model.hmd_poser": 1,
     "model.vae_hmd": 1,
-    "model.rpm": 2,
+    "model.rpm": 1,
     "model.avatar_jlm": 2,
     "model.recurrent_poser": 3,
     "model.sage": 1,

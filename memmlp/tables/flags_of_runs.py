@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from memmlp.sweep.spec import COSTS, Arm, Sweep
 from memmlp.tables.effects import RunsBySeed, control_arm, one_and_the_same
-from memmlp.tables.measured_run import SHARED, Measured
+from memmlp.tables.measured_run import SHARED, UNKNOWN, Measured
 
 Say = Callable[[Arm, int], str | None]
 BUILT_IN = "builtin"
@@ -58,6 +59,7 @@ def flags(
     for attribute, what in ORIGIN.items():
         yield from _differing(what, [(getattr(run.origin, attribute), label) for label, run in every])
     if TIMES & set(sweep.metrics):
+        yield from _differing("machine of the times", _timed(every))
         yield from _busy(sweep, runs)
     yield from _seen(sweep, runs)
     yield from _partial(every)
@@ -212,6 +214,7 @@ def _calmer_than_truth(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable
                 [value for run in found if (value := run.value(mode, arm.branch, metric)) is not None]
                 for metric in ("Jitter", "GT Jitter")
             )
+            made, true = (list(filter(math.isfinite, values)) for values in (made, true))
             if made and true and np.mean(made) < np.mean(true):
                 truths[mode] = float(np.mean(true))
                 calmer[mode].append(f"'{arm.label}' {np.mean(made):.2f}")
@@ -246,6 +249,12 @@ def _seen(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
                 unequal.append(f"'{arm.label}' {own / 1e6:.3g} M to '{other.label}' {controls / 1e6:.3g} M")
     if unequal:
         yield f"number of frames seen in training differs: {_listed(unequal)}"
+
+
+def _timed(every: Sequence[tuple[str, Measured]]) -> list[tuple[str, str]]:
+    """Return the machine on which each run's times were measured, where it is known of all, and the label."""
+    found = [(run.origin.timed_on, label) for label, run in every if run.latency or run.costs]
+    return [] if any(machine == UNKNOWN for machine, _ in found) else found
 
 
 def _busy(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:

@@ -31,7 +31,7 @@ class Origin:
         code: the commit; the package's version outside a checkout.
         changed: whether the checkout had uncommitted changes.
         data: the digest of the prepared data.
-        hardware: the processor.
+        hardware: the processor of training and evaluations.
         device: "cpu", "cuda" or "mps".
         gpu: the GPU's name.
         threads: torch's threads on the processor.
@@ -46,6 +46,7 @@ class Origin:
         plugins: version and code digest of each user's package that it uses.
         offline: whether frames are made with later ones, so that it can't run as a stream.
         deployed: the precision of the exported file that was measured for size and times.
+        timed_on: the processor on which size and times were measured, and ONNX Runtime's version there.
         divided: a warning, in words, if subjects have clips in both training and test; None otherwise.
     """
 
@@ -66,6 +67,7 @@ class Origin:
     plugins: Mapping[str, str] = field(default_factory=dict)
     offline: bool = False
     deployed: str = "fp32"
+    timed_on: str = UNKNOWN
     divided: str | None = None
 
 
@@ -203,9 +205,17 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     deployed = (deployments or [run.preferred_deployment])[-1]
     latency = deployed.record
     origin = replace(_evaluated(_origin(manifest), reports), deployed=deployed_precision(latency))
-    origin = replace(origin, recipes={**origin.recipes, **deployed.recipes})
+    origin = replace(origin, recipes={**origin.recipes, **deployed.recipes}, timed_on=_timed_on(latency))
     training = _training(run, manifest)
     return Measured(run.id, means, clips, groups, _costs(latency), origin, latency, run, sources, training)
+
+
+def _timed_on(latency: Mapping[str, Any]) -> str:
+    """Return the processor and ONNX Runtime with which a deployment was measured, as far as known."""
+    made_by = latency.get("made_by") or {}
+    runtime = (made_by.get("packages") or {}).get("onnxruntime")
+    known = [str(made_by["cpu"])] if made_by.get("cpu") else []
+    return ", ".join([*known, *([f"ONNX Runtime {runtime}"] if known and runtime else [])]) or UNKNOWN
 
 
 def of_untrained(

@@ -182,7 +182,7 @@ class ScheduleFree(Optim):
 
 
 def _split(groups: list[dict]) -> tuple[list[dict], list[dict]]:
-    """Divide parameter groups into groups of matrices and groups of all other parameters; none is empty."""
+    """Divide parameter groups into those of two dimensions, Muon's matrices, and those of all others."""
     parts: tuple[list[dict], list[dict]] = ([], [])
     for group in groups:
         for chosen, matrices in zip(parts, (True, False), strict=True):

@@ -175,6 +175,10 @@ REFUSED = [
     ),
     (["model=agrol_mlp", "loss.error=cube"], "loss.error=cube"),
     (["model=avatar_poser", "loss.anchor=foot"], "loss.anchor=foot"),
+    (
+        ["model=ego_poser", "frame.normalize=true"],
+        "frame.normalize=true: EgoPoser takes the head's place off the hands'",
+    ),
     (["model=rpm", "model.frames=19"], "model.context + model.horizon = 20"),
     (["model=manikin_l", "model.offline=true"], "allowed is evaluation.modes=[window] with export.graph=off"),
     (

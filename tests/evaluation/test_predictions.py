@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tiny import REST, model
+from tiny import REST, baseline, model
 from tiny import frames as tiny_frames
 
 from memmlp.common.errors import InputError
+from memmlp.evaluation import evaluation
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import LBFGS, NoIK
 from memmlp.evaluation.modes import stream
@@ -133,3 +134,14 @@ def test_strict_stops_at_a_bad_clip(tmp_path: Path):
     (tmp_path / "in" / "bad.npz").write_bytes(b"none")
     with pytest.raises(InputError, match=r"bad\.npz"):
         predictor().export(plan_export(tmp_path / "in", tmp_path / "out", "npz"), strict=True)
+
+
+def test_an_offline_network_has_no_stream_to_predict_or_to_draw(tmp_path: Path):
+    offline = baseline("bodiffusion", offline=True, sampling_steps=2, depth=1)
+    settings = {"modes": ["window"], "batch": 2, "ik": NoIK(), "seed": 0}
+    with pytest.raises(InputError, match="mode stream: this network makes a frame with later ones"):
+        predict_clip(offline, frames(source(30)), "stream")
+    with pytest.raises(InputError, match="mode stream: this network makes a frame with later ones"):
+        ClipPredictor(offline, "stream", "rotation", Evaluation(**settings))
+    assert predict_clip(offline, frames(source(30)), "window")["predicted_positions"].shape == (29, 22, 3)
+    evaluation.picture(offline, tiny_frames(), tmp_path / "poses.png")

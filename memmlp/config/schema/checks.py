@@ -17,6 +17,7 @@ from memmlp.config.schema.network import (
     AvatarJLMConfig,
     BaselineConfig,
     BoDiffusionConfig,
+    EgoPoserConfig,
     NoMemoryConfig,
     RecurrentPoserConfig,
     RPMConfig,
@@ -224,6 +225,11 @@ def _check_baseline(cfg: DictConfig) -> None:
         )
     if cfg.model.get("offline") and cfg.refiner is not None:
         raise InputError("refiner: corrects a stream, which model.offline=true is not; allowed is null")
+    if _is(cfg.model, EgoPoserConfig) and cfg.frame.normalize and cfg.frame.coordinates == "world":
+        raise InputError(
+            "frame.normalize=true: EgoPoser takes the head's place off the hands', which is no sense of "
+            "z-scores in the world; allowed is frame.normalize=false, or frame.coordinates=heading"
+        )
     steps = cfg.model.get("diffusion_steps", 1)
     if cfg.model.get("sampling_steps", 1) > steps:
         raise InputError(

@@ -141,6 +141,7 @@ class RPMConfig(AvatarPoserConfig):
     _target_: str = target("memmlp.networks.baselines.rpm.RPM")
     context: int = at_least(1)
     horizon: int = at_least(1)
+    own_dropout: bool = standing(True)
 
 
 @dataclass

@@ -54,6 +54,8 @@ class RPM(WindowlessModel):
         context: how many frames of its own past motion the network sees; it sees the inputs of one frame
             more.
         horizon: W, how many frames the network predicts.
+        own_dropout: whether the past that it makes itself in training has dropout, too; as published it has
+            none.
     """
 
     places: Tensor
@@ -71,9 +73,10 @@ class RPM(WindowlessModel):
         dropout: float,
         context: int,
         horizon: int,
+        own_dropout: bool = False,
     ):
         super().__init__(normalizer, frames)
-        self.context, self.horizon = context, horizon
+        self.context, self.horizon, self.own_dropout = context, horizon, own_dropout
         self.motion = nn.Linear(ROTATION.stop, width)
         self.sparse = nn.Linear(SPARSE_DIM, width)
         self.attention = Attention(width, heads)
@@ -168,7 +171,7 @@ class RPM(WindowlessModel):
         past = slice(begin - self.context, begin)
         state = self.begun(state, encoded[:, past], truth[:, past])
         training = self.training
-        self.eval()  # its own past is made as in use, without dropout
+        self.train(training and self.own_dropout)
         with torch.no_grad():
             for index in range(begin, now):
                 _, state = self.rolled(encoded[:, index : index + 1], state)

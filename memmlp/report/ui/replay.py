@@ -17,6 +17,7 @@ from memmlp.live.spaces import SPACES
 from memmlp.motion.body import FPS, JOINTS
 from memmlp.motion.drawn_limbs import LIMBS
 from memmlp.render.error_colours import HEAT, scale
+from memmlp.runs.identity import evaluation_id
 from memmlp.runs.run import Run
 
 Predict = Callable[[Run, str, str], Mapping[str, np.ndarray]]
@@ -101,10 +102,11 @@ class Replays:
         return made
 
     def _path(self, run: Run, clip: str, mode: str) -> Path:
-        """Return the file of a prediction, whose name depends on the weights with which it was made."""
+        """Return the file of a prediction, named after the weights and recipes with which it was made."""
         weights = str(read_json(run.marker).get("artifacts", {}).get(run.model.name))
         data = str(run.manifest.get("data"))
-        words = hashlib.sha256("\n".join([run.id, weights, data, clip, mode]).encode()).hexdigest()[:24]
+        made_by = evaluation_id(run.config, mode)
+        words = hashlib.sha256("\n".join([run.id, weights, data, clip, made_by]).encode()).hexdigest()[:24]
         return self.outputs / "cache" / "ui" / "replays" / f"{words}.npz"
 
     def close(self) -> None:

@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, replace
+from math import isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,10 +41,17 @@ NOT_KEPT = "this sweep's file was not kept with it, so its first arm is the cont
 
 
 class TableAndRounds(NamedTuple):
-    """The results of a sweep's runs: its table, and its rounds if seeds were spent in rounds."""
+    """The results of a sweep's runs.
+
+    Attributes:
+        table: their table.
+        rounds: the rounds, if seeds were spent in rounds.
+        values: the shown metric by arm's label and seed, where it is a number.
+    """
 
     table: dict[str, Any]
     rounds: dict[str, Any] | None
+    values: dict[tuple[str, int], float]
 
 
 class Sweeps:
@@ -105,14 +113,12 @@ class Sweeps:
             raise KeyError(name)
         states = self.states(plan)
         sweep = self._kept(name) or sweep_of_plan(plan)
-        metric = next((metric for metric in sweep.metrics if metric in UNITS), "MPJPE")
-        shown = {arm.label: f"stream.{arm.branch}.{metric}" for arm in sweep.arms}
-        cells = [self._cell(plan, entry, states, shown.get(entry.label, "")) for entry in plan.entries]
+        made = self.made(plan)
+        cells = [self._cell(entry, states, made) for entry in plan.entries]
         upstream = [self._upstream(plan, task, states) for task in plan.tasks if task.kind != NETWORK]
         branches = {arm.branch for arm in sweep.arms}
-        made = self.made(plan)
         found = {
-            "metric": metric,
+            "metric": _shown_metric(sweep),
             "branch": branches.pop() if len(branches) == 1 else "",
             "cells": cells,
             "upstream": upstream,
@@ -134,13 +140,13 @@ class Sweeps:
         run = plan.run_of(task)
         return "done" if all(map(run.has, task.stages)) else run.doing or run.state(False)
 
-    def _cell(self, plan: Plan, entry: Entry, states: Mapping[str, str], shown: str) -> dict[str, Any]:
+    def _cell(self, entry: Entry, states: Mapping[str, str], made: TableAndRounds) -> dict[str, Any]:
         facts = self.index.runs.get(entry.id, {})
         recent = facts.get("recent") or [[0, 0, None]]
         return {
             "arm": entry.label, "seed": entry.seed, "id": entry.id, "state": states[entry.key],
             "step": recent[-1][0], "steps": facts.get("steps"), "failure": facts.get("failure", ""),
-            "value": facts.get("metrics", {}).get(shown),
+            "value": made.values.get((entry.label, entry.seed)),
         }  # fmt: skip
 
     def _upstream(self, plan: Plan, task: RunTask, states: Mapping[str, str]) -> dict[str, Any]:
@@ -207,20 +213,26 @@ class Sweeps:
         sweep = rounds.spent(sweep) if rounds else sweep
         flags += doubts
         entries = {(entry.label, entry.seed): entry for entry in plan.entries}
+        metric = _shown_metric(sweep)
+        values: dict[tuple[str, int], float] = {}
 
         def find(arm: Arm, seed: int) -> Measured | None:
             entry = entries.get((arm.label, seed))
             if entry is None or not plan.complete(entry):
                 return None
             try:
-                return load(plan.run_of(entry).folder, entry.stages)
+                run = load(plan.run_of(entry).folder, entry.stages)
+                # Of this arm's own evaluation: arms that share a training may use its network in other ways.
+                value = run.value("stream", arm.branch, metric)
+                values.update({(arm.label, seed): value} if value is not None and isfinite(value) else {})
+                return run
             except InputError as error:
                 flags.append(str(error))
                 return None
 
         made = make_table(sweep, finished_runs(sweep, find), rounds=rounds)
         table = table_words(replace(made, flags=(*made.flags, *flags)))
-        return TableAndRounds(table, rounds_words(rounds, sweep) if rounds else None)
+        return TableAndRounds(table, rounds_words(rounds, sweep) if rounds else None, values)
 
     def _rounds_path(self, plan: Plan) -> Path:
         return self.index.outputs / "sweeps" / plan.name / ROUNDS_FILE
@@ -230,6 +242,11 @@ class Sweeps:
             return kept(self.index.outputs / "sweeps" / name)
         except InputError:
             return None
+
+
+def _shown_metric(sweep: Sweep) -> str:
+    """Return the metric that the cells of a sweep's page show."""
+    return next((metric for metric in sweep.metrics if metric in UNITS), "MPJPE")
 
 
 def rounds_of(sweep: Sweep, plan: Plan, path: Path) -> tuple[Rounds | None, list[str]]:

@@ -1,6 +1,7 @@
 """RPM, part by part."""
 
 import numpy as np
+import pytest
 import tiny
 import torch
 
@@ -46,9 +47,10 @@ def test_before_the_first_frame_are_its_inputs():
     torch.testing.assert_close(seen[8], encoded[:, 5:])
 
 
-def test_training_predicts_the_last_frames_after_free_running(monkeypatch):
+@pytest.mark.parametrize("own_dropout", [False, True])
+def test_training_predicts_the_last_frames_after_free_running(monkeypatch, own_dropout):
     """The one step with gradient sees the inputs up to its own frame, and motion that has no gradient."""
-    model, steps, training = tiny.baseline("rpm").train(), [], []
+    model, steps, training = tiny.baseline("rpm", own_dropout=own_dropout).train(), [], []
     rolled = model.rolled
     model.rolled = lambda *given: (steps.append((torch.is_grad_enabled(), given)), rolled(*given))[1]
     predicted = model.predicted
@@ -60,7 +62,7 @@ def test_training_predicts_the_last_frames_after_free_running(monkeypatch):
         motion, *_ = model.learn(SPARSE, model.initial_state(2), TRUTH)
         assert motion.shape[:2] == (2, 4)
         assert [grad for grad, _ in steps] == [False] * running + [True]
-        assert training[-running - 1 :] == [False] * running + [True]  # dropout, in the last alone
+        assert training[-running - 1 :] == [own_dropout] * running + [True]
         encoded = model.encoded(SPARSE)
         for index, (_, (frame, _)) in enumerate(steps):
             torch.testing.assert_close(frame, encoded[:, 5 - running + index, None])

@@ -12,6 +12,7 @@ from report.ui.conftest import run_of
 
 from memmlp.common.errors import InputError
 from memmlp.report.ui.replay import Replays, piece, worst_seconds
+from memmlp.runs.recipe_versions import RECIPES
 from memmlp.runs.run import Run
 
 FRAMES = 900
@@ -86,6 +87,14 @@ def test_a_prediction_is_computed_once_and_kept_for_these_weights(outputs: Path)
     run.marker.write_text(f'{{"id": "{run.id}", "artifacts": {{"model.safetensors": "other"}}}}')
     ready(Replays(outputs, predict), run.id, "a clip", "stream")
     assert len(asked) == 3
+
+
+def test_a_prediction_of_an_older_recipe_is_computed_anew(outputs: Path, monkeypatch: pytest.MonkeyPatch):
+    run, found = run_of(outputs), []
+    for at in (300, 100):
+        found.append(ready(Replays(outputs, lambda *_, at=at: motion(at)), run.id, "a clip", "stream"))
+        monkeypatch.setitem(RECIPES, "mode.stream", RECIPES["mode.stream"] + 1)
+    assert [one["worst"][0]["first"] for one in found] == [300, 100]
 
 
 def test_a_damaged_file_is_computed_anew(outputs: Path):

@@ -104,6 +104,23 @@ def test_the_board_shows_the_sweep_s_first_metric_and_its_branch(outputs: Path):
     assert cell["value"] == pytest.approx(run.results["stream"]["combined"]["MPJRE"])
 
 
+def test_arms_of_one_training_have_each_the_value_of_their_own_evaluation(outputs: Path):
+    """A network may be used in another way, such as with another estimate of its past."""
+    run = run_of(outputs, "gru", 0)
+    report = json.loads(run.evaluation("stream-0").read_text())
+    report["mean"]["rotation"]["MPJPE"] += 7.0
+    run.evaluation("stream-1").write_text(json.dumps(report))
+    path = outputs / "sweeps" / "mine" / "plan.json"
+    plan = json.loads(path.read_text())
+    for planned in (*plan["entries"], *plan["tasks"]):
+        if planned["id"] == run.id:
+            planned["stages"] = ["stream-1"]
+    path.write_text(json.dumps(plan))
+    page = sweeps_of(outputs).page("mine")
+    (cell,) = [cell for cell in page["cells"] if cell["id"] == run.id]
+    assert cell["value"] == pytest.approx(run.results["stream"]["rotation"]["MPJPE"] + 7.0)
+
+
 def test_a_failed_run_and_its_reason(outputs: Path):
     run = run_of(outputs, "none", 1)
     run.marker.unlink()
