@@ -23,6 +23,15 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
+WORDS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
+"""The numbers that JSON does not have, by the strings that stand for them."""
+
+
+def number_of(value: Any) -> Any:
+    """Return a measured number as JSON holds it, with NaN and infinities converted back to numbers."""
+    return WORDS.get(value, value) if isinstance(value, str) else value
+
+
 def plain(value: Any) -> Any:
     """Return the value in a form that JSON can hold.
 

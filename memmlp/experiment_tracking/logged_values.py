@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import math
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -211,12 +212,13 @@ class SweepFacts:
         if not {"name", "status", "labels", "aggregates", "verdicts"} <= found.keys():
             return None
         files = tuple(path for path in (folder / "table.md", folder / "table.html") if path.is_file())
-        own = {name: found[name] for name in ("name", "status", "aggregates", "verdicts")}
+        own = {name: found[name] for name in ("name", "status", "verdicts")}
+        own["aggregates"] = {key: value for key, value in found["aggregates"].items() if _number(value)}
         return cls(folder=folder.absolute(), arms=found["labels"], files=files, **own)
 
 
 def _number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _seconds(moment: str | None) -> float:

@@ -7,13 +7,13 @@ code.
 from __future__ import annotations
 
 import difflib
-import math
 import operator
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError
+from memmlp.common.files import number_of
 from memmlp.runs.deployment_folder import as_deployed
 from memmlp.runs.identity import SLOTS, chosen, flatten, trained_by
 from memmlp.runs.notes import read_notes
@@ -29,7 +29,6 @@ ORDER: dict[str, Callable[[Any, Any], bool]] = {
 }  # fmt: skip
 COMPARISONS = ("=", "==", "!=", *ORDER)
 WORDS = ("and", "or", "not")
-NUMBERS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}  # by their words in JSON (common.files)
 SHORT = 8  # digits of a digest that tell data apart
 DEEPEST = 50  # parentheses and "not"s in one another
 
@@ -45,7 +44,7 @@ def record(run: Run) -> dict[str, Any]:
     manifest, config, notes = run.manifest, run.config, read_notes(run)
     found = run.results
     results = flatten(found) | flatten(_times_as_deployed(found.get("latency", {})), "latency.")
-    results = {key: _measured(value) for key, value in results.items()}
+    results = {key: number_of(value) for key, value in results.items()}
     flat = flatten(config)
     short = {key.replace(".rotation.", "."): value for key, value in results.items()}
     slots = {slot: chosen(config, slot) for slot in SLOTS if slot in config}
@@ -61,11 +60,6 @@ def _times_as_deployed(latency: Mapping[str, Any]) -> dict[str, Any]:
     """Return a deployment's own numbers, with those of the file that was asked for in float32's place."""
     deployed = as_deployed(latency)
     return {key: deployed[key] for key, value in latency.items() if isinstance(value, int | float)}
-
-
-def _measured(value: Any) -> Any:
-    """Return a measured number as JSON holds it, with NaN and infinities converted back to numbers."""
-    return NUMBERS.get(value, value) if isinstance(value, str) else value
 
 
 def data_labels(records: Sequence[Record]) -> list[str]:
@@ -282,7 +276,8 @@ def _equal(own: Any, value: str) -> bool:
         return value in own
     if isinstance(own, int | float) and not isinstance(own, bool):
         return _number(value) in (own, float(as_typed(own)))
-    return as_typed(own) == value.replace(", ", ",")
+    typed = value.lower() if isinstance(own, bool | None) else value.replace(", ", ",")
+    return as_typed(own) == typed
 
 
 def _number(text: str) -> float | None:

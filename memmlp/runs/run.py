@@ -17,7 +17,15 @@ import yaml
 
 from memmlp.common import lease_fences
 from memmlp.common.errors import InputError
-from memmlp.common.files import atomic_write, file_digest, now, read_json, sync_folder, write_json
+from memmlp.common.files import (
+    atomic_write,
+    file_digest,
+    now,
+    number_of,
+    read_json,
+    sync_folder,
+    write_json,
+)
 from memmlp.common.lease import Lease, Lock
 from memmlp.runs import deployment_folder
 from memmlp.runs.deployment_folder import DeploymentFolder
@@ -283,7 +291,8 @@ class Run:
         for report in map(read_report, self.own_evaluations):
             branches = found.setdefault(report["mode"], {})
             for branch, errors in report["mean"].items():  # those of one's own metrics may be in one alone
-                branches[branch] = {**branches.get(branch, {}), **errors}
+                numbers = {name: number_of(value) for name, value in errors.items()}
+                branches[branch] = {**branches.get(branch, {}), **numbers}
         latency = self.preferred_deployment.record
         return found | ({"latency": latency} if latency else {})
 

@@ -31,10 +31,19 @@ def summary(plan: Plan, table: Table) -> dict[str, Any]:
     return {
         "name": plan.name,
         "status": "failed" if states["failed"] else "running" if plan.left() else "done",
-        "labels": {entry.id: entry.label for entry in plan.entries if plan.run_of(entry).manifest},
+        "labels": _labels(plan),
         "aggregates": {key: cell.mean for key, cell in cells.items() if cell.mean is not None},
         "verdicts": {key: verdict for key, cell in cells.items() if (verdict := _verdict(cell))},
     }
+
+
+def _labels(plan: Plan) -> dict[str, str]:
+    """Return the labels of each begun run: of all arms that are this run, used or shown in different ways."""
+    labels: dict[str, dict[str, None]] = {}
+    for entry in plan.entries:
+        if plan.run_of(entry).manifest:
+            labels.setdefault(entry.id, {})[entry.label] = None
+    return {run: ", ".join(found) for run, found in labels.items()}
 
 
 def _verdict(cell: Cell) -> str | None:

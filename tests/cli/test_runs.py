@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -170,6 +171,15 @@ def test_diff_tells_of_another_recipe_and_device(memmlp: Memmlp, outputs: Path):
     assert ["recipes.features", "1", "2"] in rows
     assert ["device", "cpu", "cuda"] in rows
     assert not [row for row in rows if row[:1] == ["recipes.memory.vq"]]
+
+
+def test_diff_tells_of_another_machine_of_the_times(memmlp: Memmlp, outputs: Path):
+    for name, cpu in ((A, "fast"), (B, "slow")):
+        path = Run.of(outputs, name).deployment("fp32-0").latency
+        path.parent.mkdir(parents=True)
+        path.write_text(json.dumps({"median_ms": 1.0, "made_by": {"cpu": cpu}}))
+    rows = [line.split() for line in memmlp("runs", "diff", A, B).out.splitlines()]
+    assert ["latency.cpu", "fast", "slow"] in rows
 
 
 def test_show_says_the_attempts_and_the_results_before_the_code(memmlp: Memmlp, outputs: Path):

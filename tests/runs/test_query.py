@@ -30,7 +30,7 @@ def holds(text: str) -> bool:
 @pytest.mark.parametrize("text", [
     "memory=gru", "memory==gru", "memory!=vq", "memory=gru and stream.MPJPE<6.3", "seed=1", "seed=1.0",
     "optim.lr=1e-3", "optim.lr<=0.001", "memory.layers=[2,4]", 'memory.layers="[2, 4]"', "tag=good",
-    "tag!=bad", 'note="two words"', "force=false", "vqvae.epochs=null", "not memory=vq",
+    "tag!=bad", 'note="two words"', "force=false", "force=False", "vqvae.epochs=null", "not memory=vq",
     "memory=vq or seed=1",
     "memory=vq and seed=2 or seed=1", "not (memory=vq or seed=2)", "not not seed=1", "started>2026-01-01",
     "(seed>0)and(seed<2)", "stream.MPJPE>=6.25",
@@ -40,7 +40,7 @@ def test_holds(text: str):
 
 
 @pytest.mark.parametrize("text", [
-    "memory=vq", "memory!=gru", "seed=2", "seed<1", "tag=bad", "tag!=good",
+    "memory=vq", "memory!=gru", "seed=2", "force!=False", "force=True", "seed<1", "tag=bad", "tag!=good",
     "memory=vq and (seed=1 or seed=2)", "vqvae.epochs<5", "vqvae.epochs>=0", "force>0", "note=two",
 ])  # fmt: skip
 def test_does_not_hold(text: str):

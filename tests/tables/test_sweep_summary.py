@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from fake_runs import fake_run, fake_sweep, table_of
@@ -42,6 +43,21 @@ def test_table_means_verdicts_labels_and_status(tmp_path: Path):
     assert facts.verdicts["none/stream/MPJPE"] == cell.effect.verdict
     assert [path.name for path in facts.files] == ["table.md", "table.html"]
     assert "Mine" in facts.files[0].read_text()
+
+
+def test_a_run_of_two_arms_has_both_labels_and_means_that_are_no_numbers_are_left_out(tmp_path: Path):
+    sweep = load_sweep(written(tmp_path))
+    run, table = fake_run(tmp_path, "one"), table_of(sweep, fake_sweep(tmp_path, sweep))
+    entries = tuple(Entry(label, 0, run.id) for label in ("full", "none"))
+    write_summary(Plan("mine", tmp_path, entries, (RunTask(run.id, "memmlp", {}),)), table, tmp_path)
+    content = read_json(tmp_path / "summary.json")
+    assert content["labels"] == {run.id: "full, none"}
+    content["aggregates"]["full/stream/MPJPE"] = "nan"
+    (tmp_path / "summary.json").write_text(json.dumps(content))
+    facts = SweepFacts.read(tmp_path)
+    assert facts is not None
+    assert "full/stream/MPJPE" not in facts.aggregates
+    assert "none/stream/MPJPE" in facts.aggregates
 
 
 def test_a_sweep_with_a_failed_run_failed_and_one_with_a_missing_run_goes_on(tmp_path: Path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -66,13 +66,22 @@ def origin_rows(first: Run, second: Run) -> list[tuple[str, ...]]:
     """Return a row for every difference in code and machine that may change numbers despite equal configs."""
     from memmlp.runs.identity import flatten
 
-    a, b = (flatten({key: run.manifest.get(key) for key in ORIGIN}) for run in (first, second))
+    a, b = (
+        flatten({key: run.manifest.get(key) for key in ORIGIN}) | _timed_on(run) for run in (first, second)
+    )
     used = {key for key in a | b if not key.startswith("recipes.") or (key in a and key in b)}
     return [
         (key, text_of(a.get(key)), text_of(b.get(key)))
         for key in a | b
         if key in used and a.get(key) != b.get(key)
     ]
+
+
+def _timed_on(run: Run) -> dict[str, Any]:
+    """Return the machine on which the run's size and times were measured, as far as known."""
+    made_by = run.preferred_deployment.record.get("made_by") or {}
+    facts = {"cpu": made_by.get("cpu"), "onnxruntime": (made_by.get("packages") or {}).get("onnxruntime")}
+    return {f"latency.{key}": value for key, value in facts.items() if value is not None}
 
 
 def config_rows(first: Run, second: Run) -> list[tuple[str, ...]]:
