@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from memmlp.cli.options import device_option, outputs_option, plugins_option
+from memmlp.common.errors import InputError
 
 
 @click.command("eval")
@@ -43,12 +44,13 @@ def evaluate(
     """
     from rich.console import Console
 
-    from memmlp.cli.train_summary import metrics_table, source_tables
+    from memmlp.cli.train_summary import metrics_table, older_code, source_tables
     from memmlp.common.files import write_json
     from memmlp.config.open_run import open_run
     from memmlp.evaluation.predictions import save_predictions as write_predictions
     from memmlp.pipeline.run_stages import clip_rows, complete_stages
 
+    _check_places(json_path, save_predictions)
     found = open_run(outputs, run, device, overrides)
     experiment = found.experiment
     results, made = complete_stages(experiment, found.run, found.data, again=again)
@@ -56,6 +58,8 @@ def evaluate(
     click.echo(f"run {found.run.id}: {said}")
     if partial := found.run.manifest.get("partial"):
         click.echo(f"on a part of the data: {partial}")
+    if changed := found.run.changed_sources:
+        click.echo(older_code(found.run, changed))
     for table in (metrics_table(results), *source_tables(found.run, experiment.stages)):
         Console(highlight=False).print(table)
     if json_path is not None:
@@ -63,3 +67,11 @@ def evaluate(
     if save_predictions is not None:
         write_predictions(experiment.evaluation, found.network(), found.test, save_predictions)
         click.echo(f"predictions of {len(found.test.names)} clips under {save_predictions}")
+
+
+def _check_places(json_path: Path | None, predictions: Path | None) -> None:
+    """Raise InputError, before anything is measured, for a place where the results can't be written."""
+    if json_path is not None and not json_path.absolute().parent.is_dir():
+        raise InputError(f"--json {json_path}: allowed is a file in a folder that exists")
+    if predictions is not None and predictions.exists() and not predictions.is_dir():
+        raise InputError(f"--save-predictions {predictions}: is a file; allowed is a folder")

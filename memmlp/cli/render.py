@@ -139,7 +139,7 @@ def taken(
             raise InputError(
                 f"run {run.run.id}: {title} is another motion or body there than in the first run"
             )
-    return ClipPiece(title, truths[0], predictions, start=first)
+    return ClipPiece(f"{title} ({mode}, {branch})", truths[0], predictions, start=first)
 
 
 def predicted(run: OpenedRun, clip: str, last: int, branch: str, mode: str) -> tuple[np.ndarray, np.ndarray]:

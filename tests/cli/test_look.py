@@ -49,7 +49,7 @@ def test_a_figure(memmlp: Memmlp, finished: Run, clips: list[str], tmp_path: Pat
     out = tmp_path / "heat.png"
     ran = memmlp("render", finished.id, "--out", str(out), "--frames", "2", "--label", "ours")
     error = rows(finished)[0]["rotation"]["MPJPE"]
-    assert (ran.code, ran.out) == (0, f"{out}: {clips[0]}, ours {error:.1f} cm\n")
+    assert (ran.code, ran.out) == (0, f"{out}: {clips[0]} (stream, rotation), ours {error:.1f} cm\n")
     with Image.open(out) as image:
         assert image.size[0] < 700
 
@@ -82,6 +82,31 @@ def test_a_films_branch_mode_and_times(memmlp: Memmlp, finished: Run, clips: lis
 def test_bad_input_to_render_is_one_line(memmlp: Memmlp, finished: Run, arguments, words):
     assert one_line(memmlp("render", finished.id, *arguments), *words)
     assert not Path("a.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "place", "words"),
+    [
+        ("--json", "no/folder/x.json", "--json no/folder/x.json: allowed is a file in a folder that exists"),
+        ("--save-predictions", "file", "--save-predictions file: is a file; allowed is a folder"),
+    ],
+)
+def test_places_that_nothing_can_be_written_to_are_told_before_anything_is_measured(
+    memmlp: Memmlp, finished: Run, monkeypatch: pytest.MonkeyPatch, option: str, place: str, words: str
+):
+    monkeypatch.chdir(finished.folder.parents[2])
+    Path("file").touch()
+    monkeypatch.setattr("memmlp.config.open_run.open_run", lambda *_: pytest.fail("it was opened"))
+    assert one_line(memmlp("eval", finished.id, option, place), words)
+    Path("file").unlink()
+
+
+def test_eval_says_that_code_has_changed_since(
+    memmlp: Memmlp, finished: Run, monkeypatch: pytest.MonkeyPatch
+):
+    assert "was made before the code" not in memmlp("eval", finished.id).out
+    monkeypatch.setattr(Run, "changed_sources", property(lambda self: ["evaluation/metrics.py"]))
+    assert "was made before the code of evaluation/metrics.py changed" in memmlp("eval", finished.id).out
 
 
 def test_a_run_is_there_once_unless_labelled(memmlp: Memmlp, finished: Run, tmp_path: Path):
