@@ -43,6 +43,7 @@ def needed(tmp_path: Path) -> dict[str, list[str]]:
         "loss=agrol": ["model=agrol_mlp"],
         "loss=avatar_poser": ["model=avatar_poser"],
         "loss=own": ["model=bodiffusion"],
+        "loss=rpm": ["model=rpm"],
         "upstream=sage": ["model=sage"],
         **{f"loss={name}": ["model=agrol_mlp"] for name in OF_TERMS},
         "predictor=rotation_only_memory": ["hand=fk"],
