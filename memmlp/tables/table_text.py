@@ -231,7 +231,7 @@ def value_words(cell: Cell, metric: str) -> str:
     if cell.mean is None:
         return MISSING
     if metric in COSTS and (metric != "ms" or cell.sd is None):
-        return f"{cell.mean:.3g}" if cell.mean < 1000 else f"{cell.mean:.0f}"
+        return significant(cell.mean, 3)
     digits = decimals(cell.mean)
     sd = "" if cell.sd is None else f" ± {cell.sd:.{digits}f}"
     return f"{cell.mean:.{digits}f}{sd}"
@@ -247,7 +247,9 @@ def effect_words(cell: Cell, metric: str) -> tuple[str, ...]:
     if effect is None:
         return (MISSING,)
     if metric in COSTS:
-        return signed(effect.mean, "+.3g"), *_ratio(cell.mean, effect.mean)
+        return significant(effect.mean, 3, "+").replace("-", MINUS) if effect.mean else "0", *_ratio(
+            cell.mean, effect.mean
+        )
     least = 2 if cell.mean is None else decimals(cell.mean)
     if effect.low is None or effect.high is None:
         return (signed(effect.mean, f"+.{least}f"),)
@@ -261,14 +263,20 @@ def effect_words(cell: Cell, metric: str) -> tuple[str, ...]:
 
 def number_words(value: float) -> str:
     """Return a number with two significant digits."""
-    return f"{value:.2g}" if value < 100 else f"{value:.0f}"
+    return significant(value, 2)
+
+
+def significant(value: float, digits: int, sign: str = "") -> str:
+    """Return a number with so many significant digits; large ones are whole, without an exponent."""
+    words = f"{value:{sign}.{digits}g}"
+    return f"{value:{sign}.0f}" if "e+" in words else words
 
 
 def _ratio(value: float | None, difference: float) -> tuple[str, ...]:
     """Return the ratio of a cost to the control's, given their difference."""
     if value is None or value == difference:
         return ()
-    return (f"(x {value / (value - difference):.3g})",)
+    return (f"(x {significant(value / (value - difference), 3)})",)
 
 
 def signed(number: float, form: str) -> str:

@@ -11,7 +11,7 @@ from fake_table import SHIPPED, printed
 from memmlp.sweep.spec import Sweep
 from memmlp.sweep.sweep_file import load_sweep
 from memmlp.tables.table import Cell, Effect, Table
-from memmlp.tables.table_text import effect_words, heading, value_words
+from memmlp.tables.table_text import MINUS, effect_words, heading, number_words, value_words
 
 
 def test_costs_show_how_many_times_the_controls_they_are(tmp_path: Path):
@@ -57,3 +57,19 @@ def test_a_power_beyond_the_values_themselves_is_no_number(table: Table, monkeyp
     said = " ".join(printed(table, 100).split())
     assert "901" not in said
     assert "MPJRE: too few seeds to have found even a difference as large as the values" in said
+
+
+@pytest.mark.parametrize(
+    ("value", "said"), [(99.6, "100"), (5.04, "5"), (0.123, "0.12"), (123.4, "123"), (2.5e6, "2500000")]
+)
+def test_two_digits_of_a_number_have_no_exponent(value: float, said: str):
+    assert number_words(value) == said
+
+
+def test_large_costs_and_their_differences_have_no_exponent():
+    assert value_words(Cell({0: 999.7}), "FPS") == "1000"
+    assert value_words(Cell({0: 1234.5}), "FPS") == "1234"
+    assert value_words(Cell({0: 41.24}), "FPS") == "41.2"
+    assert effect_words(Cell({0: 2500.0}, effect=Effect(1500.0)), "FPS") == ("+1500", "(x 2.5)")
+    assert effect_words(Cell({0: 2500.0}, effect=Effect(-1500.0)), "FPS") == (f"{MINUS}1500", "(x 0.625)")
+    assert effect_words(Cell({0: 2.0}, effect=Effect(0.0)), "FPS")[0] == "0"
