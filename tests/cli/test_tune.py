@@ -157,6 +157,7 @@ def test_what_is_trained_on_alone_may_be_searched(tmp_path: Path):
     assert prepare_search([*TINY, *space], None, tmp_path).search.space[0].key == "data.split.train_fraction"
 
 
+@pytest.mark.slow
 def test_table_5_is_of_mem_mlp_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     written: list[Path] = []
     for name in ("write_trials", "write_experiments", "write_plots"):

@@ -136,6 +136,7 @@ def test_strict_stops_at_a_bad_clip(tmp_path: Path):
         predictor().export(plan_export(tmp_path / "in", tmp_path / "out", "npz"), strict=True)
 
 
+@pytest.mark.slow
 def test_an_offline_network_has_no_stream_to_predict_or_to_draw(tmp_path: Path):
     offline = baseline("bodiffusion", offline=True, sampling_steps=2, depth=1)
     settings = {"modes": ["window"], "batch": 2, "ik": NoIK(), "seed": 0}
