@@ -145,7 +145,8 @@ def _check_fractions(cfg: DictConfig, overrides: Sequence[str]) -> None:
     for word in overrides:
         key = word.partition("=")[0].lstrip("+")
         part = key.removeprefix("data.split.")
-        if key != part and part in ("test", "val") and sources and all(one.get(part) for one in sources):
+        own = [one.get(part) for one in sources] if key != part and part in ("test", "val") else [None]
+        if own and None not in own:
             raise InputError(f"{word}: each source has its own; allowed is data.sources.NAME.{part}")
 
 

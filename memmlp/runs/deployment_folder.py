@@ -112,3 +112,12 @@ def _current(record: Mapping[str, Any]) -> dict[str, Any]:
         else value
         for key, value in record.items()
     }
+
+
+def timed_on(record: Mapping[str, Any]) -> str:
+    """Return the processor and ONNX Runtime with which a deployment was measured; "?" if that is unknown."""
+    made_by = record.get("made_by") or {}
+    runtime = (made_by.get("packages") or {}).get("onnxruntime")
+    if not made_by.get("cpu"):
+        return "?"
+    return f"{made_by['cpu']}, ONNX Runtime {runtime}" if runtime else str(made_by["cpu"])

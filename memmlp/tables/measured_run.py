@@ -13,7 +13,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
-from memmlp.runs.deployment_folder import as_deployed, deployed_precision
+from memmlp.runs.deployment_folder import as_deployed, deployed_precision, timed_on
 from memmlp.runs.evaluation_file import intact
 from memmlp.runs.run import Run
 
@@ -205,17 +205,9 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     deployed = (deployments or [run.preferred_deployment])[-1]
     latency = deployed.record
     origin = replace(_evaluated(_origin(manifest), reports), deployed=deployed_precision(latency))
-    origin = replace(origin, recipes={**origin.recipes, **deployed.recipes}, timed_on=_timed_on(latency))
+    origin = replace(origin, recipes={**origin.recipes, **deployed.recipes}, timed_on=timed_on(latency))
     training = _training(run, manifest)
     return Measured(run.id, means, clips, groups, _costs(latency), origin, latency, run, sources, training)
-
-
-def _timed_on(latency: Mapping[str, Any]) -> str:
-    """Return the processor and ONNX Runtime with which a deployment was measured, as far as known."""
-    made_by = latency.get("made_by") or {}
-    runtime = (made_by.get("packages") or {}).get("onnxruntime")
-    known = [str(made_by["cpu"])] if made_by.get("cpu") else []
-    return ", ".join([*known, *([f"ONNX Runtime {runtime}"] if known and runtime else [])]) or UNKNOWN
 
 
 def of_untrained(

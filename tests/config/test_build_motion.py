@@ -67,7 +67,8 @@ def test_named_sources_have_fractions_of_their_own():
 
 
 def test_a_fraction_that_each_source_has_itself_is_refused():
-    both = {"sources": {name: {**one, "test": 0.3} for name, one in MIX["sources"].items()}}
+    shares = {"cmu": 0.3, "bandai": 0.0}  # none is a share of its own, too
+    both = {"sources": {name: {**one, "test": shares[name]} for name, one in MIX["sources"].items()}}
     with pytest.raises(InputError, match=r"^data\.split\.test=0\.5: each source has its own"):
         mix(both, "data.split.test=0.5")
     assert mix(both, "data.split.val=0.2").data.split.val == 0.2

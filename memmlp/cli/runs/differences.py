@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -64,10 +64,13 @@ def diff(a: str, b: str, outputs: Path) -> None:
 
 def origin_rows(first: Run, second: Run) -> list[tuple[str, ...]]:
     """Return a row for every difference in code and machine that may change numbers despite equal configs."""
+    from memmlp.runs.deployment_folder import timed_on
     from memmlp.runs.identity import flatten
 
     a, b = (
-        flatten({key: run.manifest.get(key) for key in ORIGIN}) | _timed_on(run) for run in (first, second)
+        flatten({key: run.manifest.get(key) for key in ORIGIN})
+        | {"latency": timed_on(run.preferred_deployment.record)}
+        for run in (first, second)
     )
     used = {key for key in a | b if not key.startswith("recipes.") or (key in a and key in b)}
     return [
@@ -75,13 +78,6 @@ def origin_rows(first: Run, second: Run) -> list[tuple[str, ...]]:
         for key in a | b
         if key in used and a.get(key) != b.get(key)
     ]
-
-
-def _timed_on(run: Run) -> dict[str, Any]:
-    """Return the machine on which the run's size and times were measured, as far as known."""
-    made_by = run.preferred_deployment.record.get("made_by") or {}
-    facts = {"cpu": made_by.get("cpu"), "onnxruntime": (made_by.get("packages") or {}).get("onnxruntime")}
-    return {f"latency.{key}": value for key, value in facts.items() if value is not None}
 
 
 def config_rows(first: Run, second: Run) -> list[tuple[str, ...]]:
