@@ -53,7 +53,7 @@ SPACE, HZ = "amass", 60.0  # of clips, and of packets where nothing else is told
     help="Take tracker poses as OSC bundles at this UDP port, in place of a clip.",
 )
 @click.option(
-    "--from",
+    "--sender",
     "senders",
     type=Sender(),
     multiple=True,
@@ -72,12 +72,12 @@ SPACE, HZ = "amass", 60.0  # of clips, and of packets where nothing else is told
 )
 @click.option(
     "--height",
-    type=Finite(50, 250),
-    metavar="CM",
-    help="Body height of who wears the trackers, cm.  [default: that of the network's body]",
+    type=Finite(0.5, 2.5),
+    metavar="METRES",
+    help="Body height of who wears the trackers, metres.  [default: that of the network's body]",
 )
 @click.option(
-    "--floor", type=Finite(-10_000, 10_000), metavar="CM", help="Height of the floor, cm.  [default: 0]"
+    "--floor", type=Finite(-100, 100), metavar="METRES", help="Height of the floor, metres.  [default: 0]"
 )
 @click.option(
     "--calibration",
@@ -188,7 +188,7 @@ def check_options(given: InputOptions, shown: ShowOptions, send: bool) -> None:
         raise InputError("--send: has no port; allowed is --udp PORT or --osc PORT")
     worn = {
         "--height": shown.height is not None, "--floor": shown.floor is not None,
-        "--calibration": shown.calibration is not None, "--from": bool(given.senders),
+        "--calibration": shown.calibration is not None, "--sender": bool(given.senders),
     }  # fmt: skip
     if (alone := [name for name, said in worn.items() if said]) and (send or not ports):
         raise InputError(
@@ -329,11 +329,11 @@ def known_of(shown: ShowOptions, space: SpaceName, stream: Stream) -> Calibratio
     known = Calibration(space, body)
     if shown.calibration is not None and shown.calibration.exists():
         known = read_calibration(shown.calibration, space, body)
-    height = known.height if shown.height is None else shown.height / 100
-    floor = known.floor if shown.floor is None else shown.floor / 100
+    height = known.height if shown.height is None else shown.height
+    floor = known.floor if shown.floor is None else shown.floor
     if known.offsets is not None and abs((height or body) - (known.height or body)) > 0.005:
-        was = 100 * (known.height or body)
-        note(f"{shown.calibration}: its calibration is of a height of {was:.0f} cm; calibrate again")
+        was = known.height or body
+        note(f"{shown.calibration}: its calibration is of a height of {was:.2f} m; calibrate again")
     return Calibration(space, body, known.offsets, height, floor)
 
 

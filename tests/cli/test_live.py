@@ -29,11 +29,12 @@ from memmlp.motion.synthetic import synthesize_clip
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["--height", "180"], "--height: goes with --udp PORT or --osc PORT"),
+        (["--height", "186"], "--height"),
+        (["--height", "1.8"], "--height: goes with --udp PORT or --osc PORT"),
         (["--space", "unity"], "--space unity: is of packets; allowed with a clip is --space amass"),
         (["--hz", "90", "--udp", "9000"], "--hz: is of a clip"),
-        (["--from", "192.168.1.9"], "--from: goes with --udp PORT"),
-        (["--udp", "9001", "--from", "nowhere"], "nowhere"),
+        (["--sender", "192.168.1.9"], "--sender: goes with --udp PORT"),
+        (["--udp", "9001", "--sender", "nowhere"], "nowhere"),
         (["--udp", "9001", "--send", "--vmc", "127.0.0.1"], "--send: sends a clip's trackers alone"),
         (["--udp", "9001", "--token", "a token of many letters"], "--token: goes with --host"),
         (["--udp", "9001", "--host", "0.0.0.0", "--token", "short"], "--token: 5 characters"),
@@ -128,6 +129,6 @@ def test_a_calibration_of_another_height_is_told(
     room = ShowOptions(None, None, tmp_path / "me.json", (), (), (), None, 0, "127.0.0.1", None, True)
     known = known_of(room, "amass", stream)
     assert (known.height, known.floor, capsys.readouterr().err) == (1.80, 0.02, "")
-    known = known_of(room._replace(height=186.0, floor=5.0), "amass", stream)
+    known = known_of(room._replace(height=1.86, floor=0.05), "amass", stream)
     assert (known.height, known.floor) == (1.86, 0.05)
-    assert "its calibration is of a height of 180 cm; calibrate again" in capsys.readouterr().err
+    assert "its calibration is of a height of 1.80 m; calibrate again" in capsys.readouterr().err

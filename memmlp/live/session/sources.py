@@ -276,7 +276,7 @@ class PacketSource:
         self.foreign += 1
         if sender not in self.strangers and len(self.strangers) < TOLD:
             self.strangers.add(sender)
-            self.tell(f"packets from {sender} are ignored; --from {sender} takes them")
+            self.tell(f"packets from {sender} are ignored; --sender {sender} takes them")
 
     def _dropped(self, packet: Packet) -> int:
         """Return how many sample numbers are missing between the last packet and this one."""

@@ -188,7 +188,7 @@ def test_other_machines_packets_are_taken_where_they_are_asked_for_only():
         "127.0.0.1",
     ]
     assert (arrives.foreign, arrives.malformed) == (14, 0)
-    assert told[0] == "packets from 192.168.1.8 are ignored; --from 192.168.1.8 takes them"
+    assert told[0] == "packets from 192.168.1.8 are ignored; --sender 192.168.1.8 takes them"
     assert len(told) == 3  # a flood of them fills no screen
 
 
