@@ -14,7 +14,7 @@ from hydra import version
 from memmlp.cli.main import commands
 from memmlp.cli.workers import Workers, split_executor
 from memmlp.config.compose import VERSION_BASE, composed_plain, parse, preflight
-from memmlp.config.plan_sweep import find_sweep
+from memmlp.config.compose_plan import find_sweep
 from memmlp.config.schema import register
 from memmlp.sweep.search.search_file import parse_search
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from fake_runs import CLIPS, fake_sweep, runs_of
 
-from memmlp.sweep.spec import Sweep
+from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import parse_sweep
 from memmlp.tables.effects import RunsBySeed
 

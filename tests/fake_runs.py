@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from memmlp.runs.run import Run
-from memmlp.sweep.spec import MODES, Arm, Sweep
+from memmlp.sweep.definition import MODES, Arm, Sweep
 from memmlp.tables.build_table import finished_runs, make_table
 from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.measured_run import Measured, load

@@ -66,7 +66,7 @@ def report(
 def one_file(chapters: Sequence[Chapter], outputs: Path, extra: str, replays: bool) -> str:
     """Return the page of these sweeps as one file, with further HTML on a page of its own."""
     from memmlp.cli.ui import predict
-    from memmlp.config.plan_sweep import sweep_folder
+    from memmlp.config.compose_plan import sweep_folder
     from memmlp.report.ui.answers import Answers
     from memmlp.report.ui.one_file import ReportedSweep, page_text
 

@@ -16,7 +16,7 @@ from memmlp.common.errors import InputError
 if TYPE_CHECKING:
     from memmlp.report.kept_results import Kept
     from memmlp.report.result_pages import KeptTable
-    from memmlp.sweep.spec import Sweep
+    from memmlp.sweep.definition import Sweep
     from memmlp.tables.effects import RunsBySeed
     from memmlp.tables.effects_along_axes import Trends
     from memmlp.tables.table import Table
@@ -71,7 +71,7 @@ def save_command(
     """
     from memmlp.cli.sweep_to_show import sweep_to_show
     from memmlp.common.files import plain
-    from memmlp.config.plan_sweep import find_sweep, is_path
+    from memmlp.config.compose_plan import find_sweep, is_path
     from memmlp.report.kept_results import Kept, load_kept, overrides_of, save, without_paths
     from memmlp.tables.build_table import finished_runs
     from memmlp.tables.measured_run import load
@@ -183,7 +183,7 @@ def _trends(kept: Kept, stem: str) -> Trends | None:
         kept: the results.
         stem: the name of the results' page.
     """
-    from memmlp.config.plan_sweep import find_sweep
+    from memmlp.config.compose_plan import find_sweep
     from memmlp.tables.effects_along_axes import trends
 
     sweep = find_sweep(kept.sweep)
@@ -205,7 +205,7 @@ def _table(kept: Kept, source: str | None = None) -> Table:
     With a source's name, it is the table of that source's test clips alone.
     """
     from memmlp.cli.sweep_to_show import of_another
-    from memmlp.config.plan_sweep import find_sweep
+    from memmlp.config.compose_plan import find_sweep
     from memmlp.tables.build_table import make_table, on_source
     from memmlp.tables.seed_rounds import of_json
 

@@ -13,8 +13,8 @@ from memmlp.cli.sweep_to_show import difference, rounds_path
 from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
+    from memmlp.sweep.definition import Sweep
     from memmlp.sweep.plan import Plan
-    from memmlp.sweep.spec import Sweep
     from memmlp.tables.effects import RunsBySeed
     from memmlp.tables.seed_rounds import Look, Rounds
 
@@ -74,7 +74,7 @@ def run_until_decided(
     """
     from dataclasses import replace
 
-    from memmlp.config.plan_sweep import make_plan
+    from memmlp.config.compose_plan import make_plan
     from memmlp.tables.seed_rounds_file import same_runs
 
     while True:

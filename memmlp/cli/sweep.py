@@ -17,8 +17,8 @@ from memmlp.runs.identity import NETWORK
 
 if TYPE_CHECKING:
     from memmlp.cli.sweep_to_show import SweepToShow
+    from memmlp.sweep.definition import Sweep
     from memmlp.sweep.plan import Plan
-    from memmlp.sweep.spec import Sweep
 
 
 @click.command("sweep")
@@ -70,7 +70,7 @@ def sweep(
     """
     from memmlp.cli import seed_rounds
     from memmlp.cli.sweep_to_show import SweepToShow, spent_before
-    from memmlp.config.plan_sweep import find_sweep, make_plan, sweep_folder
+    from memmlp.config.compose_plan import find_sweep, make_plan, sweep_folder
 
     seed_rounds.check(overrides, until_decided, max_seeds)
     if again and (until_decided or status or dry_run):
@@ -117,7 +117,7 @@ def reset(plan: Plan) -> None:
 
 def run_workers(chosen: Sweep, plan: Plan, workers: Workers) -> None:
     """Start workers, and wait until they have done the plan's runs."""
-    from memmlp.config.plan_sweep import sweep_folder
+    from memmlp.config.compose_plan import sweep_folder
     from memmlp.sweep.controller import oversee
     from memmlp.sweep.progress_table import Board
 
@@ -134,7 +134,7 @@ def show(chosen: Sweep, plan: Plan) -> None:
     """Print the board once, and the runs left over from earlier versions of the sweep file."""
     from rich.console import Console
 
-    from memmlp.config.plan_sweep import orphans
+    from memmlp.config.compose_plan import orphans
     from memmlp.sweep.progress_table import render
 
     if plan.entries:
@@ -178,7 +178,7 @@ def show_outcome(shown: SweepToShow, words: Sequence[str], chosen: Sweep) -> Non
     from memmlp.cli.table import SHOWN_MODES, on_screen, table_of_plan
     from memmlp.cli.track import show_in_trackers
     from memmlp.config import plugins
-    from memmlp.config.plan_sweep import orphans, sweep_folder
+    from memmlp.config.compose_plan import orphans, sweep_folder
     from memmlp.tables.measured_run import load
 
     plan, known, words = shown.plan, shown.rounds, [*words, *plugins.words()]

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
+    from memmlp.sweep.definition import Sweep
     from memmlp.sweep.plan import Plan
-    from memmlp.sweep.spec import Sweep
     from memmlp.tables.seed_rounds import Rounds
 
 
@@ -35,7 +35,7 @@ def sweep_to_show(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> Swee
 
     Otherwise the sweep is shown with its own seeds; if rounds were taken, a flag says so.
     """
-    from memmlp.config.plan_sweep import make_plan
+    from memmlp.config.compose_plan import make_plan
     from memmlp.tables.seed_rounds_file import read, same_runs
 
     path = rounds_path(sweep, outputs)
@@ -83,7 +83,7 @@ def spent_before(sweep: Sweep, outputs: Path) -> tuple[str, ...]:
 
 def rounds_path(sweep: Sweep, outputs: Path) -> Path:
     """Return the file in which a sweep's rounds are kept."""
-    from memmlp.config.plan_sweep import sweep_folder
+    from memmlp.config.compose_plan import sweep_folder
     from memmlp.tables.seed_rounds_file import NAME
 
     return sweep_folder(sweep, outputs) / NAME

@@ -14,11 +14,11 @@ import click
 
 from memmlp.cli.options import config_dir_option, outputs_option, plugins_option
 from memmlp.common.errors import InputError
-from memmlp.sweep.spec import BRANCHES
+from memmlp.sweep.definition import BRANCHES
 
 if TYPE_CHECKING:
     from memmlp.cli.sweep_to_show import SweepToShow
-    from memmlp.sweep.spec import Sweep
+    from memmlp.sweep.definition import Sweep
     from memmlp.tables.effects import RunsBySeed
     from memmlp.tables.runs_of_plan import Read
     from memmlp.tables.seeds_needed import Need
@@ -224,8 +224,8 @@ def table_of_plan(
 
 def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
     """Return the sweeps with some names, with the overrides applied, and the command that runs each."""
+    from memmlp.config.compose_plan import find_sweep
     from memmlp.config.package_data import packaged
-    from memmlp.config.plan_sweep import find_sweep
     from memmlp.config.plugins import words
 
     tables = sorted(path.stem for path in packaged("sweeps").glob("table*.yaml"))

@@ -13,7 +13,7 @@ from memmlp.evaluation.units import UNITS
 from memmlp.pipeline.run_stages import Outcome
 from memmlp.runs.deployment_folder import as_deployed, deployed_precision
 from memmlp.runs.run import Run
-from memmlp.sweep.spec import BRANCHES
+from memmlp.sweep.definition import BRANCHES
 from memmlp.tables.flags_of_runs import CORE
 from memmlp.tables.measured_run import Errors, load
 

@@ -180,7 +180,7 @@ def _check_validation(configs: Sequence[Mapping[str, Any]]) -> None:
 
 def _tasks(setup: Setup, values: Mapping[str, Value]) -> list[Sequence[RunTask]]:
     """Return the runs of a trial with these values, as a list of tasks for each seed; prepares the data."""
-    from memmlp.config.plan_sweep import tasks_of
+    from memmlp.config.compose_plan import tasks_of
 
     experiments = _experiments(setup, values)
     return [tasks_of(experiment, experiment.data.prepare().digest) for experiment in experiments]
@@ -298,7 +298,7 @@ def _makes(setup: Setup, words: Sequence[str], run_id: str) -> bool:
     """Return whether `memmlp train` with these words makes the run with that id."""
     from memmlp.config.build import build_experiment
     from memmlp.config.compose import composed
-    from memmlp.config.plan_sweep import tasks_of
+    from memmlp.config.compose_plan import tasks_of
 
     try:
         cfg = composed(words)

@@ -14,7 +14,7 @@ from memmlp.config.build import build_architecture, build_training, config_of
 from memmlp.config.compose import composed
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.normalizer import Normalizer
-from memmlp.sweep.spec import Sweep
+from memmlp.sweep.definition import Sweep
 from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.effects_along_axes import in_cells
 from memmlp.tables.measured_run import Measured

@@ -178,7 +178,7 @@ def _folder(module: ModuleType, plugin: Plugin) -> Path:
 
 def _taken(plugin: Plugin) -> Iterator[str]:
     """Yield the declared names that are already taken."""
-    from memmlp.sweep.spec import COSTS
+    from memmlp.sweep.definition import COSTS
 
     for name in plugin.metrics:
         if name in UNITS or name in COSTS:

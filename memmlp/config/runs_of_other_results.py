@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from memmlp.common.errors import InputError
-from memmlp.config.plan_sweep import find_sweep, plan_anew
+from memmlp.config.compose_plan import find_sweep, plan_anew
 from memmlp.runs.recipe_versions import outdated
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from memmlp.config.build import build_deployment, untrained
 from memmlp.config.compose import composed
 from memmlp.deploy.deployment import GRAPHS, Deployment
 from memmlp.runs.environment import environment
-from memmlp.sweep.spec import COSTS, SIZES, Sweep
+from memmlp.sweep.definition import COSTS, SIZES, Sweep
 from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.measured_run import Measured, of_untrained
 

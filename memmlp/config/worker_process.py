@@ -93,7 +93,7 @@ def perform(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
 
 def check_identity(experiment: Experiment, task: RunTask) -> None:
     """Raise InputError if this code and data give the task another identity than the plan has."""
-    from memmlp.config.plan_sweep import tasks_of
+    from memmlp.config.compose_plan import tasks_of
 
     digest = experiment.data.prepare().digest
     known = tasks_of(experiment, digest)

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullFormatter, ScalarFormatter
 
-from memmlp.sweep.spec import COSTS
+from memmlp.sweep.definition import COSTS
 from memmlp.tables.error_distributions import Distribution
 from memmlp.tables.statistics import performance_profile
 from memmlp.tables.table import Cell, Table

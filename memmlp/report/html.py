@@ -15,7 +15,7 @@ from memmlp.report.figures import Curve, SpeedAndError
 from memmlp.runs.deployment_folder import as_deployed
 from memmlp.runs.identity import trained_by
 from memmlp.runs.metrics_log import Metrics
-from memmlp.sweep.spec import COSTS, Sweep
+from memmlp.sweep.definition import COSTS, Sweep
 from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.error_distributions import Distribution, distributions
 from memmlp.tables.formats import as_html

@@ -18,7 +18,7 @@ from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, plain
-from memmlp.sweep.spec import Sweep
+from memmlp.sweep.definition import Sweep
 from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.measured_run import Errors, Measured, Origin
 

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from memmlp.common.files import digest
-from memmlp.sweep.spec import COMPUTE
+from memmlp.sweep.definition import COMPUTE
 from memmlp.tables.effects_along_axes import EffectOfCell, Trend, Trends
 from memmlp.tables.table_text import with_unit
 

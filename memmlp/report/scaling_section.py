@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from memmlp.sweep.spec import COMPUTE
+from memmlp.sweep.definition import COMPUTE
 from memmlp.tables.effects_along_axes import MODE, Bounds, Slope, Trend, Trends, TrendVerdict
 from memmlp.tables.formats import escaped
 from memmlp.tables.table_text import places, signed, with_unit

@@ -33,7 +33,17 @@ import yaml
 
 from memmlp.common.errors import InputError, why_unreadable
 from memmlp.evaluation.units import SMALLEST, UNITS
-from memmlp.sweep.spec import BRANCHES, COMPUTE, COSTS, Arm, Scale, Sweep, key_of, parse_branch, parse_seeds
+from memmlp.sweep.definition import (
+    BRANCHES,
+    COMPUTE,
+    COSTS,
+    Arm,
+    Scale,
+    Sweep,
+    key_of,
+    parse_branch,
+    parse_seeds,
+)
 
 KEYS = (
     "title", "table", "notes", "base", "seeds", "control", "metrics", "branch", "branch_source", "smallest",

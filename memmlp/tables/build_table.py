@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from memmlp.common.errors import InputError
-from memmlp.sweep.spec import COSTS, MODES, Arm, Sweep
+from memmlp.sweep.definition import COSTS, MODES, Arm, Sweep
 from memmlp.tables.effects import RunsBySeed, control_arm, effects, paper_effect, with_existing_branches
 from memmlp.tables.flags_of_runs import Say, flags, silent
 from memmlp.tables.measured_run import Measured

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from memmlp.sweep.spec import COSTS, Arm, Sweep
+from memmlp.sweep.definition import COSTS, Arm, Sweep
 from memmlp.tables.measured_run import Measured
 from memmlp.tables.statistics import detectable, equivalence_p, holm, paired_effects, verdict
 from memmlp.tables.table import Effect, Key

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from memmlp.sweep.spec import COMPUTE, COSTS, Arm, Sweep
+from memmlp.sweep.definition import COMPUTE, COSTS, Arm, Sweep
 from memmlp.tables.effects import Paired, RunsBySeed, control_arm, paired
 from memmlp.tables.statistics import holm, paired_effects
 from memmlp.tables.statistics.effect_regression import Estimate, FittedLine, fit

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from memmlp.sweep.spec import COSTS, Arm, Sweep
+from memmlp.sweep.definition import COSTS, Arm, Sweep
 from memmlp.tables.effects import RunsBySeed, control_arm, one_and_the_same
 from memmlp.tables.measured_run import SHARED, UNKNOWN, Measured
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.recipe_versions import outdated
 from memmlp.runs.run import Run
+from memmlp.sweep.definition import Arm
 from memmlp.sweep.plan import Plan
-from memmlp.sweep.spec import Arm
 from memmlp.tables.build_table import Find
 from memmlp.tables.flags_of_runs import Say
 from memmlp.tables.measured_run import Measured

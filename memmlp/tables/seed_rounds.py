@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from memmlp.sweep.spec import COSTS, MODES, Arm, Sweep
+from memmlp.sweep.definition import COSTS, MODES, Arm, Sweep
 from memmlp.tables.effects import (
     RunsBySeed,
     control_arm,

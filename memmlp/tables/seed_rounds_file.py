@@ -7,8 +7,8 @@ from pathlib import Path
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import digest
+from memmlp.sweep.definition import Sweep
 from memmlp.sweep.plan import Plan
-from memmlp.sweep.spec import Sweep
 from memmlp.tables.seed_rounds import Rounds, of_json, pair_of
 
 NAME = "rounds.json"

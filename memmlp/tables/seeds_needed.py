@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from memmlp.sweep.spec import MODES, Sweep
+from memmlp.sweep.definition import MODES, Sweep
 from memmlp.tables.effects import RunsBySeed, paired, paper_effect, with_existing_branches
 from memmlp.tables.statistics import seeds_needed
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from memmlp.sweep.spec import COSTS
+from memmlp.sweep.definition import COSTS
 from memmlp.tables.statistics import Verdict
 
 LEVEL = 0.05

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from memmlp.evaluation.units import HIGHER, UNITS
-from memmlp.sweep.spec import COSTS
+from memmlp.sweep.definition import COSTS
 from memmlp.tables.statistics import Verdict
 from memmlp.tables.table import Cell, Row, Table
 

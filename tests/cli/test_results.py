@@ -10,9 +10,9 @@ import pytest
 from conftest import Memmlp, one_line
 from fake_runs import fake_sweep
 
-from memmlp.config import plan_sweep
+from memmlp.config import compose_plan
+from memmlp.sweep.definition import Sweep
 from memmlp.sweep.plan import Entry, Plan
-from memmlp.sweep.spec import Sweep
 from memmlp.sweep.sweep_file import parse_sweep
 from memmlp.tables.build_table import finished_runs
 from memmlp.tables.effects import RunsBySeed
@@ -28,7 +28,7 @@ def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
         found = [Entry(arm.label, seed, find(arm, seed).id) for arm, seed in entries]  # type: ignore[union-attr]
         return Plan(sweep.name, tmp_path / sweep.name, () if sweep.name == "table10" else tuple(found), ())
 
-    monkeypatch.setattr("memmlp.config.plan_sweep.make_plan", plan)
+    monkeypatch.setattr("memmlp.config.compose_plan.make_plan", plan)
 
 
 def test_kept_results_become_pages(memmlp: Memmlp, planned: None):
@@ -73,7 +73,7 @@ def test_what_a_file_has_stands_before_the_same_runs_of_other_files(
 ):
     """Their costs were measured at another time."""
     monkeypatch.setattr("memmlp.config.runs_of_other_results.outdated", lambda recipes: [])
-    monkeypatch.setattr("memmlp.config.runs_of_other_results.plan_anew", plan_sweep.make_plan)
+    monkeypatch.setattr("memmlp.config.runs_of_other_results.plan_anew", compose_plan.make_plan)
     memmlp("results", "save", "14")
     path = Path("docs/results/data/table14.json")
     own = path.read_text()

@@ -13,8 +13,8 @@ from conftest import Memmlp, one_line
 from fake_runs import CLIPS, fake_run
 
 from memmlp.runs.run import Run
+from memmlp.sweep.definition import Sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask
-from memmlp.sweep.spec import Sweep
 
 ARMS = {"full": [], "worse": ["a=1"], "same": ["a=2"]}
 FACTORS = {"worse": 1.5, "newer": 1.4}
@@ -64,7 +64,7 @@ def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Runs:
     monkeypatch.chdir(tmp_path)
     write(ARMS)
     found = Runs(tmp_path / "outputs")
-    monkeypatch.setattr("memmlp.config.plan_sweep.make_plan", found.planned)
+    monkeypatch.setattr("memmlp.config.compose_plan.make_plan", found.planned)
     monkeypatch.setattr("memmlp.cli.sweep.run_workers", found.work)
     monkeypatch.setattr("memmlp.cli.track.show_in_trackers", lambda *_: None)
     return found

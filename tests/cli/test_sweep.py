@@ -20,7 +20,7 @@ from processes import PATIENCE, ignoring_interrupts, started, until
 
 from memmlp.cli.workers import split_executor
 from memmlp.common.errors import InputError
-from memmlp.config.plan_sweep import find_sweep, make_plan, orphans, plan_anew
+from memmlp.config.compose_plan import find_sweep, make_plan, orphans, plan_anew
 from memmlp.config.worker_process import perform
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.recipe_versions import RECIPES

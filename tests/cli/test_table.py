@@ -11,8 +11,8 @@ from conftest import Memmlp, one_line
 from fake_runs import fake_sweep
 
 from memmlp.common.errors import InputError
+from memmlp.sweep.definition import Sweep
 from memmlp.sweep.plan import Entry, Plan
-from memmlp.sweep.spec import Sweep
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
         found = [Entry(arm.label, seed, find(arm, seed).id) for arm, seed in entries]  # type: ignore[union-attr]
         return Plan(sweep.name, tmp_path / sweep.name, tuple(found), ())
 
-    monkeypatch.setattr("memmlp.config.plan_sweep.make_plan", plan)
+    monkeypatch.setattr("memmlp.config.compose_plan.make_plan", plan)
 
 
 def test_command_prints_a_table(memmlp: Memmlp, planned: None, monkeypatch: pytest.MonkeyPatch):

@@ -19,7 +19,7 @@ from memmlp.config import plugins
 from memmlp.config.build import build_experiment, config_of
 from memmlp.config.build_motion import build_motion
 from memmlp.config.compose import composed
-from memmlp.config.plan_sweep import find_sweep
+from memmlp.config.compose_plan import find_sweep
 from memmlp.config.schema import restored
 from memmlp.runs.environment import code_digest
 from memmlp.runs.identity import evaluation_id, evaluation_settings

@@ -12,8 +12,8 @@ from memmlp.common.errors import InputError
 from memmlp.config import runs_of_other_results
 from memmlp.config.runs_of_other_results import with_kept
 from memmlp.report.kept_results import Kept, overrides_of, save
+from memmlp.sweep.definition import Sweep
 from memmlp.sweep.plan import Entry, Plan
-from memmlp.sweep.spec import Sweep
 from memmlp.sweep.sweep_file import load_sweep
 from memmlp.tables.effects import RunsBySeed
 

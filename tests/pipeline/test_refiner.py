@@ -10,7 +10,7 @@ from memmlp.common import distributed
 from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment, config_of
 from memmlp.config.compose import composed
-from memmlp.config.plan_sweep import tasks_of
+from memmlp.config.compose_plan import tasks_of
 from memmlp.config.worker_process import check_identity
 from memmlp.networks.refiner import Refined
 from memmlp.pipeline.run_in_processes import run_in_processes

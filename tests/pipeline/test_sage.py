@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment, config_of
 from memmlp.config.compose import composed
-from memmlp.config.plan_sweep import tasks_of
+from memmlp.config.compose_plan import tasks_of
 from memmlp.config.worker_process import check_identity
 from memmlp.networks import checkpoint
 from memmlp.networks.baselines.sage_net import SAGENet

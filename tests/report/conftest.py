@@ -8,7 +8,7 @@ import pytest
 from fake_runs import CLIPS, fake_sweep, runs_of
 
 from memmlp.report.kept_results import Kept, overrides_of
-from memmlp.sweep.spec import Sweep
+from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import load_sweep
 
 ROOT = Path(__file__).parent.parent.parent

@@ -18,8 +18,8 @@ from processes import finished
 from memmlp.common.errors import InputError
 from memmlp.report import figures
 from memmlp.report.html import Chapter, page, published
+from memmlp.sweep.definition import Sweep
 from memmlp.sweep.plan import Entry, Plan
-from memmlp.sweep.spec import Sweep
 from memmlp.sweep.sweep_file import load_sweep
 from memmlp.tables.build_table import make_table, without_runs
 from memmlp.tables.error_distributions import distributions
@@ -284,7 +284,7 @@ def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         found = [Entry(arm.label, seed, find(arm, seed).id) for arm, seed in entries]  # type: ignore[union-attr]
         return Plan(sweep.name, tmp_path / sweep.name, tuple(found), ())
 
-    monkeypatch.setattr("memmlp.config.plan_sweep.make_plan", plan)
+    monkeypatch.setattr("memmlp.config.compose_plan.make_plan", plan)
 
 
 @pytest.mark.slow

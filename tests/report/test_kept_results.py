@@ -13,7 +13,7 @@ from fake_runs import fake_run, nothing, runs_of
 
 from memmlp.common.errors import InputError
 from memmlp.report.kept_results import Kept, dumps, load_kept, overrides_of, save, without_paths
-from memmlp.sweep.spec import Sweep
+from memmlp.sweep.definition import Sweep
 from memmlp.tables.build_table import make_table
 
 

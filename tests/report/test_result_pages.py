@@ -17,7 +17,7 @@ from memmlp.cli.results import sources
 from memmlp.common.errors import InputError
 from memmlp.report.kept_results import Kept, dumps, overrides_of
 from memmlp.report.result_pages import KeptTable, Placeholders, origin_words, pages
-from memmlp.sweep.spec import Sweep
+from memmlp.sweep.definition import Sweep
 from memmlp.tables.build_table import make_table
 from memmlp.tables.statistics import Verdict, holm, paired_effects
 from memmlp.tables.table_text import MINUS

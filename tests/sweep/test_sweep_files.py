@@ -21,7 +21,7 @@ from memmlp.config.build import build_experiment, untrained
 from memmlp.config.compose import composed
 from memmlp.motion.normalizer import Normalizer
 from memmlp.runs.identity import flatten
-from memmlp.sweep.spec import Arm, Sweep
+from memmlp.sweep.definition import Arm, Sweep
 from memmlp.sweep.sweep_file import load_sweep
 from memmlp.training.loop import train_step
 from memmlp.training.train_network import MotionTask

@@ -8,7 +8,7 @@ import pytest
 from fake_runs import fake_sweep, table_of
 from fake_table import EFFECTS, FILE
 
-from memmlp.sweep.spec import Sweep
+from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import parse_sweep
 from memmlp.tables.table import Table
 

@@ -13,7 +13,7 @@ from fake_table import SHIPPED, printed
 from processes import finished
 
 from memmlp.common.errors import InputError
-from memmlp.sweep.spec import Sweep
+from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import load_sweep, parse_sweep
 from memmlp.tables.build_table import make_table, on_source, without_runs
 from memmlp.tables.measured_run import load

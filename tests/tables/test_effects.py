@@ -13,7 +13,7 @@ from fake_runs import CLIPS, fake_run, fake_sweep, runs_of, table_of
 from fake_table import EFFECTS, cell, printed
 
 from memmlp.runs.evaluation_file import write_report
-from memmlp.sweep.spec import Sweep
+from memmlp.sweep.definition import Sweep
 from memmlp.tables.effects import _mean_cost
 from memmlp.tables.measured_run import load
 from memmlp.tables.statistics import Verdict, holm, paired_effects

@@ -15,7 +15,7 @@ from fake_table import cell, printed
 from memmlp.report.kept_results import Kept, dumps, load_kept
 from memmlp.report.result_pages import origin_words
 from memmlp.runs.evaluation_file import write_report
-from memmlp.sweep.spec import Sweep
+from memmlp.sweep.definition import Sweep
 from memmlp.tables.build_table import make_table
 from memmlp.tables.formats import FORMATS
 from memmlp.tables.measured_run import load

@@ -10,7 +10,7 @@ import pytest
 from fake_runs import fake_sweep, table_of
 from fake_table import SHIPPED, cell, printed
 
-from memmlp.sweep.spec import Sweep
+from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import load_sweep
 from memmlp.tables.formats import FORMATS
 from memmlp.tables.table import Table

@@ -17,7 +17,7 @@ from memmlp.report.kept_results import Kept, dumps, load_kept
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.identity import deployment_id_of
 from memmlp.runs.recipe_versions import RECIPES, outdated
-from memmlp.sweep.spec import Sweep
+from memmlp.sweep.definition import Sweep
 from memmlp.tables.measured_run import Measured, load
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.config.plan_sweep import find_sweep
+from memmlp.config.compose_plan import find_sweep
 from memmlp.tables.build_table import without_runs
 from memmlp.tables.formats import FORMATS
 from memmlp.tables.rows_measured_in_browsers import read, with_rows

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from memmlp.sweep.spec import Sweep
+from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import parse_sweep
 from memmlp.tables.build_table import make_table
 from memmlp.tables.effects import RunsBySeed

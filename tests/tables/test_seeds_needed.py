@@ -7,7 +7,7 @@ from pathlib import Path
 
 from fake_runs import CLIPS, fake_sweep, runs_of
 
-from memmlp.sweep.spec import Sweep
+from memmlp.sweep.definition import Sweep
 from memmlp.tables.seeds_needed import needs
 
 

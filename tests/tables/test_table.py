@@ -10,7 +10,7 @@ import pytest
 from fake_table import cell, printed
 
 from memmlp.runs.run import Run
-from memmlp.sweep.spec import Sweep
+from memmlp.sweep.definition import Sweep
 from memmlp.tables.statistics import Verdict
 from memmlp.tables.table import Effect, Table
 

@@ -8,7 +8,7 @@ import pytest
 from fake_runs import fake_sweep, table_of
 from fake_table import SHIPPED, printed
 
-from memmlp.sweep.spec import Sweep
+from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import load_sweep
 from memmlp.tables.table import Cell, Effect, Table
 from memmlp.tables.table_text import MINUS, effect_words, heading, number_words, value_words

@@ -19,12 +19,12 @@ from memmlp.evaluation.units import UNITS
 from memmlp.report.ui.index import Index
 from memmlp.runs.identity import NETWORK, training_settings
 from memmlp.runs.run import STAGE_WORDS
-from memmlp.sweep.kept_sweep import NAME as SWEEP_FILE
-from memmlp.sweep.kept_sweep import kept
+from memmlp.sweep.definition import Arm, Sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.progress_table import name as task_name
-from memmlp.sweep.spec import Arm, Sweep
 from memmlp.sweep.sweep_file import parse_sweep
+from memmlp.sweep.sweep_json import NAME as SWEEP_FILE
+from memmlp.sweep.sweep_json import kept
 from memmlp.tables.build_table import finished_runs, make_table
 from memmlp.tables.formats import as_json
 from memmlp.tables.measured_run import Measured, load

@@ -9,10 +9,10 @@ import pytest
 from fake_runs import fake_run
 
 from memmlp.runs.run import Run
-from memmlp.sweep.kept_sweep import keep
+from memmlp.sweep.definition import Sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask
-from memmlp.sweep.spec import Sweep
 from memmlp.sweep.sweep_file import parse_sweep
+from memmlp.sweep.sweep_json import keep
 
 ARMS = {"none": 1.0, "gru": 0.8}
 SEEDS = (0, 1, 2)

@@ -19,8 +19,8 @@ from memmlp.report.ui.answers import Answers
 from memmlp.report.ui.one_file import ReportedSweep, page_text, query, rounded
 from memmlp.report.ui.server import RunsServer
 from memmlp.runs.run import Run
-from memmlp.sweep.kept_sweep import kept
 from memmlp.sweep.plan import Plan
+from memmlp.sweep.sweep_json import kept
 from memmlp.tables.build_table import finished_runs, make_table
 from memmlp.tables.measured_run import load
 from memmlp.tables.runs_of_plan import finder

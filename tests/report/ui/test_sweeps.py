@@ -14,9 +14,8 @@ from memmlp.cli.seed_rounds import look
 from memmlp.report.ui.index import Index
 from memmlp.report.ui.sweeps import NOT_KEPT, OTHERS, ROUNDS, Sweeps
 from memmlp.runs.run import Run
-from memmlp.sweep.kept_sweep import keep, kept
 from memmlp.sweep.plan import Plan, RunTask
-from memmlp.sweep.spec import Scale
+from memmlp.sweep.sweep_json import keep, kept
 from memmlp.tables.build_table import finished_runs, make_table
 from memmlp.tables.formats import as_json
 from memmlp.tables.measured_run import load
@@ -234,17 +233,3 @@ def test_a_table_is_made_again_when_a_run_changed(outputs: Path):
     run_of(outputs, "gru", 0).marker.unlink()
     sweeps.index.refresh()
     assert [row["found"] for row in sweeps.page("mine")["table"]["rows"]] == [[0, 1, 2], [1, 2]]
-
-
-def test_a_kept_sweep_is_the_sweep(outputs: Path):
-    folder = outputs / "sweeps" / "mine"
-    sweep = kept(folder)
-    assert sweep is not None
-    changed = replace(
-        sweep.with_overrides(["seed=4,5", "optim.lr=0.1"]),
-        scale=Scale(("compute", "a.b"), ("profile=paper",)),
-        arms=(*sweep.arms[1:], replace(sweep.arms[0], series="a", cell=("b=1", "c=2"))),
-    )
-    keep(changed, folder)
-    assert kept(folder) == changed
-    assert kept(folder.parent) is None

@@ -1,4 +1,4 @@
-"""Sweeps: arms, seeds, and the overrides that train each arm (memmlp.sweep.sweep_file reads the files)."""
+"""What a sweep is: arms, seeds, the overrides that train each arm (files: memmlp.sweep.sweep_file)."""
 
 from __future__ import annotations
 

@@ -18,10 +18,10 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import digest, read_json, write_json
 from memmlp.config.package_data import packaged
 from memmlp.config.plugins import activate, named, texts
-from memmlp.sweep.kept_sweep import keep
+from memmlp.sweep.definition import Arm, Sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
-from memmlp.sweep.spec import Arm, Sweep
 from memmlp.sweep.sweep_file import load_sweep
+from memmlp.sweep.sweep_json import keep
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

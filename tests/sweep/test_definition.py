@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.sweep.spec import Scale
+from memmlp.sweep.definition import Scale
 from memmlp.sweep.sweep_file import parse_sweep
 
 ARMS = {"full": [], "none": {"overrides": ["memory=none"], "paper": {"MPJPE": 4.13}}}

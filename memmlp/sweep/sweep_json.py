@@ -9,7 +9,7 @@ from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import plain, read_json, write_json
-from memmlp.sweep.spec import Arm, Scale, Sweep
+from memmlp.sweep.definition import Arm, Scale, Sweep
 
 NAME = "sweep.json"
 

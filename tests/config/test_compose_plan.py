@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from memmlp.config.plan_sweep import _stamp
+from memmlp.config.compose_plan import _stamp
 from memmlp.sweep.sweep_file import parse_sweep
 
 

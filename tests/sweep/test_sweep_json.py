@@ -1,0 +1,48 @@
+"""A sweep's copy in its folder."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from memmlp.common.errors import InputError
+from memmlp.sweep.definition import Scale
+from memmlp.sweep.sweep_file import parse_sweep
+from memmlp.sweep.sweep_json import NAME, keep, kept
+
+CONTENT = {
+    "title": "Mine",
+    "notes": ["of two arms"],
+    "base": ["data=synthetic"],
+    "control": "none",
+    "arms": {"none": ["memory=none"], "gru": ["memory=gru"]},
+}
+
+
+def test_what_is_read_is_what_was_kept(tmp_path: Path):
+    sweep = parse_sweep("mine", CONTENT)
+    changed = replace(
+        sweep.with_overrides(["seed=4,5", "optim.lr=0.1"]),
+        scale=Scale(("compute", "a.b"), ("profile=paper",)),
+        arms=(*sweep.arms[1:], replace(sweep.arms[0], series="a", cell=("b=1", "c=2"))),
+    )
+    assert kept(tmp_path) is None
+    for each in (sweep, changed):
+        keep(each, tmp_path)
+        assert kept(tmp_path) == each
+
+
+def test_a_copy_of_the_same_content_is_not_written_again(tmp_path: Path):
+    keep(parse_sweep("mine", CONTENT), tmp_path)
+    before = (tmp_path / NAME).stat().st_mtime_ns
+    keep(parse_sweep("mine", CONTENT), tmp_path)
+    assert (tmp_path / NAME).stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"arms": [{"no": 1}]}'])
+def test_a_damaged_copy_is_named(tmp_path: Path, text: str):
+    (tmp_path / NAME).write_text(text)
+    with pytest.raises(InputError, match=f"{NAME}: not a sweep"):
+        kept(tmp_path)
