@@ -1,14 +1,15 @@
 """Evaluation in the two modes of the field, with all clips side by side in one batch.
 
 The mode `stream` is live use: one frame at a time, on the network's own history, with only the last frame of
-each window kept. The mode `window` is AGRoL's: non-overlapping windows, all of whose T frames are kept; the
-last window of a clip is shifted back to end with the clip, its overlap is dropped, and what a network recalls
-of its past is shifted with it.
+each window kept. The mode `window` is AGRoL's: non-overlapping windows, all of whose T frames are kept. The
+last call for a clip takes in the frames that are left: its window ends with the clip and so reaches back onto
+frames of the window before, whose earlier estimates are kept.
 
 Some networks are evaluated otherwise in window mode. A network that recalls the window which ended one frame
 before gets each window frame by frame, so that it recalls what it was trained on: in one call it would get
 the window of T frames ago. Its result for a window is the last call's output. A network without a window is a
-stream in both modes. A network that makes the windows of a clip together (`MotionModel.joint`) gets the whole
+stream in both modes; so is, to rounding, one that makes each frame from the window that ends with it, as its
+authors evaluate it. A network that makes the windows of a clip together (`MotionModel.joint`) gets the whole
 clip, and can't be a stream.
 """
 
@@ -62,9 +63,6 @@ class Evaluable(Protocol):
         network predicts.
         """
 
-    def rewound(self, state: State, frames: Tensor) -> State:
-        """Return the state as it was `frames` (B,) ago, for a window that takes in frames a second time."""
-
     def whole(self, sparse: Tensor) -> Tensor:
         """Map the inputs (N, 54) of a whole clip, N >= T, to its motion (N, 198) in the world."""
 
@@ -92,9 +90,7 @@ def frame_by_frame(network: Evaluable, clips: Sequence[Tensor], size: int) -> li
     The motion of each window of `size` frames (or fewer at a clip's end) comes from the call that took in the
     window's last frame. With `size` 1, this is a live stream.
     """
-    order = sorted(range(len(clips)), key=lambda i: -len(clips[i]))
-    lengths = [len(clips[i]) for i in order]
-    inputs = torch.nn.utils.rnn.pad_sequence([clips[i][:, :SPARSE_DIM] for i in order], batch_first=True)
+    order, lengths, inputs = _side_by_side(clips)
     motion = inputs.new_zeros(*inputs.shape[:2], POSITION.stop)
     state = network.initial_state(len(clips))
     active = len(clips)
@@ -110,24 +106,20 @@ def frame_by_frame(network: Evaluable, clips: Sequence[Tensor], size: int) -> li
 
 @torch.no_grad()
 def window_by_window(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor]:
-    """Predict the motion (N, 198) of clips (N, 252) by calls of T new frames each."""
+    """Predict the motion (N, 198) of clips (N, 252) by calls of T new frames, or what is left of a clip."""
     size = network.frames
-    padded = [_at_least(clip[:, :SPARSE_DIM], size) for clip in clips]
-    order = sorted(range(len(clips)), key=lambda i: -len(padded[i]))
-    motion = [clip.new_zeros(len(clip), POSITION.stop) for clip in padded]
+    order, lengths, inputs = _side_by_side(clips)
+    motion = inputs.new_zeros(*inputs.shape[:2], POSITION.stop)
     state = network.initial_state(len(clips))
-    for start in range(0, len(padded[order[0]]), size):
-        order = [i for i in order if len(padded[i]) > start]
-        state = {name: tensor[: len(order)] for name, tensor in state.items()}
-        begin = [min(start, len(padded[i]) - size) for i in order]
-        inputs = torch.stack([padded[i][b : b + size] for i, b in zip(order, begin, strict=True)])
-        back = torch.tensor([start - b for b in begin], device=inputs.device)
-        if network.shift and back.any():  # a tail recalls what came before it, and not its own frames
-            state = network.rewound(state, back)
-        output, state = network.advance(inputs, state)
-        for i, b, result in zip(order, begin, output, strict=True):
-            motion[i][start : b + size] = result[start - b :]  # the tail window begins at b < start
-    return [whole[-len(clip) :] for whole, clip in zip(motion, clips, strict=True)]
+    for start in range(0, lengths[0], size):
+        left = torch.tensor([min(size, length - start) for length in lengths if length > start])
+        for new in left.unique().tolist():  # ascending: full windows, which alone go on, come last
+            rows = (left == new).nonzero()[:, 0].to(inputs.device)
+            own = {name: tensor[rows] for name, tensor in state.items()}
+            output, after = network.advance(inputs[rows, start : start + new], own)
+            motion[rows, start : start + new] = output[:, -new:]
+        state = after
+    return [motion[order.index(i), : len(clip)] for i, clip in enumerate(clips)]
 
 
 @torch.no_grad()
@@ -246,6 +238,13 @@ def quick_stream(
     pairs = zip(motions, pieces, strict=True)
     mean = _mean([clip_report(network.normalizer, motion, piece, own=own) for motion, piece in pairs])
     return {f"{branch} {name}": value for branch, values in mean.items() for name, value in values.items()}
+
+
+def _side_by_side(clips: Sequence[Tensor]) -> tuple[list[int], list[int], Tensor]:
+    """Return clips' order, the longest first, their lengths in it, and padded inputs (B, longest, 54)."""
+    order = sorted(range(len(clips)), key=lambda i: -len(clips[i]))
+    inputs = torch.nn.utils.rnn.pad_sequence([clips[i][:, :SPARSE_DIM] for i in order], batch_first=True)
+    return order, [len(clips[i]) for i in order], inputs
 
 
 def _at_least(sparse: Tensor, size: int) -> Tensor:

@@ -90,10 +90,6 @@ class MemMLP(MotionModel):
         kept |= self.memory.remember(motion, past, state, new)
         return self.normalizer.decode_motion(motion[:, -wanted:], origin[:, -wanted:]), kept
 
-    def rewound(self, state: State, frames: Tensor) -> State:
-        """Return the state whose memory buffers are as they were some frames ago; see MotionModel."""
-        return {**state, **self.memory.rewound(state, frames)}
-
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
         """Make a training call; a memory whose VQ-VAE trains with the network adds losses of its own."""
         motion, kept = self.advance(sparse, state)

@@ -121,7 +121,8 @@ class MotionModel(nn.Module):
         """Take in the newest frames.
 
         Args:
-            sparse: world inputs (B, n, 54) of the n newest frames: n is 1 for a live stream, T for windows.
+            sparse: world inputs (B, n, 54) of the n newest frames: n is 1 for a live stream, T for windows,
+                and fewer for what is left at a clip's end.
             state: what the last call returned, or `initial_state`.
             newest: how many of the newest frames are wanted; by default all that the network predicts.
 
@@ -130,18 +131,6 @@ class MotionModel(nn.Module):
             state.
         """
         raise NotImplementedError
-
-    def rewound(self, state: State, frames: Tensor) -> State:
-        """Return the state as it was some frames ago, for a window that takes in some frames a second time.
-
-        By default this is the state itself, since a network without a past sees nothing but the T new frames.
-        Recurrent states can't be rewound, so they are kept.
-
-        Args:
-            state: what the last call returned.
-            frames: how many frames each batch element goes back (B,), int64, fewer than T.
-        """
-        return state
 
     def whole(self, sparse: Tensor) -> Tensor:
         """Map the world inputs (N, 54) of a clip, N >= T, to its world motion (N, 198); see `joint`."""

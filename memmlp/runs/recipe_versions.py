@@ -79,7 +79,7 @@ RECIPES: dict[str, int] = {
     # how they are evaluated (memmlp.evaluation)
     "metrics": 1,
     "mode.stream": 1,
-    "mode.window": 2,
+    "mode.window": 3,
     "ik.lbfgs": 1,
     "ik.arms": 1,
     # how they are deployed (memmlp.deploy, memmlp.networks.streaming)

@@ -27,9 +27,7 @@ def head(width: int, size: int) -> nn.Module:
 class OwnWindows(MotionModel):
     """The base of networks that predict every frame from the window that ends with it (`rotations`).
 
-    Both evaluation modes give the same numbers, except for the last window of a clip. That window is shifted
-    back to end with the clip, so the buffer of past inputs already holds the frames with which it begins:
-    they appear twice in the windows of its frames, in place of earlier ones.
+    Both evaluation modes give the same numbers, to rounding.
     """
 
     def rotations(self, encoded: Tensor) -> Tensor:

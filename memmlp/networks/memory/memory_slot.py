@@ -78,17 +78,6 @@ class Memory(nn.Module):
         """
         return {}
 
-    def rewound(self, state: State, frames: Tensor) -> State:
-        """Return the entries of the network's state that change when each batch element is rewound.
-
-        By default nothing changes.
-
-        Args:
-            state: the network's state.
-            frames: how many frames each batch element goes back (B,).
-        """
-        return {}
-
     def auxiliary_losses(self, frames: Tensor, normalizer: Normalizer) -> dict[str, Tensor]:
         """Return the memory's own losses on true world frames (B, T, 252); they add to the network's."""
         return {}

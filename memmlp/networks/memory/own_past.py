@@ -100,16 +100,6 @@ class OwnPastMemory(FeatureMemory):
             buffer = torch.cat([buffer[:, : self.length - self.frames], motion], 1)
         return {"motion": buffer}
 
-    def rewound(self, state: State, frames: Tensor) -> State:
-        """Return the buffers (B, length, C) of inputs and motion as they were `frames` (B,) ago.
-
-        Frames that the buffers no longer hold are replaced by their oldest one; they lie before the T frames
-        that a whole new window recalls.
-        """
-        index = torch.arange(self.length, device=frames.device) - frames[:, None]
-        rows = torch.arange(len(frames), device=frames.device)[:, None]
-        return {name: state[name][rows, index.clamp_min(0)] for name in ("sparse", "motion")}
-
 
 class NoCodesMemory(OwnPastMemory):
     """A memory of the network's own past without code-vectors (Table 11)."""
