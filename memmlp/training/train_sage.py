@@ -48,6 +48,10 @@ ACTING: dict[str, tuple[str, ...]] = {
 """The keys of the model that act in the training of each part."""
 
 
+WHOLE = ("warmup", "ema", "clip_norm", "weight_decay", "compile")
+"""The keys of optim, beside the optimiser, that act for the whole network alone: parts have defaults."""
+
+
 @dataclass(frozen=True)
 class DroppingOptim(Optim):
     """AdamW with a learning rate that falls at some steps.
@@ -89,7 +93,15 @@ class SAGEUpstream:
             betas = (0.9, 0.99) if kind in ("upper_codes", "lower_codes") else (0.9, 0.999)
             optim = DroppingOptim(**own, **often, betas=betas, validate_every=own["steps"])
             make = DecoderTraining if kind == "decoder" else PartTraining
-            yield make(kind, acting(kind, config), replace(network, optim=optim))
+            only = of_whole(config["optim"]["name"], network.optim, optim)
+            yield make(kind, acting(kind, config), replace(network, optim=optim), only)
+
+
+def of_whole(name: str, whole: Optim, part: Optim) -> tuple[str, ...]:
+    """Return the settings of optim by which the whole network is trained, and a part is not: "warmup=100"."""
+    other = () if name == "adamw" else (f"optim={name}",)
+    own = {key: getattr(whole, key, None) for key in WHOLE}
+    return (*other, *(f"optim.{key}={own[key]}" for key in WHOLE if own[key] != getattr(part, key)))
 
 
 def acting(kind: str, config: Mapping[str, Any]) -> dict[str, Any]:
@@ -113,16 +125,20 @@ class PartTraining:
         kind: which of PARTS.
         config: the part of the resolved config that determines the result.
         network: seed, optimisation, and how windows are drawn.
+        of_whole: settings of optim that act in the training of the whole network alone.
     """
 
     kind: str
     config: dict[str, Any]
     network: NetworkTraining
+    of_whole: tuple[str, ...] = ()
 
     @property
     def told(self) -> str:
-        """What the training does, in words."""
-        return f"{self.kind.replace('_', ' ')}: train it for {self.network.optim.steps} steps"
+        """What the training does, in words, and which settings it leaves to that of the whole."""
+        steps = f"{self.kind.replace('_', ' ')}: train it for {self.network.optim.steps} steps"
+        left = f" by AdamW; {', '.join(self.of_whole)}: of the whole alone" if self.of_whole else ""
+        return steps + left
 
     def train(
         self,

@@ -11,6 +11,8 @@ import torch
 from tiny_tasks import part_task
 from torch import nn
 
+from memmlp.config.build import build_experiment
+from memmlp.config.compose import composed
 from memmlp.motion.body import HEAD, N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.network_coordinates import World
 from memmlp.motion.normalizer import Normalizer
@@ -141,3 +143,14 @@ def test_it_begins_with_the_weights_of_its_parts(tmp_path: Path):
 
 def test_the_learning_rate_falls_where_it_is_told():
     assert [OPTIM.factor(step) for step in range(4)] == pytest.approx([1, 1, 0.2, 0.04])
+
+
+def test_a_part_tells_which_settings_of_optim_are_of_the_whole_alone():
+    words = ["model=sage", "profile=tiny"]
+    plain = build_experiment(composed(words)).upstream
+    assert [training.told for training in plain if "alone" in training.told] == []
+    changed = build_experiment(
+        composed([*words, "optim=muon", "optim.warmup=5", "optim.precision=bf16"])
+    ).upstream
+    assert all("by AdamW; optim=muon, optim.warmup=5: of the whole alone" in one.told for one in changed)
+    assert all(one.network.optim.precision == "bf16" for one in changed)
