@@ -302,6 +302,8 @@ def _unused(config: Mapping[str, Any]) -> Iterable[str]:
         yield "optim.drop_at"
     if chosen(config, "optim") == UNNAMED["optim"]:
         yield "optim.name"
+    if config.get("optim", {}).get("vectors") == "muon" or chosen(config, "model") == "recurrent_poser":
+        yield "optim.vectors"  # as in runs before this key, and of a network that has none
     if not config.get("optim", {}).get("warmup"):
         yield "optim.warmup"
     if config.get("vqvae", {}).get("codebook", "ema") != "ema":

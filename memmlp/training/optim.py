@@ -112,10 +112,13 @@ class Muon(Optim):
         momentum: Muon's momentum, which is Nesterov momentum.
         rest_lr: learning rate at the start for parameters that are not matrices, with the same schedule; None
             for `lr`.
+        vectors: what optimises parameters of two dimensions of which one is 1, such as the biases (T, 1) of
+            TimeMix: "adamw", or "muon", which took them for matrices before.
     """
 
     momentum: float = 0.95
     rest_lr: float | None = None
+    vectors: str = "adamw"
 
     def at(self, lr: float | None) -> Self:
         """Return these settings with another learning rate; `rest_lr` is scaled by the same factor."""
@@ -132,7 +135,7 @@ class Muon(Optim):
     def build(self, groups: list[dict]) -> torch.optim.Optimizer:
         """Make both optimisers as one; a parameter group's own `lr` and `weight_decay` take precedence."""
         self.check_installed()
-        matrices, rest = _split(groups)
+        matrices, rest = _split(groups, least=1 if self.vectors == "muon" else 2)
         parts: list[torch.optim.Optimizer] = []
         if matrices:
             parts.append(
@@ -181,12 +184,12 @@ class ScheduleFree(Optim):
         return ScheduleFreeAverage(module, optimiser)
 
 
-def _split(groups: list[dict]) -> tuple[list[dict], list[dict]]:
-    """Divide parameter groups into those of two dimensions, Muon's matrices, and those of all others."""
+def _split(groups: list[dict], least: int) -> tuple[list[dict], list[dict]]:
+    """Divide parameter groups into matrices of at least `least` rows and columns, and all others."""
     parts: tuple[list[dict], list[dict]] = ([], [])
     for group in groups:
         for chosen, matrices in zip(parts, (True, False), strict=True):
-            own = [one for one in group["params"] if (one.dim() == 2) == matrices]
+            own = [one for one in group["params"] if (one.dim() == 2 and min(one.shape) >= least) == matrices]
             chosen += [{**group, "params": own}] if own else []
     return parts
 

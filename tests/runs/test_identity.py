@@ -133,5 +133,9 @@ def test_keys_that_older_runs_lack_count_only_where_they_change_something():
     assert of(optim={**names, "warmup": 0, "ema": None}) == of()
     others = [{"warmup": 2}, {"ema": 0.9}, {**names, "name": "muon"}]
     assert len({of(), *(of(optim=other) for other in others)}) == 4
+    muon, vectors = {**names, "name": "muon"}, [{"vectors": "muon"}, {"vectors": "adamw"}]
+    assert [of(optim=muon | one) == of(optim=muon) for one in vectors] == [True, False]
+    ours = [of(optim=muon | one, model={"name": "recurrent_poser"}) for one in ({}, *vectors)]
+    assert len(set(ours)) == 1
     learned = of(loss={"weighting": "learned", "lr": 0.01})
     assert len({of(), learned, of(loss={"weighting": "learned", "lr": 0.1}), of(data={"mirror": True})}) == 4

@@ -6,12 +6,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import tiny
 import torch
 from tiny_tasks import OPTIM, motion_task, weights
 
 from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
+from memmlp.networks.layers import TimeMix
+from memmlp.networks.recurrent_cells import CELLS
 from memmlp.runs.run import Run
 from memmlp.training.loop import Watch, train, unwatched
 from memmlp.training.optim import Muon, Optim, ScheduleFree
@@ -112,6 +115,22 @@ def test_muon_has_the_matrices_and_adamw_the_rest():
     assert [group["params"] for group in adamw.param_groups] == [[row], [cube]]
     assert [group["lr"] for group in optimiser.param_groups] == [1e-2, 0.5, 0.1]
     assert [group["weight_decay"] for group in optimiser.param_groups] == [1e-4, 1e-4, 0]
+
+
+@pytest.mark.parametrize(("vectors", "of_muon"), [("adamw", 1), ("muon", 3)])
+def test_what_has_one_column_or_row_is_no_matrix(vectors: str, of_muon: int):
+    """The bias of a time mix is a column."""
+    mix, gate = TimeMix(7), torch.nn.Linear(4, 1, bias=False)
+    group = {"params": [*mix.parameters(), *gate.parameters()]}
+    muon = replace(OPTIMS["muon"], vectors=vectors).build([group]).parts[0]
+    assert len(muon.param_groups[0]["params"]) == of_muon
+
+
+def test_recurrent_poser_has_no_matrix_of_one_column_or_row():
+    """So optim.vectors changes nothing of it, and does not count for its identity."""
+    for cell in CELLS:
+        matrices = [one for one in tiny.recurrent_poser(cell=cell, members=2).parameters() if one.dim() == 2]
+        assert all(min(one.shape) > 1 for one in matrices)
 
 
 def test_the_warm_up_grows_in_equal_parts_and_then_the_schedule_is_what_it_was():

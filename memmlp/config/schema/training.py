@@ -228,6 +228,7 @@ class MuonConfig(ScheduledConfig):
     _target_: str = target("memmlp.training.optim.Muon")
     momentum: float = fraction()
     rest_lr: Optional[float] = optional(Within(0, strict=True))
+    vectors: str = standing("muon", OneOf(("adamw", "muon")))
 
 
 @dataclass
