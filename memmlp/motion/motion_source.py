@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from memmlp.common.errors import InputError
 from memmlp.common.lease import Lock
 from memmlp.common.lease_fences import publish, temporary
 from memmlp.motion.preparing.cache import ClipFolder, finished_cache, prepare
@@ -37,11 +38,22 @@ class Prepared(NamedTuple):
         return self.manifest.digest
 
     def open(self, part: str) -> MotionDataset:
-        """Open a part of the cache, memory-mapped (`MotionDataset.open`)."""
+        """Open a part of the cache, memory-mapped (`MotionDataset.open`).
+
+        Raises:
+            InputError: if the cache is unfinished, or was made anew of other clips since this was prepared.
+        """
         # Imported here, since it imports torch, which finding finished work does not need.
         from memmlp.motion.dataset import MotionDataset
 
-        return MotionDataset.open(self.cache, part)
+        part_of_cache = MotionDataset.open(self.cache, part)
+        # Looked at last: arrays are replaced after the old manifest went, and before the new one comes.
+        if Manifest.load(self.cache).digest != self.digest:
+            raise InputError(
+                f"{self.cache}: was made anew of other clips while this ran with those of before; "
+                "start it again, or put the clips back"
+            )
+        return part_of_cache
 
 
 @dataclass(frozen=True)

@@ -101,3 +101,15 @@ def test_a_column_file_has_a_cache_of_its_own_and_names_the_groups(root):
     (root / f"{NAMES[0]}_stageii.npz").unlink()
     with pytest.raises(InputError, match="has not, clip CMU/01/take_stageii"):
         prepared("third")
+
+
+def test_nothing_goes_on_with_clips_that_are_others_by_now(root):
+    """What was trained on one set of clips would be tested on another, under the first one's digest."""
+    source = MotionSource(ClipFolder(root, SeededSplit(0.2, 0.2)), None, root.with_name("cache"))
+    before = source.prepare()
+    assert len(before.open("train")) > 0
+    write_clip(root / f"{NAMES[0]}_stageii.npz", still(60))
+    now = source.prepare()
+    assert len(now.open("train")) > 0
+    with pytest.raises(InputError, match="was made anew of other clips"):
+        before.open("train")
