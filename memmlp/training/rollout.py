@@ -66,7 +66,8 @@ class TeacherForcing(Rollout):
 class OwnPredictions(Rollout):
     """A rollout with the network's own history, made by 0 to `max_passes` calls without gradients beforehand.
 
-    The first of these calls sees an empty history. All samples of a step take the same number of calls.
+    The first of these calls sees an empty history, of which each call fills one stride. All samples of a step
+    take the same number of calls.
     """
 
     def __init__(self, max_passes: int):

@@ -267,6 +267,8 @@ def refused(options: tuple[str, str]) -> str:
         return "memory=none"
     if {"memory=none", "rollout=own_predictions"} == set(options):
         return "rollout=own_predictions"
+    if {"memory.shift=frame", "rollout=own_predictions"} == set(options):
+        return "rollout.max_passes"
     if of_memory and "memory=none" in options:
         return of_memory
     if of_memory not in ("", "memory.fusion") and set(RECURRENT) & set(options):

@@ -212,6 +212,7 @@ BAD = [
     (["optim.precision=fp16"], ["optim.precision=fp16", "fp32 or bf16"]),
     (["memory.blend=1.5"], ["memory.blend=1.5", "at most 1 or sampled"]),
     (["memory.blend=always"], ["memory.blend=always", "sampled"]),
+    (["rollout=own_predictions", "memory.shift=frame"], ["rollout.max_passes=3", "at least model.frames=41"]),
     (["memory.shift=window2"], ["memory.shift=window2", "frame or window"]),
     (["memory.history=all"], ["memory.history=all", "first or latest"]),
     (["memory.fusion=sum"], ["memory.fusion=sum", "residual or plain"]),

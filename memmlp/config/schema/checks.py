@@ -280,6 +280,12 @@ def _check_slots(cfg: DictConfig) -> None:
             "rollout=own_predictions makes the past that a memory recalls, and memory=none recalls none: "
             "allowed is another memory, rollout=teacher_forcing or rollout=streams"
         )
+    passes, frames = cfg.rollout.get("max_passes", cfg.model.frames), cfg.model.frames
+    if cfg.memory.get("shift") == "frame" and passes < frames:
+        raise InputError(
+            f"rollout.max_passes={passes}: a call makes one frame of the past with memory.shift=frame, which "
+            f"has {frames}: allowed is at least model.frames={frames}, memory.shift=window or rollout=streams"
+        )
     if cfg.evaluation.ik == "lbfgs" and predictor.startswith("RotationOnly"):
         raise InputError(
             "evaluation.ik=lbfgs needs the positions of predictor=two_branch: allowed is off or arms"
