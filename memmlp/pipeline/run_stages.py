@@ -155,6 +155,7 @@ def make_missing_stages(experiment: Experiment, run: Run, data: Prepared) -> lis
     made = []
     if not {"partial", "divided"} <= run.manifest.keys():  # a run from before these were recorded
         run.write_manifest(of_data(experiment, data))
+    run.want(experiment.stages)
     missing = [mode for mode, identity in experiment.evaluations.items() if not run.has(identity)]
     if missing:
         evaluate_run(experiment, run, data, missing)
@@ -274,6 +275,7 @@ def train_run(
     tell(f"network: train it for {steps} steps{onward} (run {run.id})")
     begin(experiment, run, experiment.identity(data.digest), experiment.config)
     run.write_manifest({"body": data.manifest.body, **of_data(experiment, data)})
+    run.want(experiment.stages)
     run.clear_stages()
     weights = upstream.weights() if upstream else None
     distributed.of_first(NETWORK)  # tells the others what is trained now

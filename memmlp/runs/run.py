@@ -112,6 +112,19 @@ class Run:
         return self.evaluation(stage).is_file() or self.deployment(stage).done
 
     @property
+    def wanted(self) -> tuple[str, ...]:
+        """The identities of the evaluations and the deployment that were last asked for.
+
+        Empty for a run upstream of a network's, and for runs from before this was recorded.
+        """
+        return tuple(self.manifest.get("stages", ()))
+
+    def want(self, stages: Sequence[str]) -> None:
+        """Record which evaluations and which deployment are asked for, by their identities."""
+        if self.wanted != tuple(stages):
+            self.write_manifest({"stages": list(stages)})
+
+    @property
     def preferred_deployment(self) -> DeploymentFolder:
         """The deployment to use, among those with the run's own settings.
 

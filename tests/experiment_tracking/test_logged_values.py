@@ -26,6 +26,19 @@ def test_status_is_that_of_the_folder(tmp_path: Path):
     assert facts_of(run, running=True).ended is None
 
 
+def test_a_trained_run_without_what_was_asked_for_is_not_done(tmp_path: Path):
+    run = a_run(tmp_path)
+    run.want(["stream-0", "fp32-0"])
+    run.finish([])
+    assert facts_of(run).status == "killed"
+    run.evaluations.mkdir()
+    write_json(run.evaluation("stream-0"), {"mode": "stream", "mean": {}, "clips": []})
+    assert facts_of(run).status == "killed"
+    run.deployment("fp32-0").folder.mkdir(parents=True)
+    run.deployment("fp32-0").finish({})
+    assert facts_of(run).status == "done"
+
+
 def test_a_run_that_nobody_finished_ended_with_its_last_line(tmp_path: Path):
     run = a_run(tmp_path)
     assert facts_of(run).ended == run.metrics()[-1].time

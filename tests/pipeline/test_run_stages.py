@@ -49,6 +49,8 @@ def test_a_run_leaves_everything(home):
         assert (run.folder / name).stat().st_size > 0
     assert run.preferred_deployment.done
     assert len(list(run.evaluations.iterdir())) == 2
+    made = [path.stem for path in (*run.evaluations.iterdir(), *run.deployments.iterdir())]
+    assert set(run.wanted) == set(made)
     assert set(run.results) == {"window", "stream", "latency"}
     assert {run.manifest[fact] for fact in ("partial", "divided")} == {None}
     assert run.results["stream"]["rotation"]["MPJPE"] > 0
