@@ -53,6 +53,7 @@ def flags(
     yield from _same(sweep, runs)
     yield from _unequal_clips(sweep, runs)
     yield from _unequal_groups(every)
+    yield from _fewer_seeds(sweep, runs)
     yield from _no_numbers(sweep, runs)
     if "Jitter" in sweep.metrics:
         yield from _calmer_than_truth(sweep, runs)
@@ -166,6 +167,21 @@ def _unequal_groups(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
     several = [clip for clip, names in groups.items() if len(names) > 1]
     if several:
         yield f"runs differ in the groups of test clips (data.split.groups): {_quoted(several)}"
+
+
+def _fewer_seeds(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
+    """Flag runs that were not measured by a metric in which other seeds of their arm were."""
+    lacking: dict[tuple[str, int], list[str]] = defaultdict(list)
+    for arm in sweep.runnable():
+        found = runs[arm.label]
+        modes = sorted({mode for run in found.values() for mode in run.means}) or [""]
+        for metric, mode in itertools.product(sweep.metrics, modes):
+            without = [seed for seed, run in found.items() if run.value(mode, arm.branch, metric) is None]
+            for seed in without if len(without) < len(found) else ():
+                lacking[arm.label, seed].append(metric)
+    if lacking:
+        words = [f"'{label}' seed {seed} ({_listed(_unique(m))})" for (label, seed), m in lacking.items()]
+        yield f"not measured, so that the mean is of the other seeds: {_listed(words)}"
 
 
 def _no_numbers(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:

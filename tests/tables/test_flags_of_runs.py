@@ -106,6 +106,21 @@ def test_a_network_that_diverged_on_a_clip_is_said(sweep: Sweep, tmp_path: Path,
     assert [flag for flag in table.flags if "no numbers" in flag] == [line]
 
 
+def test_a_mean_of_fewer_seeds_than_its_row_counts_is_said(sweep: Sweep, tmp_path: Path):
+    runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
+    arm = sweep.runnable()[0]
+    for mode in ("stream", "window"):
+        del runs[arm.label][1].means[mode][arm.branch]["Jitter"]
+    del runs[arm.label][2].costs["ms"]
+    for one in runs["by position"].values():  # none of its seeds has one
+        del one.means["stream"]["position"]["Jitter"]
+    (line,) = (flag for flag in make_table(sweep, runs).flags if "not measured" in flag)
+    assert line == (
+        "not measured, so that the mean is of the other seeds: "
+        "'no | memory' seed 1 (Jitter), 'no | memory' seed 2 (ms)"
+    )
+
+
 def test_a_clip_on_which_every_run_diverged_is_flagged(sweep: Sweep, tmp_path: Path):
     """It is not too short for a metric: the shortest clip has position errors."""
     runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
