@@ -254,17 +254,25 @@ def _differing(what: str, found: Iterable[tuple[str, str]]) -> Iterable[str]:
 
 def _seen(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
     """Flag arms that saw more or fewer frames in training than their controls, for whatever reason."""
-    every = [(label, run.training.get("frames")) for label, found in runs.items() for run in found.values()]
-    frames = {label: number for label, number in every if number}
+    frames = {
+        label: sorted(number for run in found.values() if (number := run.training.get("frames")))
+        for label, found in runs.items()
+    }
     unequal = []
     for arm in sweep.runnable():
         other = control_arm(sweep, arm)
-        if other and {arm.label, other.label} <= frames.keys():
-            own, controls = frames[arm.label], frames[other.label]
-            if max(own, controls) > ALIKE * min(own, controls):
-                unequal.append(f"'{arm.label}' {own / 1e6:.3g} M to '{other.label}' {controls / 1e6:.3g} M")
+        if other and frames[arm.label] and frames[other.label]:
+            every = frames[arm.label] + frames[other.label]
+            if max(every) > ALIKE * min(every):
+                own, controls = (_in_millions(frames[one.label]) for one in (arm, other))
+                unequal.append(f"'{arm.label}' {own} M to '{other.label}' {controls} M")
     if unequal:
         yield f"number of frames seen in training differs: {_listed(unequal)}"
+
+
+def _in_millions(numbers: Sequence[float]) -> str:
+    """Return sorted numbers in millions: one where all read the same, or else the least and the most."""
+    return "-".join(_unique(f"{number / 1e6:.3g}" for number in (numbers[0], numbers[-1])))
 
 
 def _timed(every: Sequence[tuple[str, Measured]]) -> list[tuple[str, str]]:

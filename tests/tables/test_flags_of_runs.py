@@ -257,6 +257,17 @@ def test_arms_that_saw_more_in_training_are_said(sweep: Sweep, tmp_path: Path):
     assert flags() == []
 
 
+def test_what_any_seed_saw_in_training_counts(sweep: Sweep, tmp_path: Path):
+    """Not that of the last one alone."""
+    runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
+    for label, of_arm in runs.items():
+        for seed, run in of_arm.items():
+            more = 2 if (label, seed) == ("by position", 0) else 1
+            of_arm[seed] = replace(run, training={"frames": more * 3e6})
+    line = "number of frames seen in training differs: 'by position' 3-6 M to 'full_model' 3 M"
+    assert [flag for flag in make_table(sweep, runs).flags if "in training" in flag] == [line]
+
+
 def test_what_is_no_stream_is_said_in_every_format(sweep: Sweep, tmp_path: Path):
     late = {"by position": {"offline": True}}
     runs = {
