@@ -236,7 +236,8 @@ def trained_by(config: Mapping[str, Any]) -> dict[str, Any]:
     out = (*NEUTRAL, *FORMER, *later, *_unused(config))
     flat = {key: _canonical(value) for key, value in flatten(config).items() if value is not None}
     counting = {key: flat[key] for key in flat if not _below(key, out) and not _is_path(key, flat)}
-    return counting | _draws(config)
+    inert = {key: value for key, value in _inert(config).items() if key in counting}
+    return counting | inert | _draws(config)
 
 
 def _draws(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -257,7 +258,8 @@ def _training(kind: str, config: Mapping[str, Any], data: str, upstream: str | N
 
 def trained_with(key: str, config: Mapping[str, Any]) -> bool:
     """Return whether a dotted key can change the training of this config, or its data."""
-    return key.startswith("data.") or any(_below(name, [key]) for name in trained_by(config))
+    counting = trained_by(config).keys() - _inert(config).keys()
+    return key.startswith("data.") or any(_below(name, [key]) for name in counting)
 
 
 def validated_on(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -317,6 +319,19 @@ def _unused(config: Mapping[str, Any]) -> Iterable[str]:
         yield "term.weight"  # it is learned
     if loss.get("name") == "terms" and loss.get("weighting") != "learned":
         yield from ("loss.weighting", "loss.lr")  # fixed weights are what runs before these keys have
+
+
+def _inert(config: Mapping[str, Any]) -> dict[str, float]:
+    """Return the fixed weights of loss terms that this config has not, with the values that they count as.
+
+    These are their defaults, which runs from before this rule have.
+    """
+    if chosen(config, "loss") != "manual":
+        return {}
+    inert = {"loss.hand": 0.1} if chosen(config, "hand") == "off" else {}
+    if chosen(config, "predictor") in ("rotation_only", "rotation_only_memory"):
+        inert |= {"loss.position": 0.5, "loss.velocity": 0.1}
+    return inert
 
 
 def _below(key: str, names: Iterable[str]) -> bool:

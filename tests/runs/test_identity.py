@@ -12,6 +12,7 @@ from memmlp.runs.identity import (
     deployment_id,
     evaluation_id,
     flatten,
+    trained_with,
 )
 
 
@@ -139,3 +140,22 @@ def test_keys_that_older_runs_lack_count_only_where_they_change_something():
     assert len(set(ours)) == 1
     learned = of(loss={"weighting": "learned", "lr": 0.01})
     assert len({of(), learned, of(loss={"weighting": "learned", "lr": 0.1}), of(data={"mirror": True})}) == 4
+
+
+def test_weights_of_terms_that_are_not_there_do_not_count():
+    """They count as their defaults, so that runs with these keep their ids."""
+    weights = {"rotation": 1.0, "position": 0.5, "velocity": 0.1, "hand": 0.1}
+
+    def of(term: str, predictor: str = "two_branch", **others: float) -> str:
+        loss = {"name": "manual", **weights, **others}
+        slots = {"hand": {"name": term}, "predictor": {"name": predictor}, "loss": loss}
+        return Identity("memmlp", {**CONFIG, **slots}, "d").what
+
+    assert of("off", hand=9.0) == of("off") == "87063d950dc5b521"
+    assert of("fk", hand=9.0) != of("fk")
+    assert of("off", position=9.0) != of("off")
+    alone = "rotation_only"
+    assert of("off", alone, position=9.0, velocity=9.0, hand=9.0) == of("off", alone)
+    assert of("off", alone, rotation=9.0) != of("off", alone)
+    config = {**CONFIG, "hand": {"name": "off"}, "loss": {"name": "manual", **weights}}
+    assert [trained_with(f"loss.{name}", config) for name in ("hand", "position")] == [False, True]
