@@ -16,6 +16,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.hydra import Hydra
 from hydra._internal.utils import create_config_search_path, get_args_parser
 from hydra.core.config_search_path import ConfigSearchPath, SearchPathQuery
+from hydra.core.default_element import GroupDefault
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
@@ -29,6 +30,7 @@ from memmlp.config import plugins
 from memmlp.config.config_errors import explain
 from memmlp.config.package_data import packaged
 from memmlp.config.schema import check, register
+from memmlp.runs.identity import flatten
 
 VERSION_BASE = "1.3"
 CONFIG = "train"
@@ -84,6 +86,24 @@ def composed_plain(name: str, overrides: Sequence[str], folder: Path | None = No
     version.setbase(VERSION_BASE)
     with _hydra(args), _explained(overrides):
         return cast(dict[str, Any], OmegaConf.to_container(compose(name, args.overrides), resolve=True))
+
+
+def set_by_experiments(options: Sequence[str]) -> set[str]:
+    """Return the groups and the dotted keys that options of the group `experiment` set."""
+    args, _ = parse([])
+    version.setbase(VERSION_BASE)
+    found: set[str] = set()
+    with _hydra(args):
+        loader = GlobalHydra.instance().config_loader()
+        assert isinstance(loader, ConfigLoaderImpl)
+        for option in options:
+            file = loader.repository.load_config(f"experiment/{option}")
+            if file is None:  # composing says so
+                continue
+            groups = [one for one in file.defaults_list or () if isinstance(one, GroupDefault)]
+            found |= {str(one.group).lstrip("/") for one in groups if one.override}
+            found |= flatten(cast(dict[str, Any], OmegaConf.to_container(file.config))).keys()
+    return found
 
 
 def preflight(args: argparse.Namespace) -> list[DictConfig]:

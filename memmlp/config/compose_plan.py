@@ -18,7 +18,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import digest, read_json, write_json
 from memmlp.config.package_data import packaged
 from memmlp.config.plugins import activate, named, texts
-from memmlp.sweep.definition import Arm, Sweep
+from memmlp.sweep.definition import Arm, Sweep, key_of
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
 from memmlp.sweep.sweep_file import load_sweep
 from memmlp.sweep.sweep_json import keep
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from memmlp.pipeline.experiment import Experiment
+
+
+EXPERIMENT = "experiment"
+"""The group whose options set groups and keys all over the config."""
 
 
 def find_sweep(name: str, overrides: Sequence[str] = ()) -> Sweep:
@@ -42,7 +46,47 @@ def find_sweep(name: str, overrides: Sequence[str] = ()) -> Sweep:
         InputError: if there is no such sweep, or its file is wrong.
     """
     activate(named(overrides))
-    return load_sweep(_path(name), lambda base: activate(named(base))).with_overrides(overrides)
+    sweep = load_sweep(_path(name), lambda base: activate(named(base))).with_overrides(overrides)
+    for arm in sweep.runnable():
+        check_experiment(sweep, arm)
+    return sweep
+
+
+def check_experiment(sweep: Sweep, arm: Arm) -> None:
+    """Check that nothing outside of an arm undoes what its `experiment=NAME` sets, and that it undoes no other.
+
+    Hydra lets a group or key on the command line win over an experiment's, wherever it stands, and the last
+    experiment replaces those before.
+
+    Raises:
+        InputError: for such an arm; the message names the sweep, the arm and both overrides.
+    """
+    from memmlp.config.compose import set_by_experiments
+
+    own = {key_of(word): word for word in arm.overrides or ()}
+    chosen = own.get(EXPERIMENT)
+    if chosen is None:
+        return
+    others = arm.own_overrides if chosen in arm.cell else ()
+    around = {key_of(word): word for word in (*sweep.base, *sweep.command_line)}
+    around = {key: word for key, word in around.items() if key not in own or key == EXPERIMENT}
+    before, options = _options(around.pop(EXPERIMENT, "")), _options(chosen)
+    where = f"sweep {sweep.name}, arm '{arm.label}': {chosen}"
+    if options and (lost := [option for option in before if option not in options]):
+        both = ",".join(dict.fromkeys([*before, *options]))
+        raise InputError(f"{where} would replace {EXPERIMENT}={lost[0]}; allowed is {EXPERIMENT}=[{both}]")
+    known = set_by_experiments(options)
+    for key, word in (around | {key_of(word): word for word in others}).items():
+        if key in known:
+            raise InputError(
+                f"{where} sets {key}, and {word} beside it would win; allowed are keys that it does not set"
+            )
+
+
+def _options(word: str) -> list[str]:
+    """Return the options that an override of a group names: one, a list of them, or none."""
+    value = word.partition("=")[2].strip("[] ")
+    return [option.strip() for option in value.split(",") if option.strip() not in ("", "null")]
 
 
 def _path(name: str) -> Path:
