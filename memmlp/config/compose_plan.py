@@ -53,7 +53,7 @@ def find_sweep(name: str, overrides: Sequence[str] = ()) -> Sweep:
 
 
 def check_experiment(sweep: Sweep, arm: Arm) -> None:
-    """Check that nothing outside of an arm undoes what its `experiment=NAME` sets, and that it undoes no other.
+    """Check that nothing outside of an arm undoes what its `experiment=NAME` sets, nor it another one.
 
     Hydra lets a group or key on the command line win over an experiment's, wherever it stands, and the last
     experiment replaces those before.

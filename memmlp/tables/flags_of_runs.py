@@ -329,14 +329,18 @@ def _replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
     measured = {label: list(found.values()) for label, found in runs.items() if found}
     if len(measured) < 2:
         return
-    if max(map(len, measured.values())) == 1:
-        yield "one seed an arm: the intervals speak of other clips, not of other seeds; nothing is starred"
-    yield from _single(sweep, runs)
     groups = [len({run.group(clip) for clip in run.clips}) for found in measured.values() for run in found]
     clips = [len(run.clips) for found in measured.values() for run in found]
+    one_seed, one_group = max(map(len, measured.values())) == 1, max(groups) == 1
+    if one_seed and one_group:
+        yield "one seed an arm and one group of test clips: no interval, and nothing is starred"
+    elif one_seed:
+        yield "one seed an arm: the intervals speak of other clips, not of other seeds; nothing is starred"
+    else:
+        yield from _single(sweep, runs, one_group)
     if groups == clips and max(groups) > 1:
         yield "each test clip is a group of its own (data.split.groups): right where none share a person"
-    if max(groups) == 1:
+    if one_group and not one_seed:
         yield "one group of test clips: the intervals speak of other seeds, not of other takes or people"
     shared = [label for label, found in measured.items() if _one_upstream(found)]
     if shared:
@@ -359,13 +363,17 @@ def _apart(ours: RunsBySeed, theirs: RunsBySeed) -> str:
     return "what tells them apart has no effect here"
 
 
-def _single(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
-    """Flag comparisons with one seed if others have more."""
+def _single(sweep: Sweep, runs: Mapping[str, RunsBySeed], one_group: bool) -> Iterable[str]:
+    """Flag comparisons over one seed where arms have more.
+
+    They have an interval only if there are several groups of clips.
+    """
     pairs = [(arm.label, other.label) for arm in sweep.runnable() if (other := control_arm(sweep, arm))]
     shared = {one: len(runs[one].keys() & runs[two].keys()) for one, two in pairs}
     few = [label for label, number in shared.items() if number == 1]
-    if few and max(shared.values()) > 1:
-        yield f"one seed, so that the interval speaks of other clips alone, and no star: {_quoted(few)}"
+    if few:
+        so = "there is no interval" if one_group else "the interval speaks of other clips alone"
+        yield f"one seed, so that {so}, and no star: {_quoted(few)}"
 
 
 def _one_upstream(found: Sequence[Measured]) -> bool:

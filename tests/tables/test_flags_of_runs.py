@@ -288,6 +288,38 @@ def test_a_comparison_of_one_seed_among_others_of_more_is_said(sweep: Sweep, tmp
     assert sum(flag.startswith("one seed, so that") and "'no | memory'" in flag for flag in table.flags) == 1
 
 
+@pytest.mark.parametrize(
+    ("seeds", "clips", "said"),
+    [
+        (
+            (0,),
+            CLIPS[:1],
+            ["one seed an arm and one group of test clips: no interval, and nothing is starred"],
+        ),
+        ((0,), CLIPS, ["one seed an arm: the intervals speak of other clips, not of other seeds; nothing"]),
+        ((0, 1), CLIPS[:1], ["one group of test clips: the intervals speak of other seeds, not of other"]),
+        ((0, 1), CLIPS, []),
+    ],
+)
+def test_what_intervals_speak_of_is_said_once(
+    sweep: Sweep, tmp_path: Path, seeds: tuple[int, ...], clips: tuple[str, ...], said: list[str]
+):
+    """One seed and one group leave nothing that an interval could speak of."""
+    sweep = replace(sweep, seeds=seeds)
+    table = table_of(sweep, fake_sweep(tmp_path, sweep, clips=clips))
+    found = [flag for flag in table.flags if flag.startswith("one ")]
+    assert [flag[: len(words)] for flag, words in zip(found, said, strict=True)] == said
+
+
+def test_arms_that_share_a_single_seed_of_several_are_said(sweep: Sweep, tmp_path: Path):
+    find, kept = fake_sweep(tmp_path, sweep), {"full_model": (0, 1)}
+    table = table_of(
+        sweep, lambda arm, seed: find(arm, seed) if seed in kept.get(arm.label, (1, 2)) else None
+    )
+    (line,) = (flag for flag in table.flags if flag.startswith("one seed"))
+    assert line.endswith("speaks of other clips alone, and no star: 'no | memory', 'by position'")
+
+
 def test_recipes_of_what_only_some_arms_have_do_not_differ(sweep: Sweep, tmp_path: Path):
     recipes = {"by position": {"recipes": {"memory": 1, "gru": 7}}}
     runs = {
