@@ -254,6 +254,8 @@ def effect_words(cell: Cell, metric: str) -> tuple[str, ...]:
     if effect.low is None or effect.high is None:
         return (signed(effect.mean, f"+.{least}f"),)
     digits = places(effect.high - effect.low, least)
+    if effect.significant and effect.mean:  # a star beside zeros alone would say nothing
+        digits = max(digits, -math.floor(math.log10(abs(effect.mean))))
     low, high = (signed(number, f".{digits}f") for number in (effect.low, effect.high))
     star = "*" if effect.significant else ""
     at = f" ({effect.decided})" if effect.decided else ""

@@ -66,6 +66,13 @@ def test_two_digits_of_a_number_have_no_exponent(value: float, said: str):
     assert number_words(value) == said
 
 
+def test_a_star_has_a_digit_beside_it():
+    small = Effect(0.0004, low=0.0001, high=0.0007, holm=0.01)
+    assert effect_words(Cell({0: 8.0}, effect=small), "MPJPE") == ("+0.0004*", "[0.0001, 0.0007]")
+    open_one = Effect(0.0004, low=-0.0001, high=0.0009, holm=0.3)
+    assert effect_words(Cell({0: 8.0}, effect=open_one), "MPJPE") == ("+0.000", f"[{MINUS}0.000, 0.001]")
+
+
 def test_large_costs_and_their_differences_have_no_exponent():
     assert value_words(Cell({0: 999.7}), "FPS") == "1000"
     assert value_words(Cell({0: 1234.5}), "FPS") == "1234"

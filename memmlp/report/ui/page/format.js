@@ -25,6 +25,20 @@ export function signed(value, digits = Math.abs(value) >= 1000 ? 0 : 2) {
   return value > 0 ? `+${number(value, digits)}` : number(value, digits);
 }
 
+// The decimals of a difference and its interval: two, or as many as a significant one needs for a digit.
+export function effectDigits({ mean, holm, level }) {
+  const size = Math.abs(mean);
+  if (size >= 1000) return 0;
+  return size > 0 && holm !== null && holm < level ? Math.max(2, -Math.floor(Math.log10(size))) : 2;
+}
+
+// An order from the largest error to the smallest: what is no number comes first, what is not there last.
+export function largestFirst(one, other) {
+  const rank = value => (value === undefined ? -1 : typeof value === 'number' ? value : Infinity);
+  const [first, second] = [rank(one), rank(other)];
+  return first === second ? 0 : second - first;
+}
+
 // A value of a config in few characters.
 export function word(value) {
   if (value === null || value === undefined) return DASH;
@@ -93,7 +107,7 @@ export function digitsOf(name) {
 }
 
 export function metricNumber(name, value) {
-  if (typeof value !== 'number') return DASH;
+  if (typeof value !== 'number') return number(value); // none, or a word such as nan
   const digits = Math.abs(value) >= 1000 ? 0 : digitsOf(name);
   return digits === 0 ? number(Math.round(value)) : number(value, digits);
 }

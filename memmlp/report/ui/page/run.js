@@ -2,7 +2,7 @@
 
 import { h, replace, link, section, select, empty, choice, code } from './dom.js';
 import { address, alone, ask, dataName, nameOf, place, remember, runs } from './store.js';
-import { ago, ARROWS, better, bytes, date, duration, metricNumber, metricWords, number, signed, word } from './format.js';
+import { ago, ARROWS, better, bytes, date, duration, largestFirst, metricNumber, metricWords, number, signed, word } from './format.js';
 import { curvePanel } from './compare.js';
 import { status, tags } from './runs.js';
 
@@ -95,7 +95,7 @@ async function replaySection(run, closing) {
 
   function draw() {
     const modes = ['stream', 'window'].filter(mode => run.clips.some(clip => clip[mode]));
-    const names = [...run.clips].sort((a, b) => error(b, set.mode) - error(a, set.mode));
+    const names = [...run.clips].sort((a, b) => largestFirst(error(a, set.mode), error(b, set.mode)));
     replace(tools,
       select('Clip, worst first', names.map(clip => [clip.name, `${clip.name} (${number(error(clip, set.mode), 1)} cm)`]), set.clip, clip => choose({ clip })),
       modes.length > 1 ? choice('Mode', modes.map(mode => [mode, mode]), set.mode, mode => choose({ mode })) : null,
@@ -113,8 +113,8 @@ async function replaySection(run, closing) {
   return { element, choose };
 }
 
-const error = (clip, mode) => clip[mode]?.rotation?.MPJPE ?? -1;
-const worst = run => [...run.clips].sort((a, b) => error(b, 'stream') - error(a, 'stream') || error(b, 'window') - error(a, 'window'))[0];
+const error = (clip, mode) => clip[mode]?.rotation?.MPJPE;
+const worst = run => [...run.clips].sort((a, b) => largestFirst(error(a, 'stream'), error(b, 'stream')) || largestFirst(error(a, 'window'), error(b, 'window')))[0];
 
 function clips(run, replay) {
   const mode = run.clips.some(clip => clip.stream) ? 'stream' : 'window';
@@ -124,11 +124,12 @@ function clips(run, replay) {
   function draw() {
     const value = (clip, metric) => clip[mode]?.[sets.branch]?.[metric];
     const metrics = ordered([...new Set(run.clips.flatMap(clip => Object.keys(clip[mode]?.[sets.branch] ?? {})))].filter(metric => run.clips.some(clip => typeof value(clip, metric) === 'number')));
-    const order = [...run.clips].sort((a, b) => (value(b, sets.by) ?? -1) - (value(a, sets.by) ?? -1));
-    const most = value(order[0], sets.by);
+    const order = [...run.clips].sort((a, b) => largestFirst(value(a, sets.by), value(b, sets.by)));
+    const most = order.map(clip => value(clip, sets.by)).find(error => typeof error === 'number');
+    const share = error => (error === undefined ? 0 : typeof error === 'number' ? (100 * error) / (most || 1) : 100);
     const headCell = metric => h('th', { scope: 'col', class: 'n', 'aria-sort': metric === sets.by ? 'descending' : null }, h('button', { type: 'button', onclick: () => { sets.by = metric; draw(); } }, metric, h('small', {}, metricWords(metric).unit)));
     const line = clip => h('tr', {}, h('th', { scope: 'row' }, clip.name), h('td', { class: 'n faint' }, clip.frames ? `${number(clip.frames / 60, 1)} s` : '–'),
-      h('td', { class: 'meter' }, h('i', { style: `width:${(100 * (value(clip, sets.by) ?? 0)) / (most || 1)}%` })),
+      h('td', { class: 'meter' }, h('i', { style: `width:${share(value(clip, sets.by))}%` })),
       metrics.map(metric => h('td', { class: metric === sets.by ? 'n strong' : 'n' }, metricNumber(metric, value(clip, metric)))),
       h('td', {}, replay ? h('button', { type: 'button', class: 'small', 'aria-label': `Replay ${clip.name}`, onclick: () => { replay.choose({ clip: clip.name }); replay.element.scrollIntoView({ behavior: matchMedia('(prefers-reduced-motion: reduce)').matches ? 'auto' : 'smooth' }); } }, 'Replay') : null));
     replace(element, branches.length > 1 ? h('div', { class: 'tools' }, choice('Branch', branches.map(branch => [branch, branch]), sets.branch, branch => { sets.branch = branch; draw(); })) : null,

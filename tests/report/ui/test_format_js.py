@@ -1,0 +1,36 @@
+"""The page's numbers and orders (page/format.js), in node."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from processes import finished
+
+PAGE = Path(__file__).parents[3] / "memmlp" / "report" / "ui" / "page"
+NODE = shutil.which("node")
+
+pytestmark = pytest.mark.skipif(NODE is None, reason="node is not installed")
+
+
+def js(code: str) -> Any:
+    """What an expression of format.js' functions is."""
+    module = (PAGE / "format.js").as_uri()
+    made = f"globalThis.document = {{ getElementById: () => null }};\nconst f = await import('{module}');\n"
+    ran = finished([str(NODE), "--input-type=module", "-e", f"{made}console.log(JSON.stringify({code}));"])
+    assert ran.returncode == 0, ran.stderr
+    return json.loads(ran.stdout)
+
+
+def test_errors_that_are_no_numbers_come_first_and_are_shown():
+    order = "[3, 'nan', undefined, 9, null, 1].sort((a, b) => f.largestFirst(a, b))"
+    assert js(f"{order}.map(String)") == ["nan", "null", "9", "3", "1", "undefined"]
+    assert js("[f.metricNumber('MPJPE', 'nan'), f.metricNumber('MPJPE', 3)]") == ["nan", "3.00"]
+
+
+def test_a_significant_difference_has_a_digit():
+    effects = "[{mean: 4e-4, holm: .01, level: .05}, {mean: 4e-4, holm: .3, level: .05}, {mean: 2e3}]"
+    assert js(f"{effects}.map(f.effectDigits)") == [4, 2, 0]
