@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import urllib.parse
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any, NamedTuple
@@ -77,18 +78,19 @@ def _curves(answers: Answers, run_id: str) -> dict[str, Any]:
 
 def _run(page: Mapping[str, Any]) -> dict[str, Any]:
     """Return a run's page without the parts that only its server could show."""
-    clips = sorted(page["clips"], key=lambda clip: -float(_error(clip) or 0))[:MOST_CLIPS]
+    clips = sorted(page["clips"], key=_error, reverse=True)[:MOST_CLIPS]
     manifest = {
         key: value for key, value in page["manifest"].items() if not key.startswith(("sources", "attempts"))
     }
     return {**page, "clips": clips, "manifest": manifest}
 
 
-def _error(clip: Mapping[str, Any]) -> float | None:
+def _error(clip: Mapping[str, Any]) -> float:
+    """Return a clip's error, by which clips are sorted: infinite if it is no number, 0 if there is none."""
     for mode in MODES:
         if (value := clip.get(mode, {}).get("rotation", {}).get("MPJPE")) is not None:
-            return float(value)
-    return None
+            return float(value) if math.isfinite(float(value)) else math.inf
+    return 0.0
 
 
 def _replays(answers: Answers, sweeps: Iterable[list[str]], found: Mapping[str, Any]) -> dict[str, Any]:

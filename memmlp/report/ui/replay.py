@@ -149,8 +149,16 @@ def piece(
     Returns:
         `errors`, the mean error over the joints for each frame of the clip, cm; `worst`, the worst seconds,
         each with its first frame and its mean error, cm; and from frame `from` on, `truth` and `joints` as
-        whole millimetres in the page's axes, 66 per frame.
+        whole millimetres in the page's axes, 66 per frame. Joints that are no numbers can't be shown: then
+        `state` is "failed" (with `reason`).
     """
+    bad = np.flatnonzero(~np.isfinite(joints).all((1, 2)))
+    if bad.size:
+        first_bad = f"first at {bad[0] / FPS:.1f} s"
+        return {
+            "state": "failed",
+            "reason": f"{bad.size} of {len(joints)} frames are no numbers, {first_bad}",
+        }
     distances = 100 * np.linalg.norm(joints - truth, axis=-1)
     errors = distances.mean(1)
     worst = worst_seconds(errors)

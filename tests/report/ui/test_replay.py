@@ -52,6 +52,14 @@ def test_a_piece_is_around_the_worst_second_in_the_page_s_axes():
     assert piece(made["true_positions"], made["predicted_positions"], 12.0)["from"] == 300
 
 
+def test_motion_that_is_no_number_is_said():
+    made = motion()
+    made["predicted_positions"][120:] = np.nan
+    found = piece(made["true_positions"], made["predicted_positions"])
+    said = f"{FRAMES - 120} of {FRAMES} frames are no numbers, first at 2.0 s"
+    assert found == {"state": "failed", "reason": said}
+
+
 def test_worst_seconds_do_not_overlap():
     errors = np.ones(400)
     errors[100:160], errors[130:190] = 5.0, 6.0
