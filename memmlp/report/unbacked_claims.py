@@ -4,7 +4,8 @@ The rules apply to each sentence (cells of tables and items of lists are sentenc
 addresses and comments are removed from it. A placeholder counts as a number.
 
 1. No number has a star or an interval: `1.47*`, `0.3 [0.1, 0.5]`.
-2. No sentence has a word of comparison or of verdict (`WORDS`) beside a number or the name of a metric.
+2. No sentence has a word of comparison or of verdict (`WORDS`) beside a number or a metric, by its name
+   or in words (`ERRORS`).
    References such as "Table 4" or "Eq. 5" are no numbers.
 3. No sentence has one of the words `NEVER`, with or without a number.
 
@@ -26,16 +27,32 @@ WORDS = (
     "gains", "holds", "opposite", "equivalent", "drop", "drops", "dropped", "fall", "falls", "fell", "rise",
     "rises", "rose", "grow", "grows", "grew", "cut", "cuts", "decrease", "decreases", "decreased", "smaller",
     "smallest", "larger", "largest", "greater", "greatest", "shrinks", "halved", "doubled", "improvement",
-    "reduction", "brings",
+    "reduction", "brings", "losing", "lost", "raising", "lowering", "lowest", "highest", "improving",
+    "improvements", "reducing", "reductions", "halving", "doubling", "tripled", "triples", "twice", "half",
+    "increasing", "decreasing", "dropping", "falling", "fallen", "rising", "risen", "growing", "grown",
+    "cutting", "shrink", "shrank", "shrunk", "shrinking", "gained", "gaining", "helped", "helping", "hurt",
+    "hurting", "calmer", "calmest", "smoothest", "roughest", "steadier", "faster", "fastest", "slower",
+    "slowest", "quicker", "quickest", "worsen", "worsens", "worsened", "degrade", "degrades", "degraded",
+    "exceed", "exceeds", "exceeded", "superior", "inferior", "less", "fewer", "closer", "closest", "nearer",
+    "nearest", "stronger", "weaker", "below", "above", "accurate", "wins", "won",
 )  # fmt: skip
-NEVER = ("significant", "significantly", "beat", "beats", "lose against", "loses against", "outperforms")
+NEVER = (
+    "significant", "significantly", "beat", "beats", "beaten", "beating", "lose against", "loses against",
+    "wins against", "outperform", "outperforms", "outperformed", "outperforming", "surpass", "surpasses",
+    *(f"{word} than" for word in (
+        "better", "worse", "more accurate", "less accurate", "smoother", "rougher", "calmer", "steadier",
+    )),
+)  # fmt: skip
+ERRORS = ("errors", "position error", "rotation error", "accuracy")  # metrics in words
 
 
 def _any(words: Iterable[str]) -> re.Pattern[str]:
-    return re.compile(rf"(?<!\w)({'|'.join(map(re.escape, words))})(?!\w)", re.IGNORECASE)
+    """Return a pattern of any of the words, which may stand on two lines."""
+    either = "|".join(r"\s+".join(map(re.escape, word.split())) for word in words)
+    return re.compile(rf"(?<!\w)({either})(?!\w)", re.IGNORECASE)
 
 
-CLAIM, REFUSED, METRIC = _any(WORDS), _any(NEVER), _any(UNITS)
+CLAIM, REFUSED, METRIC = _any(WORDS), _any(NEVER), _any((*UNITS, *ERRORS))
 INTERVAL = re.compile(r"\d\*?\s*\\?\[\s*[+\-\N{MINUS SIGN}]?\d[\d.]*,\s*[+\-\N{MINUS SIGN}]?\d[\d.]*\s*\\?\]")
 STAR = re.compile(r"\d\]?\s?\\?\*(?!\*)")
 NUMBER = re.compile(r"(?<![\w.])[+\-\N{MINUS SIGN}]?\d+([.,]\d+)*(?!\w)")
@@ -87,7 +104,7 @@ def _reason(sentence: str) -> str | None:
             return what
     never = REFUSED.search(sentence)
     if never:
-        return f"'{never[0]}'"
+        return f"'{' '.join(never[0].split())}'"
     word, bare = CLAIM.search(sentence), REFERENCE.sub(" ", sentence)
     beside = NUMBER.search(bare) or METRIC.search(bare)
     return f"'{word[0]}' beside '{beside[0]}'" if word and beside else None

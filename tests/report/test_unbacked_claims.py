@@ -25,6 +25,13 @@ DOCS = ROOT / "docs" / "results"
         "Placing it {{ effect('t', 'a', 'stream', 'MPJPE') }} further back is better.",
         "| arm | MPJPE | the effect 0.2 holds |",
         "- first\n- *manual* weights improve MPJRE",
+        "The memory lowers the position error.",
+        "Its errors are lower than those of a GRU.",
+        "The full model is better than a GRU.",
+        "Both outperform a GRU.",
+        "MPJPE is half of a GRU's.",
+        "Its Jitter is below a GRU's, by improving on it.",
+        "It is 3 % more accurate.",
     ],
 )
 def test_a_planted_claim_is_found(sentence: str):
@@ -38,7 +45,7 @@ def test_a_planted_claim_is_found(sentence: str):
     "sentence",
     [
         "The arm has {{ effect('t', 'a', 'stream', 'MPJPE') }}.",
-        "Table 4 is better than none.",
+        "Table 4 is the better one.",
         "`3.0* better` is code, [and this](https://x.org/better*3) an address.",
         "<!-- 0.17 cm lower -->",
         "A folder of 3 runs. It is better to keep them.",
@@ -53,6 +60,11 @@ def test_what_claims_nothing_is_left_alone(sentence: str):
 def test_every_word_of_the_rule_is_found():
     for word in (*WORDS, *NEVER):
         assert len(claims(f"It {word} 0.3 cm.")) == 1
+
+
+def test_words_of_a_claim_may_stand_on_two_lines():
+    (found,) = claims("The full model is more\naccurate than a GRU.\n")
+    assert found.reason == "'more accurate than'"
 
 
 def test_prose_claims_nothing_by_hand():
