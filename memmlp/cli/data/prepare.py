@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -11,64 +10,68 @@ from memmlp.cli.data.printing import show_manifest
 from memmlp.cli.options import PATH
 from memmlp.common.errors import InputError
 
-if TYPE_CHECKING:
-    from memmlp.motion.preparing.splits import Split
-
 
 @click.command("prepare")
 @click.argument("root", type=PATH)
 @click.option("--out", required=True, type=PATH, help="Folder of the cache.")
-@click.option("--body", default="builtin", show_default=True, help="builtin, or an SMPL-H model.npz.")
+@click.option("--body", help="builtin, or an SMPL-H model.npz.")
 @click.option(
     "--split", default="seeded", show_default=True, help="seeded, s2, or lists:FOLDER (AGRoL's format)."
 )
-@click.option("--val", default=0.1, show_default=True, help="Fraction for validation.")
-@click.option("--test", type=float, help="Fraction for testing, with --split seeded.  [default: 0.1]")
-@click.option("--seed", default=0, show_default=True)
+@click.option("--val", type=float, help="Fraction for validation.")
+@click.option("--test", type=float, help="Fraction for testing, with --split seeded.")
+@click.option("--seed", type=int)
 @click.option(
     "--group", multiple=True, metavar="REGEX", help="Clips that match stay on one side; repeatable."
 )
-@click.option("--min-frames", default=42, show_default=True, help="Shorter clips (at 60 Hz) are skipped.")
+@click.option("--min-frames", type=int, help="Shorter clips (at 60 Hz) are skipped.")
 @click.option("--strict", is_flag=True, help="Stop at the first bad file instead of skipping it.")
 def prepare(
     root: Path,
     out: Path,
-    body: str,
+    body: str | None,
     split: str,
-    val: float,
+    val: float | None,
     test: float | None,
-    seed: int,
+    seed: int | None,
     group: tuple[str, ...],
-    min_frames: int,
+    min_frames: int | None,
     strict: bool,
 ) -> None:
     """Write the cache of a folder of AMASS npz.
 
     The cache is memory-mappable, and has a manifest of what became of each file. It is for code of your own:
-    memmlp train makes itself one of data.root.
+    memmlp train makes itself one of data.root. What no option says is as in memmlp train, with data=mocap for
+    --split seeded, data=amass_s2 for s2 and data=amass_s1 for lists.
     """
-    from memmlp.motion.preparing.cache import ClipFolder
+    from omegaconf import OmegaConf
+
+    from memmlp.config.build_motion import build_motion
+    from memmlp.config.compose import composed
     from memmlp.motion.preparing.cache import prepare as run
 
-    chosen = _split(split, val, test, seed, group)
-    show_manifest(run(ClipFolder(root, chosen, body, min_frames, strict), out))
+    data, lists = _protocol(split)
+    if test is not None and split != "seeded":
+        raise InputError(f"--test {test:g}: goes with --split seeded; with --split {split} allowed is none")
+    given = {
+        "root": str(root), "body": body, "min_frames": min_frames, "strict": strict, "split.val": val,
+        "split.test": test, "split.seed": seed, "split.groups": list(group) or None, "split.folder": lists,
+    }  # fmt: skip
+    cfg = composed([f"data={data}", "data.root=.", *(["data.split.folder=."] if lists else [])])
+    for key, value in given.items():
+        if value is not None:
+            OmegaConf.update(cfg, f"data.{key}", value)
+    show_manifest(run(build_motion(cfg).source, out))
 
 
-def _split(name: str, val: float, test: float | None, seed: int, groups: tuple[str, ...]) -> Split:
-    """Return the split that --split names.
+def _protocol(split: str) -> tuple[str, str | None]:
+    """Return the option of `data` that --split names, and the folder of its lists, if it has any.
 
     Raises:
-        InputError: for an unknown name, or a fraction for testing where a list says what is tested on.
+        InputError: for an unknown name.
     """
-    from memmlp.motion.preparing.amass import S2_TEST, S2_TRAIN
-    from memmlp.motion.preparing.splits import ListSplit, SeededSplit, SubsetSplit
-
-    if name == "seeded":
-        return SeededSplit(0.1 if test is None else test, val, seed, groups)
-    if test is not None:
-        raise InputError(f"--test {test:g}: goes with --split seeded; with --split {name} allowed is none")
-    if name == "s2":
-        return SubsetSplit(S2_TRAIN, S2_TEST, val, seed, groups)
-    if name.startswith("lists:"):
-        return ListSplit(Path(name.removeprefix("lists:")), val, seed, groups)
-    raise InputError(f"--split {name}: no such split; allowed: seeded, s2, lists:FOLDER")
+    if split.startswith("lists:"):
+        return "amass_s1", split.removeprefix("lists:")
+    if split not in (known := {"seeded": "mocap", "s2": "amass_s2"}):
+        raise InputError(f"--split {split}: no such split; allowed: seeded, s2, lists:FOLDER")
+    return known[split], None
