@@ -245,7 +245,7 @@ def train_upstream(
 
 @contextlib.contextmanager
 def recording_outcome(experiment: Experiment, run: Run, again: bool = False) -> Iterator[None]:
-    """Follow work on a run in the trackers, and record its failure in the run's folder.
+    """Follow work on a run in the trackers, and record in the run's folder how it ended.
 
     Only failures of the work itself are recorded. Bad input, interruptions, a full disk, a closed output
     pipe, and the loss of the run to another process are not.
@@ -264,6 +264,7 @@ def recording_outcome(experiment: Experiment, run: Run, again: bool = False) -> 
             if not of_the_disk(error):
                 run.fail(f"{type(error).__name__}: {error}", traceback.format_exc())
             raise
+        run.forgive()
 
 
 def train_run(

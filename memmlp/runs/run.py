@@ -222,11 +222,17 @@ class Run:
 
     def retry(self) -> None:
         """Forget the failure, and the attempts that led to it."""
-        attempts = self.manifest.get("attempts", [])
-        if self.failure and attempts:
-            self.write_manifest({"forgiven": len(attempts)})
+        if self.failure:
+            self.forgive()
         lease_fences.check_owner(self.folder)
         (self.folder / "FAILED").unlink(missing_ok=True)
+
+    def forgive(self) -> None:
+        """Let no attempt so far count as one that died, since it ended well or is to be tried again."""
+        manifest = self.manifest
+        attempts = len(manifest.get("attempts", []))
+        if attempts > manifest.get("forgiven", 0):
+            self.write_manifest({"forgiven": attempts})
 
     def begin(
         self, kind: str, config: Mapping[str, Any], *, data: str, upstream: str | None, **facts: Any

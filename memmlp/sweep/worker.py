@@ -116,7 +116,7 @@ def _perform(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
 def deaths(run: Run) -> int:
     """Count how many processes, one after another, most recently began the run at its present step.
 
-    Processes from before the last --retry don't count.
+    Those before work that ended well, or before the last --retry, don't count.
     """
     step, count, manifest = run.step, 0, run.manifest
     for begun in reversed(manifest.get("attempts", [])[manifest.get("forgiven", 0) :]):

@@ -32,7 +32,7 @@ from memmlp.pipeline.run_stages import recording_outcome, upstream_run
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.recipe_versions import RECIPES
 from memmlp.runs.run import Run
-from memmlp.sweep.worker import Cancelled
+from memmlp.sweep.worker import Cancelled, deaths
 from memmlp.tables.measured_run import load
 
 
@@ -266,6 +266,21 @@ def test_a_failure_of_the_work_is_kept_with_the_run_and_an_interruption_is_not(
         raise error
     assert (run.failure is None) == (failure is None)
     assert (failure or "") in (run.failure or "")
+
+
+def test_work_that_ended_well_is_no_death(tmp_path: Path):
+    """Else the tenth evaluation of a trained run would count as the tenth process that died on it."""
+    run = Run.of(tmp_path, "0" * 16)
+    run.begin("memmlp", {}, data="d", upstream=None)
+    experiment: Any = SimpleNamespace(tracking=Tracking((), tmp_path), stages=(), outputs=tmp_path)
+    for _ in range(3):
+        with recording_outcome(experiment, run):
+            run.attempt("evaluation")
+    assert deaths(run) == 0
+    with pytest.raises(KeyboardInterrupt), recording_outcome(experiment, run):
+        run.attempt("evaluation")
+        raise KeyboardInterrupt
+    assert deaths(run) == 1
 
 
 def test_a_single_group_of_test_clips_is_told_to_decide_nothing():

@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from memmlp.runs.run import Run
 
 SUMMARY = ("kind", "started", "finished")
-LEFT_OUT = ("id", "name", "what", "data", "upstream", "sources", "attempts", *SUMMARY)
+LEFT_OUT = (
+    "id", "name", "what", "data", "upstream", "sources", "attempts", "forgiven", "stages", *SUMMARY
+)  # fmt: skip
 
 
 @click.command("show")
