@@ -103,7 +103,7 @@ class Session:
             return  # it never began
         with self._trying():
             facts = facts_of(self.run)
-            if self.shown is None:
+            if self.shown is None or self._outdated(facts):
                 self._begin(facts)
             assert self.shown is not None
             while points := self.tail.read():
@@ -128,8 +128,15 @@ class Session:
 
     def _begin(self, facts: RunFacts) -> None:
         self.ledger.unlink(missing_ok=True)
-        self.tail = Tail(self.run)
+        if self.shown is not None:
+            shown, self.shown = self.shown, None
+            shown.leave()
+        self.tail, self.results = Tail(self.run), facts.results
         self.shown = self.tracker.begin(facts, self.tail.history())
+
+    def _outdated(self, facts: RunFacts) -> bool:
+        """Return whether a result was measured again since the run began to be shown, with another value."""
+        return any(facts.results.get(key) != value for key, value in self.results.items())
 
     @contextlib.contextmanager
     def _trying(self) -> Iterator[None]:

@@ -273,13 +273,18 @@ def test_work_that_ended_well_is_no_death(tmp_path: Path):
     run = Run.of(tmp_path, "0" * 16)
     run.begin("memmlp", {}, data="d", upstream=None)
     experiment: Any = SimpleNamespace(tracking=Tracking((), tmp_path), stages=(), outputs=tmp_path)
-    for _ in range(3):
+
+    def evaluate(error: BaseException | None = None) -> None:
         with recording_outcome(experiment, run):
             run.attempt("evaluation")
+            if error:
+                raise error
+
+    for _ in range(3):
+        evaluate()
     assert deaths(run) == 0
-    with pytest.raises(KeyboardInterrupt), recording_outcome(experiment, run):
-        run.attempt("evaluation")
-        raise KeyboardInterrupt
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(KeyboardInterrupt())
     assert deaths(run) == 1
 
 

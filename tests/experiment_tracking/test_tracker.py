@@ -1,0 +1,32 @@
+"""A run as one tracker is shown it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fake_tracker import FakeTracker, a_run
+
+from memmlp.common.files import write_json
+from memmlp.experiment_tracking.tracker import Session
+
+
+def test_a_result_that_is_measured_again_replaces_what_is_shown(tmp_path: Path):
+    """Trackers can't take values back, so that the run has to be shown anew; new results need none of that."""
+    tracker, run = FakeTracker(), a_run(tmp_path)
+    run.finish([])
+
+    def measured(before: dict[str, float], after: dict[str, float]) -> int:
+        tracker.server.begun = 0
+        write_json(run.results_path, before)
+        session = Session(tracker, run, tmp_path / "ledgers")
+        session.step()
+        write_json(run.results_path, after)
+        session.end()
+        assert session.up_to_date()
+        session.leave()
+        return tracker.server.begun
+
+    assert measured({"a": 6.5}, {"a": 6.5}) == 1
+    assert measured({"a": 6.5}, {"a": 6.5, "b": 1.0}) == 1
+    assert measured({"a": 6.5}, {"a": 7.25}) == 2
+    assert measured({"a": 6.5}, {}) == 2
