@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import importlib
 import logging
+import math
 import os
 import re
 import warnings
@@ -251,7 +252,10 @@ def _run_tags(facts: RunFacts) -> dict[str, str]:
 
 
 def _sweep_run(client: MlflowClient, experiment: str, facts: SweepFacts) -> str:
-    """Return MLflow's id of the sweep's run, after updating its aggregates and verdicts."""
+    """Return MLflow's id of the sweep's run, after updating its aggregates and verdicts.
+
+    MLflow can't remove a mean that is no more, so it becomes NaN.
+    """
     from mlflow.entities import Metric, RunTag
 
     parents = client.search_runs([experiment], f"tags.`memmlp.sweep` = '{_quoted(facts.name)}'")
@@ -265,7 +269,9 @@ def _sweep_run(client: MlflowClient, experiment: str, facts: SweepFacts) -> str:
     for part in _chunks([RunTag(key, verdict) for key, verdict in verdicts.items()], PARAMS):
         client.log_batch(name, tags=part)
     aggregates = {allowed(key): value for key, value in facts.aggregates.items()}
-    new = {key: value for key, value in aggregates.items() if parent.data.metrics.get(key) != value}
+    before = parent.data.metrics
+    gone = {key: math.nan for key, value in before.items() if key not in aggregates and not math.isnan(value)}
+    new = gone | {key: value for key, value in aggregates.items() if before.get(key) != value}
     step = max(
         (m.step for key in parent.data.metrics for m in client.get_metric_history(name, key)), default=-1
     )

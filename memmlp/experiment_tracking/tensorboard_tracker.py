@@ -45,10 +45,11 @@ class TensorBoard:
         return shown
 
     def sweep(self, facts: SweepFacts) -> None:
-        """Write a sweep's table as text and its aggregates as values."""
+        """Write a sweep's status and table as text and its aggregates as values."""
         folder = Path(self.place) / file_name(f"sweep {facts.name}")
         shutil.rmtree(folder, ignore_errors=True)
         writer = EventFile(folder)
+        writer.text("status", facts.status)
         for path in facts.files:
             if path.suffix == ".md":
                 writer.text("table", path.read_text(encoding="utf-8"))

@@ -59,10 +59,11 @@ class WandB:
         """Write a sweep as a run of its own, with aggregates, verdicts and table."""
         own = hashlib.sha256(facts.name.encode()).hexdigest()[:16]
         run = self._begun(own, f"sweep {facts.name}", ("sweep",), None, {"arms": dict(facts.arms)})
-        run.summary.update({**facts.aggregates, **{f"verdict/{k}": v for k, v in facts.verdicts.items()}})
+        verdicts = {f"verdict/{key}": verdict for key, verdict in facts.verdicts.items()}
+        run.summary.update({"status": facts.status, **facts.aggregates, **verdicts})
         for path in facts.files:
             run.save(str(path), base_path=str(facts.folder), policy="now")
-        run.finish(exit_code=1 if facts.status == "failed" else 0)
+        run.finish(exit_code=0 if facts.status == "done" else 1)
 
     def _begun(
         self, own: str, name: str, tags: Sequence[str], notes: str | None, config: dict[str, Any]

@@ -279,6 +279,18 @@ def test_a_sweep_is_the_parent_of_its_runs_and_a_shared_run_has_one_parent(tmp_p
     assert [item.path for item in client_of(tmp_path).list_artifacts(parent.info.run_id)] == ["table.md"]
 
 
+def test_a_mean_that_is_no_more_is_not_kept(tmp_path: Path):
+    """As when an arm is renamed, or a further seed of it diverges."""
+    tracking, known = MLflow(None, tmp_path), {"a/stream/MPJPE": 6.5, "b/stream/MPJPE": 5.0}
+    for aggregates in (known, {"b/stream/MPJPE": 5.0}):
+        tracking.sweep(SweepFacts("mine", tmp_path, "done", {}, aggregates, {}, ()))
+    (found,) = (run.data.metrics for run in shown(tmp_path))
+    assert math.isnan(found.pop("a/stream/MPJPE"))
+    assert found == {"b/stream/MPJPE": 5.0}
+    tracking.sweep(SweepFacts("mine", tmp_path, "done", {}, known, {}, ()))
+    assert [run.data.metrics for run in shown(tmp_path)] == [known]
+
+
 def test_names_that_mlflow_does_not_allow_stay_different():
     assert allowed("stream/MPJPE cm") == "stream/MPJPE cm"
     assert len({allowed("a,b"), allowed("a;b"), "a_b"}) == 3

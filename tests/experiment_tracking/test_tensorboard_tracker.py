@@ -99,7 +99,7 @@ def test_a_sweep_is_its_table_verdicts_and_aggregates(tmp_path: Path):
     for _ in range(2):
         tracker.sweep(facts)
     found = {tag.split("/text")[0]: value for tag, _, value in events(Path(tracker.place) / "sweep mine")}
-    assert found["table"] == "| a table |"
+    assert (found["status"], found["table"]) == ("done", "| a table |")
     assert "| a/stream/MPJPE | holds |" in str(found["verdicts"])
     assert found["a/stream/MPJPE"] == 6.5
 

@@ -11,7 +11,7 @@ from memmlp.experiment_tracking.tracker import Session
 
 
 def test_a_result_that_is_measured_again_replaces_what_is_shown(tmp_path: Path):
-    """Trackers can't take values back, so that the run has to be shown anew; new results need none of that."""
+    """Trackers can't take values back, so that the run is shown anew; new results need none of that."""
     tracker, run = FakeTracker(), a_run(tmp_path)
     run.finish([])
 

@@ -134,3 +134,12 @@ def test_a_sweep_is_a_run_with_its_verdicts(tmp_path: Path):
         for item in record.summary.update
     }
     assert (kept["a/stream/MPJPE"], kept["verdict/a/stream/MPJPE"]) == (6.5, "holds")
+
+
+def test_a_sweep_with_runs_to_do_is_not_finished(tmp_path: Path):
+    tracker = WandB("mine", tmp_path)
+    tracker.sweep(SweepFacts("mine", tmp_path, "running", {}, {}, {}, ()))
+    (folder,) = Path(tracker.place).glob("offline-run-*")
+    found = records(tracker, folder.name.rsplit("-", 1)[-1])
+    (end,) = [record.exit for record in found if record.WhichOneof("record_type") == "exit"]
+    assert end.exit_code == 1
