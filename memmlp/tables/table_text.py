@@ -191,8 +191,9 @@ def _power(table: Table) -> list[str]:
 
 
 def _largest(table: Table, mode: str, metric: str) -> float:
-    """Return the largest mean of a metric among the arms that are compared."""
-    return max(cell.mean or 0.0 for _, name, cell, _ in table.effects(mode) if name == metric)
+    """Return the largest finite mean of a metric among the arms that are compared; 0 without one."""
+    means = [cell.mean for _, name, cell, _ in table.effects(mode) if name == metric]
+    return max((mean for mean in means if mean is not None and math.isfinite(mean)), default=0.0)
 
 
 def _agreement(table: Table) -> str:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from fake_runs import fake_sweep, table_of
-from fake_table import SHIPPED, printed
+from fake_table import SHIPPED, cell, printed
 
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import load_sweep
 from memmlp.tables.table import Cell, Effect, Table
-from memmlp.tables.table_text import MINUS, effect_words, heading, number_words, value_words
+from memmlp.tables.table_text import MINUS, effect_words, heading, legend, number_words, value_words
 
 
 def test_costs_show_how_many_times_the_controls_they_are(tmp_path: Path):
@@ -57,6 +59,19 @@ def test_a_power_beyond_the_values_themselves_is_no_number(table: Table, monkeyp
     said = " ".join(printed(table, 100).split())
     assert "901" not in said
     assert "MPJRE: too few seeds to have found even a difference as large as the values" in said
+
+
+def test_power_is_that_of_the_table_where_a_run_diverged(table: Table):
+    """A mean that is no number is no size that a difference could be compared with."""
+    before = [line for line in legend(table) if "power" in line]
+    bad = replace(cell(table, "no | memory", "MPJPE"), values={0: math.nan, 1: 8.0})
+    rows = [
+        replace(row, cells={**row.cells, "stream": {**row.cells["stream"], "MPJPE": bad}})
+        if row.label == "no | memory"
+        else row
+        for row in table.rows
+    ]
+    assert [line for line in legend(replace(table, rows=tuple(rows))) if "power" in line] == before
 
 
 @pytest.mark.parametrize(
