@@ -97,6 +97,7 @@ def profiles(name: str, found: Mapping[str, Sequence[Distribution]]) -> str:
     figure, axes = _panels(len(found), 2.8 * -(-len(found) // PANELS))
     for axis, (metric, arms) in zip(axes, found.items(), strict=True):
         every = np.concatenate([arm.errors for arm in arms if arm.errors.size])
+        every = every[np.isfinite(every)]
         thresholds = np.linspace(every.min(), every.max(), 101)
         for number, arm in enumerate(arms):
             if arm.errors.size:

@@ -198,7 +198,8 @@ def _robust(found: Mapping[str, Sequence[Distribution]]) -> str:
     ]
     note = (
         "IQM: the mean of the middle half of all seeds and clips. P(better): how often a run of the arm has "
-        "a better value than one of its control on the same clip. Neither is a test."
+        "a better value than one of its control on the same clip. A clip on which a network diverged counts "
+        "as worse than any value. Neither is a test."
     )
     return _rows(head, rows, note)
 

@@ -18,7 +18,8 @@ class Distribution(NamedTuple):
 
     Attributes:
         label: the arm's label.
-        errors: the errors (S, C) by seed and clip; empty if there are none.
+        errors: the errors (S, C) by seed and clip, infinite where the network diverged; empty if there are
+            none.
         middle: the errors' interquartile mean; None if there are none.
         improvement: the probability that a run of the arm has a better value than one of its control on the
             same clip: a smaller error, or a larger value of a metric for which higher is better; None without
@@ -34,6 +35,8 @@ class Distribution(NamedTuple):
 def distributions(sweep: Sweep, runs: Mapping[str, RunsBySeed], mode: str) -> dict[str, list[Distribution]]:
     """Return the distributions of every arm, by metric, over the clips that all runs have.
 
+    A clip for which a run has no number, while another run has one, is one on which its network diverged: its
+    error counts as infinite, for otherwise an arm that diverges on hard clips would look better for it.
     Metrics that no run has are left out.
     """
     seen = with_existing_branches(sweep, runs)
@@ -48,28 +51,27 @@ def _of_metric(
     sweep: Sweep, runs: Mapping[str, RunsBySeed], clips: list[str], mode: str, metric: str
 ) -> list[Distribution]:
     arms = [arm for arm in sweep.runnable() if runs[arm.label]]
-    errors = {arm.label: _errors(runs[arm.label], clips, mode, arm, metric) for arm in arms}
     sign = -1 if metric in HIGHER else 1
+    errors = {arm.label: _errors(runs[arm.label], clips, mode, arm, metric) for arm in arms}
+    long_enough = np.isfinite(np.concatenate([*errors.values(), np.empty((0, len(clips)))])).any(0)
+    for label, found in errors.items():
+        known = found[:, long_enough]
+        errors[label] = np.where(np.isfinite(known), known, sign * np.inf)
     return [_distribution(arm.label, errors, control_arm(sweep, arm), sign) for arm in arms]
 
 
 def _errors(runs: RunsBySeed, clips: list[str], mode: str, arm: Arm, metric: str) -> np.ndarray:
-    """Return errors (S, C), with NaN for clips for which a run has no error."""
-    return np.array([run.by_clip(clips, mode, arm.branch, metric) for run in runs.values()])
+    """Return the errors (S, C) of the runs that have the metric, with NaN for clips without a number."""
+    having = [run for run in runs.values() if run.value(mode, arm.branch, metric) is not None]
+    found = [run.by_clip(clips, mode, arm.branch, metric) for run in having]
+    return np.array(found).reshape(len(found), len(clips))
 
 
 def _distribution(label: str, errors: Mapping[str, np.ndarray], other: Arm | None, sign: int) -> Distribution:
-    """Return an arm's distribution, over the clips for which all its runs have a number.
-
-    The comparison with the control is over those of these clips for which the control's runs have numbers,
-    too. `sign` is -1 if larger values are better.
-    """
-    every, theirs = errors[label], errors.get(other.label) if other else None
-    known = np.isfinite(every).all(0)
-    ours = every[:, known]
+    """Return an arm's distribution from the errors (S, C) of all arms; `sign` is -1 if larger is better."""
+    ours, theirs = errors[label], errors.get(other.label) if other else None
     middle = interquartile_mean(ours) if ours.size else None
-    both = known & np.isfinite(theirs).all(0) if theirs is not None else known
-    if theirs is None or not both.any():
+    if theirs is None or not ours.size or not theirs.size:
         return Distribution(label, ours, middle, None)
-    improvement = probability_of_improvement(sign * every[:, both], sign * theirs[:, both])
+    improvement = probability_of_improvement(*(np.nan_to_num(sign * side) for side in (ours, theirs)))
     return Distribution(label, ours, middle, improvement)

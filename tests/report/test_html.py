@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 import re
 import shutil
 import subprocess
@@ -22,7 +23,7 @@ from memmlp.sweep.definition import Sweep
 from memmlp.sweep.plan import Entry, Plan
 from memmlp.sweep.sweep_file import load_sweep
 from memmlp.tables.build_table import make_table, without_runs
-from memmlp.tables.error_distributions import distributions
+from memmlp.tables.error_distributions import Distribution, distributions
 from memmlp.tables.table_text import caption
 
 SHIPPED = Path(__file__).parent.parent.parent / "sweeps"
@@ -135,6 +136,31 @@ def test_distributions_by_hand(tmp_path: Path):
     assert ours.middle == pytest.approx(middle.mean())
     text = page([Chapter(sweep, table_of(sweep, find), runs_of(sweep, find))], [], "now", "0")
     assert f"<td>{ours.middle:.2f}</td><td>{ours.improvement:.2f}</td>" in text
+
+
+def test_an_arm_that_diverges_on_hard_clips_does_not_look_better_for_it(tmp_path: Path):
+    sweep = load_sweep(SHIPPED / "table14.yaml")
+    runs = runs_of(sweep, fake_sweep(tmp_path, sweep, {"2": 0.5}))
+    branch = sweep.arms[0].branch
+
+    def of(label: str) -> Distribution:
+        found = distributions(sweep, runs, "stream")["MPJPE"]
+        return next(one for one in found if one.label == label)
+
+    before, clips = of("2"), runs["2"][0].clips
+    hard = max(clips, key=lambda clip: clips[clip]["stream"][branch]["MPJPE"])
+    clips[hard]["stream"][branch]["MPJPE"] = math.nan
+    after = of("2")
+    assert after.errors.shape == before.errors.shape
+    assert after.middle == before.middle  # beyond the middle half either way
+    assert before.improvement == 1
+    assert after.improvement == pytest.approx(1 - 3 / (9 * len(CLIPS)))  # one of its three seeds
+    for run in (run for found in runs.values() for run in found.values()):  # the clip is too short
+        run.clips[hard]["stream"][branch]["MPJPE"] = math.nan
+    assert of("2").errors.shape == (3, len(CLIPS) - 1)
+    for run in runs["2"].values():
+        del run.means["stream"][branch]["MPJPE"]
+    assert (of("2").errors.size, of("2").middle) == (0, None)  # not measured, which is not diverged
 
 
 @pytest.mark.slow
