@@ -276,9 +276,9 @@ def _in_millions(numbers: Sequence[float]) -> str:
 
 
 def _timed(every: Sequence[tuple[str, Measured]]) -> list[tuple[str, str]]:
-    """Return the machine on which each run's times were measured, where it is known of all, and the label."""
+    """Return the machine on which each run's times were measured, where it is known, and the run's label."""
     found = [(run.origin.timed_on, label) for label, run in every if run.latency or run.costs]
-    return [] if any(machine == UNKNOWN for machine, _ in found) else found
+    return [(machine, label) for machine, label in found if machine != UNKNOWN]
 
 
 def _busy(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:

@@ -168,6 +168,9 @@ def test_times_of_another_machine_than_the_controls_are_said(sweep: Sweep, tmp_p
     (flag,) = [flag for flag in table_of(sweep, find).flags if "machine" in flag]
     assert flag.startswith("machine of the times differs: A processor, ONNX Runtime 1.9 of ")
     assert f"A small one, ONNX Runtime 1.9 of '{arm.label}'" in flag
+    unknown = find(sweep.runnable()[0], 0).deployment("fp32-0").latency  # an older one hides no other
+    unknown.write_text(json.dumps(json.loads(unknown.read_text()) | {"made_by": {}}))
+    assert [flag for flag in table_of(sweep, find).flags if "machine" in flag] == [flag]
     assert not [one for one in table_of(replace(sweep, metrics=("MPJPE",)), find).flags if "machine" in one]
 
 
