@@ -69,7 +69,10 @@ def predict(
     found = find_run(outputs, run)
     experiment = experiment_of(found, device, [] if ik is None else [f"evaluation.ik={ik}"])
     chosen = chosen_branch(experiment.evaluation, branch)
-    predictor = ClipPredictor(trained_network(found, experiment), mode, chosen, experiment.evaluation)
+    interpolation = experiment.data.source.interpolation
+    predictor = ClipPredictor(
+        trained_network(found, experiment), mode, chosen, experiment.evaluation, interpolation
+    )
     if Path(source).exists():
         report = predictor.export(plan_export(Path(source), out, format_), strict=strict)
     else:

@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from memmlp.common.errors import InputError
 from memmlp.config.instantiate import built, located
+from memmlp.motion.clip import LINES
 from memmlp.motion.motion_source import MotionSource
 from memmlp.motion.preparing.cache import ClipFolder
 from memmlp.motion.preparing.folders import Folders, Root
@@ -44,7 +45,8 @@ def build_motion(cfg: DictConfig) -> MotionSource:
         root = Path(data.root) / made
         generate = partial(_synthesize, minutes=data.synth.minutes, seed=data.synth.seed)
 
-    source = ClipFolder(root, split, str(data.body), data.min_frames, data.strict)
+    interpolation = data.get("interpolation", LINES)
+    source = ClipFolder(root, split, str(data.body), data.min_frames, data.strict, interpolation)
     caches = Path(cfg.paths.outputs) / "cache"
     return MotionSource(source, generate, caches, partial=data.get("partial", False))
 

@@ -17,7 +17,7 @@ from memmlp.evaluation import modes
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import IK, NoIK
 from memmlp.motion.body import FPS, SPARSE_DIM
-from memmlp.motion.clip import Clip, resample
+from memmlp.motion.clip import SPLINES, Clip, resample
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.exporting.export_folder import ExportPlan, ExportReport, Target, read_motion, read_targets
 from memmlp.motion.exporting.write import write_motion
@@ -113,6 +113,7 @@ class ClipPredictor:
         branch: one of KINDS_OF_POSES: the rotation branch with the head on its tracker, the result of the
             evaluation's inverse kinematics, or the truth, which is the recorded clip itself.
         evaluation: how the network is evaluated: batches, inverse kinematics, seed.
+        interpolation: how clips of other rates are brought to 60 Hz, as those of the network's training were.
 
     Raises:
         InputError: for the stream of a network that has none.
@@ -122,6 +123,7 @@ class ClipPredictor:
     mode: str
     branch: str
     evaluation: Evaluation
+    interpolation: str = SPLINES
 
     def __post_init__(self) -> None:
         check_mode(self.model, self.mode)
@@ -177,7 +179,7 @@ class ClipPredictor:
         Raises:
             InputError: if the file can't be read, or has fewer than two frames at 60 Hz.
         """
-        clip, _ = resample(read_motion(target))
+        clip, _ = resample(read_motion(target), interpolation=self.interpolation)
         if len(clip) < 2:
             few = f"{target.source}: one frame at {FPS} Hz"
             raise InputError(f"{few}; allowed: two or more, as a velocity needs them")

@@ -1,4 +1,4 @@
-"""Motion clips in memory, and their exact resampling to 60 Hz."""
+"""Motion clips in memory, and their resampling to 60 Hz."""
 
 from __future__ import annotations
 
@@ -6,13 +6,21 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import FPS, N_JOINTS
 
 FRAME_RATE_RANGE = (1.0, 1000.0)
+INTERPOLATED = "interpolated"
 PART = 3600  # frames of a long clip that are worked on at a time
+SPLINES, LINES = "splines", "lines"
+INTERPOLATIONS = (SPLINES, LINES)
+"""How motion goes on between recorded frames, where there is none at the time that is wanted.
+
+Splines are smooth, as motion is. Lines have a kink at each recorded frame, and so a jerk that no body has:
+of Bandai-Namco's motion at 30 Hz four times as much as there is (docs/guides/motion.md).
+"""
 RATE_TOLERANCE = 1e-4  # relative: 59.94 is not 60, and 120.0005 (a BVH's frame time of .0083333) is 120
 
 
@@ -55,11 +63,17 @@ class Clip:
             yield replace(self, poses=self.poses[part], trans=self.trans[part])
 
 
-def resample(clip: Clip, fps: float = FPS) -> tuple[Clip, str]:
+def resample(clip: Clip, fps: float = FPS, interpolation: str = SPLINES) -> tuple[Clip, str]:
     """Resample a clip to exactly `fps`, and say how: `kept`, `every k. frame`, or `interpolated`.
 
-    If the clip's rate is a multiple of `fps`, every k-th frame is taken; otherwise rotations are interpolated
-    by slerp and the translation linearly, at the times k / fps that lie inside the clip.
+    If the clip's rate is a multiple of `fps`, every k-th frame is taken; otherwise poses and translation are
+    interpolated at the times k / fps that lie inside the clip.
+
+    Args:
+        clip: the clip.
+        fps: the wanted rate, Hz.
+        interpolation: SPLINES, with continuous accelerations of joints' rotations and of the translation, or
+            LINES, slerp and straight lines.
 
     Raises:
         InputError: if a clip of one frame would have to be interpolated.
@@ -74,8 +88,19 @@ def resample(clip: Clip, fps: float = FPS) -> tuple[Clip, str]:
     times = np.arange(len(clip)) / clip.fps
     wanted = np.arange(int(np.floor(times[-1] * fps + 1e-9)) + 1) / fps
     wanted = np.minimum(wanted, times[-1])
-    poses = np.stack(
-        [Slerp(times, Rotation.from_rotvec(clip.poses[:, j]))(wanted).as_rotvec() for j in range(N_JOINTS)], 1
-    )
-    trans = np.stack([np.interp(wanted, times, clip.trans[:, axis]) for axis in range(3)], 1)
-    return replace(clip, poses=poses, trans=trans, fps=float(fps)), "interpolated"
+    turning, move = (RotationSpline, _spline) if interpolation == SPLINES else (Slerp, _lines)
+    joints = [turning(times, Rotation.from_rotvec(clip.poses[:, j])) for j in range(N_JOINTS)]
+    poses = np.stack([joint(wanted).as_rotvec() for joint in joints], 1)
+    return replace(clip, poses=poses, trans=move(times, clip.trans, wanted), fps=float(fps)), INTERPOLATED
+
+
+def _spline(times: np.ndarray, points: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return where a cubic spline through points (N, 3) at times (N,) is at the wanted times (M,): (M, 3)."""
+    from scipy.interpolate import CubicSpline  # slow to import, and most clips need none
+
+    return CubicSpline(times, points)(wanted)
+
+
+def _lines(times: np.ndarray, points: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return where lines through points (N, 3) at times (N,) are at the wanted times (M,): (M, 3)."""
+    return np.stack([np.interp(wanted, times, axis) for axis in points.T], 1)

@@ -74,7 +74,7 @@ class MotionSource:
 
     @property
     def cache(self) -> Path:
-        """The folder of the cache; each combination of source, split and body has its own."""
+        """The folder of the cache; each combination of source and settings has its own."""
         key = repr(replace(self.source, root=self.source.root.resolve())) + (self.groups_digest or "")
         return self.caches / f"{self.source.root.name}-{hashlib.sha256(key.encode()).hexdigest()[:8]}"
 

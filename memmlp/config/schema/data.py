@@ -9,6 +9,7 @@ from memmlp.config.schema.rules import (
     EachOf,
     Existing,
     FolderPaths,
+    OneOf,
     Text,
     Within,
     at_least,
@@ -79,6 +80,7 @@ class DataConfig:
     body: str = key(Existing("file", ("builtin",)))
     min_frames: int = at_least(2)
     strict: bool = key()
+    interpolation: str = standing("lines", OneOf(("splines", "lines")))
     weighting: str = one_of("frames", "clips")
     mirror: bool = standing(False)
 

@@ -25,7 +25,7 @@ from memmlp.common.lease import Lock
 from memmlp.common.lease_fences import check_owner, publish, temporary
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS, FRAME_DIM, load_rest_joints
-from memmlp.motion.clip import Clip, resample
+from memmlp.motion.clip import INTERPOLATED, LINES, SPLINES, Clip, resample
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.preparing.duplicates import assign
 from memmlp.motion.preparing.find import clip_name
@@ -54,6 +54,7 @@ class ClipFolder:
         body: "builtin" or the path of an SMPL-H model.npz.
         min_frames: clips with fewer frames at 60 Hz are skipped (42 leave T = 41 frames of input).
         strict: whether the first file that would be skipped raises InputError instead.
+        interpolation: how clips of other rates are brought to 60 Hz: one of `INTERPOLATIONS`.
     """
 
     root: Root
@@ -61,6 +62,7 @@ class ClipFolder:
     body: str = "builtin"
     min_frames: int = 42
     strict: bool = False
+    interpolation: str = SPLINES
 
 
 def prepare(source: ClipFolder, out: Path) -> Manifest:
@@ -111,12 +113,13 @@ def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Mani
     if not any(clip.split == "train" for clip in clips):
         raise InputError(f"{source.root}: no clip for training (data.root, data.split); give it other data")
     manifest = Manifest(
-        digest=_digest(clips, rest, source.min_frames),
+        digest=_digest(clips, rest, source),
         request=request,
         body=_body(source.body, rest),
         rest_joints=tuple(map(tuple, rest.tolist())),
         split=split.describe(),
         min_frames=source.min_frames,
+        interpolation=source.interpolation,
         clips=clips,
         skipped=found.skipped,
         ignored=found.ignored,
@@ -166,7 +169,9 @@ def _write_frames(
             header = {"descr": "<f4", "fortran_order": False, "shape": (frames[part], FRAME_DIM)}
             np.lib.format.write_array_header_1_0(file, header)
         for record in progress_bar(manifest.clips, "writing"):
-            clip, _ = resample(read_clip(source.root / record.file, record.name))
+            clip, _ = resample(
+                read_clip(source.root / record.file, record.name), interpolation=source.interpolation
+            )
             for block in frame_blocks(clip, rest):
                 files[record.split].write(block.tobytes())
         for file in files.values():
@@ -224,16 +229,21 @@ def _total(clips: Sequence[ClipRecord], part: str) -> dict[str, float]:
     return {"clips": len(lengths), "frames": sum(lengths), "hours": sum(lengths) / FPS / 3600}
 
 
-def _digest(clips: Sequence[ClipRecord], rest: np.ndarray, min_frames: int) -> str:
+def _digest(clips: Sequence[ClipRecord], rest: np.ndarray, source: ClipFolder) -> str:
     sources = [(clip.name, clip.split, clip.sha256) for clip in clips]
-    return _hash([FRAMES_VERSION, min_frames, rest.tolist(), sources])
+    # Lines are what runs from before there was a choice have.
+    other = source.interpolation != LINES and any(clip.resampling == INTERPOLATED for clip in clips)
+    interpolation = [source.interpolation] if other else []
+    return _hash([FRAMES_VERSION, source.min_frames, rest.tolist(), sources, *interpolation])
 
 
 def _request(source: ClipFolder, rest: np.ndarray) -> str:
     """Return a digest of the settings and of each source's path, size and times, without opening any file."""
     files = [(file, *_stamp(source.root / file)) for file in find_all(source.root).files]
     code = [FORMAT, FRAMES_VERSION, RECIPES["features"]]
-    return _hash([*code, source.min_frames, rest.tolist(), source.split.describe(), files])
+    return _hash(
+        [*code, source.min_frames, source.interpolation, rest.tolist(), source.split.describe(), files]
+    )
 
 
 def _stamp(path: Path) -> tuple[int, int, int]:

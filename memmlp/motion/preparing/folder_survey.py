@@ -12,7 +12,7 @@ from memmlp.common.errors import InputError, one_line
 from memmlp.common.files import file_digest
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS
-from memmlp.motion.clip import Clip, Skipped, resample
+from memmlp.motion.clip import LINES, Clip, Skipped, resample
 from memmlp.motion.formats.npz import NoMotion, read_clip
 from memmlp.motion.plausibility import check_plausible, unusual
 from memmlp.motion.preparing.duplicates import one_content
@@ -112,7 +112,7 @@ def _inspect(path: Path, file: str, clip: Clip, min_frames: int) -> tuple[ClipRe
         InputError: for any other clip.
     """
     check_plausible(path, clip)
-    resampled, how = resample(clip)
+    resampled, how = resample(clip, interpolation=LINES)  # what is surveyed is the same with either
     if len(resampled) < min_frames:
         few = f"{len(resampled)} frames at {FPS} Hz"
         raise TooShort(f"{path}: {few}, fewer than {min_frames} (data.min_frames)")

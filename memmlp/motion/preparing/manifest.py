@@ -15,7 +15,7 @@ from memmlp.common.files import atomic_write
 from memmlp.motion.clip import Skipped
 from memmlp.motion.preparing.coverage import Coverage
 
-FORMAT = 6  # number of the cache's format; a new one makes every cache again
+FORMAT = 7  # number of the cache's format; a new one makes every cache again
 MANIFEST = "manifest.json"
 STILL = "still"  # the content of every clip without motion
 
@@ -64,6 +64,7 @@ class Manifest:
         rest_joints: rest positions (22, 3), metres.
         split: the split's settings.
         min_frames: smallest number of frames at 60 Hz that a clip must have.
+        interpolation: how clips of other rates were brought to 60 Hz: one of `INTERPOLATIONS`.
         clips: the clips, sorted by name.
         skipped: bad files.
         ignored: number of npz files without poses (shape.npz and the like).
@@ -88,6 +89,7 @@ class Manifest:
     rest_joints: tuple[tuple[float, ...], ...]
     split: dict[str, Any]
     min_frames: int
+    interpolation: str
     clips: tuple[ClipRecord, ...]
     skipped: tuple[Skipped, ...]
     ignored: int

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from memmlp.motion.body import FPS
-from memmlp.motion.clip import Clip, resample
+from memmlp.motion.clip import LINES, Clip, resample
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.preparing.folders import Root
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
@@ -64,7 +64,7 @@ def _candidates(
 def _same_motion(one: Clip, other: Clip) -> bool:
     """Return whether two clips with different frame rates are the same motion."""
     slow, fast = sorted((one, other), key=lambda clip: clip.fps)
-    fast, _ = resample(fast, slow.fps)
+    fast, _ = resample(fast, slow.fps, LINES)
     frames = min(len(slow), len(fast))
     turns = [Rotation.from_rotvec(clip.poses[:frames].reshape(-1, 3)) for clip in (slow, fast)]
     angle = np.degrees((turns[0].inv() * turns[1]).magnitude().mean())

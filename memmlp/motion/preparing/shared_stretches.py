@@ -17,7 +17,7 @@ from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from memmlp.motion.clip import Clip, resample
+from memmlp.motion.clip import LINES, Clip, resample
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.preparing.folders import Root
 from memmlp.motion.preparing.manifest import ClipRecord
@@ -74,7 +74,7 @@ def sharing(
     @lru_cache(maxsize=16)
     def turns(index: int) -> np.ndarray:
         clip = clips[index]
-        return _turns(resample(read_clip(root / clip.file, clip.name))[0])
+        return _turns(resample(read_clip(root / clip.file, clip.name), interpolation=LINES)[0])
 
     done: set[tuple[int, int]] = set()
     for mark, other in np.sort(tree.query_pairs(NEAR, output_type="ndarray"), axis=1):

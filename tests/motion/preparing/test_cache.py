@@ -137,6 +137,22 @@ def test_the_digest_knows_every_ingredient(root, tmp_path):
     assert len(digests | {base}) == 4
 
 
+def test_how_frames_are_interpolated_counts_where_some_are(root, tmp_path):
+    def prepared(name: str, interpolation: str) -> tuple[str, np.ndarray]:
+        manifest = prepare(source(root, interpolation=interpolation), tmp_path / name)
+        assert manifest.interpolation == interpolation
+        return manifest.digest, np.load(tmp_path / name / "train.npy")
+
+    (lines, _), (splines, _) = prepared("0", "lines"), prepared("1", "splines")
+    assert lines == splines  # all rates are multiples of 60 Hz
+    for seed in range(10):
+        write_clip(root / "a" / f"{seed}.npz", motion(60 + seed, seed, 30))
+    (lines, ours), (splines, theirs) = prepared("0", "lines"), prepared("1", "splines")
+    assert lines != splines
+    assert ours.shape == theirs.shape
+    assert not np.array_equal(ours, theirs)
+
+
 def test_an_interrupted_prepare_is_redone(root, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(module, "write_manifest", lambda *args: (_ for _ in ()).throw(KeyboardInterrupt))
@@ -197,7 +213,7 @@ def test_a_cache_from_before_there_were_groups_is_made_anew(root, tmp_path):
     for clip in old["clips"]:
         del clip["group"]
     path.write_text(json.dumps(old))
-    with pytest.raises(InputError, match="format 1, not 6; prepare the data again"):
+    with pytest.raises(InputError, match="format 1, not 7; prepare the data again"):
         Manifest.load(tmp_path / "cache")
     assert prepare(source(root), tmp_path / "cache") == first
 
