@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -212,6 +213,8 @@ def _robust_words(one: Distribution) -> tuple[str, str]:
 def _accuracy(chapters: Iterable[Chapter], paper: Sequence[SpeedAndError]) -> list[str]:
     """Return the paper's Fig. 1 with our measured points added."""
     ours = {chapter.title: _points(chapter) for chapter in chapters}
+    lost = [f"'{p.label}' of {title}" for title, points in ours.items() for p in points if not _drawn(p)]
+    ours = {title: [p for p in points if _drawn(p)] for title, points in ours.items()}
     ours = {title: points for title, points in ours.items() if points}
     if not ours:
         return []
@@ -222,7 +225,13 @@ def _accuracy(chapters: Iterable[Chapter], paper: Sequence[SpeedAndError]) -> li
         "data, and its frames a second are capped by the display at 72: the two kinds of points share axes, "
         "not conditions."
     )
+    note += f" Not drawn, since a run of it diverged: {', '.join(lost)}." if lost else ""
     return [_figure(f"{ERROR} against frames a second", svg, note)]
+
+
+def _drawn(point: SpeedAndError) -> bool:
+    """Return whether a point has a place in the figure."""
+    return math.isfinite(point.fps) and math.isfinite(point.error)
 
 
 def _points(chapter: Chapter) -> list[SpeedAndError]:

@@ -18,7 +18,7 @@ from processes import finished
 
 from memmlp.common.errors import InputError
 from memmlp.report import figures
-from memmlp.report.html import Chapter, page, published
+from memmlp.report.html import Chapter, _accuracy, page, published
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.plan import Entry, Plan
 from memmlp.sweep.sweep_file import load_sweep
@@ -161,6 +161,16 @@ def test_an_arm_that_diverges_on_hard_clips_does_not_look_better_for_it(tmp_path
     for run in runs["2"].values():
         del run.means["stream"][branch]["MPJPE"]
     assert (of("2").errors.size, of("2").middle) == (0, None)  # not measured, which is not diverged
+
+
+def test_an_arm_that_diverged_is_no_point_of_accuracy_and_is_named(tmp_path: Path):
+    sweep = load_sweep(SHIPPED / "table14.yaml")
+    runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
+    chapter = Chapter(sweep, table_of(sweep, fake_sweep(tmp_path, sweep)), runs)
+    assert "Not drawn" not in "".join(_accuracy([chapter], []))
+    runs["2"][0].means["stream"]["rotation"]["MPJRE"] = math.nan
+    (figure,) = _accuracy([chapter], [])
+    assert "Not drawn, since a run of it diverged: &#x27;2&#x27; of Table 14" in figure
 
 
 @pytest.mark.slow
