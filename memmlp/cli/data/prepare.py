@@ -25,6 +25,11 @@ from memmlp.common.errors import InputError
     "--group", multiple=True, metavar="REGEX", help="Clips that match stay on one side; repeatable."
 )
 @click.option("--min-frames", type=int, help="Shorter clips (at 60 Hz) are skipped.")
+@click.option(
+    "--interpolation",
+    type=click.Choice(["splines", "lines"]),
+    help="Between frames of other rates than 60 Hz.",
+)
 @click.option("--strict", is_flag=True, help="Stop at the first bad file instead of skipping it.")
 def prepare(
     root: Path,
@@ -36,6 +41,7 @@ def prepare(
     seed: int | None,
     group: tuple[str, ...],
     min_frames: int | None,
+    interpolation: str | None,
     strict: bool,
 ) -> None:
     """Write the cache of a folder of AMASS npz.
@@ -56,6 +62,7 @@ def prepare(
     given = {
         "root": str(root), "body": body, "min_frames": min_frames, "strict": strict, "split.val": val,
         "split.test": test, "split.seed": seed, "split.groups": list(group) or None, "split.folder": lists,
+        "interpolation": interpolation,
     }  # fmt: skip
     cfg = composed([f"data={data}", "data.root=.", *(["data.split.folder=."] if lists else [])])
     for key, value in given.items():

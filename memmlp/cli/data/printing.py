@@ -12,6 +12,7 @@ from rich.table import Table
 
 from memmlp.common.errors import one_line
 from memmlp.motion.body import FPS
+from memmlp.motion.clip import INTERPOLATED
 from memmlp.motion.preparing.folders import source_of
 from memmlp.motion.preparing.groups import unfitting
 
@@ -34,7 +35,7 @@ def show_manifest(manifest: Manifest) -> None:
     Console(highlight=False).print(table)
     for source in manifest.sources:
         show_source(manifest, source)
-    show_rates(manifest.clips)
+    show_rates(manifest.clips, manifest.interpolation)
     show_skipped([f"{file.file}: {file.reason}" for file in manifest.skipped])
     show_files(manifest.ignored, manifest.passed_over, manifest.links, manifest.unusual)
     show_pairs("left out, since another part has the same frames or some of them", manifest.duplicates)
@@ -57,10 +58,11 @@ def show_source(manifest: Manifest, source: str) -> None:
     click.echo(f"{source}: {'; '.join(words)}")
 
 
-def show_rates(clips: tuple[ClipRecord, ...]) -> None:
-    """Print the frame rates that were found, and how each was brought to 60 Hz."""
+def show_rates(clips: tuple[ClipRecord, ...], interpolation: str = "") -> None:
+    """Print the frame rates that were found, and how each was brought to 60 Hz; by which interpolation."""
     for (fps, how), count in sorted(Counter((clip.fps, clip.resampling) for clip in clips).items()):
-        click.echo(f"{count} clips at {fps:g} Hz: {how}")
+        by = f" by {interpolation}" if interpolation and how == INTERPOLATED else ""
+        click.echo(f"{count} clips at {fps:g} Hz: {how}{by}")
 
 
 def show_files(

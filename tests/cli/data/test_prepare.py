@@ -48,6 +48,7 @@ def prepared(memmlp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callabl
                 "data.min_frames=50", "data.strict=true",
             ],
         ),
+        (["--interpolation", "lines"], ["data=mocap", "data.interpolation=lines"]),
         (["--group", "a(.)", "--group", "b"], ["data=mocap", "data.split.groups=['a(.)',b]"]),
     ],
     ids=str,
