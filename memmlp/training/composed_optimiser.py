@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch.optim import Optimizer
 
+from memmlp.training.wide_products import wide_where_needed
+
 
 class ComposedOptimiser(Optimizer):
     """Several optimisers as one, with the parameter groups and the state of all of them.
@@ -32,8 +34,9 @@ class ComposedOptimiser(Optimizer):
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> None:  # type: ignore[override]
         """Take a step of each part; a closure is not supported."""
-        for part in self.parts:
-            part.step()
+        with wide_where_needed():
+            for part in self.parts:
+                part.step()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Load the groups and the state of all parts."""
