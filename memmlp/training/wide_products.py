@@ -43,7 +43,8 @@ def wide_where_needed() -> AbstractContextManager[object]:
 @functools.cache
 def multiplies_bfloat16() -> bool:
     """Return whether this processor has instructions for products of bfloat16; x86 is asked alone."""
-    known = getattr(torch.cpu, "get_capabilities", dict)()  # not in older versions
+    ask: Callable[[], dict[str, Any]] = getattr(torch.cpu, "get_capabilities", dict)  # newer than some torch
+    known = ask()
     return known.get("architecture") != "x86_64" or bool(known.get("avx512_bf16") or known.get("amx_bf16"))
 
 
