@@ -35,5 +35,5 @@ def registers_kept() -> Iterator[None]:
             one.clear()
             one.update(content)  # type: ignore[arg-type]
         for name in set(sys.modules) - modules:
-            if name.split(".")[0] in (PACKAGE, "mine", "other"):
+            if name.split(".")[0] in (PACKAGE, "mine", "other", "helper", "lab"):
                 del sys.modules[name]

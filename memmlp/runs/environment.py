@@ -11,12 +11,13 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import memmlp
+from memmlp.runs.imported_code import imported_modules
 
 PACKAGE = Path(memmlp.__file__).parent
 NOT_NUMBERS = (
@@ -96,10 +97,20 @@ def changes() -> str:
 def sources(packages: Iterable[str] = ()) -> dict[str, str]:
     """Return a digest of the code in each file on which a run's numbers depend.
 
-    Comments and docstrings don't matter. Files of the user's own packages are named PACKAGE:FILE.
+    Comments and docstrings don't matter. Files of the user's own packages, and of what these import, are
+    named PACKAGE:FILE.
     """
-    own = {f"{name}:{file}": digest for name in packages for file, digest in package_sources(name).items()}
-    return _sources() | own
+    own = own_sources(packages).items()
+    return _sources() | {f"{name}:{file}": digest for name, files in own for file, digest in files.items()}
+
+
+def changed(before: Mapping[str, str], after: Mapping[str, str]) -> list[str]:
+    """Return the files whose code differs between two records (`sources`).
+
+    A file that is in one of them alone is not compared: what is new runs only if other code, or the config,
+    names it, and records of earlier versions lack what packages import.
+    """
+    return sorted(name for name in before.keys() & after.keys() if before[name] != after[name])
 
 
 @functools.cache
@@ -109,16 +120,43 @@ def _sources() -> dict[str, str]:
     return {path.relative_to(PACKAGE).as_posix(): code_digest(path.read_text("utf-8")) for path in files}
 
 
-def package_sources(name: str) -> dict[str, str]:
-    """Return a digest of each Python file in a user's package; empty if the package is not imported."""
-    module = sys.modules.get(name)  # what was imported is what computes
+def own_sources(packages: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Return digests of the Python files of users' packages, by package and file.
+
+    Modules of the user's own that these import (`imported_modules`) follow, each by itself: of a package only
+    its __init__, as PACKAGE.__init__. A package that is not imported has no files, for what was imported is
+    what computes.
+    """
+    files = {name: _package_files(name) for name in packages}
+    modules = {_module(name, file): path for name, own in files.items() for file, path in own.items()}
+    imported = {
+        f"{name}.__init__" if path.stem == "__init__" else name: {path.name: path}
+        for name, path in imported_modules(modules).items()
+    }
+    return {
+        name: {file: _own_digest(path) for file, path in own.items()}
+        for name, own in {**files, **imported}.items()
+    }
+
+
+def _package_files(name: str) -> dict[str, Path]:
+    """Return the Python files of a user's package by their paths below it; none if it is not imported."""
+    module = sys.modules.get(name)
     if module is None:
         return {}
     if folders := [Path(folder) for folder in getattr(module, "__path__", ())]:
         files = {path.relative_to(root).as_posix(): path for root in folders for path in root.rglob("*.py")}
     else:
         files = {Path(path).name: Path(path) for path in [module.__file__] if path}
-    return {file: _own_digest(path) for file, path in sorted(files.items())}
+    return dict(sorted(files.items()))
+
+
+def _module(package: str, file: str) -> str:
+    """Return the dotted name of the module in a package's file; of a package of one file, that is its own."""
+    if "__path__" not in vars(sys.modules[package]):
+        return package
+    parts = Path(file).with_suffix("").parts
+    return ".".join([package, *(parts[:-1] if parts[-1] == "__init__" else parts)])
 
 
 def _own_digest(path: Path) -> str:
@@ -130,20 +168,29 @@ def _own_digest(path: Path) -> str:
 
 
 def packages_of_ones_own(names: Iterable[str]) -> dict[str, dict[str, str | None]]:
-    """Return the version and a digest of the code of some packages, by name."""
+    """Return the version and a digest of the code of some packages and of what they import, by name."""
 
-    def digest(name: str) -> str:
-        return hashlib.sha256(repr(package_sources(name)).encode()).hexdigest()[:12]
+    def digest(files: Mapping[str, str]) -> str:
+        return hashlib.sha256(repr(files).encode()).hexdigest()[:12]
 
-    return {name: {"version": _own_version(name), "digest": digest(name)} for name in names}
+    return {
+        name: {"version": _own_version(name), "digest": digest(files)}
+        for name, files in own_sources(names).items()
+    }
 
 
 def _own_version(name: str) -> str | None:
     """Return a package's own version, or that of the distribution that contains it."""
     if version := getattr(sys.modules.get(name), "__version__", None):
         return str(version)
-    distributions = metadata.packages_distributions().get(name.split(".")[0], [])
+    distributions = _distributions().get(name.split(".")[0], [])
     return _version(distributions[0]) if distributions else None
+
+
+@functools.cache
+def _distributions() -> Mapping[str, list[str]]:
+    """Return the installed distributions by the top-level packages that they contain."""
+    return metadata.packages_distributions()
 
 
 def _counts(path: Path) -> bool:

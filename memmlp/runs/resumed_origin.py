@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from memmlp.runs.environment import changed
+
 MACHINE = ("device", "gpu", "gpu_index", "threads", "processes", "precision", "cpu")
 """What can change a result's last digits, and which of a machine's GPUs it was."""
 
@@ -27,9 +29,7 @@ def joined(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any
         other = old.get("before") or (old["commit"] if old["commit"] != new["commit"] else None)
         found["git"] = {**new, "dirty": old["dirty"] or new["dirty"]} | ({"before": other} if other else {})
     known = before.get("sources", after["sources"])
-    found["sources"] = {
-        name: digest if known.get(name) == digest else "mixed" for name, digest in after["sources"].items()
-    }
+    found["sources"] = after["sources"] | dict.fromkeys(changed(known, after["sources"]), "mixed")
     for name, package in (before.get("plugins") or {}).items():
         now = (after.get("plugins") or {}).get(name, package)
         if now["digest"] != package["digest"]:

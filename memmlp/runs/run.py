@@ -29,7 +29,7 @@ from memmlp.common.files import (
 from memmlp.common.lease import Lease, Lock
 from memmlp.runs import deployment_folder
 from memmlp.runs.deployment_folder import DeploymentFolder
-from memmlp.runs.environment import changes, environment, host, sources
+from memmlp.runs.environment import changed, changes, environment, host, sources
 from memmlp.runs.evaluation_file import current, intact, read_report
 from memmlp.runs.identity import belongs, used_as_configured
 from memmlp.runs.metrics_log import Metrics, MetricsLog
@@ -327,11 +327,10 @@ class Run:
     def changed_sources(self) -> list[str]:
         """The files whose code has changed since the run was made; empty if that is not known.
 
-        Files of the user's packages that are in use are included.
+        Files of the user's packages that are in use, and of what these import, are included.
         """
         before, packages = self.manifest.get("sources", {}), self.manifest.get("plugins", ())
-        now_here = sources(packages).items() if before else ()
-        return sorted(name for name, digest in now_here if before.get(name) != digest)
+        return changed(before, sources(packages)) if before else []
 
     def log(self, step: int, values: Mapping[str, float], phase: str = "train") -> None:
         """Append one line to the metrics log, in one write: a kill damages at most that line."""

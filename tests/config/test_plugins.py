@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import sys
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint
@@ -21,7 +22,7 @@ from memmlp.config.build_motion import build_motion
 from memmlp.config.compose import composed
 from memmlp.config.compose_plan import find_sweep
 from memmlp.config.schema import restored
-from memmlp.runs.environment import code_digest
+from memmlp.runs.environment import code_digest, packages_of_ones_own
 from memmlp.runs.identity import evaluation_id, evaluation_settings
 from memmlp.runs.run import Run
 from memmlp.sweep.search.search_file import parse_search
@@ -360,4 +361,54 @@ def test_code_that_changed_since_is_told(folder: Path):
     assert run.manifest["sources"]["mine:mine.py"] == code_digest("A = 1")
     assert run.changed_sources == []
     write(folder, {"mine.py": "A = 2\n"})
+    assert run.changed_sources == ["mine:mine.py"]
+
+
+IMPORTING = {
+    "mine.py": "import os\nimport torch\nfrom helper import W\nfrom lab.deep import util\n",
+    "helper.py": "W = 1.0\n",
+    "lab/__init__.py": "from . import constants\n",
+    "lab/constants.py": "C = 1\n",
+    "lab/unused.py": "U = 1\n",
+    "lab/deep/util.py": "def late():\n    from ..later import X\n    return X\n",
+    "lab/later.py": "X = 1\n",
+}
+
+
+def test_code_that_a_package_imports_is_its_code_too(folder: Path):
+    """Directly or not, be it imported late; what is installed, memmlp's or imported by nobody is not."""
+    write(folder, IMPORTING)
+    plugins.activate(["mine"])
+    run, packages = Run(folder / "run"), packages_of_ones_own(["mine"])
+    imported = ["helper", "lab.__init__", "lab.constants", "lab.deep.util", "lab.later"]
+    assert [*packages] == ["mine", *imported]
+    run.begin("memmlp", {}, data="d", upstream=None, plugins=packages)
+    assert run.changed_sources == []
+    for module in imported[1:]:
+        file = f"{module.replace('.', '/')}.py"
+        write(folder, {file: f"{IMPORTING[file]}Z = 1\n"})
+    assert run.changed_sources == [f"{name}:{name.split('.')[-1]}.py" for name in imported[1:]]
+    write(folder, {**IMPORTING, "helper.py": "W = 100.0\n"})
+    assert run.changed_sources == ["helper:helper.py"]
+    names = [name for name, one in packages_of_ones_own(["mine"]).items() if one != packages[name]]
+    assert names == ["helper"]
+    assert any(name.startswith("helper:") for name, _ in plugins.texts())  # a plan may depend on it
+
+
+def test_records_without_what_a_package_imports_are_of_no_other_code(folder: Path):
+    """Those of earlier versions, which have the digest of the package alone."""
+    write(folder, IMPORTING)
+    plugins.activate(["mine"])
+    run = Run(folder / "run")
+    files = {"mine.py": code_digest(IMPORTING["mine.py"])}
+    digest = hashlib.sha256(repr(files).encode()).hexdigest()[:12]
+    assert packages_of_ones_own(["mine"])["mine"] == {"version": None, "digest": digest}
+    run.begin("memmlp", {}, data="d", upstream=None, plugins={"mine": {"version": None, "digest": digest}})
+    own = {name: code for name, code in run.manifest["sources"].items() if ":" not in name}
+    run.write_manifest({"sources": own | {"mine:mine.py": files["mine.py"]}})
+    assert run.changed_sources == []
+    run.checkpoint.touch()
+    run.begin("memmlp", {}, data="d", upstream=None, plugins=packages_of_ones_own(["mine"]))
+    assert "mixed" not in run.manifest["sources"].values()
+    write(folder, {"mine.py": "from helper import W\n"})
     assert run.changed_sources == ["mine:mine.py"]

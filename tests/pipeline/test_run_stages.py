@@ -153,11 +153,11 @@ def seed_of(run: Run) -> list[str]:
 
 def test_a_run_of_other_code_under_the_same_recipes_is_said(home, monkeypatch):
     run = motion_run(home)
-    changed = {**run.manifest["sources"], "losses.py": "0" * 12}
+    changed = {**run.manifest["sources"], "training/losses/terms.py": "0" * 12}
     monkeypatch.setattr("memmlp.runs.run.sources", lambda packages: changed)
-    assert run.changed_sources == ["losses.py"]
+    assert run.changed_sources == ["training/losses/terms.py"]
     said = " ".join(command(home, "train", *TINY, INT8, *seed_of(run)).split())
-    assert "before the code of losses.py changed" in said
+    assert "before the code of training/losses/terms.py changed" in said
 
 
 def test_the_live_stream_of_a_run(home, memmlp, monkeypatch):
