@@ -156,8 +156,9 @@ def make_missing_stages(experiment: Experiment, run: Run, data: Prepared) -> lis
     if not {"partial", "divided"} <= run.manifest.keys():  # a run from before these were recorded
         run.write_manifest(of_data(experiment, data))
     run.want(experiment.stages)
-    missing = [mode for mode, identity in experiment.evaluations.items() if not run.has(identity)]
-    if missing:
+    if missing := unmeasured(experiment, run):
+        if any(run.has(experiment.evaluations[mode]) for mode in missing):
+            tell("evaluation: code of the metrics' packages has changed since they were measured")
         evaluate_run(experiment, run, data, missing)
         made.append("evaluation")
     for name in experiment.deployments:
@@ -165,6 +166,26 @@ def make_missing_stages(experiment: Experiment, run: Run, data: Prepared) -> lis
             deploy_run(experiment, run, data, name)
             made.append("deployment")
     return made
+
+
+def unmeasured(experiment: Experiment, run: Run) -> list[str]:
+    """Return the modes that have no evaluation, or one by other code of the user's own metrics than today's.
+
+    What a package computes may change without a new recipe; then its metrics are measured again.
+    """
+    return [
+        mode
+        for mode, name in experiment.evaluations.items()
+        if not run.has(name) or _measured_by_other_code(experiment, read_report(run.evaluation(name)))
+    ]
+
+
+def _measured_by_other_code(experiment: Experiment, report: Mapping[str, Any]) -> bool:
+    """Return whether a report has metrics of the user's own by code of packages that has changed since."""
+    if not (report.get("settings") or {}).get("metrics"):
+        return False
+    before, now = report.get("plugins") or {}, own_code(experiment).get("plugins", {})
+    return any(before[name]["digest"] != now[name]["digest"] for name in before.keys() & now.keys())
 
 
 def results_of(experiment: Experiment, run: Run) -> dict[str, Any]:
@@ -251,6 +272,7 @@ def recording_outcome(experiment: Experiment, run: Run, again: bool = False) -> 
     pipe, and the loss of the run to another process are not.
     """
     missing = again or not run.done or not all(map(run.has, experiment.stages))
+    missing = missing or bool(unmeasured(experiment, run))
     tracking = experiment.tracking if missing else Tracking((), experiment.outputs)
     with tracking.following(run):
         try:

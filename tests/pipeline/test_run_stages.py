@@ -1,5 +1,6 @@
 """The whole way at profile=tiny, by the commands a person would type."""
 
+import importlib
 import itertools
 import json
 import re
@@ -17,6 +18,7 @@ import yaml
 from command_line import TINY
 from command_line import run as command
 from conftest import INT8, one_line
+from own_package import registers_kept
 from PIL import Image
 
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
@@ -29,6 +31,7 @@ from memmlp.motion.clip import Skipped
 from memmlp.motion.dataset import MotionDataset
 from memmlp.pipeline import run_stages
 from memmlp.pipeline.run_stages import recording_outcome, upstream_run
+from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.recipe_versions import RECIPES
 from memmlp.runs.run import Run
@@ -341,3 +344,23 @@ def test_a_part_of_the_data_is_told(whole, fraction, words):
     data = SimpleNamespace(manifest=SimpleNamespace(coverage=Coverage(whole=whole)))
     experiment = SimpleNamespace(config={"data": {"name": "s1", "split": fraction}})
     assert run_stages.partial_words(experiment, data) == words
+
+
+def test_metrics_of_other_code_are_measured_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Those of one's own, whose code is in the report; without them no package has to do with the errors."""
+    code, run = tmp_path / "mine.py", Run(tmp_path / "run")
+    monkeypatch.syspath_prepend(tmp_path)
+    code.write_text("A = 1\n")
+    with registers_kept():
+        importlib.import_module("mine")
+        evaluations = {"stream": "stream-0", "window": "window-0"}
+        experiment: Any = SimpleNamespace(config={"plugins": ["mine"]}, evaluations=evaluations)
+        made = {"mean": {}, "clips": [], **run_stages.own_code(experiment)}
+        write_report(
+            run.evaluation("stream-0"), made | {"mode": "stream", "settings": {"metrics": {"a": "mine.a"}}}
+        )
+        assert run_stages.unmeasured(experiment, run) == ["window"]
+        write_report(run.evaluation("window-0"), made | {"mode": "window", "settings": {}})
+        assert run_stages.unmeasured(experiment, run) == []
+        code.write_text("A = 2\n")
+        assert run_stages.unmeasured(experiment, run) == ["stream"]
