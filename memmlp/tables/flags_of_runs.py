@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import math
 from collections import defaultdict
@@ -19,6 +20,7 @@ TIMES = {"ms", "network ms", "pose ms", "ratio", "FPS"}
 CORE = 0.9  # how much of a measurement the thread has to have a core for its times to be the network's
 STEADY = 1.25  # how many times the ratio of one seed that of another may be: it does not depend on the seed
 ALIKE = 1.1  # how many times the frames of its control an arm may see in training before a flag says so
+FILES = 5  # names of files that a flag has at most
 SMPLH = (1, 2, 3)  # the paper's tables on AMASS, on the rest joints of SMPL-H bodies
 ORIGIN = {
     "code": "code", "data": "data", "hardware": "hardware", "device": "device", "gpu": "GPU",
@@ -59,6 +61,7 @@ def flags(
         yield from _calmer_than_truth(sweep, runs)
     for attribute, what in ORIGIN.items():
         yield from _differing(what, [(getattr(run.origin, attribute), label) for label, run in every])
+    yield from _other_files(every)
     if TIMES & set(sweep.metrics):
         yield from _differing("machine of the times", _timed(every))
         yield from _busy(sweep, runs)
@@ -67,9 +70,9 @@ def flags(
     yield from _divided_subjects(every)
     yield from _recipes(every)
     yield from _own_code(every)
-    changed = [label for label, run in every if run.origin.changed]
-    if changed:
-        yield f"made by code with uncommitted changes: {_quoted(changed)}"
+    uncommitted = [label for label, run in every if run.origin.changed]
+    if uncommitted:
+        yield f"made by code with uncommitted changes: {_quoted(uncommitted)}"
     if set(sweep.metrics) - set(COSTS):
         yield from _replicates(sweep, runs)
         yield from _body(sweep, every)
@@ -315,6 +318,26 @@ def _recipes(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
         yield from _differing(
             f"recipe of {name}", [(str(r.origin.recipes[name]), label) for r, label in having]
         )
+
+
+def _other_files(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
+    """Flag files of memmlp whose code differs between arms, be it of one commit.
+
+    Users' packages are left to `_own_code`. Kept results have no digests of files, and are left out.
+    """
+    having = [(run.code, label) for label, run in every if run.code]
+    digests: dict[str, set[str]] = defaultdict(set)
+    for code, _ in having:
+        for name in code:
+            digests[name].add(code[name])
+    names = sorted(name for name, found in digests.items() if len(found) > 1 and ":" not in name)
+
+    def version(code: Mapping[str, str]) -> str:
+        return hashlib.sha256(repr([code.get(name) for name in names]).encode()).hexdigest()[:7]
+
+    yield from _differing(
+        f"code of {_listed(names, FILES)}", [(version(code), label) for code, label in having]
+    )
 
 
 def _own_code(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:

@@ -90,6 +90,7 @@ class Measured:
         run: the run's folder; None for results that were kept without it.
         training: what its training took, as far as known: `seconds`; `frames`, the frames seen, each counted
             as often as it was drawn in a window; and `flops` for kept results.
+        code: a digest of the code of each file with which it was trained (`sources`); empty for kept results.
     """
 
     id: str
@@ -102,6 +103,7 @@ class Measured:
     run: Run | None = None
     sources: Mapping[str, str] = field(default_factory=dict)
     training: Mapping[str, float] = field(default_factory=dict)
+    code: Mapping[str, str] = field(default_factory=dict)
 
     def value(self, mode: str, branch: str, metric: str) -> float | None:
         """Return a metric's mean over clips, or a cost; None if the run has none."""
@@ -206,8 +208,9 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     latency = deployed.record
     origin = replace(_evaluated(_origin(manifest), reports), deployed=deployed_precision(latency))
     origin = replace(origin, recipes={**origin.recipes, **deployed.recipes}, timed_on=timed_on(latency))
-    training = _training(run, manifest)
-    return Measured(run.id, means, clips, groups, _costs(latency), origin, latency, run, sources, training)
+    training, code = _training(run, manifest), manifest.get("sources") or {}
+    costs = _costs(latency)
+    return Measured(run.id, means, clips, groups, costs, origin, latency, run, sources, training, code)
 
 
 def of_untrained(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,10 +17,11 @@ from fake_table import cell, printed
 from memmlp.report.kept_results import Kept, dumps, load_kept
 from memmlp.report.result_pages import origin_words
 from memmlp.runs.evaluation_file import write_report
-from memmlp.sweep.definition import Sweep
+from memmlp.runs.run import Run
+from memmlp.sweep.definition import Arm, Sweep
 from memmlp.tables.build_table import make_table
 from memmlp.tables.formats import FORMATS
-from memmlp.tables.measured_run import load
+from memmlp.tables.measured_run import Measured, load
 from memmlp.tables.statistics import Verdict
 from memmlp.tables.table import Table
 
@@ -234,6 +237,30 @@ def test_runs_of_different_origin_are_flagged(
     assert len(flags) == 1
     assert all(word in flags[0] for word in words)
     assert any("one seed" in flag for flag in table.flags)
+
+
+def test_files_that_differ_between_arms_of_one_commit_are_named(sweep: Sweep, tmp_path: Path):
+    """As they do with other uncommitted changes; kept results have no digests of files."""
+    terms, loop = "training/losses/terms.py", "training/loop.py"
+    codes = {arm.label: {terms: "111", loop: "222", "a.py": "1"} for arm in sweep.runnable()}
+    codes["by position"] |= {terms: "333", "mine:mine.py": "444"}
+
+    def flags(read: Callable[[Path], Measured] = load) -> list[str]:
+        def run(arm: Arm, seed: int) -> Run:
+            return fake_run(tmp_path, arm.label, seed, origin={"sources": codes[arm.label]})
+
+        found = make_table(sweep, runs_of(sweep, run, read)).flags
+        return [flag for flag in found if "py differs" in flag]
+
+    (said,) = flags()
+    assert re.fullmatch(
+        f"code of {terms} differs: \\w{{7}} of 'no \\| memory', 'full_model'; \\w{{7}} of 'by position'", said
+    )
+    assert flags(lambda folder: replace(load(folder), code={})) == []
+    codes["by position"][loop] = "555"
+    assert flags()[0].startswith(f"code of {loop}, {terms} differs: ")
+    codes["by position"] |= codes["full_model"]
+    assert flags() == []
 
 
 def test_arms_that_saw_more_in_training_are_said(sweep: Sweep, tmp_path: Path):
