@@ -131,14 +131,19 @@ def devices(plan: Plan) -> set[str]:
 
 
 def show(chosen: Sweep, plan: Plan) -> None:
-    """Print the board once, and the runs left over from earlier versions of the sweep file."""
+    """Print the board once, what older code made, and runs left over from earlier versions of the file."""
     from rich.console import Console
 
     from memmlp.config.compose_plan import orphans
     from memmlp.sweep.progress_table import render
+    from memmlp.tables.flags_of_runs import older_code
 
     if plan.entries:
-        Console(highlight=False).print(render(plan, plan.states()))
+        states = plan.states()
+        Console(highlight=False).print(render(plan, states))
+        done = [(e.label, plan.run_of(e).manifest) for e in plan.entries if states[e.key] == "done"]
+        for line in older_code((label, m.get("sources", {}), m.get("plugins", ())) for label, m in done):
+            click.echo(line)
     if found := unprepared(chosen, plan):
         click.echo(f"{found} runs: their data is not prepared yet; the sweep does that first")
     for entry in orphans(chosen, plan):

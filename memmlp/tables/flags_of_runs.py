@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import itertools
 import math
@@ -10,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
+from memmlp.runs.environment import changed, sources
 from memmlp.sweep.definition import COSTS, Arm, Sweep
 from memmlp.tables.effects import RunsBySeed, control_arm, one_and_the_same
 from memmlp.tables.measured_run import SHARED, UNKNOWN, Measured
@@ -62,6 +64,7 @@ def flags(
     for attribute, what in ORIGIN.items():
         yield from _differing(what, [(getattr(run.origin, attribute), label) for label, run in every])
     yield from _other_files(every)
+    yield from older_code((label, run.code, run.origin.plugins) for label, run in every)
     if TIMES & set(sweep.metrics):
         yield from _differing("machine of the times", _timed(every))
         yield from _busy(sweep, runs)
@@ -338,6 +341,22 @@ def _other_files(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
     yield from _differing(
         f"code of {_listed(names, FILES)}", [(version(code), label) for code, label in having]
     )
+
+
+def older_code(runs: Iterable[tuple[str, Mapping[str, str], Iterable[str]]]) -> Iterable[str]:
+    """Flag runs that were made before code changed, though no recipe version was raised.
+
+    Args:
+        runs: for each run its arm's label, the digests of its code (`sources`; empty where these are not
+            known), and the users' packages that it uses.
+    """
+    today = functools.cache(sources)
+    found = [(label, changed(code, today(tuple(packages)))) for label, code, packages in runs if code]
+    names = sorted({name for _, files in found for name in files})
+    if names:
+        labels = _quoted(label for label, files in found if files)
+        since = "has changed since these runs, under the same recipes"
+        yield f"code of {_listed(names, FILES)} {since}: {labels}"
 
 
 def _own_code(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:

@@ -75,6 +75,15 @@ def test_status_and_dry_run_show_and_do_nothing(home: Path):
     assert "full" in said
     assert "failed" in said
     assert "3 done, 1 failed" in said
+    assert "has changed since" not in said
+    older = next(
+        run for run in list_runs(home / "outputs") if run.config.get("memory", {}).get("name") == "none"
+    )
+    sources = older.manifest["sources"]
+    older.write_manifest({"sources": sources | {"training/loop.py": "0" * 12}})
+    line = "code of training/loop.py has changed since these runs, under the same recipes: 'none'\n"
+    assert line in command(home, "--status")
+    older.write_manifest({"sources": sources})
     forecast = command(home, "seed=0,1", "--dry-run", "--workers", "2")
     assert "4 of 8 runs to do, 2 at once: about" in forecast
     words = ("executor=slurm", "slurm.partition=gpu", "slurm.time=10:00:00", "slurm.mem_gb=8")

@@ -263,6 +263,35 @@ def test_files_that_differ_between_arms_of_one_commit_are_named(sweep: Sweep, tm
     assert flags() == []
 
 
+def test_runs_from_before_code_changed_are_said(
+    sweep: Sweep, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Code of memmlp and of packages of one's own, and what is alike is digested once."""
+    asked: list[tuple[str, ...]] = []
+
+    def today(packages: tuple[str, ...]) -> dict[str, str]:
+        asked.append(packages)
+        return {"training/loop.py": "1", "ik.py": "1", "new.py": "1", "mine:mine.py": "2"}
+
+    monkeypatch.setattr("memmlp.tables.flags_of_runs.sources", today)
+    code = {"training/loop.py": "1", "ik.py": "1", "gone.py": "0"}
+    old = {"full_model": code | {"ik.py": "0"}, "by position": code | {"mine:mine.py": "1"}}
+    own = {"by position": {"mine": {"version": None, "digest": "d"}}}
+
+    def flags() -> list[str]:
+        def run(arm: Arm, seed: int) -> Run:
+            made = {"sources": old.get(arm.label, code), "plugins": own.get(arm.label)}
+            return fake_run(tmp_path, arm.label, seed, origin=made)
+
+        return [flag for flag in table_of(sweep, run).flags if "has changed since" in flag]
+
+    since = "has changed since these runs, under the same recipes: 'by position', 'full_model'"
+    assert flags() == [f"code of ik.py, mine:mine.py {since}"]
+    assert sorted(asked) == [(), ("mine",)]
+    old.clear()
+    assert flags() == []
+
+
 def test_arms_that_saw_more_in_training_are_said(sweep: Sweep, tmp_path: Path):
     """A window twice as long, or a batch twice as large, is twice the data a step."""
     settings = {"optim": {"steps": 2000, "batch": 32}, "model": {"frames": 41}}
