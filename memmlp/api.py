@@ -19,6 +19,7 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.evaluation.units import UNITS
 from memmlp.live.stream import Offsets, Stream
+from memmlp.runs.evaluation_file import COMBINED
 from memmlp.runs.lookup import check_trained, find_run, is_trained, list_runs
 from memmlp.runs.run import Run
 from memmlp.tables.measured_run import load
@@ -37,7 +38,7 @@ StrPath = str | os.PathLike[str]
 Mode = Literal["stream", "window"]
 Branch = Literal["rotation", "position"]
 
-COLUMNS = ("run", "seed", "mode", "branch", "clip", "group", "frames", *UNITS)
+COLUMNS = ("run", "seed", "mode", "branch", "combined_by", "clip", "group", "frames", *UNITS)
 
 
 def load_run(name: StrPath, outputs: StrPath | None = None, *, plugins: Sequence[str] = ()) -> TrainedRun:
@@ -143,17 +144,28 @@ class TrainedRun(os.PathLike[str]):
     def results(self) -> dict[str, dict[str, dict[str, float]]]:
         """The mean results over the test clips: mode -> branch -> metric, in the units of `per_clip`.
 
-        Raises InputError if a file of results is damaged.
+        If inverse kinematics of several kinds were evaluated, the branch "combined" is that of the run's
+        config, else the last one; `combined_by` says which. Raises InputError if a file of results is
+        damaged.
         """
         return {
             mode: {branch: _numbers(errors) for branch, errors in branches.items()}
             for mode, branches in sorted(load(self.folder).means.items())
         }
 
+    @property
+    def combined_by(self) -> dict[str, str | None]:
+        """The inverse kinematics of the branch "combined", by mode, such as "arms" or "lbfgs-15".
+
+        It is None where that is not known. Raises InputError if a file of results is damaged.
+        """
+        return self._run.combined_by
+
     def per_clip(self) -> pd.DataFrame:
         """Return a DataFrame with one row for each mode, branch and test clip.
 
-        Columns are run, seed, mode, branch, clip, group (clips of the same take or subject share a group),
+        Columns are run, seed, mode, branch, combined_by (which inverse kinematics the branch combined is by;
+        None for other branches), clip, group (clips of the same take or subject share a group),
         frames at 60 Hz, and the metrics, whose units are in `.attrs["units"]`: MPJRE and geodesic in degrees
         (NaN in the position branch), MPJPE and the other PE in cm, MPJVE in cm/s, Jitter in 10^2 m/s^3. Lower
         is better, except for metrics of a package that says otherwise. For a network without a position
@@ -233,12 +245,14 @@ class TrainedRun(os.PathLike[str]):
 
     def _rows(self) -> Iterator[dict[str, Any]]:
         """Yield the rows of `per_clip`."""
-        measured = load(self.folder)
+        measured, combined_by = load(self.folder), self.combined_by
         for mode, branches in sorted(measured.means.items()):
             for branch in branches:
+                by = combined_by.get(mode) if branch == COMBINED else None
                 for clip, modes in measured.clips.items():
                     facts = {"clip": clip, "group": measured.group(clip), "frames": modes[mode]["frames"]}
                     about = {"run": self.id, "seed": self.seed, "mode": mode, "branch": branch}
+                    about["combined_by"] = by
                     yield about | facts | _numbers(modes[mode][branch])
 
 

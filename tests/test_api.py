@@ -138,9 +138,11 @@ def test_config_and_results_are_those_of_the_folder(run: memmlp.TrainedRun):
 
 def test_per_clip_results_are_a_frame(run: memmlp.TrainedRun):
     frame = run.per_clip()
-    facts = ["run", "seed", "mode", "branch", "clip", "group", "frames"]
+    facts = ["run", "seed", "mode", "branch", "combined_by", "clip", "group", "frames"]
     assert list(frame.columns) == [*facts, *UNITS]
     assert frame.attrs["units"]["MPJPE"] == "cm"
+    assert frame["combined_by"].isna().all()
+    assert run.combined_by == {}
     pairs = [(mode, branch) for mode in ("stream", "window") for branch in ("rotation", "position")]
     assert list(frame[["mode", "branch"]].itertuples(index=False, name=None)) == pairs  # one test clip
     for row, (mode, branch) in zip(frame.to_dict("records"), pairs, strict=True):

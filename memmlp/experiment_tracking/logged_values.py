@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from memmlp.common.files import file_digest, plain, read_json
+from memmlp.runs.evaluation_file import with_solvers
 from memmlp.runs.identity import flatten
 from memmlp.runs.metrics_log import Metrics, parsed
 from memmlp.runs.notes import read_notes
@@ -90,6 +91,7 @@ def facts_of(run: Run, running: bool = False) -> RunFacts:
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
     status = "running" if running else _status(run)
+    results = flatten(with_solvers(run.results, run.combined_by))
     started = _seconds(manifest.get("started"))
     own = (
         run.config_path, run.results_path, run.picture, run.folder / "code.patch",
@@ -108,7 +110,7 @@ def facts_of(run: Run, running: bool = False) -> RunFacts:
         tags=notes.tags,
         note=notes.note,
         data=(str((config.get("data") or {}).get("name") or "data"), str(manifest.get("data"))),
-        results={k.replace(".", "/"): float(v) for k, v in flatten(run.results).items() if _number(v)},
+        results={k.replace(".", "/"): float(v) for k, v in results.items() if _number(v)},
         files=tuple(path for path in own if path.is_file()),
     )
 

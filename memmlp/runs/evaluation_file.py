@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import now, plain, read_json, write_json
 from memmlp.runs.environment import environment
-from memmlp.runs.identity import belongs, evaluation_id_of
+from memmlp.runs.identity import belongs, evaluation_id_of, solver_of
+
+COMBINED = "combined"
+"""The branch of the rotations after inverse kinematics; whose, the settings of the evaluation say."""
 
 
 def write_report(path: Path, report: Mapping[str, Any]) -> None:
@@ -24,9 +27,14 @@ def write_report(path: Path, report: Mapping[str, Any]) -> None:
 def read_report(path: Path) -> dict[str, Any]:
     """Read the file of an evaluation. Raises InputError if it is damaged."""
     found = read_json(path)
+    check_report(path, found)
+    return found
+
+
+def check_report(path: Path, found: Mapping[str, Any]) -> None:
+    """Raise InputError if what was read from the file of an evaluation is no report."""
     if not {"mode", "mean", "clips"} <= found.keys():
         raise InputError(f"{path}: cannot be read; remove it, and the run's command makes it again")
-    return found
 
 
 def intact(path: Path) -> bool:
@@ -41,6 +49,62 @@ def current(path: Path, report: Mapping[str, Any]) -> bool:
     """Return whether an evaluation was made with the present recipe versions."""
     settings = report.get("settings") or {}
     return {"mode", "ik"} <= settings.keys() and path.stem == evaluation_id_of(settings)
+
+
+def preference(path: Path, report: Mapping[str, Any], config: Mapping[str, Any]) -> tuple[bool, bool, str]:
+    """Return what sorts a run's evaluations, the one that counts last.
+
+    Today's recipes come before the inverse kinematics of the run's own config, and that before the time.
+    """
+    settings = report.get("settings") or {}
+    own = solver_of(settings) == solver_of(config.get("evaluation") or {})
+    return current(path, report), own, str(report.get("made"))
+
+
+def combined_by(reports: Sequence[Mapping[str, Any]]) -> dict[str, str | None]:
+    """Return the inverse kinematics (`solver_of`) of the last report with the branch `combined`, by mode."""
+    having = [report for report in reports if COMBINED in report["mean"]]
+    return {str(report.get("mode")): solver_of(report.get("settings") or {}) for report in having}
+
+
+def of_one_solver(reports: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return reports in which the branch `combined` of a mode is by one inverse kinematics, the last one's.
+
+    In reports with another it is left out, so that results that are joined never mix two.
+    """
+    last = combined_by(reports)
+
+    def fits(report: Mapping[str, Any]) -> bool:
+        return solver_of(report.get("settings") or {}) == last.get(str(report.get("mode")))
+
+    return [dict(report) if fits(report) else _without_combined(report) for report in reports]
+
+
+def _without_combined(report: Mapping[str, Any]) -> dict[str, Any]:
+    mean, *clips = (
+        {branch: errors for branch, errors in row.items() if branch != COMBINED}
+        for row in (report["mean"], *report.get("clips", ()))
+    )
+    return {**report, "mean": mean, "clips": clips}
+
+
+def with_solvers(results: Mapping[str, Any], by: Mapping[str, str | None]) -> dict[str, Any]:
+    """Return results with the inverse kinematics in the name of the branch `combined`: "combined-lbfgs-15".
+
+    Args:
+        results: by mode and branch; what else is in them stays.
+        by: the inverse kinematics by mode (`combined_by`).
+    """
+
+    def named(mode: str, branch: str) -> str:
+        return f"{branch}-{by[mode]}" if branch == COMBINED and by.get(mode) else branch
+
+    return {
+        mode: {named(mode, branch): errors for branch, errors in branches.items()}
+        if isinstance(branches, Mapping)
+        else branches
+        for mode, branches in results.items()
+    }
 
 
 def _content_digest(content: Mapping[str, Any]) -> str:

@@ -158,6 +158,17 @@ def evaluation_settings(
     return {"mode": mode, **solver, **inference(config), **groups, **drawn, **measured}
 
 
+def solver_of(settings: Mapping[str, Any]) -> str | None:
+    """Return which inverse kinematics an evaluation's settings or a config's `evaluation` name.
+
+    L-BFGS has its iterations with it ("lbfgs-15"). None is returned for none, or if it is not known.
+    """
+    ik, iterations = settings.get("ik", "off"), settings.get("ik_iterations")
+    if ik in (None, "off"):
+        return None
+    return f"{ik}-{iterations}" if ik == "lbfgs" and iterations else str(ik)
+
+
 def _own_metrics(names: Iterable[str]) -> dict[str, str]:
     """Return the paths of custom metrics' functions, by name."""
     return {name: METRICS[name].function if name in METRICS else "" for name in sorted(names)}

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 from memmlp.common.errors import InputError
 from memmlp.common.files import number_of
 from memmlp.runs.deployment_folder import as_deployed
+from memmlp.runs.evaluation_file import with_solvers
 from memmlp.runs.identity import SLOTS, chosen, flatten, trained_by
 from memmlp.runs.notes import read_notes
 from memmlp.runs.run import STATUSES, Run
@@ -39,10 +40,11 @@ def record(run: Run) -> dict[str, Any]:
     These are its id, kind, status, name, started, upstream, user, tag and note; its data by name (`data`) and
     by digest (`data_digest`); the keys of its config, with slots also under their name alone (`memory` for
     `memory.name`); and its results, with those of the rotation branch also without the branch (`stream.MPJPE`
-    for `stream.rotation.MPJPE`). Times and size are those of the file in the precision that was asked for.
+    for `stream.rotation.MPJPE`), and after inverse kinematics with its name (`stream.combined-arms.MPJPE`).
+    Times and size are those of the file in the precision that was asked for.
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
-    found = run.results
+    found = with_solvers(run.results, run.combined_by)
     results = flatten(found) | flatten(_times_as_deployed(found.get("latency", {})), "latency.")
     results = {key: number_of(value) for key, value in results.items()}
     flat = flatten(config)

@@ -30,7 +30,7 @@ from memmlp.common.lease import Lease, Lock
 from memmlp.runs import deployment_folder
 from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.environment import changed, changes, environment, host, sources
-from memmlp.runs.evaluation_file import current, intact, read_report
+from memmlp.runs.evaluation_file import check_report, combined_by, intact, of_one_solver, preference
 from memmlp.runs.identity import belongs, used_as_configured
 from memmlp.runs.metrics_log import Metrics, MetricsLog
 from memmlp.runs.resumed_origin import joined
@@ -299,15 +299,15 @@ class Run:
     def results(self) -> dict[str, Any]:
         """The results with the run's own settings: mode -> branch -> metric, and "latency".
 
-        A VQ-VAE's run has its own results instead. Where a branch was evaluated by inverse kinematics with
-        several numbers of iterations, the last evaluation is used; tables ask for an evaluation by its
-        identity.
+        A VQ-VAE's run has its own results instead. Where a branch was evaluated by several kinds of inverse
+        kinematics, that of the run's config counts, else the last one (`combined_by`); tables ask for an
+        evaluation by its identity.
 
         Raises:
             InputError: if the file of an evaluation is damaged.
         """
         found = read_json(self.results_path)
-        for report in map(read_report, self.own_evaluations):
+        for report in of_one_solver(self._own_reports()):
             branches = found.setdefault(report["mode"], {})
             for branch, errors in report["mean"].items():  # those of one's own metrics may be in one alone
                 numbers = {name: number_of(value) for name, value in errors.items()}
@@ -316,12 +316,33 @@ class Run:
         return found | ({"latency": latency} if latency else {})
 
     @property
+    def combined_by(self) -> dict[str, str | None]:
+        """The inverse kinematics of the branch `combined` in `results`, by mode: "arms", "lbfgs-15".
+
+        It is None where that is not known. Raises InputError as `results` does.
+        """
+        return combined_by(self._own_reports())
+
+    @property
     def own_evaluations(self) -> list[Path]:
-        """The evaluations with the settings of the run's config: older recipes first, then by time."""
-        config, paths = self.config, sorted(self.evaluations.glob("*.json"))
-        every = {path: read_json(path) for path in paths}
-        own = [path for path, made in every.items() if used_as_configured(made.get("settings", {}), config)]
-        return sorted(own, key=lambda path: (current(path, every[path]), str(every[path].get("made"))))
+        """The evaluations with the settings of the run's config, the one that counts last (`preference`)."""
+        return list(self._own_evaluations())
+
+    def _own_evaluations(self) -> dict[Path, dict[str, Any]]:
+        """Return what is in the files of `own_evaluations`, unchecked."""
+        config = self.config
+        every = {path: read_json(path) for path in sorted(self.evaluations.glob("*.json"))}
+        own = {
+            path: one for path, one in every.items() if used_as_configured(one.get("settings", {}), config)
+        }
+        return dict(sorted(own.items(), key=lambda one: preference(one[0], one[1], config)))
+
+    def _own_reports(self) -> list[dict[str, Any]]:
+        """Return the reports of `own_evaluations`. Raises InputError if one is damaged."""
+        found = self._own_evaluations()
+        for path, report in found.items():
+            check_report(path, report)
+        return list(found.values())
 
     @property
     def changed_sources(self) -> list[str]:

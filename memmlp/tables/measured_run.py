@@ -14,7 +14,7 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
 from memmlp.runs.deployment_folder import as_deployed, deployed_precision, timed_on
-from memmlp.runs.evaluation_file import intact
+from memmlp.runs.evaluation_file import intact, of_one_solver
 from memmlp.runs.run import Run
 
 Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # values by mode, branch and metric
@@ -196,7 +196,7 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     clips: dict[str, dict[str, Any]] = {}
     groups: dict[str, str] = {}
     sources: dict[str, str] = {}
-    reports = list(map(_read, _evaluations(run, stages)))
+    reports = of_one_solver(list(map(_read, _evaluations(run, stages))))
     for report in reports:
         _join(means.setdefault(report["mode"], {}), report["mean"])
         for clip in report["clips"]:

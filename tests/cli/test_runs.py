@@ -10,6 +10,7 @@ import pytest
 from conftest import Memmlp, Ran, one_line
 
 from memmlp.common.files import write_json
+from memmlp.runs.identity import evaluation_id_of
 from memmlp.runs.run import Run
 
 A, B, C = ("a" * 16, "b" * 16, "c" * 16)
@@ -304,3 +305,18 @@ def test_export_and_import(memmlp: Memmlp, outputs: Path):
     assert one_line(memmlp("runs", "import", "run.zip", "--sha256", "0" * 64), "SHA-256")
     assert one_line(memmlp("runs", "import", "none.zip"), "no such file")
     assert one_line(memmlp("runs", "export", C), "allowed is a finished run")
+
+
+def test_values_of_two_inverse_kinematics_are_named_and_not_subtracted(memmlp: Memmlp, outputs: Path):
+    for name, ik, value in ((A, "arms", 2.5), (B, "lbfgs", 1.25)):
+        run, settings = Run.of(outputs, name), {"mode": "stream", "ik": ik}
+        report = {"mode": "stream", "settings": settings, "mean": {"combined": {"MPJPE": value}}, "clips": []}
+        run.evaluations.mkdir(exist_ok=True)
+        write_json(run.evaluation(evaluation_id_of(settings)), report)
+    said = memmlp("runs", "diff", A, B).out
+    rows = {line.split()[0]: line.split() for line in said.splitlines() if "combined" in line}
+    assert rows["stream.combined-arms.MPJPE"][1:4] == ["2.5", "-", "-"]
+    assert rows["stream.combined-lbfgs.MPJPE"][1:4] == ["-", "1.25", "-"]
+    assert "stream.combined-arms.MPJPE" in memmlp("runs", "show", A).out
+    listed = memmlp("runs", "list", "--columns", "stream.combined-lbfgs.MPJPE").out
+    assert re.search(rf"^{B}.* 1.25 *$", listed, re.M)

@@ -93,7 +93,7 @@ def config_rows(first: Run, second: Run) -> list[tuple[str, ...]]:
 
 def result_rows(first: Run, second: Run) -> list[tuple[str, ...]]:
     """Return a row for each measured number that differs: its key, both values, the change, and its unit."""
-    a, b = measured_numbers(first.results), measured_numbers(second.results)
+    a, b = measured_numbers(first), measured_numbers(second)
     keys = [key for key in a | b if a.get(key) != b.get(key)]
     return [
         (

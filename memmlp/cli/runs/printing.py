@@ -39,10 +39,12 @@ def value_text(record: Record, key: str, whole: bool) -> str:
     return text if whole or len(text) <= LONGEST else f"{text[:LONGEST]}…"
 
 
-def measured_numbers(results: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the numbers in results by dotted key; results may also hold settings and digests."""
+def measured_numbers(run: Run) -> dict[str, Any]:
+    """Return the numbers in a run's results by dotted key, with the names of inverse kinematics in these."""
+    from memmlp.runs.evaluation_file import with_solvers
     from memmlp.runs.identity import flatten
 
+    results = with_solvers(run.results, run.combined_by)  # which hold settings and digests, too
     numbers = {key: value for key, value in flatten(results).items() if isinstance(value, int | float)}
     return {
         key: value

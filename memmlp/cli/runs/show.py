@@ -29,6 +29,7 @@ def show(run: str, config: bool, outputs: Path) -> None:
 
     RUN is its id, the beginning of it, or its folder.
     """
+    from memmlp.runs.evaluation_file import with_solvers
     from memmlp.runs.identity import flatten
     from memmlp.runs.lookup import find_run, is_trained
     from memmlp.tables.measured_run import load
@@ -37,9 +38,10 @@ def show(run: str, config: bool, outputs: Path) -> None:
     console().print(pairs(_summary(found)))
     if is_trained(found):
         for source, measured in load(found.folder).by_source().items():
-            console().print(pairs(flatten(measured.means), title=f"results on {source}"))
+            means = with_solvers(measured.means, found.combined_by)
+            console().print(pairs(flatten(means), title=f"results on {source}"))
     if found.results:
-        console().print(pairs(measured_numbers(found.results), title="results"))
+        console().print(pairs(measured_numbers(found), title="results"))
     console().print(pairs(_origin(found), title="made by"))
     if config and found.config:
         console().print(pairs(flatten(found.config), title="config"))

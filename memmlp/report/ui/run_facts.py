@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import yaml
 
 from memmlp.common.files import plain, read_json
 from memmlp.runs.deployment_folder import as_deployed
-from memmlp.runs.evaluation_file import current
+from memmlp.runs.evaluation_file import combined_by, of_one_solver, preference, with_solvers
 from memmlp.runs.identity import INFERENCE, flatten, training_settings, used_as_configured
 from memmlp.runs.run import Run
 from memmlp.runs.shown_name import run_name
@@ -22,7 +22,7 @@ from memmlp.runs.shown_name import run_name
 HIDDEN = ("paths", "tracking", "tracker", "force", "hydra", "save_predictions")
 """Config groups that are not shown with a run."""
 
-ACTING = {key.split(".")[0] for key in INFERENCE}
+ACTING = {"evaluation", *(key.split(".")[0] for key in INFERENCE)}
 """Groups of the config that say how a trained network is used."""
 
 TAIL = 1 << 14  # bytes at the end of a metrics log in which its last entries are looked for
@@ -174,15 +174,17 @@ def _reports(run: Run, config: Mapping[str, Any], damage: list[str]) -> list[dic
         if not isinstance(report.get("mean"), dict) or not isinstance(report.get("settings", {}), dict):
             damage.append(f"{path.parent.name}/{path.name}")
         elif used_as_configured(report.get("settings", {}), config):
-            found.append((current(path, report), str(report.get("made")), report))
-    return [report for *_, report in sorted(found, key=lambda one: one[:2])]
+            found.append((preference(path, report, config), report))
+    return [report for _, report in sorted(found, key=lambda one: one[0])]
 
 
-def _metrics(run: Run, config: Mapping[str, Any], reports: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+def _metrics(run: Run, config: Mapping[str, Any], reports: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """Return the measured numbers by dotted name, such as "stream.rotation.MPJPE"."""
     found: dict[str, Any] = {}
-    for report in reports:
-        found |= flatten(report["mean"], f"{report.get('mode')}.")
+    means = [{key: report.get(key) for key in ("mode", "settings", "mean")} for report in reports]
+    by = combined_by(means)
+    for report in of_one_solver(means):
+        found |= flatten(with_solvers({str(report.get("mode")): report["mean"]}, by))
     record = as_deployed(run.deployment_used(config).record)
     found |= {f"latency.{key}": record[key] for key in COSTS if key in record}
     if run.results_path.exists():

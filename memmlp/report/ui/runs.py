@@ -10,6 +10,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
 from memmlp.report.ui.index import Index
 from memmlp.report.ui.run_facts import COSTS, read_config
+from memmlp.runs.evaluation_file import with_solvers
 from memmlp.runs.identity import NEUTRAL, flatten, is_data_path
 from memmlp.runs.lookup import is_trained
 from memmlp.runs.run import Run
@@ -259,7 +260,7 @@ def clips(run: Run) -> list[dict[str, Any]]:
     if not is_trained(run):
         return []
     try:
-        found = load(run.folder).clips
+        found, by = load(run.folder).clips, run.combined_by
         own = {
             report["name"]: report.get("frames")
             for path in run.own_evaluations
@@ -271,7 +272,7 @@ def clips(run: Run) -> list[dict[str, Any]]:
         {
             "name": clip,
             "frames": own.get(clip),
-            **{mode: errors[mode] for mode in ("stream", "window") if mode in errors},
+            **with_solvers({mode: errors[mode] for mode in ("stream", "window") if mode in errors}, by),
         }
         for clip, errors in found.items()
     ]
