@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import memmlp
-from memmlp.runs.imported_code import imported_modules
+from memmlp.runs.imported_code import imported_modules, module_spec
 
 PACKAGE = Path(memmlp.__file__).parent
 NOT_NUMBERS = (
@@ -121,11 +121,10 @@ def _sources() -> dict[str, str]:
 
 
 def own_sources(packages: Iterable[str]) -> dict[str, dict[str, str]]:
-    """Return digests of the Python files of users' packages, by package and file.
+    """Return digests of the Python files of users' packages, by package and file; nothing is imported.
 
     Modules of the user's own that these import (`imported_modules`) follow, each by itself: of a package only
-    its __init__, as PACKAGE.__init__. A package that is not imported has no files, for what was imported is
-    what computes.
+    its __init__, as PACKAGE.__init__. A package that is not found has no files.
     """
     files = {name: _package_files(name) for name in packages}
     modules = {_module(name, file): path for name, own in files.items() for file, path in own.items()}
@@ -140,20 +139,21 @@ def own_sources(packages: Iterable[str]) -> dict[str, dict[str, str]]:
 
 
 def _package_files(name: str) -> dict[str, Path]:
-    """Return the Python files of a user's package by their paths below it; none if it is not imported."""
-    module = sys.modules.get(name)
-    if module is None:
+    """Return the Python files of a user's package by their paths below it; none if it is not found."""
+    spec = module_spec(name)
+    if spec is None:
         return {}
-    if folders := [Path(folder) for folder in getattr(module, "__path__", ())]:
+    if folders := [Path(folder) for folder in spec.submodule_search_locations or ()]:
         files = {path.relative_to(root).as_posix(): path for root in folders for path in root.rglob("*.py")}
     else:
-        files = {Path(path).name: Path(path) for path in [module.__file__] if path}
+        files = {Path(path).name: Path(path) for path in [spec.origin] if path}
     return dict(sorted(files.items()))
 
 
 def _module(package: str, file: str) -> str:
     """Return the dotted name of the module in a package's file; of a package of one file, that is its own."""
-    if "__path__" not in vars(sys.modules[package]):
+    spec = module_spec(package)
+    if spec is None or spec.submodule_search_locations is None:
         return package
     parts = Path(file).with_suffix("").parts
     return ".".join([package, *(parts[:-1] if parts[-1] == "__init__" else parts)])

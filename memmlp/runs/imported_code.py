@@ -70,15 +70,18 @@ def _source(node: ast.ImportFrom, module: str, file: Path) -> str:
 
 def _own_file(module: str) -> Path | None:
     """Return the file of a module of the user's own; None if there is none, or if it is not the user's."""
-    spec = _spec(module)
+    spec = module_spec(module)
     if spec is None or not spec.has_location or not spec.origin:  # such as a folder without __init__.py
         return None
     file = Path(spec.origin)
     return file if file.is_file() and not set(INSTALLED) & set(file.parts) else None
 
 
-def _spec(module: str) -> ModuleSpec | None:
-    """Return where a module lies, without importing it or its parents; None for one that is nobody's own."""
+def module_spec(module: str) -> ModuleSpec | None:
+    """Return where a module lies, without importing it or its parents; None for one that is nobody's own.
+
+    One that is imported lies where it was imported from.
+    """
     top, *rest = module.split(".")
     try:
         spec = None if top in NOT_OWN else importlib.util.find_spec(top)

@@ -348,7 +348,7 @@ class Run:
     def changed_sources(self) -> list[str]:
         """The files whose code has changed since the run was made; empty if that is not known.
 
-        Files of the user's packages that are in use, and of what these import, are included.
+        Files of the user's packages that are found, and of what these import, are included.
         """
         before, packages = self.manifest.get("sources", {}), self.manifest.get("plugins", ())
         return changed(before, sources(packages)) if before else []

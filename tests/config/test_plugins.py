@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
 import sys
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint
@@ -412,3 +413,18 @@ def test_records_without_what_a_package_imports_are_of_no_other_code(folder: Pat
     assert "mixed" not in run.manifest["sources"].values()
     write(folder, {"mine.py": "from helper import W\n"})
     assert run.changed_sources == ["mine:mine.py"]
+
+
+def test_code_that_changed_since_is_told_where_nothing_imports_it(folder: Path):
+    """As in tables of a sweep that was planned before."""
+    write(folder, {"mine.py": "A = 1\n"})
+    plugins.activate(["mine"])
+    run = Run(folder / "run")
+    run.begin("memmlp", {}, data="d", upstream=None, plugins=packages_of_ones_own(["mine"]))
+    del sys.modules["mine"]
+    write(folder, {"mine.py": "A = 22\n"})
+    assert run.changed_sources == ["mine:mine.py"]
+    assert "mine" not in sys.modules
+    (folder / "mine.py").unlink()
+    importlib.invalidate_caches()
+    assert run.changed_sources == []  # nobody knows
