@@ -280,7 +280,12 @@ def _array_frames(out: Path, part: str) -> int:
 def _check_space(out: Path, needed: int) -> None:
     free = shutil.disk_usage(out).free
     if needed > free:
-        raise InputError(f"{out}: the cache needs {needed / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free")
+        raise InputError(f"{out}: the cache needs {_size(needed)}, and {_size(free)} are free")
+
+
+def _size(count: int) -> str:
+    """Return a number of bytes in GB, or in MB where it is less than one GB."""
+    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.1f} MB"
 
 
 def _no_clips(root: Root, found: Survey) -> str:

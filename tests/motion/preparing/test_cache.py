@@ -7,6 +7,7 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -238,6 +239,16 @@ def test_nothing_to_prepare_is_one_line(tmp_path):
     for where in ("none", "empty"):
         with pytest.raises(InputError, match=r"data\.root"):
             prepare(source(tmp_path / where), tmp_path / "cache")
+
+
+@pytest.mark.parametrize(
+    ("free", "said"),
+    [(250_000, "needs 0.5 MB, and 0.2 MB are free"), (1_500_000_000, "needs 3.0 GB, and 1.5 GB are free")],
+)
+def test_a_disk_that_is_too_small_is_told_in_numbers_that_are_not_zero(free, said, tmp_path, monkeypatch):
+    monkeypatch.setattr(module.shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
+    with pytest.raises(InputError, match=re.escape(said)):
+        module._check_space(tmp_path, 2 * free)
 
 
 def test_frames_of_an_older_recipe_are_made_again(root, tmp_path, monkeypatch):
