@@ -21,10 +21,15 @@ _DURING: ContextVar[str] = ContextVar("what the work is part of", default="")
 _SAY: ContextVar[Callable[[str], None] | None] = ContextVar("what is told of work", default=None)
 
 
+def to_stderr(line: str) -> None:
+    """Write a line to stderr."""
+    print(line, file=sys.stderr, flush=True)
+
+
 def to_log(line: str) -> None:
     """Write a line to stderr, unless stderr is a terminal, which has the bars."""
     if not sys.stderr.isatty():
-        print(line, file=sys.stderr, flush=True)
+        to_stderr(line)
 
 
 @contextmanager
@@ -41,6 +46,12 @@ def tell(line: str) -> None:
     """Report a line about the work, such as what begins now, to the listener set by `telling`, if any."""
     if say := _SAY.get():
         say(line)
+
+
+def remark(line: str) -> None:
+    """Report what the user should know, such as skipped files: as `tell` does, but on a terminal, too."""
+    if say := _SAY.get():
+        (to_stderr if say is to_log else say)(line)
 
 
 @contextmanager

@@ -19,7 +19,7 @@ import torch
 from memmlp.common import distributed
 from memmlp.common.errors import LeaseLost, TrainingDiverged, of_the_disk
 from memmlp.common.files import write_json
-from memmlp.common.progress import tell
+from memmlp.common.progress import remark, tell
 from memmlp.evaluation.evaluation import picture
 from memmlp.evaluation.predictions import save_predictions
 from memmlp.experiment_tracking.follower_pipe import Tracking
@@ -91,6 +91,16 @@ def of_skipped(skipped: Sequence[Skipped]) -> str | None:
     return f"{files} skipped, first {first.file} ({first.reason}); data.strict=true stops there"
 
 
+def of_unusual(unusual: Mapping[str, str]) -> str | None:
+    """Return what to say of clips that are odd but may be sound (name -> why); None if there are none."""
+    if not unusual:
+        return None
+    clips = "1 clip is" if len(unusual) == 1 else f"{len(unusual)} clips are"
+    first, *others = list(unusual)[:3]
+    names = ", ".join([f"{first} ({unusual[first]})", *others])
+    return f"{clips} unusual, first {names}; memmlp data inspect tells more"
+
+
 def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     """Bring the experiment's run to its end, doing only what is missing.
 
@@ -102,9 +112,9 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     clips = data.manifest.clips
     tell(f"data: {len(clips)} clips ({of_tests(clips)}), prepared in {data.cache}")
     untied = unfitting(data.manifest.split, [clip.name for clip in clips])
-    skipped = of_skipped(data.manifest.skipped)
-    for said in filter(None, (skipped, of_subjects(experiment.config["data"], clips), untied)):
-        tell(f"data: {said}")
+    files = of_skipped(data.manifest.skipped), of_unusual(data.manifest.unusual)
+    for said in filter(None, (*files, of_subjects(experiment.config["data"], clips), untied)):
+        remark(f"data: {said}")
     run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
     if not run.done:
         experiment.training.optim.check_installed()

@@ -7,7 +7,7 @@ import re
 import pytest
 
 from memmlp.common import progress
-from memmlp.common.progress import counting, during, progress_bar, tell, telling, to_log
+from memmlp.common.progress import counting, during, progress_bar, remark, tell, telling, to_log
 
 
 @pytest.mark.parametrize(("terminal", "said"), [(True, ""), (False, "data: once\n")])
@@ -15,6 +15,19 @@ def test_a_terminal_has_its_progress_bars_alone(capsys, monkeypatch: pytest.Monk
     monkeypatch.setattr("sys.stderr.isatty", lambda: terminal, raising=False)
     to_log("data: once")
     assert capsys.readouterr().err == said
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_remark_is_shown_on_a_terminal_too(capsys, monkeypatch: pytest.MonkeyPatch, terminal):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: terminal, raising=False)
+    remark("data: before")
+    with telling():
+        remark("data: 1 file was skipped")
+    assert capsys.readouterr().err == "data: 1 file was skipped\n"
+    told: list[str] = []
+    with telling(told.append):
+        remark("data: 1 file was skipped")
+    assert told == ["data: 1 file was skipped"]
 
 
 def test_lines_are_told_to_who_listens_alone():

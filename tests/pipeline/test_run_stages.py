@@ -22,6 +22,7 @@ from own_package import registers_kept
 from PIL import Image
 
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
+from memmlp.common.progress import telling
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.config.package_data import packaged
@@ -78,6 +79,28 @@ def test_what_was_skipped_of_the_data_is_said():
     said = run_stages.of_skipped([bad, replace(bad, file="c.npz")])
     assert said.startswith("2 files were skipped, first b.npz (NaN or Inf in 1 frames, first in frame 3); ")
     assert run_stages.of_skipped([bad]).startswith("1 file was skipped, first b.npz (")
+
+
+def test_what_is_unusual_of_the_data_is_said():
+    assert run_stages.of_unusual({}) is None
+    odd = {"a/1": "Z is not up", "a/2": "Z is not up", "b": "the pelvis is at z = 20 m", "c": "Z is not up"}
+    told = run_stages.of_unusual(odd)
+    assert told == "4 clips are unusual, first a/1 (Z is not up), a/2, b; memmlp data inspect tells more"
+    assert run_stages.of_unusual({"b": "high"}).startswith("1 clip is unusual, first b (high); ")
+
+
+def test_a_training_says_on_a_terminal_what_is_odd_about_its_data(capsys, monkeypatch):
+    """Upside-down clips would be trained on in silence."""
+    manifest = SimpleNamespace(clips=(), split={}, skipped=(), unusual={"a": "Z is not up"})
+    prepared = SimpleNamespace(manifest=manifest, cache="cache", digest="0")
+    experiment = SimpleNamespace(
+        data=SimpleNamespace(prepare=lambda: prepared), config={"data": {"split": {}}}
+    )
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    with telling(), pytest.raises(AttributeError, match="outputs"):  # it comes no further than to the run
+        run_stages.run_experiment(experiment)
+    said = "data: 1 clip is unusual, first a (Z is not up); memmlp data inspect tells more\n"
+    assert capsys.readouterr().err == said
 
 
 def test_the_same_command_finds_the_run_and_others_share_the_vqvae(home, monkeypatch):
