@@ -30,6 +30,7 @@ NEUTRAL = np.concatenate([np.zeros(3), IDENTITY.reshape(9)])
 FARTHEST = 1e6  # metres; a tracker farther from the origin is taken as lost
 LATEST = 1e10  # seconds; at much later times floats can't tell frames of 1/60 s apart
 TILTED = np.radians(60)  # from upright; which way a device that is tilted further looks, nobody knows
+FAR = 0.25  # metres from a T-pose's joint, beyond which a device is not worn there
 UNIT = 1e-2  # how far a quaternion's norm may be from 1, or a matrix from orthonormal
 
 TrackerPose = tuple[ArrayLike, ArrayLike] | None
@@ -77,6 +78,11 @@ class Offsets(NamedTuple):
 
     positions: np.ndarray
     rotations: np.ndarray
+
+    @property
+    def distances(self) -> np.ndarray:
+        """How far each device is from its joint (3,), metres."""
+        return np.linalg.norm(self.positions, axis=1)
 
 
 ROTATION_FORMATS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -215,8 +221,9 @@ class Stream:
             The offsets, which can be passed to later streams.
 
         Raises:
-            InputError: for a lost tracker, hands that are not apart, or a head that looks backwards with
-                respect to the hands.
+            InputError: for a lost tracker, hands that are not apart, a head that looks backwards with respect
+                to the hands, or a device that is more than 25 cm from where a T-pose has its joint. The
+                offsets of before stay.
         """
         positions, rotations, lost = read_trackers((head, left, right))
         if any(lost):
@@ -236,9 +243,11 @@ class Stream:
         inverse = rotations.swapaxes(1, 2)
         away = self._positions_out(joints) - positions
         turned = inverse @ self.space.rotations_out(pose.rotations)
-        self.offsets = Offsets((inverse @ away[:, :, None])[..., 0], turned)
+        offsets = Offsets((inverse @ away[:, :, None])[..., 0], turned)
+        _check_worn(offsets)
+        self.offsets = offsets
         self.reset()
-        return self.offsets
+        return offsets
 
     def _positions_in(self, positions: np.ndarray) -> np.ndarray:
         """Convert the wearer's positions (..., 3) from the caller's space to the network's world."""
@@ -372,6 +381,17 @@ def _looks_back(head: np.ndarray, heading: float) -> bool:
     """
     upright = (head @ UPRIGHT.T)[2, 2] > np.cos(TILTED)
     return bool(upright and np.cos(heading_of(head) - heading) < 0)
+
+
+def _check_worn(offsets: Offsets) -> None:
+    """Raise InputError if a device is farther from its joint than it can be on a person in T-pose."""
+    worst = int(offsets.distances.argmax())
+    if offsets.distances[worst] > FAR:
+        raise InputError(
+            f"calibrate: {TRACKERS[worst]} is {100 * offsets.distances[worst]:.0f} cm from where a T-pose "
+            f"has it; allowed are {100 * FAR:.0f}: stand upright, arms straight to the sides, and give the "
+            "body height; positions are in metres"
+        )
 
 
 def checked_offsets(offsets: Offsets) -> Offsets:

@@ -333,6 +333,27 @@ def test_exchanged_controllers_are_not_calibrated(name, heading, tilt, file):
     stream.calibrate(head, left, right)
 
 
+@pytest.mark.parametrize("name", SPACES)
+def test_devices_that_no_t_pose_has_there_are_not_calibrated(name, file):
+    """Arms that hang, and positions in centimetres, would move every later pose in silence."""
+    space, stream = SPACES[name], Stream(file, space=name)
+    pose = t_pose(stream.network.skeleton, np.array([0.3, -0.2, 1.6]), 2.1)
+    rotations = space.rotations_out(pose.rotations)
+    standing = list(zip(space.positions_out(pose.positions), rotations, strict=True))
+    before = stream.calibrate(*standing)
+    hanging = 0.4 * pose.positions + 0.6 * pose.positions[0] - [[0, 0, 0], [0, 0, 0.7], [0, 0, 0.7]]
+    for wrong, said in (
+        (
+            space.positions_out(hanging),
+            r"calibrate: \w+ is \d\d cm from where a T-pose has it; allowed are 25",
+        ),
+        (100 * space.positions_out(pose.positions), r"is \d{4} cm from where .* positions are in metres"),
+    ):
+        with pytest.raises(InputError, match=said):
+            stream.calibrate(*zip(wrong, rotations, strict=True))
+        assert stream.offsets is before
+
+
 # A long stream
 
 

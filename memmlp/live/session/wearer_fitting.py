@@ -19,14 +19,12 @@ from memmlp.common.errors import InputError
 from memmlp.live.calibration_file import Calibration, save_calibration
 from memmlp.live.session.packets import TrackerPoses
 from memmlp.live.spaces import SpaceName
-from memmlp.live.stream import Offsets, Stream
-from memmlp.live.tracker_frames import TRACKERS
+from memmlp.live.stream import Stream
 from memmlp.live.wearer import stature
 from memmlp.motion.body import ROOT
 
 COUNTDOWN = 5.0  # seconds
 LONGEST = 60.0  # seconds of a countdown
-FAR = 0.25  # metres from a T-pose's joint, beyond which a device is not worn there
 ACTIONS = ("calibrate", "touch_floor", "height", "floor", "forget", "cancel")
 
 Tell = Callable[[str, Mapping[str, Any]], None]
@@ -129,15 +127,9 @@ class Fitting:
             self._say(said)
 
     def _calibrate(self, trackers: TrackerPoses) -> str:
-        """Learn the offsets of the devices, unless the devices can't be worn like that in a T-pose."""
-        before = self.stream.offsets
-        apart = distances(self.stream.calibrate(*trackers))
-        worst = int(apart.argmax())
-        if apart[worst] > FAR:
-            self.stream.offsets = before
-            away = f"{TRACKERS[worst]} is {100 * apart[worst]:.0f} cm from where a T-pose has it"
-            raise InputError(f"{away}; stand upright, arms straight to the sides, and give the body height")
-        return f"Calibrated; the devices are up to {100 * apart[worst]:.0f} cm from the joints."
+        """Learn the offsets of the devices."""
+        apart = self.stream.calibrate(*trackers).distances.max()
+        return f"Calibrated; the devices are up to {100 * apart:.0f} cm from the joints."
 
     def _touch_floor(self, trackers: TrackerPoses) -> str:
         """Set the floor's height to that of the lower hand."""
@@ -193,8 +185,3 @@ class Fitting:
 def hips_height(rest: np.ndarray) -> float:
     """Return the height of the hips above the lowest joint, in a rest pose (22, 3), metres."""
     return float(rest[ROOT, 1] - rest[:, 1].min())
-
-
-def distances(offsets: Offsets) -> np.ndarray:
-    """Return how far each device is from its joint (3,), metres."""
-    return np.linalg.norm(offsets.positions, axis=1)

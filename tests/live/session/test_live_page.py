@@ -99,7 +99,7 @@ class Worn(ClipSource):
 def test_the_wearer_fits_the_stream_from_the_page(
     browser: Browser, network: Path, clip: TrackedClip, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("memmlp.live.session.wearer_fitting.FAR", 0.0)  # nobody stands so well in a T-pose
+    monkeypatch.setattr("memmlp.live.stream.FAR", 0.0)  # nobody stands so well in a T-pose
     stopped, source, stream = threading.Event(), Worn(clip, 60), Stream(network)
     hub = Hub(greeting(source, "tiny"))
     fitting = Fitting(stream, "amass", None, hub.tell, clock=lambda: 0.0)  # a countdown ends when cancelled

@@ -97,7 +97,20 @@ PARTS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-EXCHANGED = {"samples": [], "calibrate": [t_pose()[k] for k in (0, 2, 1)]}
+def hanging() -> list[dict[str, Any]]:
+    """The same devices with the arms beside the body."""
+    head, left, right = t_pose()
+    return [
+        head,
+        left | {"position": [0.15, 0.85, 0.45]},
+        right | {"position": [0.15, 0.85, -0.05]},
+    ]
+
+
+REFUSED = {
+    "exchanged": {"samples": [], "calibrate": [t_pose()[k] for k in (0, 2, 1)]},
+    "hanging": {"samples": [], "calibrate": hanging()},
+}
 
 
 def in_python(step: Path, part: dict[str, Any]) -> tuple[Stream, list[Pose]]:
@@ -125,7 +138,7 @@ def answers(site: Made, node: str, tmp_path_factory: pytest.TempPathFactory) -> 
     for name in ("session.js", "stream.js", "trackers.js", "rotations.js", "ort/wasm.js"):
         (page / Path(name).name).write_bytes((site.folder / name).read_bytes())
     job = folder / "job.json"
-    job.write_text(json.dumps({"body": entry["body"], "parts": [*PARTS.values(), EXCHANGED]}))
+    job.write_text(json.dumps({"body": entry["body"], "parts": [*PARTS.values(), *REFUSED.values()]}))
     command = [
         node,
         HERE / "play.mjs",
@@ -136,7 +149,7 @@ def answers(site: Made, node: str, tmp_path_factory: pytest.TempPathFactory) -> 
         job,
     ]
     finished([str(word) for word in command])
-    names = [*PARTS, "exchanged"]
+    names = [*PARTS, *REFUSED]
     return dict(zip(names, json.loads(Path(f"{job}.answer").read_text()), strict=True))
 
 
@@ -168,13 +181,21 @@ def test_it_is_python_s_stream(name: str, site: Made, answers: dict[str, Any]):
         np.testing.assert_allclose(turns, 1, atol=1e-9)
 
 
-def test_exchanged_controllers_are_not_calibrated(site: Made, answers: dict[str, Any]):
-    with pytest.raises(InputError) as refused:
-        in_python(site.step, EXCHANGED)
-    said = answers["exchanged"]["refused"]
-    assert said.endswith("exchanged, or the head's device is mounted backwards")
-    assert said in str(refused.value)
-    assert answers["exchanged"]["offsets"] is None
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("exchanged", "exchanged, or the head's device is mounted backwards"),
+        ("hanging", "cm from where a T-pose has it"),
+    ],
+)
+def test_what_is_no_t_pose_is_not_calibrated(name: str, words: str, site: Made, answers: dict[str, Any]):
+    """Both refuse it for the same reason."""
+    with pytest.raises(InputError, match=words) as refused:
+        in_python(site.step, REFUSED[name])
+    said = answers[name]["refused"]
+    assert words in said
+    assert said.split("; ")[0] in str(refused.value)
+    assert answers[name]["offsets"] is None
 
 
 def entry_is_of(site: Made) -> bool:

@@ -9,6 +9,7 @@ import { tPose, TrackerFrames } from './trackers.js';
 
 export const TRACKERS = ['head', 'left', 'right'];
 const FARTHEST = 1e6; // metres; a tracker farther from the origin is taken as lost
+const FAR = 0.25; // metres from a T-pose's joint, beyond which a device is not worn there
 const UNIT = 1e-2; // how far a quaternion's norm may be from 1
 const APART = 0.1; // metres between the hands, at least, in a T-pose
 const TILTED = Math.PI / 3; // from upright; which way a device that is tilted further looks, nobody knows
@@ -63,13 +64,15 @@ export class Stream {
     }
     const pose = tPose(this.body, world[0], heading);
     const away = [0, 1, 2].map(axis => mean(world.map((place, i) => place[axis] - pose.positions[i][axis])));
-    this.offsets = {
+    const offsets = {
       positions: devices.map((device, i) =>
         rotate(inverse(device.rotation), minus(times(plus(pose.positions[i], away), 1 / this.scale), device.position))),
       rotations: devices.map((device, i) => multiply(inverse(device.rotation), pose.rotations[i])),
     };
+    checkWorn(offsets);
+    this.offsets = offsets;
     this.reset();
-    return this.offsets;
+    return offsets;
   }
 
   // The joints on the devices, in metres of the network's body.
@@ -105,6 +108,14 @@ export class Stream {
 // Whether a head's device looks away from a heading by over 90 degrees. One that is far from upright is not asked.
 const looksBack = (rotation, heading) =>
   rotate(rotation, [0, 1, 0])[1] > Math.cos(TILTED) && Math.cos(headingOf(rotation) - heading) < 0;
+
+// Throw an error if a device is farther from its joint than it can be on a person in T-pose.
+function checkWorn({ positions }) {
+  const distances = positions.map(place => Math.hypot(...place));
+  const worst = distances.indexOf(Math.max(...distances));
+  if (distances[worst] <= FAR) return;
+  throw new Error(`${TRACKERS[worst]} is ${(100 * distances[worst]).toFixed(0)} cm from where a T-pose has it; stand upright, arms straight to the sides`);
+}
 
 // The heading of a head, radians to the left of -Z.
 export const heading = tracker => headingOf(tracker.rotation);
