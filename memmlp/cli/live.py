@@ -321,8 +321,11 @@ def network_file(given: InputOptions) -> tuple[Path, str]:
 
 
 def known_of(shown: ShowOptions, space: SpaceName, stream: Stream) -> Calibration:
-    """Return the facts about the wearer, from --calibration's file and the options, which take precedence."""
-    from memmlp.live.calibration_file import Calibration, read_calibration
+    """Return the facts about the wearer, from --calibration's file and the options, which take precedence.
+
+    Offsets are left out if they are of another height than that of the options.
+    """
+    from memmlp.live.calibration_file import SAME, Calibration, read_calibration
     from memmlp.live.wearer import stature
 
     body = stature(stream.network.skeleton)
@@ -331,10 +334,12 @@ def known_of(shown: ShowOptions, space: SpaceName, stream: Stream) -> Calibratio
         known = read_calibration(shown.calibration, space, body)
     height = known.height if shown.height is None else shown.height
     floor = known.floor if shown.floor is None else shown.floor
-    if known.offsets is not None and abs((height or body) - (known.height or body)) > 0.005:
+    offsets = known.offsets
+    if offsets is not None and abs((height or body) - (known.height or body)) > SAME:
         was = known.height or body
         note(f"{shown.calibration}: its calibration is of a height of {was:.2f} m; calibrate again")
-    return Calibration(space, body, known.offsets, height, floor)
+        offsets = None
+    return Calibration(space, body, offsets, height, floor)
 
 
 def outputs_of(shown: ShowOptions, stream: Stream) -> Outputs:

@@ -25,7 +25,7 @@ class Calibration:
         body: the body height of the network for which the offsets were found, metres
             (`memmlp.live.wearer.stature`).
         offsets: the offsets of the joints from the devices; None for none.
-        height: the body height, metres; None for the height of the network's body.
+        height: the body height, metres, of which the offsets are; None for the height of the network's body.
         floor: the height of the floor, metres.
     """
 

@@ -122,13 +122,14 @@ def test_the_avatar_as_a_file(memmlp: Memmlp, step: Path, tmp_path: Path):
 def test_a_calibration_of_another_height_is_told(
     step: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """Its offsets are of that height, and would be wrong in silence."""
+    """Its offsets are of that height, would be wrong in silence, and be kept as those of the new height."""
     stream = Stream(step)
     worn = Offsets(np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1)))
     save_calibration(tmp_path / "me.json", Calibration("amass", 1.72, worn, 1.80, 0.02))
     room = ShowOptions(None, None, tmp_path / "me.json", (), (), (), None, 0, "127.0.0.1", None, True)
     known = known_of(room, "amass", stream)
     assert (known.height, known.floor, capsys.readouterr().err) == (1.80, 0.02, "")
+    assert known.offsets is not None
     known = known_of(room._replace(height=1.86, floor=0.05), "amass", stream)
-    assert (known.height, known.floor) == (1.86, 0.05)
+    assert (known.offsets, known.height, known.floor) == (None, 1.86, 0.05)
     assert "its calibration is of a height of 1.80 m; calibrate again" in capsys.readouterr().err

@@ -341,11 +341,12 @@ def test_devices_that_no_t_pose_has_there_are_not_calibrated(name, file):
     rotations = space.rotations_out(pose.rotations)
     standing = list(zip(space.positions_out(pose.positions), rotations, strict=True))
     before = stream.calibrate(*standing)
-    hanging = 0.4 * pose.positions + 0.6 * pose.positions[0] - [[0, 0, 0], [0, 0, 0.7], [0, 0, 0.7]]
+    arms = 0.4 * pose.positions + 0.6 * pose.positions[0] - [[0, 0, 0], [0, 0, 0.7], [0, 0, 0.7]]
+    hanging = space.positions_out(arms)
     for wrong, said in (
         (
             space.positions_out(hanging),
-            r"calibrate: \w+ is \d\d cm from where a T-pose has it; allowed are 25",
+            r"calibrate: \w+ is \d\d cm from where a T-pose has it; allowed are 25:",
         ),
         (100 * space.positions_out(pose.positions), r"is \d{4} cm from where .* positions are in metres"),
     ):

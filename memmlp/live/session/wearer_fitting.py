@@ -25,6 +25,7 @@ from memmlp.motion.body import ROOT
 
 COUNTDOWN = 5.0  # seconds
 LONGEST = 60.0  # seconds of a countdown
+ROUNDED = 5e-4  # metres by which the page, which shows millimetres, may give the same height otherwise
 ACTIONS = ("calibrate", "touch_floor", "height", "floor", "forget", "cancel")
 
 Tell = Callable[[str, Mapping[str, Any]], None]
@@ -140,10 +141,18 @@ class Fitting:
         return self._floor(round(floor, 4))
 
     def _height(self, value: float | None) -> str:
-        """Set the wearer's body height, metres; None for the network's."""
+        """Set the wearer's body height, metres; None for the network's.
+
+        A calibration is forgotten, since its offsets are of another height: kept, they would hold the hands
+        some centimetres away, and a file would keep them as those of the new height.
+        """
+        before = self.stream.wearer.height
         self.stream.fit(value, self.stream.wearer.floor)
         self.own_height = value
-        return "" if self.stream.offsets is None else "Calibrate again: the offsets are of another height."
+        if self.stream.offsets is None or abs(self.stream.wearer.height - before) <= ROUNDED:
+            return ""
+        self.stream.offsets = None
+        return "Calibrate again: the calibration was of another height, and is forgotten."
 
     def _floor(self, value: float | None) -> str:
         """Set the height of the floor, metres."""

@@ -114,6 +114,31 @@ def test_height_and_floor(worn: Wearing):
     assert (saved.height, saved.floor) == (None, 0)
 
 
+def test_another_height_forgets_the_calibration(worn: Wearing):
+    """Its offsets are of the height before: seven centimetres at the hands, which a file would keep."""
+    worn.order("calibrate", 0)
+    worn.fitting.step(worn.pose())
+    worn.order("height", round(worn.stream.wearer.height, 3))  # the same, as the page shows it
+    worn.fitting.step(None)
+    assert worn.stream.offsets is not None
+    worn.order("height", 1.90)
+    worn.fitting.step(None)
+    assert worn.stream.offsets is None
+    state = worn.told[-1]
+    assert (state["calibrated"], state["height"], state["failed"]) == (False, 190, False)
+    assert state["said"].startswith("Calibrate again: the calibration was of another height")
+    saved = read_calibration(worn.path, "amass", 1.72)
+    assert (saved.offsets, saved.height) == (None, 1.90)
+
+
+def test_a_height_of_nobody_forgets_nothing(worn: Wearing):
+    worn.order("calibrate", 0)
+    worn.fitting.step(worn.pose())
+    worn.order("height", 18.0)
+    worn.fitting.step(None)
+    assert worn.stream.offsets is not None
+
+
 def test_a_hand_that_was_not_seen_touches_no_floor(worn: Wearing):
     head, _, _ = worn.pose()
     worn.order("touch_floor", 0)
