@@ -6,11 +6,22 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from memmlp.api import Prediction, Runs, TrainedRun, load_run
     from memmlp.common.errors import InputError
+    from memmlp.live.odd_samples import SampleWarning
     from memmlp.live.stream import Offsets, Pose, Stream
 
 __version__ = "0.2.0"
 
-__all__ = ["InputError", "Offsets", "Pose", "Prediction", "Runs", "Stream", "TrainedRun", "load_run"]
+__all__ = [
+    "InputError",
+    "Offsets",
+    "Pose",
+    "Prediction",
+    "Runs",
+    "SampleWarning",
+    "Stream",
+    "TrainedRun",
+    "load_run",
+]
 
 _HOMES = {
     "InputError": "memmlp.common.errors",
@@ -18,6 +29,7 @@ _HOMES = {
     "Pose": "memmlp.live.stream",
     "Prediction": "memmlp.api",
     "Runs": "memmlp.api",
+    "SampleWarning": "memmlp.live.odd_samples",
     "Stream": "memmlp.live.stream",
     "TrainedRun": "memmlp.api",
     "load_run": "memmlp.api",

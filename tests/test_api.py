@@ -23,7 +23,17 @@ from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.lookup import list_runs
 
 ROOT = Path(memmlp.__file__).parents[1]
-NAMES = ["InputError", "Offsets", "Pose", "Prediction", "Runs", "Stream", "TrainedRun", "load_run"]
+NAMES = [
+    "InputError",
+    "Offsets",
+    "Pose",
+    "Prediction",
+    "Runs",
+    "SampleWarning",
+    "Stream",
+    "TrainedRun",
+    "load_run",
+]
 UPRIGHT = ((0.0, 1.6, 0.0), np.eye(3))
 
 

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from memmlp.common.errors import InputError
 from memmlp.live.exported import ExportedNetwork
+from memmlp.live.odd_samples import OddSamples
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
 from memmlp.live.spaces import SpaceName, space_of
 from memmlp.live.tracker_frames import TRACKERS, UPRIGHT, Features, Lost, TrackerFrames, heading_of, t_pose
@@ -82,7 +83,8 @@ class Offsets(NamedTuple):
     @property
     def distances(self) -> np.ndarray:
         """How far each device is from its joint (3,), metres."""
-        return np.linalg.norm(self.positions, axis=1)
+        distances: np.ndarray = np.linalg.norm(self.positions, axis=1)
+        return distances
 
 
 ROTATION_FORMATS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -112,6 +114,7 @@ class Stream:
     Attributes:
         wearer: height and floor (`memmlp.live.wearer`), as `fit` sets them.
         network_seconds: how long the network itself took in the last `step`.
+        odd: warns, once of each kind, of samples that are hardly metres or seconds (`SampleWarning`).
 
     Raises:
         InputError: if an argument is not one of the above; its message is one line.
@@ -137,6 +140,7 @@ class Stream:
         self.offsets = None if offsets is None else checked_offsets(offsets)
         self.wearer = wearer(self.network.skeleton, height, floor)
         self.network_seconds = 0.0
+        self.odd = OddSamples()
         self.solve = None if ik is None else Solver(ik, self.network.skeleton.rest)
         self._output = ROTATION_FORMATS[rotations]
         self._trackers = TrackerFrames(self.network.skeleton, self.network.fps)
@@ -187,9 +191,9 @@ class Stream:
             positions = positions + (rotations @ self.offsets.positions[:, :, None])[..., 0]
             rotations = rotations @ self.offsets.rotations
         self.network_seconds = 0.0
-        frames, restarted = self._trackers.take(
-            time, self._positions_in(positions), self.space.rotations_in(rotations), lost
-        )
+        world = self._positions_in(positions)
+        self.odd.take(time, world, lost)
+        frames, restarted = self._trackers.take(time, world, self.space.rotations_in(rotations), lost)
         if not frames:
             return self._again(lost)
         if restarted:

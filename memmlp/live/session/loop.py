@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from memmlp.common.errors import InputError
+from memmlp.live.odd_samples import OddSamples
 from memmlp.live.outputs.output import Outputs
 from memmlp.live.rotations import matrix_to_quaternion
-from memmlp.live.session.sources import SourceSample, TrackerSource
+from memmlp.live.session.sources import TrackerSource
 from memmlp.live.session.wearer_fitting import Fitting, hips_height
 from memmlp.live.spaces import SPACES, Space
 from memmlp.live.stream import Pose, Stream
-from memmlp.live.tracker_frames import GAP
 from memmlp.motion.body import FPS, JOINTS, PARENTS
 from memmlp.motion.drawn_limbs import LIMBS
 from memmlp.motion.formats.humanoid_bones import VRM
@@ -25,8 +24,6 @@ from memmlp.render.error_colours import HEAT
 
 PAGE_SPACE = SPACES["openxr"]  # the page's axes: those of three.js
 TOP = 20  # cm at the top of the page's colour scale
-JUMPS, STILL = 5, 30  # samples in a row
-COARSE = 1e-3  # seconds between neighbouring times
 UNIT = 10_000  # whole numbers that a quaternion's 1 is sent as
 
 Publish = Callable[[dict[str, Any]], None]
@@ -65,7 +62,7 @@ def play(
 
     A message has the frame's number and time (s); the milliseconds that the network itself took (`ms`), and
     those that the whole pose took, from the sample's arrival until all outputs had it (`whole`); how many
-    samples were dropped, malformed, or foreign so far; whether the samples' times jump (`Clock`); the
+    samples were dropped, malformed, or foreign so far; whether the samples' times jump (`OddSamples`); the
     trackers that are held; and the joints, predicted and true (66 whole millimetres each, axes of openxr).
     Packets that are not taken are reported at once, by a message with these counts alone.
 
@@ -77,9 +74,9 @@ def play(
         outputs: get the frames first.
         fitting: fits the stream to its wearer between the samples.
         avatar: whether messages have the joints' rotations as well.
-        tell: gets a line if the samples' times are no clock's.
+        tell: gets a line if samples are odd (`OddSamples`), or the first time that one is refused.
     """
-    clock = Clock(tell)
+    stream.odd = OddSamples(tell)
     number, refused, dropped, told = 0, 0, 0, (0, 0)
     while not stopped.is_set():
         sample = source.read()
@@ -91,11 +88,13 @@ def play(
         if sample is None:
             continue
         dropped += sample.dropped
-        clock.take(sample.time)
         arrived = sample.arrived or time.perf_counter()
-        pose = take_step(stream, sample)
-        if pose is None:
+        try:
+            pose = stream.step(*sample.trackers, time=sample.time)
+        except InputError as error:
             refused += 1
+            if refused == 1:
+                tell(f"a sample is not taken: {error}")
             continue
         if not pose.fresh:
             continue
@@ -104,7 +103,12 @@ def play(
         whole = 1000 * (time.perf_counter() - arrived)
         times = {"ms": round(1000 * stream.network_seconds, 3), "whole": round(whole, 3)}
         told = source.malformed + refused, source.foreign
-        head = {"number": number, "time": round(pose.time, 4), "held": pose.held, "jumping": clock.jumping}
+        head = {
+            "number": number,
+            "time": round(pose.time, 4),
+            "held": pose.held,
+            "jumping": stream.odd.jumping,
+        }
         message = (
             head
             | times
@@ -113,77 +117,6 @@ def play(
         )
         publish(message | (rotations_message(stream.space, pose) if avatar else {}))
         number += 1
-
-
-class Odd(NamedTuple):
-    """A kind of times that are no clock's: how many samples in a row show it, and what is said then."""
-
-    row: int
-    words: str
-
-
-ODD = {
-    "jump": Odd(
-        JUMPS,
-        f"are over {GAP:g} s apart by their times, and the network begins anew with each; "
-        "is `time` in seconds?",
-    ),
-    "still": Odd(
-        STILL, "are no later than the ones before them, and no frame is made; does `time` stand still?"
-    ),
-    "coarse": Odd(
-        STILL,
-        "have times of single precision, which is milliseconds so late; velocities are wrong with them: send "
-        "`time` in double precision (OSC's d), or count from the start",
-    ),
-}
-
-
-class Clock:
-    """Detects times that are not those of a clock in seconds, and says so once of each kind.
-
-    Times in milliseconds jump at every sample, and each jump restarts the network. While a clock stands
-    still, no frame is made. One in single precision, such as OSC's `f`, is coarse after some hours, and the
-    velocities of the trackers are wrong then.
-
-    Args:
-        tell: gets a line at the first detection of each kind.
-    """
-
-    def __init__(self, tell: Callable[[str], None]):
-        self.tell, self.told = tell, set[str]()
-        self.last: float | None = None
-        self.row = dict.fromkeys(ODD, 0)
-
-    @property
-    def jumping(self) -> bool:
-        """Whether more times in a row jumped than a pause would explain."""
-        return self.row["jump"] >= ODD["jump"].row
-
-    def take(self, time: float) -> None:
-        """Take a sample's time, seconds."""
-        later = math.inf if self.last is None else time - self.last
-        with np.errstate(over="ignore"):  # of a time that no clock has
-            single = np.float32(time)
-        found = {
-            "jump": GAP < abs(later) < math.inf,
-            "still": -GAP <= later <= 0,
-            "coarse": float(single) == time and float(np.spacing(single)) > COARSE,
-        }
-        self.last = time
-        for kind, odd in found.items():
-            self.row[kind] = self.row[kind] + 1 if odd else 0
-            if self.row[kind] == ODD[kind].row and kind not in self.told:
-                self.told.add(kind)
-                self.tell(f"{ODD[kind].row} samples in a row {ODD[kind].words}")
-
-
-def take_step(stream: Stream, sample: SourceSample) -> Pose | None:
-    """Return the pose for a sample; None if the stream refuses the sample."""
-    try:
-        return stream.step(*sample.trackers, time=sample.time)
-    except InputError:
-        return None
 
 
 def refusals_message(dropped: int, malformed: int, foreign: int) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +13,9 @@ import pytest
 from processes import PATIENCE
 
 from memmlp.common.errors import InputError
+from memmlp.live.odd_samples import JUMPS
 from memmlp.live.session import page_server as module
-from memmlp.live.session.loop import JUMPS, STILL, Clock, greeting, play
+from memmlp.live.session.loop import greeting, play
 from memmlp.live.session.page_server import FILES, Hub, LiveServer
 from memmlp.live.session.sources import ClipSource, SourceSample, TrackedClip
 from memmlp.live.stream import Stream
@@ -108,45 +109,20 @@ def test_times_in_milliseconds_are_told_once(network: Path, clip: TrackedClip):
     assert [message["jumping"] for message in messages] == [n >= JUMPS for n in range(len(messages))]
 
 
-def told_of(times: Iterable[float]) -> list[str]:
-    """What is said of samples with these times."""
-    told: list[str] = []
-    clock = Clock(told.append)
-    for time in times:
-        clock.take(time)
-    return told
+class Since1970(Instant):
+    """A clip whose times are milliseconds since 1970, which no stream takes for seconds."""
+
+    def read(self) -> SourceSample | None:
+        sample = super().read()
+        return sample._replace(time=1.7e12 + 1000 * sample.time)
 
 
-@pytest.mark.parametrize(
-    "times",
-    [
-        (0.0, 1.0, 2.0, 3.0, 4.0, 4.1, 5.1, 3.1, 3.2),
-        [n / 60 for n in range(200)],
-        [1.7e9 + n / 60 for n in range(200)],
-        [float(np.float32(1000 + n / 60)) for n in range(200)],  # single precision, which is fine so early
-        [time for n in range(100) for time in (n / 60, n / 60)],  # each twice
-        [7.0] * (STILL - 1),
-        [1e300],
-    ],
-    ids=["pauses", "steady", "epoch", "single", "twice", "a while", "beyond"],
-)
-def test_of_other_times_nothing_is_said(times: list[float]):
-    assert told_of(times) == []
-
-
-@pytest.mark.parametrize(
-    ("times", "words"),
-    [
-        ([5.0] * 300, "does `time` stand still?"),
-        ([float(np.float32(100_000 + n / 60)) for n in range(300)], "milliseconds so late"),
-        ([float(np.float32(1.7e9 + n / 60)) for n in range(300)], "does `time` stand still?"),
-    ],
-    ids=["still", "single", "single epoch"],
-)
-def test_times_that_are_no_clock_s_are_told_once(times: list[float], words: str):
-    said = told_of(times)
-    assert sum(words in line for line in said) == 1
-    assert len(said) == len(set(said))
+def test_why_samples_are_refused_is_told_once(network: Path, clip: TrackedClip):
+    stopped, told = threading.Event(), []
+    play(Stream(network), Since1970(clip, 60, stopped), lambda message: None, stopped, tell=told.append)
+    assert len(told) == 1
+    assert told[0].startswith("a sample is not taken: time=17000000")
+    assert "allowed is a number of seconds" in told[0]
 
 
 @pytest.fixture
