@@ -94,6 +94,10 @@ class OddSamples:
                 self.told.add(kind)
                 self.tell(f"{ODD[kind].row} samples in a row {ODD[kind].words}")
 
+    def take_calibration(self, words: str) -> None:
+        """Tell what is odd about a calibration, each time."""
+        self.tell(f"calibrate: {words}")
+
     def _odd_times(self, time: float) -> dict[str, bool]:
         """Return what is odd about a sample's time, seconds."""
         later = math.inf if self.last is None else time - self.last

@@ -86,6 +86,17 @@ class Offsets(NamedTuple):
         distances: np.ndarray = np.linalg.norm(self.positions, axis=1)
         return distances
 
+    @property
+    def doubt(self) -> str | None:
+        """What is odd about a head's device that is far from upright, in words; None for one that is not."""
+        tilt = float(np.arccos(np.clip(self.rotations[0, 1, 1], -1, 1)))  # Y is up in every space's body axes
+        if tilt <= TILTED:
+            return None
+        return (
+            f"the head's device is {np.degrees(tilt):.0f} degrees from upright; "
+            "are quaternions xyzw, and is `space` right?"
+        )
+
 
 ROTATION_FORMATS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "matrix": lambda matrices: matrices,
@@ -216,7 +227,8 @@ class Stream:
         The line from the right to the left tracker tells which way the person looks, and thereby every
         joint's rotation. The joints' positions are those of the network's body in that pose, at the wearer's
         height, placed as near to the devices as possible (least squares). So a person with other proportions
-        moves a body with the network's proportions.
+        moves a body with the network's proportions. A head's device far from upright is taken, with a
+        `SampleWarning`: it may be mounted so, but quaternions of another order look like that, too.
 
         Args:
             head, left, right: the devices' poses, as in `step`.
@@ -249,6 +261,8 @@ class Stream:
         turned = inverse @ self.space.rotations_out(pose.rotations)
         offsets = Offsets((inverse @ away[:, :, None])[..., 0], turned)
         _check_worn(offsets)
+        if offsets.doubt:
+            self.odd.take_calibration(offsets.doubt)
         self.offsets = offsets
         self.reset()
         return offsets

@@ -23,6 +23,7 @@ from memmlp.common.errors import InputError
 from memmlp.deploy.export import export
 from memmlp.evaluation.ik import LBFGS
 from memmlp.evaluation.modes import joint_positions, local_rotations, stream
+from memmlp.live.odd_samples import SampleWarning
 from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.soak import TrackedMotion, repetitions, soak
 from memmlp.live.spaces import SPACES
@@ -305,7 +306,8 @@ def test_calibration_finds_how_the_devices_sit(name, file):
         return [*zip(space.positions_out(positions + away), turned, strict=True)]
 
     pose = t_pose(stream.network.skeleton, np.array([0.3, -0.2, 1.6]), 2.1)
-    offsets = stream.calibrate(*devices(pose.positions, pose.rotations))
+    with pytest.warns(SampleWarning, match="138 degrees from upright"):
+        offsets = stream.calibrate(*devices(pose.positions, pose.rotations))
     np.testing.assert_allclose(offsets.rotations, turns, atol=1e-9)
     mean = (pose.rotations @ sits[:, :, None])[..., 0].mean(0)
     rotations = np.stack([rotation for _, rotation in devices(pose.positions, pose.rotations)])
@@ -353,6 +355,23 @@ def test_devices_that_no_t_pose_has_there_are_not_calibrated(name, file):
         with pytest.raises(InputError, match=said):
             stream.calibrate(*zip(wrong, rotations, strict=True))
         assert stream.offsets is before
+
+
+@pytest.mark.parametrize("name", SPACES)
+def test_quaternions_in_another_order_are_warned_of(name, file):
+    """A head that seems to hang or to lie is no person in T-pose, unless the device is mounted so."""
+    space, stream = SPACES[name], Stream(file, space=name)
+    pose = t_pose(stream.network.skeleton, np.array([0.3, -0.2, 1.6]), 0.4)
+    places = space.positions_out(pose.positions)
+    xyzw = matrix_to_quaternion(space.rotations_out(pose.rotations))
+    stream.calibrate(*zip(places, xyzw, strict=True))
+    with pytest.warns(SampleWarning, match=r"calibrate: the head's device is \d+ degrees .* xyzw") as warned:
+        offsets = stream.calibrate(*zip(places, np.roll(xyzw, 1, axis=1), strict=True))
+    assert warned[0].filename == __file__
+    assert stream.offsets is offsets
+    tilted = pose.rotations @ Rotation.from_euler("z", 70, degrees=True).as_matrix()
+    with pytest.warns(SampleWarning, match="head's device is 70 degrees from upright"):
+        stream.calibrate(*zip(places, space.rotations_out(tilted), strict=True))
 
 
 # A long stream

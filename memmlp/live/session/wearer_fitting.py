@@ -129,8 +129,9 @@ class Fitting:
 
     def _calibrate(self, trackers: TrackerPoses) -> str:
         """Learn the offsets of the devices."""
-        apart = self.stream.calibrate(*trackers).distances.max()
-        return f"Calibrated; the devices are up to {100 * apart:.0f} cm from the joints."
+        offsets = self.stream.calibrate(*trackers)
+        said = f"Calibrated; the devices are up to {100 * offsets.distances.max():.0f} cm from the joints."
+        return f"{said} But {offsets.doubt}" if offsets.doubt else said
 
     def _touch_floor(self, trackers: TrackerPoses) -> str:
         """Set the floor's height to that of the lower hand."""

@@ -98,6 +98,17 @@ def test_exchanged_controllers_are_told_and_nothing_changes(worn: Wearing):
     assert "left and right look exchanged" in worn.told[-1]["said"]
 
 
+def test_quaternions_in_another_order_are_told(worn: Wearing):
+    worn.stream.odd.tell = (told := []).append
+    worn.order("calibrate", 0)
+    worn.fitting.step(tuple((place, np.roll(turn, 1)) for place, turn in worn.pose()))
+    assert worn.told[-1]["calibrated"]
+    assert "But the head's device is 90 degrees from upright; are quaternions xyzw" in worn.told[-1]["said"]
+    assert told == [
+        "calibrate: the head's device is 90 degrees from upright; are quaternions xyzw, and is `space` right?"
+    ]
+
+
 def test_height_and_floor(worn: Wearing):
     worn.order("height", 1.86)
     worn.order("touch_floor", 0)
