@@ -20,6 +20,7 @@ HEAD, ANKLES = JOINTS.index("head"), [JOINTS.index("left_ankle"), JOINTS.index("
 MOST_TURN = 4 * math.pi  # a rotation vector has no reason to be longer than pi; fits wind up to 2 pi and more
 MOST_SPEED = 30.0  # m/s; the fastest runner reached 12.4
 MOST_HEIGHT = 10.0  # metres of the pelvis over z = 0 beyond which the feet have to prove that they stand
+LOWEST = 0.3  # metres of the lowest joint over or below z = 0, beyond which feet that slide are told
 SAMPLES = 50  # frames looked at for posture
 
 
@@ -37,10 +38,12 @@ def implausible(clip: Clip) -> str | None:
 
 def unusual(clip: Clip) -> str | None:
     """Return what the user should know of a clip that is odd but may be sound, or None."""
-    if _never_upright(_joints(clip, _spread(clip))):
+    joints = _joints(clip, _spread(clip))
+    if _never_upright(joints):
         return "the head is never above the pelvis, so it lies throughout, or Z is not up"
-    height = _height(clip)
-    return f"the pelvis is at z = {height:.0f} m" if abs(height) > MOST_HEIGHT else None
+    if abs(height := _height(clip)) > MOST_HEIGHT:
+        return f"the pelvis is at z = {height:.0f} m"
+    return _off_the_floor(clip, joints)
 
 
 def _degrees(clip: Clip) -> str | None:
@@ -87,6 +90,19 @@ def _y_up(clip: Clip) -> str | None:
     if abs(middle) > 0.2 and (high - low > 0.35 or np.ptp(joints[:, 0, 2]) < 1.0):
         return None
     return "the person stands along Y and never along Z, so Y is up; allowed: Z up"
+
+
+def _off_the_floor(clip: Clip, joints: np.ndarray) -> str | None:
+    """Return what is odd about a clip off the floor whose feet slide, or None.
+
+    A trans of other axes or units than the poses', or of zeros, lifts or sinks the body and does not fit the
+    steps. On a floor at another height than zero the feet stand still.
+    """
+    low = float(np.quantile(joints[:, :, 2].min(1), 0.05))
+    if abs(low) <= LOWEST or _feet_hold(clip):
+        return None
+    where = f"the lowest joint is at z = {low:.1f} m and none stands still while the pelvis moves"
+    return f"{where}, so trans may have other units or axes than metres with Z up, or lack the heights"
 
 
 def _height(clip: Clip) -> float:

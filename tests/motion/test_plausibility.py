@@ -66,6 +66,22 @@ def test_a_floor_at_any_height_passes_where_feet_stand_on_it():
         assert f"z = {z + 1:.0f} m" in unusual(clip)
 
 
+@pytest.mark.parametrize(
+    ("trans", "z"),
+    [
+        (lambda trans: trans * 0, "-0.9"),  # relative to the root
+        (lambda trans: trans * 3.281, "2.1"),  # feet
+        (lambda trans: trans[:, [0, 2, 1]] * [1, 1, -1], "-5.0"),  # Y up, the rotations Z up
+    ],
+    ids=["zeros", "feet", "Y up"],
+)
+def test_a_translation_that_does_not_fit_the_steps_is_told(trans, z):
+    clip = motion("walking")
+    wrong = replace(clip, trans=trans(clip.trans))
+    assert implausible(wrong) is None
+    assert unusual(wrong).startswith(f"the lowest joint is at z = {z} m and none stands still")
+
+
 def test_a_glitch_or_a_wound_up_root_passes():
     clip = motion("walking")
     trans, poses = clip.trans.copy(), clip.poses.copy()
