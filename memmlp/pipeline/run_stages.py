@@ -24,6 +24,7 @@ from memmlp.evaluation.evaluation import picture
 from memmlp.evaluation.predictions import save_predictions
 from memmlp.experiment_tracking.follower_pipe import Tracking
 from memmlp.live.pose_time import measure_pose
+from memmlp.motion.body import FPS
 from memmlp.motion.clip import Skipped
 from memmlp.motion.motion_source import Prepared
 from memmlp.motion.preparing.amass import divided_subjects
@@ -42,6 +43,8 @@ from memmlp.runs.identity import (
 )
 from memmlp.runs.run import Run
 from memmlp.training.loop import Watch, unwatched
+
+SLOW = 0.99  # of the network's rate, below which a recording lacks frames: 59.94 Hz is as good as 60
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,23 @@ def of_subjects(config: Mapping[str, Any], clips: Sequence[ClipRecord]) -> str:
     return f"clips of {divided[0]}{more} are in training and in test; data=amass_s3 keeps subjects apart"
 
 
+def of_rates(clips: Sequence[ClipRecord], what: str) -> str | None:
+    """Return what to say of clips recorded at a lower rate than the network's; None if there are none.
+
+    Straight lines between their frames give the interpolated clips kinks, which no person makes.
+
+    Args:
+        clips: the clips.
+        what: what they are called, in the plural.
+    """
+    rates = sorted(clip.fps for clip in clips if clip.fps < SLOW * FPS)
+    if not rates:
+        return None
+    hertz = f"{rates[0]:g}" + (f" to {rates[-1]:g}" if rates[-1] > rates[0] else "")
+    slow = f"{len(rates)} of {len(clips)} {what} were recorded at {hertz} Hz"
+    return f"{slow} and are resampled by straight lines: their Jitter and velocities have its kinks"
+
+
 def of_skipped(skipped: Sequence[Skipped]) -> str | None:
     """Return what to say of files that are no usable clips; None if there are none."""
     if not skipped:
@@ -113,7 +133,8 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     tell(f"data: {len(clips)} clips ({of_tests(clips)}), prepared in {data.cache}")
     untied = unfitting(data.manifest.split, [clip.name for clip in clips])
     files = of_skipped(data.manifest.skipped), of_unusual(data.manifest.unusual)
-    for said in filter(None, (*files, of_subjects(experiment.config["data"], clips), untied)):
+    subjects = of_subjects(experiment.config["data"], clips)
+    for said in filter(None, (*files, of_rates(clips, "clips"), subjects, untied)):
         remark(f"data: {said}")
     run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
     if not run.done:
@@ -163,8 +184,9 @@ def make_missing_stages(experiment: Experiment, run: Run, data: Prepared) -> lis
         The names of the stages that were made.
     """
     made = []
-    if not {"partial", "divided"} <= run.manifest.keys():  # a run from before these were recorded
-        run.write_manifest(of_data(experiment, data))
+    facts = of_data(experiment, data)
+    if not facts.keys() <= run.manifest.keys():  # a run from before these were recorded
+        run.write_manifest(facts)
     run.want(experiment.stages)
     if missing := unmeasured(experiment, run):
         if any(run.has(experiment.evaluations[mode]) for mode in missing):
@@ -381,7 +403,9 @@ def own_code(experiment: Experiment) -> dict[str, Any]:
 def of_data(experiment: Experiment, data: Prepared) -> dict[str, Any]:
     """Return warnings about a run's data for tables to flag, in words; None for each that does not apply."""
     divided = of_subjects(experiment.config["data"], data.manifest.clips) or None
-    return {"partial": partial_words(experiment, data), "divided": divided}
+    tested = [clip for clip in data.manifest.clips if clip.split == "test"]
+    resampled = of_rates(tested, "test clips")
+    return {"partial": partial_words(experiment, data), "divided": divided, "resampled": resampled}
 
 
 def partial_words(experiment: Experiment, data: Prepared) -> str | None:

@@ -31,6 +31,7 @@ LATER_FACTS = (
     "deployed",
     "timed_on",
     "divided",
+    "resampled",
 )  # the origins of older files have none of these
 OLDER_NAMES = {"vqvae": "upstream"}  # what the origins of older files call otherwise
 

@@ -61,6 +61,8 @@ def flags(
     yield from _no_numbers(sweep, runs)
     if "Jitter" in sweep.metrics:
         yield from _calmer_than_truth(sweep, runs)
+    if set(sweep.metrics) - set(COSTS):
+        yield from _resampled(every)
     for attribute, what in ORIGIN.items():
         yield from _differing(what, [(getattr(run.origin, attribute), label) for label, run in every])
     yield from _other_files(every)
@@ -312,6 +314,12 @@ def _divided_subjects(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
     """Flag runs that were tested on subjects on whom they were trained."""
     for said in _unique(run.origin.divided for _, run in every if run.origin.divided):
         yield f"{said}: {_quoted(label for label, run in every if run.origin.divided == said)}"
+
+
+def _resampled(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
+    """Flag runs that were tested on clips recorded at a lower rate than the network's."""
+    for said in _unique(run.origin.resampled for _, run in every if run.origin.resampled):
+        yield f"{said}: {_quoted(label for label, run in every if run.origin.resampled == said)}"
 
 
 def _recipes(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:

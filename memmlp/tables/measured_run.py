@@ -48,6 +48,7 @@ class Origin:
         deployed: the precision of the exported file that was measured for size and times.
         timed_on: the processor on which size and times were measured, and ONNX Runtime's version there.
         divided: a warning, in words, if subjects have clips in both training and test; None otherwise.
+        resampled: a warning, in words, if test clips were recorded at a lower rate; None otherwise.
     """
 
     code: str
@@ -69,6 +70,7 @@ class Origin:
     deployed: str = "fp32"
     timed_on: str = UNKNOWN
     divided: str | None = None
+    resampled: str | None = None
 
 
 @dataclass(frozen=True)
@@ -325,6 +327,7 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
         upstream=manifest.get("upstream"),
         partial=manifest.get("partial"),
         divided=manifest.get("divided"),
+        resampled=manifest.get("resampled"),
         plugins={
             name: f"{one['version'] or 'no version'} ({one['digest']})"
             for name, one in (manifest.get("plugins") or {}).items()

@@ -56,7 +56,7 @@ def test_a_run_leaves_everything(home):
     made = [path.stem for path in (*run.evaluations.iterdir(), *run.deployments.iterdir())]
     assert set(run.wanted) == set(made)
     assert set(run.results) == {"window", "stream", "latency"}
-    assert {run.manifest[fact] for fact in ("partial", "divided")} == {None}
+    assert {run.manifest[fact] for fact in ("partial", "divided", "resampled")} == {None}
     assert run.results["stream"]["rotation"]["MPJPE"] > 0
     assert run.results["latency"]["steps"] >= 200
     assert run.results["latency"]["onnx_parity"] < 1e-4
@@ -340,12 +340,30 @@ def test_a_single_group_of_test_clips_is_told_to_decide_nothing():
 )
 def test_a_split_that_tests_on_the_people_that_it_trains_on_says_so(names, config, said):
     parts = zip(names, itertools.cycle(["train", "test"]))
-    clips = [SimpleNamespace(name=name, split=part) for name, part in parts]
+    clips = [SimpleNamespace(name=name, split=part, fps=60.0) for name, part in parts]
     found = run_stages.of_subjects({"split": {}, **config}, clips)
     assert found.startswith(said) if said else found == ""
     data = SimpleNamespace(manifest=SimpleNamespace(coverage=SimpleNamespace(whole=True), clips=clips))
     experiment = SimpleNamespace(config={"data": {"name": "mine", "split": {}, **config}})
-    assert run_stages.of_data(experiment, data) == {"partial": None, "divided": found or None}
+    assert run_stages.of_data(experiment, data) == {
+        "partial": None,
+        "divided": found or None,
+        "resampled": None,
+    }
+
+
+def test_clips_that_were_recorded_at_a_lower_rate_are_said():
+    """Straight lines between 30 frames a second give jerks to the truth itself."""
+    rates = {"a": 30.0, "b": 30.0, "c": 60.0, "d": 59.94, "e": 120.0, "f": 100.0}
+    clips = [SimpleNamespace(name=name, split="test", fps=fps) for name, fps in rates.items()]
+    clips.append(SimpleNamespace(name="g", split="train", fps=25.0))
+    kinks = "Hz and are resampled by straight lines: their Jitter and velocities have its kinks"
+    assert run_stages.of_rates(clips, "clips") == f"3 of 7 clips were recorded at 25 to 30 {kinks}"
+    assert run_stages.of_rates(clips[2:6], "clips") is None
+    data = SimpleNamespace(manifest=SimpleNamespace(coverage=SimpleNamespace(whole=True), clips=clips))
+    experiment = SimpleNamespace(config={"data": {"name": "mine", "split": {}}})
+    said = run_stages.of_data(experiment, data)["resampled"]
+    assert said == f"2 of 6 test clips were recorded at 30 {kinks}"
 
 
 @pytest.mark.parametrize(

@@ -463,3 +463,20 @@ def test_runs_that_were_tested_on_people_of_their_training_are_named(sweep: Swee
     path = tmp_path / "kept.json"
     path.write_text(dumps(Kept("5", (), measured, {label: () for label in arms})))
     assert {run.origin.divided for run in load_kept(path).every} == {said, None}
+
+
+def test_test_clips_of_a_lower_rate_are_flagged(sweep: Sweep, tmp_path: Path):
+    """Their truth has kinks, and so have the numbers that compare with it; kept results know it, too."""
+    said = "2 of 6 test clips were recorded at 30 Hz and are resampled by straight lines"
+    arms = [arm.label for arm in sweep.runnable()]
+    runs = {
+        label: fake_run(tmp_path, label, origin={"resampled": said} if label != arms[0] else None)
+        for label in arms
+    }
+    flagged = table_of(replace(sweep, seeds=(0,)), lambda arm, seed: runs[arm.label]).flags
+    assert f"{said}: {', '.join(map(repr, arms[1:]))}" in flagged
+    measured = {label: {0: load(runs[label].folder)} for label in arms}
+    path = tmp_path / "kept.json"
+    path.write_text(dumps(Kept("5", (), measured, {label: () for label in arms})))
+    assert {run.origin.resampled for run in load_kept(path).every} == {said, None}
+    assert '"resampled": null' not in path.read_text()  # files of before keep their bytes
