@@ -25,11 +25,11 @@ from memmlp.evaluation.predictions import save_predictions
 from memmlp.experiment_tracking.follower_pipe import Tracking
 from memmlp.live.pose_time import measure_pose
 from memmlp.motion.body import FPS
-from memmlp.motion.clip import Skipped
+from memmlp.motion.clip import LINES, Skipped
 from memmlp.motion.motion_source import Prepared
 from memmlp.motion.preparing.amass import divided_subjects
 from memmlp.motion.preparing.groups import unfitting
-from memmlp.motion.preparing.manifest import ClipRecord
+from memmlp.motion.preparing.manifest import ClipRecord, Manifest
 from memmlp.pipeline.devices import described
 from memmlp.pipeline.experiment import Experiment, UpstreamTraining
 from memmlp.runs.environment import packages_of_ones_own
@@ -85,21 +85,24 @@ def of_subjects(config: Mapping[str, Any], clips: Sequence[ClipRecord]) -> str:
     return f"clips of {divided[0]}{more} are in training and in test; data=amass_s3 keeps subjects apart"
 
 
-def of_rates(clips: Sequence[ClipRecord], what: str) -> str | None:
-    """Return what to say of clips recorded at a lower rate than the network's; None if there are none.
+def of_rates(manifest: Manifest, clips: Sequence[ClipRecord], what: str) -> str | None:
+    """Return what to say of clips of a lower rate than the network's between whose frames lines go on.
 
-    Straight lines between their frames give the interpolated clips kinks, which no person makes.
+    Straight lines give the interpolated clips kinks, which no person makes. None if there are none.
 
     Args:
-        clips: the clips.
+        manifest: the data's manifest.
+        clips: some or all of its clips.
         what: what they are called, in the plural.
     """
     rates = sorted(clip.fps for clip in clips if clip.fps < SLOW * FPS)
-    if not rates:
+    if not rates or manifest.interpolation != LINES:
         return None
     hertz = f"{rates[0]:g}" + (f" to {rates[-1]:g}" if rates[-1] > rates[0] else "")
     slow = f"{len(rates)} of {len(clips)} {what} were recorded at {hertz} Hz"
-    return f"{slow} and are resampled by straight lines: their Jitter and velocities have its kinks"
+    return (
+        f"{slow} and go on by straight lines (data.interpolation): their Jitter and velocities have its kinks"
+    )
 
 
 def of_skipped(skipped: Sequence[Skipped]) -> str | None:
@@ -134,7 +137,7 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     untied = unfitting(data.manifest.split, [clip.name for clip in clips])
     files = of_skipped(data.manifest.skipped), of_unusual(data.manifest.unusual)
     subjects = of_subjects(experiment.config["data"], clips)
-    for said in filter(None, (*files, of_rates(clips, "clips"), subjects, untied)):
+    for said in filter(None, (*files, of_rates(data.manifest, clips, "clips"), subjects, untied)):
         remark(f"data: {said}")
     run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
     if not run.done:
@@ -404,7 +407,7 @@ def of_data(experiment: Experiment, data: Prepared) -> dict[str, Any]:
     """Return warnings about a run's data for tables to flag, in words; None for each that does not apply."""
     divided = of_subjects(experiment.config["data"], data.manifest.clips) or None
     tested = [clip for clip in data.manifest.clips if clip.split == "test"]
-    resampled = of_rates(tested, "test clips")
+    resampled = of_rates(data.manifest, tested, "test clips")
     return {"partial": partial_words(experiment, data), "divided": divided, "resampled": resampled}
 
 

@@ -467,7 +467,7 @@ def test_runs_that_were_tested_on_people_of_their_training_are_named(sweep: Swee
 
 def test_test_clips_of_a_lower_rate_are_flagged(sweep: Sweep, tmp_path: Path):
     """Their truth has kinks, and so have the numbers that compare with it; kept results know it, too."""
-    said = "2 of 6 test clips were recorded at 30 Hz and are resampled by straight lines"
+    said = "2 of 6 test clips were recorded at 30 Hz and go on by straight lines"
     arms = [arm.label for arm in sweep.runnable()]
     runs = {
         label: fake_run(tmp_path, label, origin={"resampled": said} if label != arms[0] else None)
