@@ -67,6 +67,7 @@ UNTRIED = {
     "data.root": "where the same clips lie; another folder's are another digest",
     "data.sources": "other folders are another digest; weights: tests/config/test_build_motion.py",
     "data.synth": "makes other clips, and so another digest: see the test below",
+    "data.interpolation": "here all clips have 60 Hz: tests/motion/preparing/test_cache.py",
     "data.body": "a file of the user's; its rest pose is in the data's digest",
     "data.split.per_group": "here are no groups: tests/motion/preparing/test_splits.py",
     "plugins": "changes no run by itself: tests/config/test_plugins.py",
