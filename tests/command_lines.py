@@ -22,7 +22,8 @@ ROOT = Path(__file__).parent.parent
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"(?<!`)`([^`\n]+(?:\n[^`\n]+)?)`(?!`)")
 OF_BOTH_SOURCES = (
-    "mix", "scaling", "networks", "recurrent_poser", "recurrent_poser_ingredients", "data=cmu_bandai",
+    "mix", "scaling", "networks", "recurrent_poser", "recurrent_poser_ingredients", "smooth_motion",
+    "data=cmu_bandai",
 )  # fmt: skip
 OWN = re.compile(r"[\w./-]*\.yaml")  # a sweep file that a page invents
 
