@@ -450,33 +450,28 @@ def test_a_part_of_a_list_is_said_wherever_its_runs_are(sweep: Sweep, tmp_path: 
     assert part in origin_words(kept).replace("\\", "")  # escaped for Markdown
 
 
-def test_runs_that_were_tested_on_people_of_their_training_are_named(sweep: Sweep, tmp_path: Path):
-    said = "clips of CMU/01 and 2 more are in training and in test; data=amass_s3 keeps subjects apart"
+@pytest.mark.parametrize(
+    ("fact", "said"),
+    [
+        (
+            "divided",
+            "clips of CMU/01 and 2 more are in training and in test; data=amass_s3 keeps subjects apart",
+        ),
+        ("resampled", "2 of 6 test clips were recorded at 30 Hz and go on by straight lines"),
+    ],
+)
+def test_what_runs_say_of_their_data_is_flagged_with_their_names(
+    sweep: Sweep, tmp_path: Path, fact: str, said: str
+):
+    """People of the training in the test, or clips whose truth has kinks; kept results know it, too."""
     arms = [arm.label for arm in sweep.runnable()]
     runs = {
-        label: fake_run(tmp_path, label, origin={"divided": said} if label != arms[0] else None)
-        for label in arms
+        label: fake_run(tmp_path, label, origin={fact: said} if label != arms[0] else None) for label in arms
     }
     flagged = table_of(replace(sweep, seeds=(0,)), lambda arm, seed: runs[arm.label]).flags
     assert f"{said}: {', '.join(map(repr, arms[1:]))}" in flagged
     measured = {label: {0: load(runs[label].folder)} for label in arms}
     path = tmp_path / "kept.json"
     path.write_text(dumps(Kept("5", (), measured, {label: () for label in arms})))
-    assert {run.origin.divided for run in load_kept(path).every} == {said, None}
-
-
-def test_test_clips_of_a_lower_rate_are_flagged(sweep: Sweep, tmp_path: Path):
-    """Their truth has kinks, and so have the numbers that compare with it; kept results know it, too."""
-    said = "2 of 6 test clips were recorded at 30 Hz and go on by straight lines"
-    arms = [arm.label for arm in sweep.runnable()]
-    runs = {
-        label: fake_run(tmp_path, label, origin={"resampled": said} if label != arms[0] else None)
-        for label in arms
-    }
-    flagged = table_of(replace(sweep, seeds=(0,)), lambda arm, seed: runs[arm.label]).flags
-    assert f"{said}: {', '.join(map(repr, arms[1:]))}" in flagged
-    measured = {label: {0: load(runs[label].folder)} for label in arms}
-    path = tmp_path / "kept.json"
-    path.write_text(dumps(Kept("5", (), measured, {label: () for label in arms})))
-    assert {run.origin.resampled for run in load_kept(path).every} == {said, None}
-    assert '"resampled": null' not in path.read_text()  # files of before keep their bytes
+    assert {getattr(run.origin, fact) for run in load_kept(path).every} == {said, None}
+    assert f'"{fact}": null' not in path.read_text()  # files of before keep their bytes
