@@ -136,7 +136,7 @@ def show(chosen: Sweep, plan: Plan) -> None:
 
     from memmlp.config.compose_plan import orphans
     from memmlp.sweep.progress_table import render
-    from memmlp.tables.flags_of_runs import older_code
+    from memmlp.tables.flags_of_code import older_code
 
     if plan.entries:
         states = plan.states()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import hashlib
 import itertools
 import math
 from collections import defaultdict
@@ -11,9 +9,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from memmlp.runs.environment import changed, sources
 from memmlp.sweep.definition import COSTS, Arm, Sweep
+from memmlp.tables import flags_of_code
 from memmlp.tables.effects import RunsBySeed, control_arm, one_and_the_same
+from memmlp.tables.flag_words import differing, listed, quoted, unique
 from memmlp.tables.measured_run import SHARED, UNKNOWN, Measured
 
 Say = Callable[[Arm, int], str | None]
@@ -22,7 +21,6 @@ TIMES = {"ms", "network ms", "pose ms", "ratio", "FPS"}
 CORE = 0.9  # how much of a measurement the thread has to have a core for its times to be the network's
 STEADY = 1.25  # how many times the ratio of one seed that of another may be: it does not depend on the seed
 ALIKE = 1.1  # how many times the frames of its control an arm may see in training before a flag says so
-FILES = 5  # names of files that a flag has at most
 SMPLH = (1, 2, 3)  # the paper's tables on AMASS, on the rest joints of SMPL-H bodies
 ORIGIN = {
     "code": "code", "data": "data", "hardware": "hardware", "device": "device", "gpu": "GPU",
@@ -64,20 +62,20 @@ def flags(
     if set(sweep.metrics) - set(COSTS):
         yield from _resampled(every)
     for attribute, what in ORIGIN.items():
-        yield from _differing(what, [(getattr(run.origin, attribute), label) for label, run in every])
-    yield from _other_files(every)
-    yield from older_code((label, run.code, run.origin.plugins) for label, run in every)
+        yield from differing(what, [(getattr(run.origin, attribute), label) for label, run in every])
+    yield from flags_of_code.other_files(every)
+    yield from flags_of_code.older_code((label, run.code, run.origin.plugins) for label, run in every)
     if TIMES & set(sweep.metrics):
-        yield from _differing("machine of the times", _timed(every))
+        yield from differing("machine of the times", _timed(every))
         yield from _busy(sweep, runs)
     yield from _seen(sweep, runs)
     yield from _partial(every)
     yield from _divided_subjects(every)
-    yield from _recipes(every)
-    yield from _own_code(every)
+    yield from flags_of_code.recipes(every)
+    yield from flags_of_code.own_code(every)
     uncommitted = [label for label, run in every if run.origin.changed]
     if uncommitted:
-        yield f"made by code with uncommitted changes: {_quoted(uncommitted)}"
+        yield f"made by code with uncommitted changes: {quoted(uncommitted)}"
     if set(sweep.metrics) - set(COSTS):
         yield from _replicates(sweep, runs)
         yield from _body(sweep, every)
@@ -88,7 +86,7 @@ def _less_precise(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
     """Flag arms whose size and times come from another file than the network that was evaluated."""
     found = [label for label, run in every if run.origin.deployed != "fp32"]
     if found:
-        yield f"size and times are of a file of less precision, errors of float32: {_quoted(found)}"
+        yield f"size and times are of a file of less precision, errors of float32: {quoted(found)}"
 
 
 def _other_data(sweep: Sweep) -> Iterable[str]:
@@ -107,11 +105,11 @@ def _missing(sweep: Sweep, runs: Mapping[str, RunsBySeed], command: str, state: 
     for arm in sweep.runnable():
         seeds = _gaps(sweep, arm, runs)
         if seeds:
-            states = _unique(word for seed in seeds if (word := state(arm, seed)))
+            states = unique(word for seed in seeds if (word := state(arm, seed)))
             words = f" ({', '.join(states)})" if states else ""
             gaps.append(f"'{arm.label}' seed {', '.join(map(str, seeds))}{words}")
     if gaps:
-        yield f"missing: {_listed(gaps)}; fill with: {command}"
+        yield f"missing: {listed(gaps)}; fill with: {command}"
 
 
 def _older(sweep: Sweep, runs: Mapping[str, RunsBySeed], older: Say) -> Iterable[str]:
@@ -123,7 +121,7 @@ def _older(sweep: Sweep, runs: Mapping[str, RunsBySeed], older: Say) -> Iterable
         if (run := older(arm, seed))
     ]
     if found:
-        yield f"made by an earlier recipe, left out and made again by the sweep: {_listed(found)}"
+        yield f"made by an earlier recipe, left out and made again by the sweep: {listed(found)}"
 
 
 def _gaps(sweep: Sweep, arm: Arm, runs: Mapping[str, RunsBySeed]) -> list[int]:
@@ -135,11 +133,11 @@ def _branches(sweep: Sweep, asked: Sweep, runs: Mapping[str, RunsBySeed], comman
     wanted = {arm.label: arm.branch for arm in asked.arms}
     fallen = [arm for arm in sweep.runnable() if arm.branch != wanted[arm.label]]
     if fallen:
-        labels, branches = _quoted(arm.label for arm in fallen), _listed(_unique(a.branch for a in fallen))
+        labels, branches = quoted(arm.label for arm in fallen), listed(unique(a.branch for a in fallen))
         yield f"the network has no other branch, so the row shows {branches}: {labels}"
     lacking = [a for a in sweep.runnable() if any(not run.has(a.branch) for run in runs[a.label].values())]
     if lacking:
-        branches, labels = _listed(_unique(a.branch for a in lacking)), _quoted(a.label for a in lacking)
+        branches, labels = listed(unique(a.branch for a in lacking)), quoted(a.label for a in lacking)
         yield f"not evaluated in the branch {branches}: {labels}; do so with: {command}"
 
 
@@ -147,7 +145,7 @@ def _offline(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
     """Flag networks that can't run as a stream."""
     found = [label for label, run in every if run.origin.offline]
     if found:
-        yield f"offline, no stream, for frames are made with later ones: {_quoted(found)}"
+        yield f"offline, no stream, for frames are made with later ones: {quoted(found)}"
 
 
 def _unequal_clips(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
@@ -174,7 +172,7 @@ def _unequal_groups(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
             groups[clip].add(run.group(clip))
     several = [clip for clip, names in groups.items() if len(names) > 1]
     if several:
-        yield f"runs differ in the groups of test clips (data.split.groups): {_quoted(several)}"
+        yield f"runs differ in the groups of test clips (data.split.groups): {quoted(several)}"
 
 
 def _fewer_seeds(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
@@ -188,8 +186,8 @@ def _fewer_seeds(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
             for seed in without if len(without) < len(found) else ():
                 lacking[arm.label, seed].append(metric)
     if lacking:
-        words = [f"'{label}' seed {seed} ({_listed(_unique(m))})" for (label, seed), m in lacking.items()]
-        yield f"not measured, so that the mean is of the other seeds: {_listed(words)}"
+        words = [f"'{label}' seed {seed} ({listed(unique(m))})" for (label, seed), m in lacking.items()]
+        yield f"not measured, so that the mean is of the other seeds: {listed(words)}"
 
 
 def _no_numbers(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
@@ -217,7 +215,7 @@ def _no_numbers(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
             lost[cell] |= clips - short
     found = [f"'{label}' seed {seed} ({len(clips)} clips)" for (label, seed), clips in lost.items() if clips]
     if found:
-        yield f"errors that are no numbers, of clips that are left out of differences: {_listed(found)}"
+        yield f"errors that are no numbers, of clips that are left out of differences: {listed(found)}"
 
 
 def _lacking(run: Measured, mode: str, branch: str, metric: str) -> set[str]:
@@ -243,21 +241,8 @@ def _calmer_than_truth(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable
                 truths[mode] = float(np.mean(true))
                 calmer[mode].append(f"'{arm.label}' {np.mean(made):.2f}")
     for mode, arms in calmer.items():
-        less = f"Jitter below the truth's {truths[mode]:.2f} ({mode}): {_listed(arms)}"
+        less = f"Jitter below the truth's {truths[mode]:.2f} ({mode}): {listed(arms)}"
         yield f"{less}; calmer than the motion itself is no better"
-
-
-def _differing(what: str, found: Iterable[tuple[str, str]]) -> Iterable[str]:
-    """Flag a property in which arms differ, and name the arms that have each value.
-
-    `found` has pairs of a value and an arm's label.
-    """
-    groups: dict[str, list[str]] = defaultdict(list)
-    for value, label in found:
-        groups[value].append(label)
-    if len(groups) > 1:
-        parts = [f"{value} of {_quoted(labels)}" for value, labels in groups.items()]
-        yield f"{what} differs: {'; '.join(parts)}"
 
 
 def _seen(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
@@ -275,12 +260,12 @@ def _seen(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
                 own, controls = (_in_millions(frames[one.label]) for one in (arm, other))
                 unequal.append(f"'{arm.label}' {own} M to '{other.label}' {controls} M")
     if unequal:
-        yield f"number of frames seen in training differs: {_listed(unequal)}"
+        yield f"number of frames seen in training differs: {listed(unequal)}"
 
 
 def _in_millions(numbers: Sequence[float]) -> str:
     """Return sorted numbers in millions: one where all read the same, or else the least and the most."""
-    return "-".join(_unique(f"{number / 1e6:.3g}" for number in (numbers[0], numbers[-1])))
+    return "-".join(unique(f"{number / 1e6:.3g}" for number in (numbers[0], numbers[-1])))
 
 
 def _timed(every: Sequence[tuple[str, Measured]]) -> list[tuple[str, str]]:
@@ -301,77 +286,25 @@ def _busy(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
         elif ratios and max(ratios) > STEADY * min(ratios):
             found.append(f"'{arm.label}' (ratio {min(ratios):.3g} to {max(ratios):.3g} over seeds)")
     if found:
-        yield f"timed on a busy machine, so that other work is in the times: {_listed(found)}"
+        yield f"timed on a busy machine, so that other work is in the times: {listed(found)}"
 
 
 def _partial(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
     """Flag runs whose data is only a part of their protocol's list."""
-    for part in _unique(run.origin.partial for _, run in every if run.origin.partial):
-        yield f"{part}, and no more: {_quoted(label for label, run in every if run.origin.partial == part)}"
+    for part in unique(run.origin.partial for _, run in every if run.origin.partial):
+        yield f"{part}, and no more: {quoted(label for label, run in every if run.origin.partial == part)}"
 
 
 def _divided_subjects(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
     """Flag runs that were tested on subjects on whom they were trained."""
-    for said in _unique(run.origin.divided for _, run in every if run.origin.divided):
-        yield f"{said}: {_quoted(label for label, run in every if run.origin.divided == said)}"
+    for said in unique(run.origin.divided for _, run in every if run.origin.divided):
+        yield f"{said}: {quoted(label for label, run in every if run.origin.divided == said)}"
 
 
 def _resampled(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
     """Flag runs that were tested on clips recorded at a lower rate than the network's."""
-    for said in _unique(run.origin.resampled for _, run in every if run.origin.resampled):
-        yield f"{said}: {_quoted(label for label, run in every if run.origin.resampled == said)}"
-
-
-def _recipes(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Flag components that several arms use, but with different recipe versions."""
-    for name in sorted({name for _, run in every for name in run.origin.recipes}):
-        having = [(run, label) for label, run in every if name in run.origin.recipes]
-        yield from _differing(
-            f"recipe of {name}", [(str(r.origin.recipes[name]), label) for r, label in having]
-        )
-
-
-def _other_files(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Flag files of memmlp whose code differs between arms, be it of one commit.
-
-    Users' packages are left to `_own_code`. Kept results have no digests of files, and are left out.
-    """
-    having = [(run.code, label) for label, run in every if run.code]
-    digests: dict[str, set[str]] = defaultdict(set)
-    for code, _ in having:
-        for name in code:
-            digests[name].add(code[name])
-    names = sorted(name for name, found in digests.items() if len(found) > 1 and ":" not in name)
-
-    def version(code: Mapping[str, str]) -> str:
-        return hashlib.sha256(repr([code.get(name) for name in names]).encode()).hexdigest()[:7]
-
-    yield from _differing(
-        f"code of {_listed(names, FILES)}", [(version(code), label) for code, label in having]
-    )
-
-
-def older_code(runs: Iterable[tuple[str, Mapping[str, str], Iterable[str]]]) -> Iterable[str]:
-    """Flag runs that were made before code changed, though no recipe version was raised.
-
-    Args:
-        runs: for each run its arm's label, the digests of its code (`sources`; empty where these are not
-            known), and the users' packages that it uses.
-    """
-    today = functools.cache(sources)
-    found = [(label, changed(code, today(tuple(packages)))) for label, code, packages in runs if code]
-    names = sorted({name for _, files in found for name in files})
-    if names:
-        labels = _quoted(label for label, files in found if files)
-        since = "has changed since these runs, under the same recipes"
-        yield f"code of {_listed(names, FILES)} {since}: {labels}"
-
-
-def _own_code(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Flag users' packages of which arms use different versions or code."""
-    for name in sorted({name for _, run in every for name in run.origin.plugins}):
-        having = [(run.origin.plugins[name], label) for label, run in every if name in run.origin.plugins]
-        yield from _differing(f"code of {name}", having)
+    for said in unique(run.origin.resampled for _, run in every if run.origin.resampled):
+        yield f"{said}: {quoted(label for label, run in every if run.origin.resampled == said)}"
 
 
 def _replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
@@ -394,7 +327,7 @@ def _replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
         yield "one group of test clips: the intervals speak of other seeds, not of other takes or people"
     shared = [label for label, found in measured.items() if _one_upstream(found)]
     if shared:
-        yield f"all seeds share one VQ-VAE, which they so do not replicate: {_quoted(shared)}"
+        yield f"all seeds share one VQ-VAE, which they so do not replicate: {quoted(shared)}"
 
 
 def _same(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
@@ -423,7 +356,7 @@ def _single(sweep: Sweep, runs: Mapping[str, RunsBySeed], one_group: bool) -> It
     few = [label for label, number in shared.items() if number == 1]
     if few:
         so = "there is no interval" if one_group else "the interval speaks of other clips alone"
-        yield f"one seed, so that {so}, and no star: {_quoted(few)}"
+        yield f"one seed, so that {so}, and no star: {quoted(few)}"
 
 
 def _one_upstream(found: Sequence[Measured]) -> bool:
@@ -435,17 +368,4 @@ def _body(sweep: Sweep, every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
     """Flag runs on the built-in skeleton in tables where the paper's numbers are on SMPL-H bodies."""
     bare = [label for label, run in every if run.origin.body == BUILT_IN]
     if sweep.table in SMPLH and bare:
-        yield f"on the built-in skeleton, the paper's are on SMPL-H bodies (data.body=FILE): {_quoted(bare)}"
-
-
-def _unique(words: Iterable[str]) -> list[str]:
-    return list(dict.fromkeys(words))
-
-
-def _quoted(labels: Iterable[str]) -> str:
-    return _listed([f"'{label}'" for label in _unique(labels)])
-
-
-def _listed(words: Sequence[str], most: int = 12) -> str:
-    """Join words with commas; of many words, only the first ones and the number of the others."""
-    return ", ".join(words[:most]) + (f", and {len(words) - most} more" if len(words) > most else "")
+        yield f"on the built-in skeleton, the paper's are on SMPL-H bodies (data.body=FILE): {quoted(bare)}"
