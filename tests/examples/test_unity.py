@@ -20,6 +20,7 @@ from engine_clips import EXAMPLES, PERSON, Played, trackers
 from processes import started
 from scipy.spatial.transform import Rotation
 
+from memmlp.common.errors import InputError
 from memmlp.deploy.onnx_stream import open_session
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix
 from memmlp.live.spaces import SPACES
@@ -191,3 +192,16 @@ def test_calibration_is_that_of_the_stream(play: Player, stream: Stream):
     bones = play(samples)
     np.testing.assert_allclose(bones, poses(stream, samples), atol=1e-4)
     assert len(bones) == len(PERSON.positions) + 1
+
+
+def test_calibration_of_arms_that_hang_is_refused(play: Player, stream: Stream):
+    """As the stream refuses it, and what was known before stays."""
+    hanging = np.array([[0, 1.6, 0, 0, 0, 0, 1], [-0.25, 0.8, 0, 0, 0, 0, 1], [0.25, 0.8, 0, 0, 0, 0, 1]])
+    with pytest.raises(InputError, match="from where a T-pose has it"):
+        stream.calibrate(*((device[:3], device[3:]) for device in hanging))
+    samples = [
+        (time, hanging if index == 0 else frame, "")
+        for index, (time, frame, _) in enumerate(rows(trackers("unity")))
+    ]
+    refused = [(*samples[0][:2], "refuse"), *samples[1:]]
+    np.testing.assert_allclose(play(refused), play(samples), atol=1e-4)

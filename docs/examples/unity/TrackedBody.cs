@@ -14,6 +14,7 @@ namespace Memmlp
         const double FrameTime = 1.0 / 60; // seconds; the network was trained at this rate
         const double Early = 5e-4; // seconds that a frame may be ahead of its sample
         const double Gap = 0.5; // seconds without a sample after which everything begins anew
+        const float Far = 0.25f; // metres from a T-pose's joint, beyond which a device is not worn there
         const float Recovery = 0.2f; // seconds over which a lost tracker comes back, as a jump looks like a blow
 
         static readonly XRNode[] Nodes = { XRNode.Head, XRNode.LeftHand, XRNode.RightHand };
@@ -93,8 +94,9 @@ namespace Memmlp
 
         /// <summary>
         /// Learn where the joints are on the devices, from a wearer who stands upright in a T-pose. The line from
-        /// hand to hand tells where the wearer looks. Return whether all three were tracked, hands apart, and the
-        /// head did not look backwards, as it does where the controllers are exchanged.
+        /// hand to hand tells where the wearer looks. Return false, and keep what was known before, unless all three
+        /// are tracked and near their joints in a T-pose, with the hands apart, and the head does not look backwards,
+        /// as it does where the controllers are exchanged.
         /// </summary>
         public bool Calibrate()
         {
@@ -108,6 +110,9 @@ namespace Memmlp
             Vector3 place = Vector3.zero; // where the T-pose's origin is, so that the joints are near the devices
             for (int k = 0; k < 3; k++)
                 place += (devices[k].position - turn * rest[k]) / 3;
+            for (int k = 0; k < 3; k++)
+                if ((place + turn * rest[k] - devices[k].position).magnitude > Far)
+                    return false; // arms that hang would turn every later pose
             for (int k = 0; k < 3; k++)
             {
                 Quaternion back = Quaternion.Inverse(devices[k].rotation);

@@ -2,7 +2,7 @@
 //
 // play.exe model.txt avatar.csv samples.csv bones.csv: the model's inputs and outputs, a line each with an empty
 // line between them; a row of 3 numbers for each bone, its place in T-pose; and rows of a time, 21 numbers and a
-// word: "calibrate" asks for it after the sample. An empty place of a tracker is one that is lost.
+// word: "calibrate" asks for it after the sample, and "refuse" for one that has to fail. An empty place of a tracker is one that is lost.
 using System;
 using System.Globalization;
 using System.IO;
@@ -38,8 +38,8 @@ public static class Play
             for (int k = 0; k < 3; k++)
                 InputDevices.Poses[(int)Nodes[k]] = Read(row.Skip(1 + 7 * k).Take(7).ToArray());
             Call(tracked, "Update");
-            if (row[22] == "calibrate" && !tracked.Calibrate())
-                throw new InvalidOperationException("not calibrated");
+            if (row[22] != "" && tracked.Calibrate() != (row[22] == "calibrate"))
+                throw new InvalidOperationException(row[22] + " at " + row[0]);
             bones.AppendLine(string.Join(",", rig.Select((bone, joint) => Words(bone, rest[joint]))));
         }
         File.WriteAllText(words[3], bones.ToString());
