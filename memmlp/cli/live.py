@@ -157,6 +157,7 @@ class InputOptions(NamedTuple):
 
 
 FED = InputOptions._fields[1:]
+"""The options among these; the network is the command's argument."""
 
 
 class ShowOptions(NamedTuple):

@@ -53,10 +53,10 @@ def find_sweep(name: str, overrides: Sequence[str] = ()) -> Sweep:
 
 
 def check_experiment(sweep: Sweep, arm: Arm) -> None:
-    """Check that nothing outside of an arm undoes what its `experiment=NAME` sets, nor it another one.
+    """Check that an arm's `experiment=NAME` sets all that it should, and replaces no other experiment.
 
     Hydra lets a group or key on the command line win over an experiment's, wherever it stands, and the last
-    experiment replaces those before.
+    experiment replaces those before. So an override of the base could undo a part of what the arm is for.
 
     Raises:
         InputError: for such an arm; the message names the sweep, the arm and both overrides.

@@ -9,9 +9,9 @@ The rules apply in this order:
 - **Frames** lie on a grid of 1 / fps from the first sample on. A frame is made as soon as there is a sample
   at or after its time, by interpolation between the samples beside it (positions linearly, rotations by
   slerp). No sample of the future is waited for, and a pose is at most one frame older than the newest sample.
-  A frame that is ahead of its sample, by `EARLY` at most, goes on a little way past it (`FURTHEST`).
-  A slow tracker gives several frames at once, a fast one none at some samples, and the rate may change at any
-  time.
+  A frame may also lie a little after its sample, by `EARLY` at most, since times are rounded; it is then
+  extrapolated, but no further than `FURTHEST`. A slow tracker gives several frames at once, a fast one none
+  at some samples, and the rate may change at any time.
 - A sample that is not newer than the last one is **ignored**.
 - After a **gap** (no sample for longer than `GAP` seconds, or a clock that was set back by more) everything
   begins anew.
@@ -34,7 +34,7 @@ from memmlp.motion.body import (
 
 GAP = 0.5  # seconds without a sample after which everything begins anew
 RECOVERY = 0.2  # seconds over which a tracker that returns is led to its true pose
-EARLY = 5e-4  # seconds that a frame may be ahead of its sample, for times that are rounded to milliseconds
+EARLY = 5e-4  # seconds that a frame may lie after its sample, since times are rounded to milliseconds
 FURTHEST = 1.1  # of the way from one sample to the next; two that came together tell no speed
 SAME = 1e-6  # seconds; a sample this near to a frame is taken as the frame
 

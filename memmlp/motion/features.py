@@ -5,9 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from memmlp.motion.body import (
-    TRACKED,
-)
+from memmlp.motion.body import TRACKED
 from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics, matrix_to_sixd
 
 

@@ -1,4 +1,4 @@
-"""Architectures: each builds the networks of one family with fresh weights, and loads trained ones."""
+"""Families of networks: an `Architecture` builds the networks of one family, and loads trained ones."""
 
 from __future__ import annotations
 

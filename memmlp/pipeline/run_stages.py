@@ -86,9 +86,9 @@ def of_subjects(config: Mapping[str, Any], clips: Sequence[ClipRecord]) -> str:
 
 
 def of_rates(manifest: Manifest, clips: Sequence[ClipRecord], what: str) -> str | None:
-    """Return what to say of clips of a lower rate than the network's between whose frames lines go on.
+    """Return a remark on clips of a lower rate than the network's that were interpolated by straight lines.
 
-    Straight lines give the interpolated clips kinks, which no person makes. None if there are none.
+    The lines give these clips kinks, which no person makes. It is None if there are no such clips.
 
     Args:
         manifest: the data's manifest.

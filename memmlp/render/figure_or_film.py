@@ -1,4 +1,4 @@
-"""Writes a take as a file: a figure or a film, depending on the name's suffix."""
+"""Writes a piece of a clip as a file: a figure or a film, depending on the name's suffix."""
 
 from __future__ import annotations
 

@@ -259,4 +259,4 @@ def resume(
     torch.set_rng_state(tensors["rng.torch"])
     for group, rate in zip(optimiser.param_groups, values["initial_lr"], strict=True):
         group["initial_lr"] = rate
-    return values["step"], values.get("seconds", 0.0)  # checkpoints of before have none
+    return values["step"], values.get("seconds", 0.0)  # older checkpoints have none

@@ -105,7 +105,7 @@ class Hub:
                 self.watchers.discard(watcher)
 
     def close(self) -> None:
-        """End every watcher's stream of events, and accept no more events."""
+        """End the stream of events of every watcher, and of each that comes later."""
         with self.lock:
             self.closed = True
             for watcher in self.watchers:

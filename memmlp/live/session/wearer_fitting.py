@@ -119,6 +119,7 @@ class Fitting:
     def _carry_out(self, order: Order, trackers: TrackerPoses | None) -> None:
         """Carry out an order, save what it changed, and report the result."""
         try:
+            # Actions after a countdown need the trackers; the others need the order's value.
             said = self.actions[order.action](order.value if trackers is None else trackers)
             if order.action != "cancel":
                 self._save()

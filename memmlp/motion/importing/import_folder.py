@@ -163,7 +163,8 @@ def import_folder(source: Path, out: Path, how: ImportSettings | None = None) ->
 def _one_floor_a_take(clips: list[Imported], takes: Mapping[str, str], staging: Path) -> list[Imported]:
     """Lower the clips of a take by the take's lowest floor, instead of each clip by its own.
 
-    A floor is one at the files' size, which of two persons is not one at the body's.
+    The floors are compared at the size that the files have. Two persons of a take stand on the same floor
+    there, but no longer once each was scaled to the body by a factor of his or her own.
     """
     floors: dict[str, float] = {}
     for clip in clips:

@@ -46,7 +46,7 @@ ITEM_BYTES = FRAME_DIM * 4
 
 @dataclass(frozen=True)
 class ClipFolder:
-    """The source and the settings from which a cache is made.
+    """What a cache is made from: the clips below a folder or several, and the settings.
 
     Attributes:
         root: folder of npz files, at any depth, or several of them by name.
@@ -231,7 +231,7 @@ def _total(clips: Sequence[ClipRecord], part: str) -> dict[str, float]:
 
 def _digest(clips: Sequence[ClipRecord], rest: np.ndarray, source: ClipFolder) -> str:
     sources = [(clip.name, clip.split, clip.sha256) for clip in clips]
-    # Lines are what runs from before there was a choice have.
+    # Data from before there was a choice was made with lines, and keeps its digest.
     other = source.interpolation != LINES and any(clip.resampling == INTERPOLATED for clip in clips)
     interpolation = [source.interpolation] if other else []
     return _hash([FRAMES_VERSION, source.min_frames, rest.tolist(), sources, *interpolation])
