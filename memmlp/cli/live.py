@@ -273,7 +273,7 @@ def serve(given: InputOptions, shown: ShowOptions) -> None:
     import webbrowser
 
     from memmlp.common.termination import closed_in_peace
-    from memmlp.live.session.loop import greeting, play, with_avatar
+    from memmlp.live.session.loop import greeting, run_loop, with_avatar
     from memmlp.live.session.page_server import Hub, LiveServer
     from memmlp.live.session.wearer_fitting import Fitting
 
@@ -296,7 +296,7 @@ def serve(given: InputOptions, shown: ShowOptions) -> None:
                 webbrowser.open(server.url)
             stopped = threading.Event()
             avatar = shown.avatar is not None
-            play(stream, source, hub.publish, stopped, outputs, fitting, avatar, tell=note)
+            run_loop(stream, source, hub.publish, stopped, outputs, fitting, avatar, tell=note)
 
 
 def open_stream(given: InputOptions, space: SpaceName, shown: ShowOptions) -> tuple[Stream, str]:

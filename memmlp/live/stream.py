@@ -32,7 +32,7 @@ FARTHEST = 1e6  # metres; a tracker farther from the origin is taken as lost
 LATEST = 1e10  # seconds; at much later times floats can't tell frames of 1/60 s apart
 TILTED = np.radians(60)  # from upright; which way a device that is tilted further looks, nobody knows
 FAR = 0.25  # metres from a T-pose's joint, beyond which a device is not worn there
-UNIT = 1e-2  # how far a quaternion's norm may be from 1, or a matrix from orthonormal
+TOLERANCE = 1e-2  # how far a quaternion's norm may be from 1, or a matrix from orthonormal
 
 TrackerPose = tuple[ArrayLike, ArrayLike] | None
 RotationFormat = Literal["matrix", "quaternion"]
@@ -364,7 +364,7 @@ def _matrices(quaternions: dict[int, np.ndarray]) -> np.ndarray:
     array = np.array(list(quaternions.values()))
     norms = np.sqrt(np.einsum("ni,ni->n", array, array))
     for index, norm in zip(quaternions, norms.tolist(), strict=True):
-        if abs(norm - 1) > UNIT and norm != 0 and math.isfinite(norm):
+        if abs(norm - 1) > TOLERANCE and norm != 0 and math.isfinite(norm):
             raise InputError(f"{TRACKERS[index]}: a quaternion of norm {norm:.3g}; allowed is 1 (xyzw)")
     norms[norms == 0] = np.nan
     return quaternion_to_matrix(array / norms[:, None])
@@ -373,10 +373,10 @@ def _matrices(quaternions: dict[int, np.ndarray]) -> np.ndarray:
 def _check_rotations(names: Sequence[str], rotations: np.ndarray) -> None:
     """Raise InputError for matrices (3, 3, 3) that are no rotations: not orthonormal, or mirror images."""
     product = rotations @ rotations.swapaxes(1, 2)
-    if np.abs(product - IDENTITY).max() <= UNIT and np.linalg.det(rotations).min() > 0:
+    if np.abs(product - IDENTITY).max() <= TOLERANCE and np.linalg.det(rotations).min() > 0:
         return
     for name, matrix in zip(names, rotations, strict=True):
-        if np.abs(matrix @ matrix.T - IDENTITY).max() > UNIT:
+        if np.abs(matrix @ matrix.T - IDENTITY).max() > TOLERANCE:
             raise InputError(f"{name}: the matrix is not orthonormal; allowed is a rotation (3, 3)")
         if np.linalg.det(matrix) < 0:
             raise InputError(f"{name}: the matrix is a mirror image; allowed is a rotation (3, 3)")

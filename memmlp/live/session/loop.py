@@ -48,7 +48,7 @@ def with_avatar(words: Mapping[str, Any], rest: np.ndarray) -> dict[str, Any]:
     return dict(words) | {"avatar": avatar}
 
 
-def play(
+def run_loop(
     stream: Stream,
     source: TrackerSource,
     publish: Publish,

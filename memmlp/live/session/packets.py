@@ -29,21 +29,22 @@ POSE = 7  # numbers of a pose
 PREFIX = "/memmlp/"
 FARTHEST = 1e6  # the largest absolute value of a number in a pose
 
-TrackerPose = tuple[np.ndarray, np.ndarray] | None
-TrackerPoses = tuple[TrackerPose, TrackerPose, TrackerPose]
+QuaternionPose = tuple[np.ndarray, np.ndarray] | None
+"""A tracker's position (3,), metres, and quaternion xyzw (4,); None for a lost tracker."""
+QuaternionPoses = tuple[QuaternionPose, QuaternionPose, QuaternionPose]
+"""The poses of head, left and right."""
 
 
 class Packet(NamedTuple):
     """One sample of the trackers.
 
     Attributes:
-        trackers: head, left and right, each a position (3,), metres, and a quaternion xyzw (4,); None if
-            lost.
+        trackers: head, left and right.
         time: seconds of the sender's clock; None if the packet has no time.
         seq: the sample's number; None if the packet has none.
     """
 
-    trackers: TrackerPoses
+    trackers: QuaternionPoses
     time: float | None = None
     seq: int | None = None
 
@@ -119,7 +120,7 @@ def needs_osc(option: str = "--osc", instead: str = "--udp") -> None:
         raise InputError(f"{option}: needs python-osc, pip install 'memmlp[osc]'; allowed without: {instead}")
 
 
-def _tracker(name: str, values: Any) -> TrackerPose:
+def _tracker(name: str, values: Any) -> QuaternionPose:
     """Return a tracker from its seven numbers. Raises ValueError if they are no pose."""
     if values is None:
         return None

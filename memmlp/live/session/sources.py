@@ -15,7 +15,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
-from memmlp.live.session.packets import Packet, Parse, TrackerPoses
+from memmlp.live.session.packets import Packet, Parse, QuaternionPoses
 from memmlp.live.spaces import Space, SpaceName
 from memmlp.live.tracker_frames import TrackerSample, between
 from memmlp.motion.body import (
@@ -49,7 +49,7 @@ class SourceSample(NamedTuple):
     """
 
     time: float
-    trackers: TrackerPoses
+    trackers: QuaternionPoses
     dropped: int = 0
     arrived: float | None = None
 
@@ -97,7 +97,7 @@ class TrackedClip:
         self.joints = frames[:, SPARSE_DIM : SPARSE_DIM + MOTION_DIM][:, POSITION].reshape(-1, N_JOINTS, 3)
         self.seconds = (len(frames) - 1) / FPS
 
-    def trackers(self, time: float) -> TrackerPoses:
+    def trackers(self, time: float) -> QuaternionPoses:
         """Return position and quaternion (xyzw) of head, left and right wrist at a time, interpolated."""
         first, _ = self._place(time)
         a, b = (TrackerSample(i / FPS, self.positions[i], self.rotations[i]) for i in (first, first + 1))
@@ -142,7 +142,7 @@ def npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
     return motion_frames(*tensors).numpy()
 
 
-def in_space(trackers: TrackerPoses, space: Space) -> TrackerPoses:
+def in_space(trackers: QuaternionPoses, space: Space) -> QuaternionPoses:
     """Convert trackers, positions and quaternions (xyzw), from AMASS' world to a frame of reference."""
     positions, rotations = (np.stack(part) for part in zip(*filter(None, trackers), strict=True))
     matrices = space.rotations_out(quaternion_to_matrix(rotations))

@@ -17,7 +17,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.live.calibration_file import Calibration, save_calibration
-from memmlp.live.session.packets import TrackerPoses
+from memmlp.live.session.packets import QuaternionPoses
 from memmlp.live.spaces import SpaceName
 from memmlp.live.stream import Stream
 from memmlp.live.wearer import stature
@@ -94,7 +94,7 @@ class Fitting:
         """Take an order, from any thread. Raises InputError if it is no valid order."""
         self.orders.put(read_order(fields))
 
-    def step(self, trackers: TrackerPoses | None) -> None:
+    def step(self, trackers: QuaternionPoses | None) -> None:
         """Carry out the orders that are due: new ones at once, and a waiting one after its countdown.
 
         Args:
@@ -116,7 +116,7 @@ class Fitting:
             self.waiting = None
             self._carry_out(order, None)
 
-    def _carry_out(self, order: Order, trackers: TrackerPoses | None) -> None:
+    def _carry_out(self, order: Order, trackers: QuaternionPoses | None) -> None:
         """Carry out an order, save what it changed, and report the result."""
         try:
             # Actions after a countdown need the trackers; the others need the order's value.
@@ -128,13 +128,13 @@ class Fitting:
         else:
             self._say(said)
 
-    def _calibrate(self, trackers: TrackerPoses) -> str:
+    def _calibrate(self, trackers: QuaternionPoses) -> str:
         """Learn the offsets of the devices."""
         offsets = self.stream.calibrate(*trackers)
         said = f"Calibrated; the devices are up to {100 * offsets.distances.max():.0f} cm from the joints."
         return f"{said} But {offsets.doubt}" if offsets.doubt else said
 
-    def _touch_floor(self, trackers: TrackerPoses) -> str:
+    def _touch_floor(self, trackers: QuaternionPoses) -> str:
         """Set the floor's height to that of the lower hand."""
         hands = [tracker[0] for tracker in trackers[1:] if tracker is not None]
         if not hands:

@@ -11,7 +11,7 @@ import pytest
 from chromium import Browser
 from processes import PATIENCE, until
 
-from memmlp.live.session.loop import greeting, play
+from memmlp.live.session.loop import greeting, run_loop
 from memmlp.live.session.page_server import Hub, LiveServer
 from memmlp.live.session.sources import ClipSource, TrackedClip
 from memmlp.live.session.wearer_fitting import Fitting
@@ -29,7 +29,7 @@ def url(network: Path, clip: TrackedClip) -> Iterator[str]:
     stopped, source = threading.Event(), ClipSource(clip, 60)
     with LiveServer(Hub(greeting(source, "tiny")), 0) as server:
         parts = (Stream(network), source, server.hub.publish, stopped)
-        loop = threading.Thread(target=play, args=parts, daemon=True)
+        loop = threading.Thread(target=run_loop, args=parts, daemon=True)
         loop.start()
         yield server.url
         stopped.set()
@@ -105,7 +105,7 @@ def test_the_wearer_fits_the_stream_from_the_page(
     fitting = Fitting(stream, "amass", None, hub.tell, clock=lambda: 0.0)  # a countdown ends when cancelled
     with LiveServer(hub, 0, ask=fitting.ask) as server:
         parts = (stream, source, hub.publish, stopped, None, fitting)
-        loop = threading.Thread(target=play, args=parts, daemon=True)
+        loop = threading.Thread(target=run_loop, args=parts, daemon=True)
         loop.start()
         browser.open(server.url)
         browser.wait("document.querySelector('#height').value == '172'")

@@ -15,7 +15,7 @@ from processes import PATIENCE
 from memmlp.common.errors import InputError
 from memmlp.live.odd_samples import JUMPS
 from memmlp.live.session import page_server as module
-from memmlp.live.session.loop import greeting, play
+from memmlp.live.session.loop import greeting, run_loop
 from memmlp.live.session.page_server import FILES, Hub, LiveServer
 from memmlp.live.session.sources import ClipSource, SourceSample, TrackedClip
 from memmlp.live.stream import Stream
@@ -54,7 +54,7 @@ class Losing(Instant):
 def played(network: Path, clip: TrackedClip, hz: float, kind: type[Instant] = Instant) -> list[dict]:
     """Return the messages about a clip."""
     stopped, messages = threading.Event(), []
-    play(Stream(network), kind(clip, hz, stopped), messages.append, stopped)
+    run_loop(Stream(network), kind(clip, hz, stopped), messages.append, stopped)
     return messages
 
 
@@ -103,7 +103,7 @@ class InMilliseconds(Instant):
 def test_times_in_milliseconds_are_told_once(network: Path, clip: TrackedClip):
     stopped, messages, told = threading.Event(), [], []
     source = InMilliseconds(clip, 60, stopped)
-    play(Stream(network), source, messages.append, stopped, tell=told.append)
+    run_loop(Stream(network), source, messages.append, stopped, tell=told.append)
     assert len(told) == 1
     assert told[0].endswith("is `time` in seconds?")
     assert [message["jumping"] for message in messages] == [n >= JUMPS for n in range(len(messages))]
@@ -119,7 +119,7 @@ class Since1970(Instant):
 
 def test_why_samples_are_refused_is_told_once(network: Path, clip: TrackedClip):
     stopped, told = threading.Event(), []
-    play(Stream(network), Since1970(clip, 60, stopped), lambda message: None, stopped, tell=told.append)
+    run_loop(Stream(network), Since1970(clip, 60, stopped), lambda message: None, stopped, tell=told.append)
     assert len(told) == 1
     assert told[0].startswith("a sample is not taken: time=17000000")
     assert "allowed is a number of seconds" in told[0]
