@@ -20,7 +20,7 @@ from memmlp.motion.body import JOINTS, PARENTS, TRACKED, builtin_rest_joints
 from memmlp.motion.drawn_limbs import RADII
 from memmlp.render.canvas import FAINT, INK, Sheet, png
 from memmlp.render.raster import Camera, draw
-from memmlp.render.skeleton_map import LEFT, MIDDLE, RIGHT
+from memmlp.render.skeleton_picture import LEFT, MIDDLE, RIGHT
 
 IMAGES = Path(__file__).parent / "images"
 COLOURS = ("#d1242f", "#1a7f37", "#0969da")  # of X, Y and Z

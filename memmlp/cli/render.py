@@ -84,10 +84,10 @@ def render(
 
     check_picture(out, "--out")
     check_labels(runs, labels)
-    take = taken([open_run(outputs, run) for run in runs], labels, clip, (begin, end), branch, mode)
-    write_picture(out, take, frames, "--out")
-    errors = ", ".join(f"{label} {error.mean():.1f} cm" for label, error in take.errors.items())
-    click.echo(f"{out}: {take.title}, {errors}")
+    piece = piece_of([open_run(outputs, run) for run in runs], labels, clip, (begin, end), branch, mode)
+    write_picture(out, piece, frames, "--out")
+    errors = ", ".join(f"{label} {error.mean():.1f} cm" for label, error in piece.errors.items())
+    click.echo(f"{out}: {piece.title}, {errors}")
 
 
 def check_labels(runs: tuple[str, ...], labels: tuple[str, ...]) -> None:
@@ -98,7 +98,7 @@ def check_labels(runs: tuple[str, ...], labels: tuple[str, ...]) -> None:
         raise InputError(f"--label: {len(labels)} for {len(runs)} runs; allowed is one for each, or none")
 
 
-def taken(
+def piece_of(
     runs: list[OpenedRun],
     labels: tuple[str, ...],
     clip: str | None,

@@ -28,15 +28,15 @@ def check_picture(path: Path, key: str = "path", suffixes: tuple[str, ...] = SUF
         pyav()
 
 
-def write_picture(path: Path, take: ClipPiece, poses: int = POSES, key: str = "path") -> None:
+def write_picture(path: Path, piece: ClipPiece, poses: int = POSES, key: str = "path") -> None:
     """Write a PNG of `poses` poses in a row, or a GIF or MP4 of all frames, completely or not at all.
 
     Raises InputError if the file can't be written.
     """
     try:
         if path.suffix.lower() == ".png":
-            heatmap_png(path, take, poses)
+            heatmap_png(path, piece, poses)
         else:
-            film(path, take)
+            film(path, piece)
     except OSError as error:
         raise InputError(f"{key} {path}: {error.strerror or error}") from None

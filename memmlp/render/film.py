@@ -25,7 +25,7 @@ TOP, RIGHT, BOTTOM = 88, 112, 44
 TICKS = (30, 30, 40)  # milliseconds of a GIF's pictures in turn, multiples of 10: 30 a second on average
 
 
-def film(path: Path, take: ClipPiece) -> None:
+def film(path: Path, piece: ClipPiece) -> None:
     """Write a film at 30 pictures per second, completely or not at all: MP4 or GIF, by the path's suffix.
 
     Raises:
@@ -34,15 +34,15 @@ def film(path: Path, take: ClipPiece) -> None:
     encode = {".mp4": mp4, ".gif": gif}[path.suffix.lower()]
     if path.suffix.lower() == ".mp4":
         pyav()
-    atomic_write(path, encode(pictures(take)))
+    atomic_write(path, encode(pictures(piece)))
 
 
-def pictures(take: ClipPiece) -> Iterator[np.ndarray]:
+def pictures(piece: ClipPiece) -> Iterator[np.ndarray]:
     """Yield the film's pictures (H, W, 3), uint8, with a progress bar."""
-    labels = ["truth", *take.predictions]
+    labels = ["truth", *piece.predictions]
     width = len(labels) * WIDTH + RIGHT
     sheet = Sheet(width + width % 2, TOP + HEIGHT + BOTTOM)
-    sheet.text(20, 26, take.title, 22, ha="left", weight="bold")
+    sheet.text(20, 26, piece.title, 22, ha="left", weight="bold")
     time = sheet.text(width - 20, 26, "", 20, ha="right")
     middles = [(column + 0.5) * WIDTH for column in range(len(labels))]
     for x, label in zip(middles, labels, strict=True):
@@ -52,15 +52,15 @@ def pictures(take: ClipPiece) -> Iterator[np.ndarray]:
         k: sheet.text(x, TOP + HEIGHT + 18, "", 18, color=FAINT)
         for x, k in zip(middles[1:], labels[1:], strict=True)
     }
-    sheet.colour_bar(len(labels) * WIDTH + 16, TOP + 60, 16, HEIGHT - 120, take.top)
-    path, azimuth = take.path(), take.azimuth(len(take.truth) // 2)
-    for frame in progress_bar(range(0, len(take.truth), EVERY), "pictures"):
-        camera = take.camera(azimuth, path[frame], WIDTH, HEIGHT)
-        for panel, (joints, errors) in zip(panels, take.rows(frame), strict=True):
-            panel.set_data(draw(camera, joints, errors, take.floor))
+    sheet.colour_bar(len(labels) * WIDTH + 16, TOP + 60, 16, HEIGHT - 120, piece.top)
+    path, azimuth = piece.path(), piece.azimuth(len(piece.truth) // 2)
+    for frame in progress_bar(range(0, len(piece.truth), EVERY), "pictures"):
+        camera = piece.camera(azimuth, path[frame], WIDTH, HEIGHT)
+        for panel, (joints, errors) in zip(panels, piece.rows(frame), strict=True):
+            panel.set_data(draw(camera, joints, errors, piece.floor))
         for label, text in means.items():
-            text.set_text(f"{take.errors[label][frame].mean():.1f} cm")
-        time.set_text(f"{take.seconds(frame):.2f} s")
+            text.set_text(f"{piece.errors[label][frame].mean():.1f} cm")
+        time.set_text(f"{piece.seconds(frame):.2f} s")
         yield sheet.pixels()
 
 

@@ -26,22 +26,22 @@ OFF = np.array([0.0, 0.0, 0.08])
 
 
 @pytest.fixture
-def take() -> ClipPiece:
-    """Make a take of half a second, with a good and a bad prediction."""
+def piece() -> ClipPiece:
+    """Make a piece of half a second, with a good and a bad prediction."""
     return ClipPiece("clips/one", TRUTH, {"good": TRUTH + OFF / 8, "bad": TRUTH + OFF}, start=60)
 
 
 @pytest.fixture
 def short() -> ClipPiece:
-    """Make a take of a sixth of a second, for films."""
+    """Make a piece of a sixth of a second, for films."""
     return ClipPiece(
         "clips/one", TRUTH[:11], {"good": TRUTH[:11] + OFF / 8, "bad": TRUTH[:11] + OFF}, start=60
     )
 
 
 @pytest.fixture
-def camera(take: ClipPiece) -> Camera:
-    return take.camera(take.azimuth(0), TRUTH[0, 0, :2], 120, 180)
+def camera(piece: ClipPiece) -> Camera:
+    return piece.camera(piece.azimuth(0), TRUTH[0, 0, :2], 120, 180)
 
 
 def colour(picture: np.ndarray) -> np.ndarray:
@@ -115,15 +115,15 @@ def test_tips_go_on_from_their_joint():
         assert np.linalg.norm(end - start) == pytest.approx(limb.tip)
 
 
-def test_the_camera_goes_along(take: ClipPiece):
+def test_the_camera_goes_along(piece: ClipPiece):
     moving = ClipPiece("walk", TRUTH + np.linspace(0, 4, 31)[:, None, None] * [1, 0, 0], {"a": TRUTH})
     apart = moving.path() - moving.truth[:, 0, :2]
     assert np.abs(apart[10:21]).max() < 0.8
     assert np.ptp(moving.path()[:, 0]) > 1.5
 
 
-def test_png(tmp_path: Path, take: ClipPiece):
-    heatmap.heatmap_png(tmp_path / "a.png", take, poses=2)
+def test_png(tmp_path: Path, piece: ClipPiece):
+    heatmap.heatmap_png(tmp_path / "a.png", piece, poses=2)
     with Image.open(tmp_path / "a.png") as image:
         assert image.size == (
             heatmap.LEFT + 2 * heatmap.WIDTH + heatmap.RIGHT,
@@ -172,27 +172,27 @@ def test_mp4(tmp_path: Path, short: ClipPiece):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["a.gif", "a.mp4"])
-def test_nothing_is_left_of_a_film_that_was_broken_off(tmp_path, take, monkeypatch, name: str):
+def test_nothing_is_left_of_a_film_that_was_broken_off(tmp_path, piece, monkeypatch, name: str):
     if name.endswith("mp4"):
         pytest.importorskip("av")
 
-    def interrupted(take: ClipPiece):
-        yield from itertools.islice(whole(take), 2)
+    def interrupted(piece: ClipPiece):
+        yield from itertools.islice(whole(piece), 2)
         raise KeyboardInterrupt
 
     whole = film.pictures
     monkeypatch.setattr(film, "pictures", interrupted)
     (tmp_path / name).write_text("the last one")
     with pytest.raises(KeyboardInterrupt):
-        film.film(tmp_path / name, take)
+        film.film(tmp_path / name, piece)
     assert [path.name for path in tmp_path.iterdir()] == [name]
     assert (tmp_path / name).read_text() == "the last one"
 
 
-def test_without_pyav_a_line_says_what_to_install(tmp_path, take, monkeypatch):
+def test_without_pyav_a_line_says_what_to_install(tmp_path, piece, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(InputError, match=r"pip install 'memmlp\[video\]'"):
-        film.film(tmp_path / "a.mp4", take)
+        film.film(tmp_path / "a.mp4", piece)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -14,7 +14,7 @@ from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.importing.file_stance import find_stance
 from memmlp.motion.importing.skeleton_map import find_skeleton
-from memmlp.render.skeleton_map import HEIGHT, LEFT, MIDDLE, RIGHT, WIDTH, skeleton_png, spread
+from memmlp.render.skeleton_picture import HEIGHT, LEFT, MIDDLE, RIGHT, WIDTH, skeleton_png, spread
 
 
 @pytest.mark.parametrize(
