@@ -117,10 +117,10 @@ token_option = click.option(
 
 def _use(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
     """Use the users' packages that the option names, and those in the environment."""
-    from memmlp.config.plugins import activate, listed
+    from memmlp.config.plugins import activate, split_names
 
     if not ctx.resilient_parsing:
-        activate(listed(value or ""))
+        activate(split_names(value or ""))
 
 
 def _search(ctx: click.Context, param: click.Parameter, value: Path | None) -> None:

@@ -75,12 +75,14 @@ def save_command(
     from memmlp.report.kept_results import Kept, load_kept, overrides_of, save, without_paths
     from memmlp.tables.build_table import finished_runs
     from memmlp.tables.measured_run import load
-    from memmlp.tables.runs_of_plan import finder
+    from memmlp.tables.runs_of_plan import run_finder
     from memmlp.tables.seed_rounds import as_json
 
     sweep = find_sweep(name, overrides)
     known = sweep_to_show(sweep, overrides, outputs.absolute())
-    found: Mapping[str, RunsBySeed] = finished_runs(known.sweep, finder(known.plan, functools.cache(load)))
+    found: Mapping[str, RunsBySeed] = finished_runs(
+        known.sweep, run_finder(known.plan, functools.cache(load))
+    )
     path = out / f"{stem or sweep.name}.json"
     files: tuple[str, ...] = ()
     its_own = 0
@@ -204,7 +206,7 @@ def _table(kept: Kept, source: str | None = None) -> Table:
 
     With a source's name, it is the table of that source's test clips alone.
     """
-    from memmlp.cli.sweep_to_show import of_another
+    from memmlp.cli.sweep_to_show import flag_of_other_rounds
     from memmlp.config.compose_plan import find_sweep
     from memmlp.tables.build_table import make_table, on_source
     from memmlp.tables.seed_rounds import of_json
@@ -213,7 +215,7 @@ def _table(kept: Kept, source: str | None = None) -> Table:
     sweep = replace(find_sweep(kept.sweep), command_line=words)  # tables say where it is on other data
     left_out: tuple[str, ...] = ()
     rounds = of_json(kept.rounds) if kept.rounds else None
-    other = of_another(rounds, sweep) if rounds else None
+    other = flag_of_other_rounds(rounds, sweep) if rounds else None
     if rounds and not other:
         spent = rounds.spent(sweep)
         table = make_table(spent, kept.of(spent), command=f"{kept.command} --until-decided", rounds=rounds)

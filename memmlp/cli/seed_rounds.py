@@ -31,14 +31,14 @@ def current_rounds(sweep: Sweep, outputs: Path, most: int | None) -> Rounds:
     Raises:
         InputError: if looks were taken of a sweep that has changed since, or with another maximum.
     """
-    from memmlp.tables.seed_rounds import MOST, begin
+    from memmlp.tables.seed_rounds import MOST, new_rounds
     from memmlp.tables.seed_rounds_file import read
 
     path = rounds_path(sweep, outputs)
     kept = read(path)
     if kept is None or not kept.taken:
-        return begin(sweep, most or MOST)
-    wanted = begin(sweep, most or len(kept.seeds))
+        return new_rounds(sweep, most or MOST)
+    wanted = new_rounds(sweep, most or len(kept.seeds))
     if len(wanted.seeds) != len(kept.seeds):
         raise InputError(f"--max-seeds {most}: the looks of {path} are of up to {len(kept.seeds)} seeds")
     if other := difference(kept, wanted):
@@ -89,7 +89,7 @@ def run_until_decided(
         if after == rounds:
             return rounds, plan
         rounds = after
-        click.echo("\n".join(told(rounds, sweep, rounds.taken[-1])))
+        click.echo("\n".join(progress_lines(rounds, sweep, rounds.taken[-1])))
 
 
 def look(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
@@ -101,7 +101,7 @@ def look(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
     from memmlp.common.lease import Lock
     from memmlp.tables.build_table import finished_runs
     from memmlp.tables.measured_run import load
-    from memmlp.tables.runs_of_plan import finder
+    from memmlp.tables.runs_of_plan import run_finder
     from memmlp.tables.seed_rounds import advanced, as_json
     from memmlp.tables.seed_rounds_file import read
 
@@ -110,7 +110,7 @@ def look(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
         kept = read(path)
         if kept is not None and len(kept.taken) > len(rounds.taken):
             return kept
-        runs: dict[str, RunsBySeed] = finished_runs(rounds.spent(sweep), finder(plan, load))
+        runs: dict[str, RunsBySeed] = finished_runs(rounds.spent(sweep), run_finder(plan, load))
         after = advanced(rounds, sweep, runs, names(rounds, sweep, plan))
         write_json(path, as_json(after))
     return after
@@ -132,7 +132,7 @@ def schedule(rounds: Rounds) -> str:
     return f"looks at {', '.join(words)} seeds; together they spend 5 %"
 
 
-def told(rounds: Rounds, sweep: Sweep, last: Look | None = None) -> list[str]:
+def progress_lines(rounds: Rounds, sweep: Sweep, last: Look | None = None) -> list[str]:
     """Describe each arm's progress: comparisons decided and open, seeds so far, and its next look."""
     from memmlp.tables.seed_rounds import standings
 

@@ -77,13 +77,13 @@ def sweep(
         raise InputError("--again: allowed is without --until-decided, --status and --dry-run")
     chosen = find_sweep(name, overrides)
     outputs = outputs.absolute()
-    known = seed_rounds.current_rounds(chosen, outputs, max_seeds) if until_decided else None
-    spent = known.spent(chosen) if known else chosen
+    rounds = seed_rounds.current_rounds(chosen, outputs, max_seeds) if until_decided else None
+    spent = rounds.spent(chosen) if rounds else chosen
     plan = make_plan(spent, outputs, prepare=not (status or dry_run))
     if status or dry_run:
         show(spent, plan)
-        if known:
-            click.echo("\n".join([seed_rounds.schedule(known), *seed_rounds.told(known, chosen)]))
+        if rounds:
+            click.echo("\n".join([seed_rounds.schedule(rounds), *seed_rounds.progress_lines(rounds, chosen)]))
         if dry_run:
             show_forecast(spent, plan, workers.number(workers.shares(devices(plan))))
             click.echo(workers.script(sweep_folder(chosen, outputs)) or "", nl=False)
@@ -94,9 +94,9 @@ def sweep(
     if again:
         reset(plan)
     work = partial(run_workers, workers=workers)
-    if known:
-        known, plan = seed_rounds.run_until_decided(chosen, outputs, known, work, fail_fast)
-        show_outcome(SweepToShow(known.spent(chosen), plan, known), [name, *overrides], chosen)
+    if rounds:
+        rounds, plan = seed_rounds.run_until_decided(chosen, outputs, rounds, work, fail_fast)
+        show_outcome(SweepToShow(rounds.spent(chosen), plan, rounds), [name, *overrides], chosen)
         return
     plan = replace(plan, fail_fast=fail_fast)
     if plan.left():
@@ -186,14 +186,14 @@ def show_outcome(shown: SweepToShow, words: Sequence[str], chosen: Sweep) -> Non
     from memmlp.config.compose_plan import orphans, sweep_folder
     from memmlp.tables.measured_run import load
 
-    plan, known, words = shown.plan, shown.rounds, [*words, *plugins.words()]
+    plan, rounds, words = shown.plan, shown.rounds, [*words, *plugins.config_dir_words()]
     states = plan.states()
     failed = [task for task in plan.tasks if states[task.key] in ("failed", "blocked")]
     command = " ".join(["memmlp sweep", *words])
     found = table_of_plan(shown, SHOWN_MODES["both"], command, load)
     show_in_trackers(plan, sweep_folder(chosen, plan.outputs), found.table)
     on_screen([found.table])
-    for line in closing(known, chosen, found.runs) if known else ():
+    for line in closing(rounds, chosen, found.runs) if rounds else ():
         click.echo(line)
     click.echo(f"{sum(state == 'done' for state in states.values())} of {len(states)} runs done")
     for entry in orphans(chosen, plan):

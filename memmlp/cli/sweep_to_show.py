@@ -42,8 +42,8 @@ def sweep_to_show(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> Swee
     kept = read(path)
     if kept is None or not kept.taken:
         return SweepToShow(sweep, make_plan(sweep, outputs), None)
-    chosen = any(word.startswith("seed=") for word in overrides)
-    if flag := of_another(kept, sweep, chosen):
+    seeds_given = any(word.startswith("seed=") for word in overrides)
+    if flag := flag_of_other_rounds(kept, sweep, seeds_given):
         return SweepToShow(sweep, make_plan(sweep, outputs), None, (flag,))
     spent = kept.spent(sweep)
     plan = make_plan(spent, outputs)
@@ -56,14 +56,14 @@ def sweep_to_show(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> Swee
     return SweepToShow(spent, plan, kept)
 
 
-def of_another(kept: Rounds, sweep: Sweep, chosen: bool = False) -> str | None:
+def flag_of_other_rounds(kept: Rounds, sweep: Sweep, seeds_given: bool = False) -> str | None:
     """Return a flag if the sweep has changed since the kept looks were taken; else None.
 
-    `chosen` says that the sweep's seeds were chosen by hand.
+    `seeds_given` says that the sweep's seeds were given on the command line.
     """
-    from memmlp.tables.seed_rounds import begin
+    from memmlp.tables.seed_rounds import new_rounds
 
-    other = "seeds" if chosen else difference(kept, begin(sweep, len(kept.seeds)))
+    other = "seeds" if seeds_given else difference(kept, new_rounds(sweep, len(kept.seeds)))
     return (
         f"seeds were spent in rounds with other {other}: these verdicts do not keep the 5 %"
         if other

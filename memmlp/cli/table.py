@@ -171,7 +171,7 @@ def gathered(
     from memmlp.tables.build_table import without_runs
 
     found, failures = [], []
-    for sweep, command in chosen(names, overrides):
+    for sweep, command in find_sweeps(names, overrides):
         sweep = sweep.with_branch(branch) if branch else sweep
         if untrained:
             from memmlp.config.untrained_costs import check_costs
@@ -202,12 +202,12 @@ def table_of_plan(
     With `untrained`, networks without a run are measured with random weights.
     """
     from memmlp.tables.build_table import finished_runs, make_table, on_source, titled
-    from memmlp.tables.runs_of_plan import finder, older, states
+    from memmlp.tables.runs_of_plan import older_run_finder, run_finder, state_finder
 
     sweep, plan, rounds, flags = shown
     if source and rounds:
         raise InputError(f"--source {source}: allowed for a fixed number of seeds, not for --until-decided")
-    runs = finished_runs(sweep, finder(plan, read))
+    runs = finished_runs(sweep, run_finder(plan, read))
     if untrained:
         from memmlp.config.untrained_costs import with_costs
 
@@ -217,21 +217,22 @@ def table_of_plan(
         sweep, runs, left_out = on_source(sweep, runs, source)
         flags = (*left_out, *flags)
     command = f"{command} --until-decided" if rounds else command
-    table = make_table(sweep, runs, modes, command, states(plan), older(plan), rounds)
+    table = make_table(sweep, runs, modes, command, state_finder(plan), older_run_finder(plan), rounds)
     table = titled(table, source) if source else table
     return SweepTable(sweep, runs, replace(table, flags=(*table.flags, *flags)))
 
 
-def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
-    """Return the sweeps with some names, with the overrides applied, and the command that runs each."""
+def find_sweeps(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
+    """Find the sweeps with these names and overrides, and return each with the command that runs it."""
     from memmlp.config.compose_plan import find_sweep
     from memmlp.config.package_data import packaged
-    from memmlp.config.plugins import words
+    from memmlp.config.plugins import config_dir_words
 
     tables = sorted(path.stem for path in packaged("sweeps").glob("table*.yaml"))
     every = [one for name in names for one in (tables if name == "all" else [name])]
     return [
-        (find_sweep(one, overrides), " ".join(["memmlp sweep", one, *overrides, *words()])) for one in every
+        (find_sweep(one, overrides), " ".join(["memmlp sweep", one, *overrides, *config_dir_words()]))
+        for one in every
     ]
 
 

@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Any
 from memmlp.common.errors import InputError
 from memmlp.common.files import digest, read_json, write_json
 from memmlp.config.package_data import packaged
-from memmlp.config.plugins import activate, named, texts
+from memmlp.config.plugins import activate, named, texts_outside_memmlp
 from memmlp.sweep.definition import Arm, Sweep, key_of
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
 from memmlp.sweep.sweep_file import load_sweep
-from memmlp.sweep.sweep_json import keep
+from memmlp.sweep.sweep_json import keep_sweep
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -134,11 +134,11 @@ def make_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
     stamp = _stamp(sweep, outputs)
     kept = read_json(path)
     if kept.get("stamp") == stamp and all(_fresh(data, prepare) for data in kept["data"]):
-        keep(sweep, path.parent)
+        keep_sweep(sweep, path.parent)
         return Plan.load(path.with_name("plan.json"))
     plan, data = _plan(sweep, outputs, prepare)
     if prepare or _has_all(sweep, plan, path.with_name("plan.json")):
-        keep(sweep, path.parent)
+        keep_sweep(sweep, path.parent)
         plan.save(path.with_name("plan.json"))
         write_json(path, {"stamp": stamp if data is not None else None, "data": data or []})
         _remember(sweep, plan, path.with_name("entries.json"))
@@ -270,7 +270,7 @@ def _stamp(sweep: Sweep, outputs: Path) -> str:
     package = Path(__file__).parent.parent
     files = [*packaged("conf").rglob("*.yaml"), *package.rglob("*.py")]
     ours = [(str(file), file.read_text(encoding="utf-8")) for file in sorted(files)]
-    own = texts()
+    own = texts_outside_memmlp()
     elsewhere = any(sign in repr((asdict(sweep), own)) for sign in ELSEWHERE)
     anew = [time.time_ns()] if elsewhere else []
     return digest([asdict(sweep), str(outputs), ours, *([own] if own else []), *anew])

@@ -62,10 +62,10 @@ def installed() -> tuple[str, ...]:
 
 def in_environment() -> list[str]:
     """Return the packages that the environment names."""
-    return listed(os.environ.get(VARIABLE, ""))
+    return split_names(os.environ.get(VARIABLE, ""))
 
 
-def listed(words: str) -> list[str]:
+def split_names(words: str) -> list[str]:
     """Return the names in a text, which are separated by commas."""
     return [name.strip() for name in words.split(",") if name.strip()]
 
@@ -104,13 +104,13 @@ def searching(folder: Path | None) -> Iterator[None]:
         _own.reset(token)
 
 
-def words() -> list[str]:
+def config_dir_words() -> list[str]:
     """Return the words `--config-dir FOLDER` for a command that should search the same folder, or none."""
     own = _own.get()
     return ["--config-dir", str(own)] if own else []
 
 
-def texts() -> list[tuple[str, str]]:
+def texts_outside_memmlp() -> list[tuple[str, str]]:
     """Return code and configs from outside memmlp, as (name, text), on which a plan depends."""
     found = [
         (f"{name}:{file}", text)

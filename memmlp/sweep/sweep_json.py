@@ -14,7 +14,7 @@ from memmlp.sweep.definition import Arm, Scale, Sweep
 NAME = "sweep.json"
 
 
-def keep(sweep: Sweep, folder: Path) -> None:
+def keep_sweep(sweep: Sweep, folder: Path) -> None:
     """Write the sweep into its folder, unless the folder has the same content already."""
     content = plain(asdict(sweep))
     if read_json(folder / NAME) != content:
@@ -22,7 +22,7 @@ def keep(sweep: Sweep, folder: Path) -> None:
         write_json(folder / NAME, content)
 
 
-def kept(folder: Path) -> Sweep | None:
+def kept_sweep(folder: Path) -> Sweep | None:
     """Return the sweep kept in a folder; None if there is none. Raises InputError if it is damaged."""
     path = folder / NAME
     if not path.exists():

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 
 
-def differing(what: str, found: Iterable[tuple[str, str]]) -> Iterable[str]:
+def flags_of_difference(what: str, found: Iterable[tuple[str, str]]) -> Iterable[str]:
     """Flag a property in which arms differ, and name the arms that have each value.
 
     `found` has pairs of a value and an arm's label.

@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 
 from memmlp.runs.environment import changed, sources
-from memmlp.tables.flag_words import differing, listed, quoted
+from memmlp.tables.flag_words import flags_of_difference, listed, quoted
 from memmlp.tables.measured_run import Measured
 
 FILES = 5  # names of files that a flag has at most
@@ -18,7 +18,7 @@ def recipes(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
     """Flag components that several arms use, but with different recipe versions."""
     for name in sorted({name for _, run in every for name in run.origin.recipes}):
         having = [(run, label) for label, run in every if name in run.origin.recipes]
-        yield from differing(
+        yield from flags_of_difference(
             f"recipe of {name}", [(str(r.origin.recipes[name]), label) for r, label in having]
         )
 
@@ -38,7 +38,7 @@ def other_files(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
     def version(code: Mapping[str, str]) -> str:
         return hashlib.sha256(repr([code.get(name) for name in names]).encode()).hexdigest()[:7]
 
-    yield from differing(
+    yield from flags_of_difference(
         f"code of {listed(names, FILES)}", [(version(code), label) for code, label in having]
     )
 
@@ -63,4 +63,4 @@ def own_code(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
     """Flag users' packages of which arms use different versions or code."""
     for name in sorted({name for _, run in every for name in run.origin.plugins}):
         having = [(run.origin.plugins[name], label) for label, run in every if name in run.origin.plugins]
-        yield from differing(f"code of {name}", having)
+        yield from flags_of_difference(f"code of {name}", having)

@@ -12,7 +12,7 @@ import numpy as np
 from memmlp.sweep.definition import COSTS, Arm, Sweep
 from memmlp.tables import flags_of_code
 from memmlp.tables.effects import RunsBySeed, control_arm, one_and_the_same
-from memmlp.tables.flag_words import differing, listed, quoted, unique
+from memmlp.tables.flag_words import flags_of_difference, listed, quoted, unique
 from memmlp.tables.measured_run import SHARED, UNKNOWN, Measured
 
 Say = Callable[[Arm, int], str | None]
@@ -62,11 +62,13 @@ def flags(
     if set(sweep.metrics) - set(COSTS):
         yield from _resampled(every)
     for attribute, what in ORIGIN.items():
-        yield from differing(what, [(getattr(run.origin, attribute), label) for label, run in every])
+        yield from flags_of_difference(
+            what, [(getattr(run.origin, attribute), label) for label, run in every]
+        )
     yield from flags_of_code.other_files(every)
     yield from flags_of_code.older_code((label, run.code, run.origin.plugins) for label, run in every)
     if TIMES & set(sweep.metrics):
-        yield from differing("machine of the times", _timed(every))
+        yield from flags_of_difference("machine of the times", _timed(every))
         yield from _busy(sweep, runs)
     yield from _seen(sweep, runs)
     yield from _partial(every)

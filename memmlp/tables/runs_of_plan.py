@@ -18,7 +18,7 @@ from memmlp.tables.measured_run import Measured
 Read = Callable[[Path, tuple[str, ...]], Measured]
 
 
-def finder(plan: Plan, read: Read) -> Find:
+def run_finder(plan: Plan, read: Read) -> Find:
     """Return a function that finds the results of the plan's finished run for an arm and a seed."""
 
     entries = {(entry.label, entry.seed): entry for entry in plan.entries}
@@ -31,7 +31,7 @@ def finder(plan: Plan, read: Read) -> Find:
     return find
 
 
-def states(plan: Plan) -> Say:
+def state_finder(plan: Plan) -> Say:
     """Return a function that describes the state of an unfinished run of the plan, once it has begun."""
 
     entries = {(entry.label, entry.seed): entry for entry in plan.entries}
@@ -49,7 +49,7 @@ def states(plan: Plan) -> Say:
     return state
 
 
-def older(plan: Plan) -> Say:
+def older_run_finder(plan: Plan) -> Say:
     """Return a function that names a finished run that differs from a planned one only in recipe versions."""
     whats = {task.key: task.what for task in plan.tasks}
     entries = {(entry.label, entry.seed): entry for entry in plan.entries}

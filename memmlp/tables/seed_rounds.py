@@ -188,7 +188,7 @@ def subject(sweep: Sweep) -> dict[str, Any]:
     }
 
 
-def begin(sweep: Sweep, most: int = MOST) -> Rounds:
+def new_rounds(sweep: Sweep, most: int = MOST) -> Rounds:
     """Return new rounds of a sweep with at most `most` seeds.
 
     The sweep's own seeds come first, then the whole numbers that follow the largest of them.

@@ -254,7 +254,7 @@ def effect_words(cell: Cell, metric: str) -> tuple[str, ...]:
     least = 2 if cell.mean is None else decimals(cell.mean)
     if effect.low is None or effect.high is None:
         return (signed(effect.mean, f"+.{least}f"),)
-    digits = places(effect.high - effect.low, least)
+    digits = decimals_of_interval(effect.high - effect.low, least)
     if effect.significant and effect.mean:  # a star beside zeros alone would say nothing
         digits = max(digits, -math.floor(math.log10(abs(effect.mean))))
     low, high = (signed(number, f".{digits}f") for number in (effect.low, effect.high))
@@ -292,7 +292,7 @@ def decimals(value: float) -> int:
     return max(1 - math.floor(math.log10(abs(value))), 2) if value and math.isfinite(value) else 2
 
 
-def places(width: float, least: int = 2) -> int:
+def decimals_of_interval(width: float, least: int = 2) -> int:
     """Return the decimals, `least` or one more, that show two digits of half an interval's width."""
     return min(max(1 - math.floor(math.log10(width / 2)), least), least + 1) if width > 0 else least
 

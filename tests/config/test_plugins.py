@@ -227,8 +227,8 @@ def test_a_folder_of_configs_is_searched_while_a_command_runs(folder: Path):
     write(folder, {"conf/experiment/own.yaml": "# @package _global_\nseed: 7"})
     with plugins.searching(folder / "conf"):
         assert composed(["experiment=own"]).seed == 7
-        assert plugins.words() == ["--config-dir", str(folder / "conf")]
-        assert any("own.yaml" in name for name, _ in plugins.texts())
+        assert plugins.config_dir_words() == ["--config-dir", str(folder / "conf")]
+        assert any("own.yaml" in name for name, _ in plugins.texts_outside_memmlp())
     with pytest.raises(InputError, match=r"experiment=own: no such option"):
         composed(["experiment=own"])
 
@@ -393,7 +393,9 @@ def test_code_that_a_package_imports_is_its_code_too(folder: Path):
     assert run.changed_sources == ["helper:helper.py"]
     names = [name for name, one in packages_of_ones_own(["mine"]).items() if one != packages[name]]
     assert names == ["helper"]
-    assert any(name.startswith("helper:") for name, _ in plugins.texts())  # a plan may depend on it
+    assert any(
+        name.startswith("helper:") for name, _ in plugins.texts_outside_memmlp()
+    )  # a plan may depend on it
 
 
 def test_records_without_what_a_package_imports_are_of_no_other_code(folder: Path):

@@ -10,7 +10,7 @@ import pytest
 from memmlp.common.errors import InputError
 from memmlp.sweep.definition import Scale
 from memmlp.sweep.sweep_file import parse_sweep
-from memmlp.sweep.sweep_json import NAME, keep, kept
+from memmlp.sweep.sweep_json import NAME, keep_sweep, kept_sweep
 
 CONTENT = {
     "title": "Mine",
@@ -28,16 +28,16 @@ def test_what_is_read_is_what_was_kept(tmp_path: Path):
         scale=Scale(("compute", "a.b"), ("profile=paper",)),
         arms=(*sweep.arms[1:], replace(sweep.arms[0], series="a", cell=("b=1", "c=2"))),
     )
-    assert kept(tmp_path) is None
+    assert kept_sweep(tmp_path) is None
     for each in (sweep, changed):
-        keep(each, tmp_path)
-        assert kept(tmp_path) == each
+        keep_sweep(each, tmp_path)
+        assert kept_sweep(tmp_path) == each
 
 
 def test_a_copy_of_the_same_content_is_not_written_again(tmp_path: Path):
-    keep(parse_sweep("mine", CONTENT), tmp_path)
+    keep_sweep(parse_sweep("mine", CONTENT), tmp_path)
     before = (tmp_path / NAME).stat().st_mtime_ns
-    keep(parse_sweep("mine", CONTENT), tmp_path)
+    keep_sweep(parse_sweep("mine", CONTENT), tmp_path)
     assert (tmp_path / NAME).stat().st_mtime_ns == before
 
 
@@ -45,4 +45,4 @@ def test_a_copy_of_the_same_content_is_not_written_again(tmp_path: Path):
 def test_a_damaged_copy_is_named(tmp_path: Path, text: str):
     (tmp_path / NAME).write_text(text)
     with pytest.raises(InputError, match=f"{NAME}: not a sweep"):
-        kept(tmp_path)
+        kept_sweep(tmp_path)

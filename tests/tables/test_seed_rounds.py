@@ -16,7 +16,7 @@ from memmlp.tables.build_table import make_table
 from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.formats import markdown
 from memmlp.tables.measured_run import Measured, Origin
-from memmlp.tables.seed_rounds import Rounds, advanced, as_json, begin, of_json, outlook
+from memmlp.tables.seed_rounds import Rounds, advanced, as_json, new_rounds, of_json, outlook
 from memmlp.tables.statistics import Verdict
 
 ORIGIN = Origin("c", False, "d", "cpu")
@@ -95,7 +95,7 @@ def verdicts(rounds: Rounds, mode: str = "stream") -> dict[str, tuple[str, int]]
 
 
 def test_the_schedule_is_fixed_at_the_start():
-    rounds = begin(SWEEP, 6)
+    rounds = new_rounds(SWEEP, 6)
     assert rounds.seeds == (4, 2, 5, 6, 7, 8)  # the sweep's own, then those that follow
     assert rounds.looks == (3, 5, 6)
     assert sum(rounds.levels) == pytest.approx(0.05)
@@ -103,12 +103,12 @@ def test_the_schedule_is_fixed_at_the_start():
     spent = rounds.spent(SWEEP)
     assert {arm.label: spent.seeds_of(arm) for arm in spent.runnable()} == dict.fromkeys(TRUTH, (4, 2, 5))
     assert len(spent.arm_seeds()) == 12
-    assert begin(SWEEP, 1 + 2).looks == (3,)
+    assert new_rounds(SWEEP, 1 + 2).looks == (3,)
 
 
 def test_open_arms_and_their_control_alone_go_on():
     world = World()
-    rounds = world.look(begin(SWEEP))
+    rounds = world.look(new_rounds(SWEEP))
     assert verdicts(rounds) == {"worse": ("higher", 3), "same": ("equivalent", 3), "unsure": ("open", 3)}
     assert rounds.next_looks(SWEEP) == {"unsure": 1}
     assert rounds.counts(SWEEP) == {"full": 5, "worse": 3, "same": 3, "unsure": 5}
@@ -133,7 +133,7 @@ def test_what_is_decided_stays_though_later_data_would_reverse_it():
         return planted({"other": "worse"}.get(label, label), seed, metric) + 2 * (label == "unsure")
 
     world = World(sweep, draw)
-    rounds = world.to_the_end(begin(sweep, 5))
+    rounds = world.to_the_end(new_rounds(sweep, 5))
     assert rounds.counts(sweep) == {"full": 3, "other": 5, "unsure": 5}
     assert verdicts(rounds)["other"] == ("higher", 3)
     assert [f.label for f in rounds.taken[1].found] == ["unsure", "unsure"]  # it was not looked at again
@@ -152,7 +152,7 @@ def test_a_decided_comparison_of_an_open_arm_is_not_looked_at_again():
             return planted({"other": "unsure"}.get(label, label), seed, metric)
         return planted("worse", seed, metric) - 9 * (seed >= 3)
 
-    rounds = World(sweep, draw).to_the_end(begin(sweep))
+    rounds = World(sweep, draw).to_the_end(new_rounds(sweep))
     assert verdicts(rounds) == {"other": ("higher", 3)}
     assert len(rounds.taken) > 1
     assert {finding.mode for look in rounds.taken[1:] for finding in look.found} == {"window"}
@@ -160,7 +160,7 @@ def test_a_decided_comparison_of_an_open_arm_is_not_looked_at_again():
 
 def test_a_look_uses_its_seeds_alone_whatever_other_runs_there_are():
     few, many = World(), World()
-    whole = begin(SWEEP, 13)
+    whole = new_rounds(SWEEP, 13)
     for seed in whole.seeds:
         for label in TRUTH:
             many.runs[label][seed] = run(label, seed, planted, ("MPJPE",), {})
@@ -169,7 +169,7 @@ def test_a_look_uses_its_seeds_alone_whatever_other_runs_there_are():
 
 def test_one_group_of_clips_ends_it_at_once():
     world = World(groups=dict.fromkeys(CLIPS, "one take"))
-    rounds = world.to_the_end(begin(SWEEP))
+    rounds = world.to_the_end(new_rounds(SWEEP))
     assert len(rounds.taken) == 1
     assert {verdict for verdict, _ in verdicts(rounds).values()} == {"open"}
     assert rounds.next_looks(SWEEP) == {}
@@ -178,7 +178,7 @@ def test_one_group_of_clips_ends_it_at_once():
 def test_an_arm_whose_runs_failed_is_late_and_others_do_not_wait():
     world = World()
     world.failing = {("worse", 2)}
-    rounds = world.to_the_end(begin(SWEEP, 5))
+    rounds = world.to_the_end(new_rounds(SWEEP, 5))
     assert [sorted(look.runs) for look in rounds.taken] == [["same", "unsure"], ["unsure"]]
     assert rounds.next_looks(SWEEP) == {"worse": 0}
     assert len(rounds.family(SWEEP)) == 6  # its comparisons count although they were not looked at
@@ -191,17 +191,17 @@ def test_an_arm_whose_runs_failed_is_late_and_others_do_not_wait():
 def test_a_control_that_failed_stops_what_needs_it():
     world = World()
     world.failing = {("full", 5)}
-    assert world.to_the_end(begin(SWEEP)).taken == ()
+    assert world.to_the_end(new_rounds(SWEEP)).taken == ()
 
 
 def test_a_file_holds_all_of_it():
-    rounds = World().to_the_end(begin(SWEEP))
+    rounds = World().to_the_end(new_rounds(SWEEP))
     assert of_json(json.loads(json.dumps(as_json(rounds)))) == rounds
 
 
 def test_corrections_are_over_all_that_nobody_has_claimed():
     """Of 6 comparisons, 2 differences are claimed at the first look; the next corrects by 4."""
-    rounds = World().look(World().look(begin(SWEEP)))
+    rounds = World().look(World().look(new_rounds(SWEEP)))
     first, second = rounds.taken
     plain = {finding.key: finding for finding in first.found}
     unsure = [f for f in second.found if f.mode == "stream"]
@@ -212,7 +212,7 @@ def test_corrections_are_over_all_that_nobody_has_claimed():
 
 def test_the_table_shows_rounds(tmp_path):
     world = World()
-    rounds = world.to_the_end(begin(SWEEP, 5))
+    rounds = world.to_the_end(new_rounds(SWEEP, 5))
     table = make_table(rounds.spent(SWEEP), world.runs, rounds=rounds)
     assert {row.label: (len(row.found), len(row.wanted)) for row in table.rows[:4]} == {
         "full": (5, 5), "worse": (3, 3), "same": (3, 3), "unsure": (5, 5)
@@ -251,7 +251,7 @@ def false_claims(truth: float, noise: float, spend: Callable[[Rounds], Rounds], 
             difference = noise * normal(number, seed, label, metric) + truth if label != "full" else 0.0
             return np.full(len(CLIPS), difference)
 
-        rounds = World(sweep, draw).to_the_end(spend(begin(sweep)))
+        rounds = World(sweep, draw).to_the_end(spend(new_rounds(sweep)))
         counts.append(any(finding.verdict in false for finding, _ in rounds.latest().values()))
     return float(np.mean(counts))
 

@@ -14,7 +14,7 @@ from memmlp.report.ui.replay import Predict, Replays, body
 from memmlp.report.ui.runs import Rows
 from memmlp.report.ui.searches import Searches
 from memmlp.report.ui.sweeps import Sweeps
-from memmlp.report.ui.users_of_run import places
+from memmlp.report.ui.users_of_run import uses_by_run
 from memmlp.runs.identity import ID
 
 MOST_CURVES = 60  # runs whose curves are told at once
@@ -48,7 +48,7 @@ class Answers:
 
     def places(self) -> dict[str, list[dict[str, Any]]]:
         """Return, by run id, the sweeps and searches that use a run."""
-        return places(self.sweeps.known(), self.searches.runs())
+        return uses_by_run(self.sweeps.known(), self.searches.runs())
 
     def of(self, name: str, query: Mapping[str, str]) -> Mapping[str, Any]:
         """Return the answer to a question.

@@ -24,7 +24,7 @@ from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.progress_table import name as task_name
 from memmlp.sweep.sweep_file import parse_sweep
 from memmlp.sweep.sweep_json import NAME as SWEEP_FILE
-from memmlp.sweep.sweep_json import kept
+from memmlp.sweep.sweep_json import kept_sweep
 from memmlp.tables.build_table import finished_runs, make_table
 from memmlp.tables.formats import as_json
 from memmlp.tables.measured_run import Measured, load
@@ -239,7 +239,7 @@ class Sweeps:
 
     def _kept(self, name: str) -> Sweep | None:
         try:
-            return kept(self.index.outputs / "sweeps" / name)
+            return kept_sweep(self.index.outputs / "sweeps" / name)
         except InputError:
             return None
 

@@ -8,7 +8,7 @@ from typing import Any
 from memmlp.sweep.plan import Plan
 
 
-def places(
+def uses_by_run(
     plans: Iterable[Plan], trials: Iterable[tuple[str, int, str]] = ()
 ) -> dict[str, list[dict[str, Any]]]:
     """Return, by run id, the sweeps that use a run, each with arm and seed, and the searches with trials.

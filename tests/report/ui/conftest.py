@@ -12,7 +12,7 @@ from memmlp.runs.run import Run
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.sweep_file import parse_sweep
-from memmlp.sweep.sweep_json import keep
+from memmlp.sweep.sweep_json import keep_sweep
 
 ARMS = {"none": 1.0, "gru": 0.8}
 SEEDS = (0, 1, 2)
@@ -40,7 +40,7 @@ def made(outputs: Path) -> Sweep:
             tasks.append(RunTask(run.id, "memmlp", config))
     folder = outputs / "sweeps" / "mine"
     Plan("mine", outputs, tuple(entries), tuple(tasks)).save(folder / "plan.json")
-    keep(sweep, folder)
+    keep_sweep(sweep, folder)
     return sweep
 
 

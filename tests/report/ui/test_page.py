@@ -20,11 +20,11 @@ from memmlp.report.ui.one_file import ReportedSweep, page_text, query, rounded
 from memmlp.report.ui.server import RunsServer
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan
-from memmlp.sweep.sweep_json import kept
+from memmlp.sweep.sweep_json import kept_sweep
 from memmlp.tables.build_table import finished_runs, make_table
 from memmlp.tables.measured_run import load
-from memmlp.tables.runs_of_plan import finder
-from memmlp.tables.seed_rounds import begin
+from memmlp.tables.runs_of_plan import run_finder
+from memmlp.tables.seed_rounds import new_rounds
 
 EVIL = "<img src=x onerror=owned=1>"
 READY = "document.documentElement.dataset.ready"
@@ -186,7 +186,7 @@ def test_units_and_directions_of_metrics_of_ones_own(
 
 def test_rounds_of_a_sweep(browser: Browser, tmp_path: Path):
     sweep, folder = made(tmp_path), tmp_path / "sweeps" / "mine"
-    look(sweep, tmp_path, begin(sweep), Plan.load(folder / "plan.json"))
+    look(sweep, tmp_path, new_rounds(sweep), Plan.load(folder / "plan.json"))
     with RunsServer(Answers(tmp_path, kept=False), 0, every=0.05) as running:
         go(browser, running.url, "sweep/mine", "document.body.textContent.includes('Rounds')")
         words = browser.value("document.body.textContent")
@@ -260,9 +260,9 @@ EXTRA = "<h1>Extra</h1><a href='#low'>Low</a><p style='height: 5000px'></p><h2 i
 
 def test_a_file_without_a_server(browser: Browser, home: Path, tmp_path: Path):
     folder = home / "sweeps" / "mine"
-    sweep, plan = kept(folder), Plan.load(folder / "plan.json")
+    sweep, plan = kept_sweep(folder), Plan.load(folder / "plan.json")
     assert sweep is not None
-    table = make_table(sweep, finished_runs(sweep, finder(plan, load)))
+    table = make_table(sweep, finished_runs(sweep, run_finder(plan, load)))
     text = page_text(Answers(home, predict, kept=False), [ReportedSweep("mine", table)], EXTRA)
     assert EVIL not in text
     file = tmp_path / "report.html"

@@ -15,12 +15,12 @@ from memmlp.report.ui.index import Index
 from memmlp.report.ui.sweeps import NOT_KEPT, OTHERS, ROUNDS, Sweeps
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan, RunTask
-from memmlp.sweep.sweep_json import keep, kept
+from memmlp.sweep.sweep_json import keep_sweep, kept_sweep
 from memmlp.tables.build_table import finished_runs, make_table
 from memmlp.tables.formats import as_json
 from memmlp.tables.measured_run import load
-from memmlp.tables.runs_of_plan import finder, states
-from memmlp.tables.seed_rounds import Rounds, begin
+from memmlp.tables.runs_of_plan import run_finder, state_finder
+from memmlp.tables.seed_rounds import Rounds, new_rounds
 
 
 def sweeps_of(outputs: Path) -> Sweeps:
@@ -31,9 +31,9 @@ def sweeps_of(outputs: Path) -> Sweeps:
 
 def test_the_table_is_that_of_the_command(outputs: Path):
     folder = outputs / "sweeps" / "mine"
-    sweep, plan = kept(folder), Plan.load(folder / "plan.json")
+    sweep, plan = kept_sweep(folder), Plan.load(folder / "plan.json")
     assert sweep is not None
-    table = json.loads(as_json(make_table(sweep, finished_runs(sweep, finder(plan, load)))))
+    table = json.loads(as_json(make_table(sweep, finished_runs(sweep, run_finder(plan, load)))))
     shown = sweeps_of(outputs).page("mine")["table"]
     assert shown["rows"] == table["rows"]
     (row,) = [row for row in shown["rows"] if row["label"] == "gru"]
@@ -77,8 +77,8 @@ def test_a_run_that_lacks_an_evaluation_is_trained_and_a_vqvae_is_no_arm(outputs
     sweeps = sweeps_of(outputs)
     found = sweeps.progress(sweeps.known()[0])
     assert (found["counts"], found["above"], found["tasks"]) == ({"trained": 1, "done": 5}, {"done": 1}, 6)
-    say = states(Plan.load(path))
-    arm = next(arm for arm in kept(path.parent).runnable() if arm.label == first.label)
+    say = state_finder(Plan.load(path))
+    arm = next(arm for arm in kept_sweep(path.parent).runnable() if arm.label == first.label)
     assert say(arm, first.seed) == "trained, an evaluation or export is missing"
 
 
@@ -94,9 +94,9 @@ def test_no_time_is_left_where_only_the_evaluation_is(outputs: Path):
 
 def test_the_board_shows_the_sweep_s_first_metric_and_its_branch(outputs: Path):
     folder, run = outputs / "sweeps" / "mine", run_of(outputs, "gru", 0)
-    sweep = kept(folder)
+    sweep = kept_sweep(folder)
     assert sweep is not None
-    keep(replace(sweep, metrics=("FLOPs", "MPJRE", "MPJPE")).with_branch("combined"), folder)
+    keep_sweep(replace(sweep, metrics=("FLOPs", "MPJRE", "MPJPE")).with_branch("combined"), folder)
     page = sweeps_of(outputs).page("mine")
     assert (page["metric"], page["branch"]) == ("MPJRE", "combined")
     (cell,) = [cell for cell in page["cells"] if cell["id"] == run.id]
@@ -141,11 +141,11 @@ def test_a_sweep_from_before_has_its_first_arm_as_control_and_says_so(outputs: P
 def test_a_sweep_with_another_control_has_another_table(outputs: Path):
     """The runs stay as they are: an arm's control, metrics and margins are the sweep's own."""
     folder = outputs / "sweeps" / "mine"
-    sweeps, sweep = sweeps_of(outputs), kept(folder)
+    sweeps, sweep = sweeps_of(outputs), kept_sweep(folder)
     assert sweep is not None
     assert sweeps.page("mine")["table"]["control"] == "none"
     before = sweeps.stamp()
-    keep(replace(sweep, control="gru", metrics=("MPJRE",)), folder)
+    keep_sweep(replace(sweep, control="gru", metrics=("MPJRE",)), folder)
     table = sweeps.page("mine")["table"]
     assert (table["control"], table["metrics"]) == ("gru", ["MPJRE"])
     assert sweeps.stamp() != before
@@ -168,9 +168,9 @@ def test_a_sweep_that_is_planned_anew_has_another_table(outputs: Path):
 def looked(outputs: Path) -> Rounds:
     """Take the first look, at the three seeds that there are."""
     folder = outputs / "sweeps" / "mine"
-    sweep = kept(folder)
+    sweep = kept_sweep(folder)
     assert sweep is not None
-    return look(sweep, outputs, begin(sweep), Plan.load(folder / "plan.json"))
+    return look(sweep, outputs, new_rounds(sweep), Plan.load(folder / "plan.json"))
 
 
 def test_verdicts_of_rounds_and_their_looks_are_shown(outputs: Path):
