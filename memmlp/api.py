@@ -298,7 +298,7 @@ class Prediction:
 
         Raises InputError for another branch, or one that the network does not have.
         """
-        return self._take(branch).errors[branch]
+        return self._piece(branch).errors[branch]
 
     def draw(
         self,
@@ -332,7 +332,7 @@ class Prediction:
         if poses not in range(1, 21):
             raise InputError(f"poses {poses}: allowed are 1 to 20")
         first, last = span(len(self), self.clip, begin, end)
-        write_picture(file, self._take(branch, first, last), poses)
+        write_picture(file, self._piece(branch, first, last), poses)
         return file
 
     def save(self, path: StrPath, *, truth: bool = False) -> Path:
@@ -361,7 +361,7 @@ class Prediction:
         write_motion(file, clip, self.rest, chosen)
         return file
 
-    def _take(self, branch: Branch, first: int = 0, last: int | None = None) -> ClipPiece:
+    def _piece(self, branch: Branch, first: int = 0, last: int | None = None) -> ClipPiece:
         """Return the frames of a branch from one index up to another, for drawing."""
         from memmlp.render.clip_piece import ClipPiece
 

@@ -58,7 +58,7 @@ def measure_costs(overrides: tuple[str, ...], timed: bool) -> Measured:
     """
     from memmlp.deploy.export import export  # slow to import
     from memmlp.deploy.latency import size
-    from memmlp.live.pose_time import measure_pose
+    from memmlp.live.pose_latency import measure_pose
 
     deployment = build_deployment(composed(list(overrides))) or Deployment(latency_steps=1)
     model = untrained(overrides)

@@ -16,10 +16,10 @@ INTERPOLATED = "interpolated"
 PART = 3600  # frames of a long clip that are worked on at a time
 SPLINES, LINES = "splines", "lines"
 INTERPOLATIONS = (SPLINES, LINES)
-"""How motion goes on between recorded frames, where there is none at the time that is wanted.
+"""How motion is interpolated at times that lie between two recorded frames.
 
 Splines are smooth, as motion is. Lines have a kink at each recorded frame, and so a jerk that no body has:
-of Bandai-Namco's motion at 30 Hz four times as much as there is (docs/guides/motion.md).
+four times as much as there is in Bandai-Namco's motion at 30 Hz (docs/guides/motion.md).
 """
 RATE_TOLERANCE = 1e-4  # relative: 59.94 is not 60, and 120.0005 (a BVH's frame time of .0083333) is 120
 

@@ -23,7 +23,7 @@ from memmlp.common.progress import remark, tell
 from memmlp.evaluation.evaluation import picture
 from memmlp.evaluation.predictions import save_predictions
 from memmlp.experiment_tracking.follower_pipe import Tracking
-from memmlp.live.pose_time import measure_pose
+from memmlp.live.pose_latency import measure_pose
 from memmlp.motion.body import FPS
 from memmlp.motion.clip import LINES, Skipped
 from memmlp.motion.motion_source import Prepared
@@ -64,7 +64,7 @@ class Outcome:
     stages: tuple[str, ...]
 
 
-def of_tests(clips: Sequence[ClipRecord]) -> str:
+def tested_clips_remark(clips: Sequence[ClipRecord]) -> str:
     """Say how many test clips and groups there are, and whether they are too few for conclusions."""
     tested = [clip.group for clip in clips if clip.split == "test"]
     counts = f"test clips: {len(tested)}, in groups: {len(set(tested))}"
@@ -73,7 +73,7 @@ def of_tests(clips: Sequence[ClipRecord]) -> str:
     return f"{counts}, too few to tell networks apart; more motion or a larger data.split.test tests on more"
 
 
-def of_subjects(config: Mapping[str, Any], clips: Sequence[ClipRecord]) -> str:
+def divided_subjects_remark(config: Mapping[str, Any], clips: Sequence[ClipRecord]) -> str:
     """Say that a seeded split of AMASS has subjects in both training and test; empty if it has none.
 
     It is also empty for published lists, which are used as they were published, and for mixes.
@@ -85,7 +85,7 @@ def of_subjects(config: Mapping[str, Any], clips: Sequence[ClipRecord]) -> str:
     return f"clips of {divided[0]}{more} are in training and in test; data=amass_s3 keeps subjects apart"
 
 
-def of_rates(manifest: Manifest, clips: Sequence[ClipRecord], what: str) -> str | None:
+def low_rates_remark(manifest: Manifest, clips: Sequence[ClipRecord], what: str) -> str | None:
     """Return a remark on clips of a lower rate than the network's that were interpolated by straight lines.
 
     The lines give these clips kinks, which no person makes. It is None if there are no such clips.
@@ -105,7 +105,7 @@ def of_rates(manifest: Manifest, clips: Sequence[ClipRecord], what: str) -> str 
     )
 
 
-def of_skipped(skipped: Sequence[Skipped]) -> str | None:
+def skipped_remark(skipped: Sequence[Skipped]) -> str | None:
     """Return what to say of files that are no usable clips; None if there are none."""
     if not skipped:
         return None
@@ -114,7 +114,7 @@ def of_skipped(skipped: Sequence[Skipped]) -> str | None:
     return f"{files} skipped, first {first.file} ({first.reason}); data.strict=true stops there"
 
 
-def of_unusual(unusual: Mapping[str, str]) -> str | None:
+def unusual_remark(unusual: Mapping[str, str]) -> str | None:
     """Return what to say of clips that are odd but may be sound (name -> why); None if there are none."""
     if not unusual:
         return None
@@ -133,11 +133,11 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     """
     data = experiment.data.prepare()
     clips = data.manifest.clips
-    tell(f"data: {len(clips)} clips ({of_tests(clips)}), prepared in {data.cache}")
+    tell(f"data: {len(clips)} clips ({tested_clips_remark(clips)}), prepared in {data.cache}")
     untied = unfitting(data.manifest.split, [clip.name for clip in clips])
-    files = of_skipped(data.manifest.skipped), of_unusual(data.manifest.unusual)
-    subjects = of_subjects(experiment.config["data"], clips)
-    for said in filter(None, (*files, of_rates(data.manifest, clips, "clips"), subjects, untied)):
+    files = skipped_remark(data.manifest.skipped), unusual_remark(data.manifest.unusual)
+    subjects = divided_subjects_remark(experiment.config["data"], clips)
+    for said in filter(None, (*files, low_rates_remark(data.manifest, clips, "clips"), subjects, untied)):
         remark(f"data: {said}")
     run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
     if not run.done:
@@ -187,7 +187,7 @@ def make_missing_stages(experiment: Experiment, run: Run, data: Prepared) -> lis
         The names of the stages that were made.
     """
     made = []
-    facts = of_data(experiment, data)
+    facts = data_warnings(experiment, data)
     if not facts.keys() <= run.manifest.keys():  # a run from before these were recorded
         run.write_manifest(facts)
     run.want(experiment.stages)
@@ -332,7 +332,7 @@ def train_run(
     onward = ", on from its checkpoint" if run.checkpoint.exists() else ""
     tell(f"network: train it for {steps} steps{onward} (run {run.id})")
     begin(experiment, run, experiment.identity(data.digest), experiment.config)
-    run.write_manifest({"body": data.manifest.body, **of_data(experiment, data)})
+    run.write_manifest({"body": data.manifest.body, **data_warnings(experiment, data)})
     run.want(experiment.stages)
     run.clear_stages()
     weights = upstream.weights() if upstream else None
@@ -403,11 +403,11 @@ def own_code(experiment: Experiment) -> dict[str, Any]:
     return {"plugins": packages_of_ones_own(packages)} if packages else {}
 
 
-def of_data(experiment: Experiment, data: Prepared) -> dict[str, Any]:
+def data_warnings(experiment: Experiment, data: Prepared) -> dict[str, Any]:
     """Return warnings about a run's data for tables to flag, in words; None for each that does not apply."""
-    divided = of_subjects(experiment.config["data"], data.manifest.clips) or None
+    divided = divided_subjects_remark(experiment.config["data"], data.manifest.clips) or None
     tested = [clip for clip in data.manifest.clips if clip.split == "test"]
-    resampled = of_rates(data.manifest, tested, "test clips")
+    resampled = low_rates_remark(data.manifest, tested, "test clips")
     return {"partial": partial_words(experiment, data), "divided": divided, "resampled": resampled}
 
 

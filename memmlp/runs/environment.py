@@ -30,7 +30,7 @@ NOT_NUMBERS = (
     "sweep",
     "tables",
 )
-"""Folders of the package whose code no result comes from, but for the times of whole poses (`live`)."""
+"""Folders of the package on whose code no result depends; `live` alone measures one, whole poses' times."""
 WIRING = ("config/build.py", "config/instantiate.py")  # they decide what reaches the constructors
 PATCH = 1_000_000  # at most so many characters of changes are kept with a run
 

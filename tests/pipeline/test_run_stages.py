@@ -75,18 +75,18 @@ def test_a_run_leaves_everything(home):
 
 def test_what_was_skipped_of_the_data_is_said():
     bad = Skipped("b.npz", "NaN or Inf in 1 frames, first in frame 3")
-    assert run_stages.of_skipped([]) is None
-    said = run_stages.of_skipped([bad, replace(bad, file="c.npz")])
+    assert run_stages.skipped_remark([]) is None
+    said = run_stages.skipped_remark([bad, replace(bad, file="c.npz")])
     assert said.startswith("2 files were skipped, first b.npz (NaN or Inf in 1 frames, first in frame 3); ")
-    assert run_stages.of_skipped([bad]).startswith("1 file was skipped, first b.npz (")
+    assert run_stages.skipped_remark([bad]).startswith("1 file was skipped, first b.npz (")
 
 
 def test_what_is_unusual_of_the_data_is_said():
-    assert run_stages.of_unusual({}) is None
+    assert run_stages.unusual_remark({}) is None
     odd = {"a/1": "Z is not up", "a/2": "Z is not up", "b": "the pelvis is at z = 20 m", "c": "Z is not up"}
-    told = run_stages.of_unusual(odd)
+    told = run_stages.unusual_remark(odd)
     assert told == "4 clips are unusual, first a/1 (Z is not up), a/2, b; memmlp data inspect tells more"
-    assert run_stages.of_unusual({"b": "high"}).startswith("1 clip is unusual, first b (high); ")
+    assert run_stages.unusual_remark({"b": "high"}).startswith("1 clip is unusual, first b (high); ")
 
 
 def test_a_training_says_on_a_terminal_what_is_odd_about_its_data(capsys, monkeypatch):
@@ -319,10 +319,10 @@ def test_a_single_group_of_test_clips_is_told_to_decide_nothing():
         return [SimpleNamespace(split="test", group=group) for group in groups]
 
     train = [SimpleNamespace(split="train", group="c")]
-    assert run_stages.of_tests([*train, *clips("a", "b", "b")]) == "test clips: 3, in groups: 2"
+    assert run_stages.tested_clips_remark([*train, *clips("a", "b", "b")]) == "test clips: 3, in groups: 2"
     assert (
         "in groups: 1, too few to tell networks apart; more motion or a larger data.split.test"
-        in run_stages.of_tests([*train, *clips("a", "a")])
+        in run_stages.tested_clips_remark([*train, *clips("a", "a")])
     )
 
 
@@ -341,12 +341,12 @@ def test_a_single_group_of_test_clips_is_told_to_decide_nothing():
 def test_a_split_that_tests_on_the_people_that_it_trains_on_says_so(names, config, said):
     parts = zip(names, itertools.cycle(["train", "test"]))
     clips = [SimpleNamespace(name=name, split=part, fps=60.0) for name, part in parts]
-    found = run_stages.of_subjects({"split": {}, **config}, clips)
+    found = run_stages.divided_subjects_remark({"split": {}, **config}, clips)
     assert found.startswith(said) if said else found == ""
     manifest = SimpleNamespace(coverage=SimpleNamespace(whole=True), clips=clips)
     data = SimpleNamespace(manifest=manifest)
     experiment = SimpleNamespace(config={"data": {"name": "mine", "split": {}, **config}})
-    assert run_stages.of_data(experiment, data) == {
+    assert run_stages.data_warnings(experiment, data) == {
         "partial": None,
         "divided": found or None,
         "resampled": None,
@@ -359,13 +359,13 @@ def test_clips_that_were_recorded_at_a_lower_rate_are_said():
     clips = [SimpleNamespace(name=name, split="test", fps=fps) for name, fps in rates.items()]
     clips.append(SimpleNamespace(name="g", split="train", fps=25.0))
     lines, splines = SimpleNamespace(interpolation="lines"), SimpleNamespace(interpolation="splines")
-    said = run_stages.of_rates(lines, clips, "clips")
+    said = run_stages.low_rates_remark(lines, clips, "clips")
     assert said.startswith("3 of 7 clips were recorded at 25 to 30 Hz and go on by straight lines")
-    assert run_stages.of_rates(lines, clips[2:6], "clips") is None
-    assert run_stages.of_rates(splines, clips, "clips") is None
+    assert run_stages.low_rates_remark(lines, clips[2:6], "clips") is None
+    assert run_stages.low_rates_remark(splines, clips, "clips") is None
     manifest = SimpleNamespace(coverage=SimpleNamespace(whole=True), clips=clips, interpolation="lines")
     experiment = SimpleNamespace(config={"data": {"name": "mine", "split": {}}})
-    said = run_stages.of_data(experiment, SimpleNamespace(manifest=manifest))["resampled"]
+    said = run_stages.data_warnings(experiment, SimpleNamespace(manifest=manifest))["resampled"]
     assert said.startswith("2 of 6 test clips were recorded at 30 Hz and go on by straight lines")
 
 

@@ -170,7 +170,7 @@ def calibration_clips() -> list[Any]:
 def timed(paths: dict[Timed, Path], rounds: int, steps: int) -> list[dict[str, Any]]:
     """Time all files in turn: their steps, then the whole poses of those that make any; see `summary`."""
     from memmlp.deploy.latency import time_in_turn
-    from memmlp.live.pose_time import time_poses_in_turn
+    from memmlp.live.pose_latency import time_poses_in_turn
 
     seconds = time_in_turn(paths, rounds, steps)
     deployed = {key: path for key, path in paths.items() if key[1] in DEPLOYED}

@@ -55,7 +55,7 @@ def live_frame(
 
     from memmlp.common.errors import InputError
     from memmlp.deploy.onnx_stream import OnnxStream
-    from memmlp.live.pose_time import alternate
+    from memmlp.live.pose_latency import alternate
     from memmlp.live.stream import Stream
     from memmlp.runs.lookup import find_run
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from memmlp.live.pose_time import alternate, measure_pose
+from memmlp.live.pose_latency import alternate, measure_pose
 from memmlp.live.stream import Stream
 
 pytestmark = pytest.mark.slow
