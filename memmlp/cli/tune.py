@@ -227,14 +227,15 @@ def search(setup: Setup, study: Study, workers: Workers) -> None:
 def leave(setup: Setup, study: Study) -> None:
     """Write the results of the search into its folder."""
     from memmlp.config.package_data import packaged
-    from memmlp.runs.identity import chosen
+    from memmlp.runs.identity import option_in_slot
     from memmlp.runs.shown_name import USUAL
     from memmlp.sweep.search import results
 
     results.write_trials(study, setup.folder / "trials.csv")
     groups = [path.name for path in packaged("conf").iterdir() if path.is_dir()]
     results.write_experiments(study, setup.folder, groups)
-    if chosen(_experiments(setup, {})[0].config, "model") == USUAL["model"]:  # Table 5 is of no other network
+    model = option_in_slot(_experiments(setup, {})[0].config, "model")
+    if model == USUAL["model"]:  # Table 5 is of no other network
         table = f"table{results.TABLE:02d}.yaml"
         results.write_table(study, packaged("sweeps") / table, setup.folder / table)
     results.write_plots(study, setup.folder)

@@ -69,8 +69,8 @@ def leave() -> None:
         distributed.destroy_process_group()
 
 
-def of_first(value: T) -> T:
-    """Return the first process' value, in all processes."""
+def broadcast(value: T) -> T:
+    """Send the first process' value to all processes, and return it in each; all have to call this."""
     if size() == 1:
         return value
     from torch import distributed

@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from memmlp.config.compose import VERSION_BASE
 from memmlp.config.package_data import packaged
 from memmlp.config.schema import register
-from memmlp.runs.identity import NETWORK, SLOTS, chosen, flatten, trained_by
+from memmlp.runs.identity import NETWORK, SLOTS, flatten, option_in_slot, trained_by
 from memmlp.runs.shown_name import kind_words
 
 MOST = 6  # words
@@ -82,7 +82,7 @@ def _keys(config: Mapping[str, Any], default: Mapping[str, Any], foreign: list[s
 
 def _option(config: Mapping[str, Any], slot: str) -> str | None:
     """Return the name of the option in a slot; Mem-MLP itself has no name in the config."""
-    return chosen(config, slot) or ("mem_mlp" if slot == "model" else None)
+    return option_in_slot(config, slot) or ("mem_mlp" if slot == "model" else None)
 
 
 def _shipped(slot: str, option: str | None) -> bool:

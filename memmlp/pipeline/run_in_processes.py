@@ -25,14 +25,14 @@ def run_in_processes(experiment: Experiment) -> Outcome | None:
         _train_along(experiment)
         return None
     outcome = run_experiment(experiment)
-    distributed.of_first("end")
+    distributed.broadcast("end")
     distributed.leave()
     return outcome
 
 
 def _train_along(experiment: Experiment) -> None:
     """Train the stages that the first process names, until it says that it is at the end."""
-    while (stage := distributed.of_first("")) != "end":
+    while (stage := distributed.broadcast("")) != "end":
         data = experiment.data.prepare()  # the first process has prepared it
         chain = [*experiment.upstream_identities(data.digest), experiment.identity(data.digest)]
         runs = [Run.of(experiment.outputs, identity.id) for identity in chain]

@@ -293,7 +293,7 @@ def train_upstream(
     run.write_manifest({"partial": partial_words(experiment, data)})
     tell(f"{training.told} (run {run.id})")
     weights = upstream.weights() if upstream else None
-    distributed.of_first(training.kind)  # tells the others what is trained now
+    distributed.broadcast(training.kind)  # tells the others what is trained now
     errors = training.train(experiment.architecture, data, weights, run, experiment.device)
     write_json(run.results_path, {"val": errors})
     run.finish(("model.safetensors", "results.json"))
@@ -336,7 +336,7 @@ def train_run(
     run.want(experiment.stages)
     run.clear_stages()
     weights = upstream.weights() if upstream else None
-    distributed.of_first(NETWORK)  # tells the others what is trained now
+    distributed.broadcast(NETWORK)  # tells the others what is trained now
     experiment.training.train(experiment.architecture, data, weights, run, experiment.device, watch)
     run.finish(("model.safetensors",))
 

@@ -214,7 +214,7 @@ def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
         yield "mirror"
     if coordinates := config.get("frame", {}).get("coordinates"):
         yield f"coordinates.{coordinates}"
-    names = {slot: chosen(config, slot) for slot in SLOTS}
+    names = {slot: option_in_slot(config, slot) for slot in SLOTS}
     yield from (f"{slot}.{name}" for slot, name in names.items() if name and name != UNNAMED.get(slot))
     if (config.get("loss") or {}).get("weighting") == "learned":
         yield "weighting.learned"
@@ -236,7 +236,7 @@ def training_settings(kind: str, config: Mapping[str, Any]) -> Mapping[str, Any]
     return config["optim"] if kind == NETWORK else config["upstream"][kind]
 
 
-def chosen(config: Mapping[str, Any], slot: str) -> str | None:
+def option_in_slot(config: Mapping[str, Any], slot: str) -> str | None:
     """Return the name of the option in a slot; None if the slot is empty, and for Mem-MLP in `model`."""
     return (config.get(slot) or {}).get("name", UNNAMED.get(slot))
 
@@ -313,9 +313,12 @@ def _unused(config: Mapping[str, Any]) -> Iterable[str]:
     """Yield the keys that have no effect, given the values of the others."""
     if config.get("optim", {}).get("schedule", "step") != "step":
         yield "optim.drop_at"
-    if chosen(config, "optim") == UNNAMED["optim"]:
+    if option_in_slot(config, "optim") == UNNAMED["optim"]:
         yield "optim.name"
-    if config.get("optim", {}).get("vectors") == "muon" or chosen(config, "model") == "recurrent_poser":
+    if (
+        config.get("optim", {}).get("vectors") == "muon"
+        or option_in_slot(config, "model") == "recurrent_poser"
+    ):
         yield "optim.vectors"  # as in runs before this key, and of a network that has none
     if not config.get("optim", {}).get("warmup"):
         yield "optim.warmup"
@@ -337,10 +340,10 @@ def _inert(config: Mapping[str, Any]) -> dict[str, float]:
 
     These are their defaults, which runs from before this rule have.
     """
-    if chosen(config, "loss") != "manual":
+    if option_in_slot(config, "loss") != "manual":
         return {}
-    inert = {"loss.hand": 0.1} if chosen(config, "hand") == "off" else {}
-    if chosen(config, "predictor") in ("rotation_only", "rotation_only_memory"):
+    inert = {"loss.hand": 0.1} if option_in_slot(config, "hand") == "off" else {}
+    if option_in_slot(config, "predictor") in ("rotation_only", "rotation_only_memory"):
         inert |= {"loss.position": 0.5, "loss.velocity": 0.1}
     return inert
 

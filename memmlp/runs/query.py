@@ -16,7 +16,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import number_of
 from memmlp.runs.deployment_folder import as_deployed
 from memmlp.runs.evaluation_file import with_solvers
-from memmlp.runs.identity import SLOTS, chosen, flatten, trained_by
+from memmlp.runs.identity import SLOTS, flatten, option_in_slot, trained_by
 from memmlp.runs.notes import read_notes
 from memmlp.runs.run import STATUSES, Run
 from memmlp.runs.shown_name import run_name
@@ -49,7 +49,7 @@ def record(run: Run) -> dict[str, Any]:
     results = {key: number_of(value) for key, value in results.items()}
     flat = flatten(config)
     short = {key.replace(".rotation.", "."): value for key, value in results.items()}
-    slots = {slot: chosen(config, slot) for slot in SLOTS if slot in config}
+    slots = {slot: option_in_slot(config, slot) for slot in SLOTS if slot in config}
     facts = {name: manifest.get(name) for name in ("kind", "started", "upstream", "user")}
     digest = str(manifest.get("data") or "")
     facts |= {"data": flat.get("data.name") or digest[:SHORT], "data_digest": digest}

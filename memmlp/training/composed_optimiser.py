@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch.optim import Optimizer
 
-from memmlp.training.wide_products import wide_where_needed
+from memmlp.training.bfloat16_products import wide_where_needed
 
 
 class ComposedOptimiser(Optimizer):

@@ -249,7 +249,7 @@ def resume(
 ) -> tuple[int, float]:
     """Load the run's checkpoint, if any; return the number of finished steps, and the seconds they took."""
     found = checkpoint.read(run.checkpoint) if distributed.first() and run.checkpoint.exists() else None
-    found = distributed.of_first(found)
+    found = distributed.broadcast(found)
     if found is None:
         return 0, 0.0
     tensors, values = found

@@ -106,7 +106,7 @@ class Muon(Optim):
 
     Muon's steps are scaled to the typical length of AdamW's steps (Liu et al. 2025), so that AdamW's learning
     rates and weight decay fit both. The implementation is torch.optim.Muon, which multiplies matrices in
-    bfloat16 (memmlp.training.wide_products).
+    bfloat16 (memmlp.training.bfloat16_products).
 
     Attributes:
         momentum: Muon's momentum, which is Nesterov momentum.

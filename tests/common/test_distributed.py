@@ -153,4 +153,4 @@ def test_one_process_shares_nothing(monkeypatch: pytest.MonkeyPatch):
         assert distributed.own_rows(value) is value
         assert distributed.whole(value) is value
         assert distributed.mean(value) is value
-    assert distributed.of_first("a") == "a"
+    assert distributed.broadcast("a") == "a"

@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from memmlp.config.schema.checks import WITHOUT_STREAM
 from memmlp.config.schema.config import DATA, GROUPS, SCHEMAS, Config, TrackerConfig
 from memmlp.config.schema.data import SynthDataConfig
-from memmlp.runs.identity import chosen
+from memmlp.runs.identity import option_in_slot
 
 RENAMED = {"tracker": "tracking"}
 """The present names of groups that runs of version 0.1 recorded under other names."""
@@ -38,7 +38,7 @@ def _restored(group: str, content: Mapping[str, Any]) -> Any:
     """
     if group == "tracking":
         return _trackers(content)
-    option = SCHEMAS.get(f"{group}_{chosen({group: content}, group)}")
+    option = SCHEMAS.get(f"{group}_{option_in_slot({group: content}, group)}")
     ours = option is None or option.__module__.startswith("memmlp.")
     if group == "data" and ours:
         schema = SynthDataConfig if content["synth"] else DATA[content["split"]["name"]]

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from memmlp.training import wide_products
+from memmlp.training import bfloat16_products
+from memmlp.training.bfloat16_products import WideProducts, multiplies_bfloat16, wide_where_needed
 from memmlp.training.composed_optimiser import ComposedOptimiser
-from memmlp.training.wide_products import WideProducts, multiplies_bfloat16, wide_where_needed
 
 
 def matrices(*shapes: tuple[int, int]) -> list[torch.Tensor]:
@@ -50,8 +50,8 @@ def test_everything_else_is_torchs():
 )
 def test_a_processor_is_asked(known, has, monkeypatch):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: known)
-    monkeypatch.setattr(wide_products, "multiplies_bfloat16", multiplies_bfloat16.__wrapped__)
-    assert wide_products.multiplies_bfloat16() is has
+    monkeypatch.setattr(bfloat16_products, "multiplies_bfloat16", multiplies_bfloat16.__wrapped__)
+    assert bfloat16_products.multiplies_bfloat16() is has
     assert isinstance(wide_where_needed(), WideProducts) is not has
 
 
@@ -59,7 +59,7 @@ def test_muon_steps_alike_with_either(monkeypatch):
     """Newton and Schulz' iteration loses what a rounding differs by."""
 
     def stepped(narrow: bool) -> torch.Tensor:
-        monkeypatch.setattr(wide_products, "multiplies_bfloat16", lambda: narrow)
+        monkeypatch.setattr(bfloat16_products, "multiplies_bfloat16", lambda: narrow)
         torch.manual_seed(0)
         weight = torch.nn.Parameter(torch.randn(12, 20))
         optimiser = ComposedOptimiser([torch.optim.Muon([weight], 0.02)])
