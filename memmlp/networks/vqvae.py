@@ -62,7 +62,8 @@ class Codebook(nn.Module):
 
     def _distances(self, latent: Tensor) -> Tensor:
         """Return the squared distances (..., K) of latents (..., width), less the latents' own squares."""
-        return self.vectors.square().sum(-1) - 2 * latent @ self.vectors.T
+        with in_float32(latent.device):  # bfloat16 would make another code-vector the nearest
+            return self.vectors.square().sum(-1) - 2 * latent.to(self.vectors.dtype) @ self.vectors.T
 
     def forward(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         """Return the code-vectors (..., width) and indices (...) of latents (..., width)."""
@@ -183,16 +184,25 @@ class VQVAE(nn.Module):
         self.codebook: LearnedCodebook = CODEBOOKS[codebook](codes, width, commitment, decay)
         self.decoder = nn.Sequential(*_blocks(width, decoder_depth), nn.Linear(width, ROTATION.stop))
 
+    def latent(self, frames: Tensor) -> Tensor:
+        """Encode frames (..., 252) in network space to latents (..., width).
+
+        They are computed in float32 in a mixed-precision training, too: rounded latents have other
+        code-vectors than those that evaluation and export find.
+        """
+        with in_float32(frames.device):
+            return self.encoder(frames.to(self.codebook.vectors.dtype))
+
     def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
         """Return the code-vectors (..., width) of inputs (..., 54) and motion (..., 198) in network space."""
-        return self.codebook(self.encoder(torch.cat([sparse, motion], -1)))[0]
+        return self.codebook(self.latent(torch.cat([sparse, motion], -1)))[0]
 
     def reconstruct(self, frames: Tensor) -> tuple[Tensor, Quantised]:
         """Reconstruct the rotations (B, 132) of frames (B, 252), with the straight-through gradient.
 
         An EMA codebook learns from this call.
         """
-        latent = self.encoder(frames)
+        latent = self.latent(frames)
         quantised: Quantised = self.codebook.learn(latent)
         return self.decoder(straight_through(latent, quantised.codes)), quantised
 

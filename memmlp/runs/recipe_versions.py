@@ -61,7 +61,7 @@ RECIPES: dict[str, int] = {
     "optim.schedule_free": 1,
     "ema": 1,
     "warmup": 1,
-    "precision.bf16": 1,
+    "precision.bf16": 2,
     "rollout.teacher_forcing": 1,
     "rollout.own_predictions": 1,
     "rollout.streams": 2,

@@ -131,9 +131,13 @@ def seen(net: SAGENet, frames: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def latents(codes: HalfVQVAE, rotation: Tensor, encoded: Tensor) -> Tensor:
-    """Return a trained VQ-VAE's latents (B, T // 2, 384) of rotations (B, T, 132) and inputs (B, T, 54)."""
+    """Return a trained VQ-VAE's latents (B, T // 2, 384) of rotations (B, T, 132) and inputs (B, T, 54).
+
+    They are computed in float32 in a mixed-precision training, too: rounded ones have other code-vectors.
+    """
     assert not codes.training
-    return codes.encode(rotation, encoded)[0]
+    with in_float32(rotation.device):
+        return codes.encode(rotation, encoded)[0]
 
 
 def noised(net: SAGENet, clean: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -113,7 +113,7 @@ class VQVAETask:
     def validate(self) -> dict[str, float]:
         """Compute Eq. 1 and the perplexity on the validation frames."""
         frames = self.normalizer.encode(self.validation.frames)
-        vectors, index = self.model.codebook(self.model.encoder(frames))
+        vectors, index = self.model.codebook(self.model.latent(frames))
         used = torch.bincount(index, minlength=len(self.used)).float()
         error = rotation_error(self.model.decoder(vectors), frames, self.normalizer)
         return {"rotation": float(error), "perplexity": perplexity(used)}

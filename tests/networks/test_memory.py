@@ -127,6 +127,19 @@ def test_every_memory_trains_in_bfloat16(kind, rollout, tmp_path):
     assert all(torch.isfinite(p).all() for p in model.parameters())
 
 
+@pytest.mark.parametrize("training", [True, False])
+@pytest.mark.parametrize("kind", [CodeMemory, JointCodeMemory])
+@torch.no_grad()
+def test_a_memory_recalls_the_same_codes_in_a_mixed_precision_training(kind, training):
+    memory, state = tiny.model(kind).memory.train(training), {"motion": 3 * torch.randn(200, 13, 198)}
+    sparse = 3 * torch.randn(200, 20, SPARSE_DIM)
+    latent = memory.codes.encoder(torch.cat([sparse[:, :7], state["motion"][:, :7]], -1))
+    memory.codes.codebook.vectors.copy_(latent[:8, 0])
+    with torch.autocast("cpu", torch.bfloat16):
+        found = memory.recall(sparse, state, 7)
+    torch.testing.assert_close(found, memory.recall(sparse, state, 7), rtol=0, atol=0)
+
+
 def joint_task(codebook: str = "ema") -> MotionTask:
     """A tiny network with a VQ-VAE of its own, and its training."""
     vqvae = partial(VQVAE, codes=8, width=12, encoder_depth=2, codebook=codebook)

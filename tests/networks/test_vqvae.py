@@ -35,6 +35,22 @@ def test_the_margin_is_none_between_equal_codes_and_infinite_with_one():
     assert torch.equal(one.margins(torch.ones(4, 3)), torch.full((4,), torch.inf))
 
 
+@pytest.mark.parametrize("codebook", ["ema", "gradient"])
+@torch.no_grad()
+def test_a_mixed_precision_training_finds_the_code_vectors_that_evaluation_finds(codebook):
+    """Each code-vector is some frame's latent, so that many frames are almost as near to two of them."""
+    torch.manual_seed(3)
+    model = VQVAE(codes=64, width=12, encoder_depth=2, codebook=codebook).eval()
+    frames = torch.randn(4000, FRAME_DIM)
+    latent = model.encoder(frames)
+    model.codebook.vectors.copy_(latent[:64])
+    with torch.autocast("cpu", torch.bfloat16):
+        vectors = model.code_vectors(frames[:, :54], frames[:, 54:])
+        indices = model.codebook.indices(latent)
+    assert torch.equal(vectors, model.code_vectors(frames[:, :54], frames[:, 54:]))
+    assert torch.equal(indices, model.codebook.indices(latent))
+
+
 def learned(codebook: str, steps: int = 150) -> tuple[float, float, int]:
     torch.manual_seed(0)
     model = VQVAE(codes=8, width=12, encoder_depth=1, codebook=codebook)

@@ -154,3 +154,22 @@ def test_a_part_tells_which_settings_of_optim_are_of_the_whole_alone():
     ).upstream
     assert all("by AdamW; optim=muon, optim.warmup=5: of the whole alone" in one.told for one in changed)
     assert all(one.network.optim.precision == "bf16" for one in changed)
+
+
+@pytest.mark.parametrize("kind", PARTS[:-1])
+def test_every_part_trains_in_mixed_precision(kind):
+    optim = replace(OPTIM, precision="bf16")
+    task = part_task(kind, optim)
+    optimiser = optim.build(task.parameter_groups())
+    for step in range(2):
+        train_step(task, optim, optimiser, step)
+    assert all(torch.isfinite(p).all() for p in task.module.parameters())
+
+
+@pytest.mark.parametrize("half", JOINTS)
+def test_latents_to_learn_from_are_those_of_float32_in_a_mixed_precision_training(half):
+    _, codes = parts(f"{half}_diffusion")
+    rotation, encoded = 3 * torch.randn(500, 8, ROTATION.stop), 3 * torch.randn(500, 8, SPARSE_DIM)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = sage_losses.latents(codes, rotation, encoded)
+    torch.testing.assert_close(found, sage_losses.latents(codes, rotation, encoded), rtol=0, atol=0)

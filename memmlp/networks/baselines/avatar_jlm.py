@@ -7,6 +7,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from memmlp.common.float32_regions import in_float32
 from memmlp.motion.body import (
     HEAD,
     N_JOINTS,
@@ -120,9 +121,11 @@ class AvatarJLM(WholeWindow):
             Joints (..., 22, 3), metres, relative to the head, and their global 6D rotations (..., 22, 6).
         """
         mean, std = (part[SPARSE_DIM:][ROTATION] for part in (self.normalizer.mean, self.normalizer.std))
-        local = sixd_to_matrix((self.coarse(embedded) * std + mean).unflatten(-1, (N_JOINTS, 6)))
-        pelvis = torch.zeros_like(local[..., 0, :, 0])
-        rotations, positions = forward_kinematics(local, pelvis, self.normalizer.rest)
+        sixd = (self.coarse(embedded) * std + mean).unflatten(-1, (N_JOINTS, 6))
+        with in_float32(sixd.device):
+            local = sixd_to_matrix(sixd)
+            pelvis = torch.zeros_like(local[..., 0, :, 0])
+            rotations, positions = forward_kinematics(local, pelvis, self.normalizer.rest)
         return positions - positions[..., HEAD : HEAD + 1, :], matrix_to_sixd(rotations)
 
     def tokens(self, encoded: Tensor) -> Tensor:

@@ -57,13 +57,16 @@ def in_head(rotation: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
 def hands_in_head(sparse: Tensor) -> list[Tensor]:
     """Return what `by_tracker` returns, for both hands in the head's frame, from world inputs (..., 54).
 
-    The previous frame is reconstructed from the velocities in the inputs.
+    The previous frame is reconstructed from the velocities in the inputs. All is computed in float32 in a
+    mixed-precision training, too: velocities are small differences.
     """
     rotation, turn, position, velocity = by_tracker(sparse)
-    now = sixd_to_matrix(rotation)
-    before = now @ sixd_to_matrix(turn).transpose(-1, -2)
-    (rotations, positions), (earlier, places) = in_head(now, position), in_head(before, position - velocity)
-    turned = earlier.transpose(-1, -2) @ rotations
+    with in_float32(sparse.device):
+        now = sixd_to_matrix(rotation)
+        before = now @ sixd_to_matrix(turn).transpose(-1, -2)
+        rotations, positions = in_head(now, position)
+        earlier, places = in_head(before, position - velocity)
+        turned = earlier.transpose(-1, -2) @ rotations
     return [matrix_to_sixd(rotations), matrix_to_sixd(turned), positions, positions - places]
 
 
@@ -253,5 +256,5 @@ class HMDPoser(WindowlessModel):
         """Return the weighted loss of how much the shapes of features (B, T, d) vary within a window."""
         if self.shape is None:
             return {}
-        shapes = self.shape(features)
+        shapes = self.shape(features).to(self.normalizer.mean)  # their differences are small
         return {"shape": self.shape_weight * (shapes - shapes.mean(1, keepdim=True)).abs().mean()}

@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from memmlp.common import distributed
+from memmlp.common.float32_regions import in_float32
 from memmlp.motion.body import (
     HEAD,
     N_JOINTS,
@@ -178,8 +179,12 @@ class Manikin(MotionModel):
         raise NotImplementedError
 
     def posed(self, made: Tensor, encoded: Tensor) -> Tensor:
-        """Map outputs (..., 86 or more) and the same frames' inputs (..., 54) to rotations (..., 132)."""
-        return Parts.of(made, self.normalizer).posed(encoded, self.normalizer)
+        """Map outputs (..., 86 or more) and the same frames' inputs (..., 54) to rotations (..., 132).
+
+        Limbs are solved in float32 in a mixed-precision training, too.
+        """
+        with in_float32(made.device):
+            return Parts.of(made.to(encoded.dtype), self.normalizer).posed(encoded, self.normalizer)
 
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
         """Make a training call in which each window is turned by its own random heading; see MotionModel."""
@@ -204,7 +209,8 @@ class Manikin(MotionModel):
         motion = self.normalizer.coordinates.motion_in(
             true[..., SPARSE_DIM:], self.normalizer.origin(true[..., :SPARSE_DIM])
         )
-        parts = self.losses_of_parts(made, Truth(motion[:, -made.shape[1] :]))
+        with in_float32(made.device):
+            parts = self.losses_of_parts(made.to(true.dtype), Truth(motion[:, -made.shape[1] :]))
         return {name: self.parts * term for name, term in parts.items()}
 
 

@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from memmlp.common.float32_regions import in_float32
 from memmlp.motion.body import N_JOINTS, ROTATION, TRACKED
 from memmlp.networks.baselines.agrol import TimeEmbedding
 from memmlp.networks.baselines.avatar_jlm import JOINT_DIM, tracker_features
@@ -167,7 +168,15 @@ class ProductQuantiser(nn.Module):
         self.register_buffer("usage", torch.zeros(BOOKS, CODES))
 
     def forward(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the quantised latents (..., 384), with straight-through gradients, and their loss."""
+        """Return the quantised latents (..., 384), with straight-through gradients, and their loss.
+
+        They are compared with the code-vectors in float32 in a mixed-precision training, too.
+        """
+        with in_float32(z.device):
+            return self.quantised(z.to(self.vectors.dtype))
+
+    def quantised(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what `forward` does, in the precision of the latents (..., 384)."""
         parts = z.flatten(0, -2).unflatten(-1, (BOOKS, -1)).transpose(0, 1)
         distance = torch.cdist(parts, self.vectors).square()
         index = distance.argmin(-1)

@@ -172,7 +172,7 @@ class JointCodeMemory(VQMemory):
         """
         if not self.training:
             return super().code_vectors(sparse, motion)
-        latent = self.codes.encoder(torch.cat([sparse, motion], -1))
+        latent = self.codes.latent(torch.cat([sparse, motion], -1))
         return straight_through(latent, self.codes.codebook(latent)[0])
 
     def auxiliary_losses(self, frames: Tensor, normalizer: Normalizer) -> dict[str, Tensor]:

@@ -83,3 +83,12 @@ def test_the_coarse_poses_loss_is_of_joints_relative_to_the_head():
     model.coarse = coarse
     found = model.learn(truth[:, -1:, :SPARSE_DIM], model.true_state(truth[:, :-1]), truth).losses["coarse"]
     assert float(found) == float(model.coarse_loss(truth)["coarse"]) > 0.1
+
+
+@torch.no_grad()
+def test_coarse_joints_follow_from_their_rotations_in_float32_in_a_mixed_precision_training():
+    model, rotations = tiny.baseline("avatar_jlm"), torch.randn(50, ROTATION.stop)
+    model.coarse = torch.nn.Identity()
+    with torch.autocast("cpu", torch.bfloat16):
+        found = model.coarse_joints(rotations)
+    torch.testing.assert_close(found, model.coarse_joints(rotations), rtol=0, atol=0)

@@ -81,3 +81,9 @@ def test_the_shape_is_trained_to_be_the_same_within_a_window():
     plain = tiny.baseline("hmd_poser", shape=0)
     assert plain.learn(truth[..., :SPARSE_DIM], plain.initial_state(2), truth).losses == {}
     assert model.count_parameters() - plain.count_parameters() == 8 * 16 * 16 + 16 + 16 * 16 + 16
+
+
+def test_hands_in_the_heads_frame_are_those_of_float32_in_a_mixed_precision_training():
+    with torch.autocast("cpu", torch.bfloat16):
+        found = hands_in_head(SPARSE)
+    torch.testing.assert_close(found, hands_in_head(SPARSE), rtol=0, atol=0)

@@ -201,3 +201,17 @@ def test_offline_it_is_no_stream():
     with pytest.raises(InputError, match=r"model\.offline=true"):
         streaming(model)
     assert tiny.baseline("manikin_l").streams
+
+
+@pytest.mark.parametrize("name", NAMES)
+@torch.no_grad()
+def test_limbs_are_solved_and_compared_in_float32_in_a_mixed_precision_training(name):
+    """A pose and its losses are those of the parts, however the parts were computed."""
+    model, truth = tiny.baseline(name), TRUTH.float()
+    encoded = model.normalizer.encode_sparse(truth[..., :SPARSE_DIM], model.normalizer.origin(truth))
+    made = torch.randn(2, 7, model.regressor[-1].out_features if name == "manikin_l" else 86).bfloat16()
+    with torch.autocast("cpu", torch.bfloat16):
+        posed, losses = model.posed(made, encoded), manikin.Manikin.losses(model, made, truth)
+    torch.testing.assert_close(posed, model.posed(made.float(), encoded), rtol=0, atol=0)
+    expected = manikin.Manikin.losses(model, made.float(), truth)
+    torch.testing.assert_close(losses, expected, rtol=0, atol=0)
