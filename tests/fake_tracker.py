@@ -134,7 +134,7 @@ class FileTracker:
 def a_run(outputs: Path, name: str = "0" * 16, steps: int = 3, **config: object) -> Run:
     """A begun run with some steps."""
     run = Run.of(outputs, name)
-    run.begin("memmlp", {"seed": 0, **config}, data="d" * 64, upstream=None)
+    run.begin("memmlp", {"seed": 0, **config}, data="d" * 64, upstream=None, stages=[])
     for step in range(1, steps + 1):
         run.log(step, {"loss": 1 / step})
     return run

@@ -116,13 +116,10 @@ def facts_of(run: Run, running: bool = False) -> RunFacts:
 
 
 def _status(run: Run) -> str:
-    """Return the status of a run on which no process works: failed, done, or else killed.
-
-    A run is done when it is trained and has the evaluations and the deployment that were last asked for.
-    """
+    """Return the status of a run on which no process works: failed, done (see `Run.complete`), or killed."""
     if run.failure:
         return "failed"
-    return "done" if run.done and all(map(run.has, run.wanted)) else "killed"
+    return "done" if run.complete else "killed"
 
 
 def _ended(run: Run, started: float) -> float:

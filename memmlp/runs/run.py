@@ -31,15 +31,15 @@ from memmlp.runs import deployment_folder
 from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.environment import changed, changes, environment, host, sources
 from memmlp.runs.evaluation_file import check_report, combined_by, intact, of_one_solver, preference
-from memmlp.runs.identity import belongs, used_as_configured
+from memmlp.runs.identity import NETWORK, belongs, used_as_configured
 from memmlp.runs.metrics_log import Metrics, MetricsLog
 from memmlp.runs.resumed_origin import joined
 
 STAGE_WORDS = {"training": "training", "evaluation": "evaluating", "deployment": "exporting"}
 """What a process is doing that works on a stage of a run."""
 
-STATUSES = (*STAGE_WORDS.values(), "done", "lost", "failed", "stopped", "new")
-"""What the status of a run may be: lost is one whose process died."""
+STATUSES = (*STAGE_WORDS.values(), "done", "trained", "lost", "failed", "stopped", "new")
+"""What the status of a run may be: lost is one whose process died; see `Run.state`."""
 
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # six times as quick, where PyYAML was built with it
 
@@ -125,6 +125,25 @@ class Run:
             self.write_manifest({"stages": list(stages)})
 
     @property
+    def complete(self) -> bool:
+        """Whether the run is trained and has the evaluations and the deployment that were last asked for.
+
+        For a network's run from before these were recorded it is whether each of its config's modes has an
+        evaluation, or one file has the results of all; whether a deployment was asked for is not known.
+        """
+        manifest = self.manifest
+        if manifest.get("kind") != NETWORK or "stages" in manifest or self.results_path.exists():
+            return self.done and all(map(self.has, self.wanted))
+        return self.done and all(any(self.evaluations.glob(f"{mode}*.json")) for mode in self._modes())
+
+    def _modes(self) -> Sequence[str]:
+        """Return the modes in which the run's config evaluates it; "" for any, if that is not known."""
+        try:
+            return (self.config.get("evaluation") or {}).get("modes") or [""]
+        except InputError:
+            return [""]
+
+    @property
     def preferred_deployment(self) -> DeploymentFolder:
         """The deployment to use, among those with the run's own settings.
 
@@ -182,7 +201,10 @@ class Run:
     @property
     def status(self) -> str:
         """The run's status, one of STATUSES: what a process is doing with it, or else its progress."""
-        return self.doing or self.state(self.done and not self.failure)
+        if doing := self.doing:
+            return doing
+        word = self.state(self.complete and not self.failure)
+        return "trained" if word == "running" else word  # somebody holds it, at none of its stages
 
     @property
     def doing(self) -> str | None:

@@ -283,6 +283,38 @@ def test_the_status_names_the_stage_that_somebody_is_at(tmp_path: Path):
     assert (run.status, run.done) == ("failed", True)
 
 
+def test_a_run_that_was_killed_before_its_evaluation_is_trained_and_not_done(tmp_path: Path):
+    """Older code did not record which evaluations it was to make; its config says in which modes."""
+    run = begun(tmp_path, CONFIG | {"evaluation": {"modes": ["window", "stream"]}})
+    run.model.write_bytes(b"weights")
+    run.finish(["model.safetensors"])
+    run.evaluations.mkdir()
+    for name, status in (("none", "trained"), ("stream-0", "trained"), ("window-0", "done")):
+        run.evaluation(name).write_text("{}")
+        assert (run.status, facts(run.folder)["complete"]) == (status, status == "done")
+    run.want(["window-0", "stream-1"])
+    with run.lock():
+        assert run.status == "trained"  # somebody holds it, at none of its stages
+    assert run.status == "trained"
+    run.want(["window-0", "stream-0"])
+    assert run.status == "done"
+
+
+def test_an_old_run_with_a_damaged_config_is_done_if_it_has_an_evaluation(tmp_path: Path):
+    run = complete(tmp_path)
+    run.config_path.write_text("a: [b")
+    assert run.status == "done"
+    run.evaluation("stream-0").unlink()
+    assert run.status == "trained"
+
+
+def test_a_vqvae_s_run_is_done_without_an_evaluation(tmp_path: Path):
+    run = begun(tmp_path, kind="vqvae")
+    write_json(run.results_path, {})
+    run.finish(["results.json"])
+    assert run.status == "done"
+
+
 def test_runs_need_neither_torch_nor_hydra():
     code = "import sys, memmlp.runs.run; print([m for m in ('torch', 'hydra', 'mlflow') if m in sys.modules])"
     assert finished([sys.executable, "-c", code]).stdout == "[]\n"

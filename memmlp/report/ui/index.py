@@ -81,7 +81,7 @@ class Index:
             if self.store:
                 self.store.put(run_id, signature, known)
             known["status"] = None
-        complete = known["done"] and not known["failure"]
+        complete = known["complete"] and not known["failure"]
         status = "done" if complete and not _claimed(folder) else _status(folder)
         if known.get("status") == status and run_id in self.runs and "generation" in known:
             return False

@@ -50,6 +50,7 @@ def facts(folder: Path) -> dict[str, Any]:
         "name": run_name(manifest, shown),
         "kind": _word(manifest.get("kind")),
         "done": run.done,
+        "complete": run.complete,
         "started": _word(manifest.get("started")),
         "finished": _word(manifest.get("finished")),
         "seconds": _seconds(manifest.get("seconds")),

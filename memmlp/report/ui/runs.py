@@ -226,7 +226,7 @@ def control_of(plans: Sequence[Plan], run_id: str, known: Mapping[str, Any]) -> 
 
 
 def partners(known: Mapping[str, Mapping[str, Any]], run_id: str, control: str | None = None) -> list[str]:
-    """Return the finished networks on a run's own data, with the one to compare it with first.
+    """Return the trained networks on a run's own data, with the one to compare it with first.
 
     The first is its control, then come those with its seed whose configs differ in the fewest groups and
     keys. Keys that do not change results are ignored. Runs on other data are left out, since their errors
@@ -237,7 +237,8 @@ def partners(known: Mapping[str, Mapping[str, Any]], run_id: str, control: str |
         other["id"]: differences(own["config"], other["config"])
         for other in known.values()
         if other["id"] != run_id
-        and (other["kind"], other["status"]) == ("memmlp", "done")
+        and other["kind"] == "memmlp"
+        and other["status"] in ("done", "trained")
         and other["data"] == own["data"]
     }
 

@@ -135,7 +135,7 @@ class Sweeps:
         facts = self.index.runs.get(task.id)
         if facts is None:
             return "new"
-        if facts["status"] != "done":
+        if not facts["done"] or facts["status"] not in ("done", "trained", "lost"):
             return facts["status"]
         run = plan.run_of(task)
         return "done" if all(map(run.has, task.stages)) else run.doing or run.state(False)

@@ -112,6 +112,14 @@ def test_a_trained_run_whose_deployment_failed_is_not_done(outputs: Path):
     assert index.runs[run.id]["status"] == "done"
 
 
+def test_a_trained_run_without_its_evaluation_is_not_done(outputs: Path):
+    run, index = run_of(outputs), Index(outputs)
+    for path in run.evaluations.iterdir():
+        path.unlink()
+    index.refresh()
+    assert (run.status, index.runs[run.id]["status"]) == ("trained", "trained")
+
+
 def test_a_run_that_is_gone_is_told(outputs: Path):
     index = Index(outputs)
     index.refresh()

@@ -82,6 +82,13 @@ def test_a_run_that_lacks_an_evaluation_is_trained_and_a_vqvae_is_no_arm(outputs
     assert say(arm, first.seed) == "trained, an evaluation or export is missing"
 
 
+def test_a_run_that_lacks_only_what_the_sweep_does_not_want_is_done(outputs: Path):
+    run_of(outputs, "gru", 2).want(["stream-0", "stream-absent"])
+    sweeps = sweeps_of(outputs)
+    assert sweeps.progress(sweeps.known()[0])["counts"] == {"done": 6}
+    assert sweeps.index.runs[run_of(outputs, "gru", 2).id]["status"] == "trained"
+
+
 def test_no_time_is_left_where_only_the_evaluation_is(outputs: Path):
     run = run_of(outputs, "gru", 2)
     with run.lock():

@@ -4,7 +4,7 @@ import { h, replace, link, section, select, empty, choice, code } from './dom.js
 import { address, alone, ask, dataName, nameOf, place, remember, runs } from './store.js';
 import { ago, ARROWS, better, bytes, date, duration, largestFirst, metricNumber, metricWords, number, signed, word } from './format.js';
 import { curvePanel } from './compare.js';
-import { status, tags } from './runs.js';
+import { FINISHED, status, tags } from './runs.js';
 
 const METRICS = ['MPJPE', 'MPJRE', 'MPJVE', 'Jitter', 'Hand PE', 'Upper PE', 'Lower PE', 'Root PE', 'geodesic'];
 
@@ -83,7 +83,7 @@ function results(run) {
 // The worst clips, one of which is replayed beside the truth and beside another run.
 async function replaySection(run, closing) {
   const { Replay } = await import('./replay.js');
-  const others = [...runs.values()].filter(other => other.id !== run.id && other.status === 'done' && other.kind === 'memmlp');
+  const others = [...runs.values()].filter(other => other.id !== run.id && FINISHED.includes(other.status) && other.kind === 'memmlp');
   const partners = new Map(run.partners.map((other, i) => [other, i]));
   const rank = other => partners.get(other.id) ?? Infinity;
   const near = others.sort((a, b) => (rank(a) === rank(b) ? 0 : rank(a) - rank(b))).slice(0, 40);

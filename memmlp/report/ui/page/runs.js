@@ -11,9 +11,10 @@ const METRICS = ['stream.rotation.MPJPE', 'stream.rotation.MPJRE', 'stream.rotat
 const NARROW = matchMedia('(max-width: 640px)'); // errors come first where little can be seen
 const KINDS = [['memmlp', 'Networks'], ['vqvae', 'VQ-VAEs'], ['', 'All']];
 export const AT_WORK = ['training', 'evaluating', 'exporting'];
-const STATES = [...AT_WORK, 'done', 'failed', 'lost', 'stopped', 'new'];
+const STATES = [...AT_WORK, 'done', 'trained', 'failed', 'lost', 'stopped', 'new'];
 export const STATE_WORDS = { lost: 'lost', new: 'waiting', blocked: 'blocked', stopped: 'stopped', trained: 'trained' };
-const STATE_TITLES = { trained: 'Trained; an evaluation or export that this sweep asks for is missing.' };
+const STATE_TITLES = { trained: 'Trained; an evaluation or export that was asked for is missing.' };
+export const FINISHED = ['done', 'trained'];
 
 // How a status looks: whatever somebody does with a run looks alike.
 export const look = status => (AT_WORK.includes(status) ? 'running' : status);
@@ -126,11 +127,11 @@ export function page() {
 
   function bests(list) {
     const metric = ui.columns.find(name => name.startsWith('stream.')) ?? METRICS[0];
-    const known = list.filter(run => run.status === 'done' && typeof run.metrics[metric] === 'number');
+    const known = list.filter(run => FINISHED.includes(run.status) && typeof run.metrics[metric] === 'number');
     const value = bestOf(metric, known.map(run => run.metrics[metric]));
     const first = known.find(run => run.metrics[metric] === value);
     best.hidden = !first;
-    ui.sets = [...new Set(list.filter(run => run.status === 'done').map(run => run.data))];
+    ui.sets = [...new Set(list.filter(run => FINISHED.includes(run.status)).map(run => run.data))];
     if (ui.sets.length > 1) {
       const chosen = data => { remember({ filter: `${place().query.get('filter') ?? ''} data=${data}`.trim() }); draw(); };
       replace(best, `Of ${ui.sets.length} data sets, whose errors do not compare: `, ui.sets.slice(0, 5).map(data => h('button', { type: 'button', class: 'small', onclick: () => chosen(data) }, dataName(data) || 'unknown', ' ', h('small', {}, number(list.filter(run => run.data === data).length)))));
