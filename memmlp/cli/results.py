@@ -131,7 +131,8 @@ def save_command(
 def docs(folder: Path, check: bool) -> None:
     """Make all pages of results from what is kept.
 
-    No training is needed. Every file of data/ gives a table's page. The templates give pages whose sentences
+    No training is needed. Every file of data/ gives a table's page, which counts seeds beside those of the
+    sweep's definition. The templates give pages whose sentences
     take their numbers and verdicts from the tables. Prose that claims an effect by hand is refused, there and
     in README.md.
     """
@@ -196,13 +197,16 @@ def _trends(kept: Kept, stem: str) -> Trends | None:
 
 
 def _with_seeds(sweep: Sweep, kept: Kept) -> Sweep:
-    """Return the sweep with all seeds that any of the kept runs has."""
-    seeds = sorted({seed for runs in kept.runs.values() for seed in runs})
+    """Return the sweep with the seeds of its definition, and further ones that any of the kept runs has.
+
+    Those of the definition that are not kept are missing: one seed of five is no finished table.
+    """
+    seeds = sorted({*sweep.seeds, *(seed for runs in kept.runs.values() for seed in runs)})
     return sweep.with_overrides([f"seed={','.join(map(str, seeds))}"])
 
 
 def _table(kept: Kept, source: str | None = None) -> Table:
-    """Compute the table of kept results, over all seeds of their runs.
+    """Compute the table of kept results, over the sweep's seeds and all further ones of their runs.
 
     With a source's name, it is the table of that source's test clips alone.
     """

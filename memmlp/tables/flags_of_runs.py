@@ -103,15 +103,18 @@ def _other_data(sweep: Sweep) -> Iterable[str]:
 
 def _missing(sweep: Sweep, runs: Mapping[str, RunsBySeed], command: str, state: Say) -> Iterable[str]:
     """Flag the missing runs, with their states, and the command that makes them."""
-    gaps = []
+    gaps = {}
     for arm in sweep.runnable():
         seeds = _gaps(sweep, arm, runs)
         if seeds:
             states = unique(word for seed in seeds if (word := state(arm, seed)))
             words = f" ({', '.join(states)})" if states else ""
-            gaps.append(f"'{arm.label}' seed {', '.join(map(str, seeds))}{words}")
+            gaps[arm.label] = f"seed {', '.join(map(str, seeds))}{words}"
+    alike = 1 < len(sweep.runnable()) == len(gaps) and len(set(gaps.values())) == 1
+    told = [f"'{label}' {gap}" for label, gap in gaps.items()]
     if gaps:
-        yield f"missing: {listed(gaps)}; fill with: {command}"
+        every = f"every arm's {next(iter(gaps.values()))}"
+        yield f"missing: {every if alike else listed(told)}; fill with: {command}"
 
 
 def _older(sweep: Sweep, runs: Mapping[str, RunsBySeed], older: Say) -> Iterable[str]:

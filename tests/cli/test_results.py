@@ -45,6 +45,18 @@ def test_kept_results_become_pages(memmlp: Memmlp, planned: None):
     assert ", open" in Path("docs/results/README.md").read_text()
 
 
+def test_one_kept_seed_of_three_is_no_finished_table(memmlp: Memmlp, planned: None):
+    """Seeds count beside those of the sweep's definition; more of them may be kept than it asks for."""
+    memmlp("results", "save", "14", "seed=1")
+    memmlp("results", "docs")
+    page = Path("docs/results/table14.md")
+    assert (page.read_text().count("| 1/3 |"), page.read_text().count("| 1/1 |")) == (8, 0)
+    assert "missing: every arm's seed 0, 2; fill with: memmlp sweep table14" in page.read_text()
+    memmlp("results", "save", "14", "seed=0,2,3")
+    memmlp("results", "docs")
+    assert page.read_text().count("| 4/4 |") == 8
+
+
 def test_results_of_an_earlier_default_do_not_stand_beside_todays(
     memmlp: Memmlp, planned: None, monkeypatch: pytest.MonkeyPatch
 ):
