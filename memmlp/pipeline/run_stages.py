@@ -32,7 +32,7 @@ from memmlp.motion.preparing.groups import unfitting
 from memmlp.motion.preparing.manifest import ClipRecord, Manifest
 from memmlp.pipeline.devices import described
 from memmlp.pipeline.experiment import Experiment, UpstreamTraining
-from memmlp.runs.environment import packages_of_ones_own
+from memmlp.runs.environment import computed_imports, packages_of_ones_own
 from memmlp.runs.evaluation_file import read_report, write_report
 from memmlp.runs.identity import (
     NETWORK,
@@ -332,6 +332,8 @@ def train_run(
     onward = ", on from its checkpoint" if run.checkpoint.exists() else ""
     tell(f"network: train it for {steps} steps{onward} (run {run.id})")
     begin(experiment, run, experiment.identity(data.digest), experiment.config)
+    if files := computed_imports(run.manifest.get("plugins") or {}):
+        remark(f"plugins: edits are not seen of what is imported by computed names ({files})")
     run.write_manifest({"body": data.manifest.body, **data_warnings(experiment, data)})
     run.want(experiment.stages)
     run.clear_stages()

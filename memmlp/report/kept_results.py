@@ -32,6 +32,7 @@ LATER_FACTS = (
     "timed_on",
     "divided",
     "resampled",
+    "computed_imports",
 )  # the origins of older files have none of these
 OLDER_NAMES = {"vqvae": "upstream"}  # what the origins of older files call otherwise
 

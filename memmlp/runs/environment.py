@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import memmlp
-from memmlp.runs.imported_code import imported_modules, module_spec
+from memmlp.runs.imported_code import imported_modules, imports_by_computed_names, module_spec
 
 PACKAGE = Path(memmlp.__file__).parent
 NOT_NUMBERS = (
@@ -126,16 +126,21 @@ def own_sources(packages: Iterable[str]) -> dict[str, dict[str, str]]:
     Modules of the user's own that these import (`imported_modules`) follow, each by itself: of a package only
     its __init__, as PACKAGE.__init__. A package that is not found has no files.
     """
+    return {
+        name: {file: _own_digest(path) for file, path in own.items()}
+        for name, own in _own_files(packages).items()
+    }
+
+
+def _own_files(packages: Iterable[str]) -> dict[str, dict[str, Path]]:
+    """Return the files of `own_sources`, by package and file."""
     files = {name: _package_files(name) for name in packages}
     modules = {_module(name, file): path for name, own in files.items() for file, path in own.items()}
     imported = {
         f"{name}.__init__" if path.stem == "__init__" else name: {path.name: path}
         for name, path in imported_modules(modules).items()
     }
-    return {
-        name: {file: _own_digest(path) for file, path in own.items()}
-        for name, own in {**files, **imported}.items()
-    }
+    return {**files, **imported}
 
 
 def _package_files(name: str) -> dict[str, Path]:
@@ -168,15 +173,32 @@ def _own_digest(path: Path) -> str:
 
 
 def packages_of_ones_own(names: Iterable[str]) -> dict[str, dict[str, str | None]]:
-    """Return the version and a digest of the code of some packages and of what they import, by name."""
+    """Return the version and a digest of the code of some packages and of what they import, by name.
+
+    One with files that import by computed names has these, with commas between, as `computed_imports`: edits
+    of what they import are not seen.
+    """
+    packages = list(names)
 
     def digest(files: Mapping[str, str]) -> str:
         return hashlib.sha256(repr(files).encode()).hexdigest()[:12]
 
+    def computed(name: str, files: Mapping[str, Path]) -> dict[str, str | None]:
+        modules = {file: _module(name.removesuffix(".__init__"), file) for file in files}
+        found = [f for f, path in files.items() if imports_by_computed_names(modules[f], path, packages)]
+        return {"computed_imports": ", ".join(found)} if found else {}
+
+    own, digests = _own_files(packages), own_sources(packages)
     return {
-        name: {"version": _own_version(name), "digest": digest(files)}
-        for name, files in own_sources(names).items()
+        name: {"version": _own_version(name), "digest": digest(digests[name]), **computed(name, files)}
+        for name, files in own.items()
     }
+
+
+def computed_imports(plugins: Mapping[str, Mapping[str, str | None]]) -> str | None:
+    """Return which files of the recorded packages import by computed names, in words; None for none."""
+    found = {name: one.get("computed_imports") for name, one in plugins.items()}
+    return "; ".join(f"{name}: {files}" for name, files in found.items() if files) or None
 
 
 def _own_version(name: str) -> str | None:

@@ -14,6 +14,7 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
 from memmlp.runs.deployment_folder import as_deployed, deployed_precision, timed_on
+from memmlp.runs.environment import computed_imports
 from memmlp.runs.evaluation_file import intact, of_one_solver
 from memmlp.runs.run import Run
 
@@ -44,6 +45,7 @@ class Origin:
             None if there is none.
         partial: which part of its protocol's list the data is, in words; None if it is complete.
         plugins: version and code digest of each user's package that it uses.
+        computed_imports: the files of these that import by names that they compute, in words; None for none.
         offline: whether frames are made with later ones, so that it can't run as a stream.
         deployed: the precision of the exported file that was measured for size and times.
         timed_on: the processor on which size and times were measured, and ONNX Runtime's version there.
@@ -66,6 +68,7 @@ class Origin:
     upstream: str | None = None
     partial: str | None = None
     plugins: Mapping[str, str] = field(default_factory=dict)
+    computed_imports: str | None = None
     offline: bool = False
     deployed: str = "fp32"
     timed_on: str = UNKNOWN
@@ -332,6 +335,7 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
             name: f"{one['version'] or 'no version'} ({one['digest']})"
             for name, one in (manifest.get("plugins") or {}).items()
         },
+        computed_imports=computed_imports(manifest.get("plugins") or {}),
     )
 
 
@@ -343,6 +347,8 @@ def _evaluated(origin: Origin, reports: Sequence[Mapping[str, Any]]) -> Origin:
     for name in ("code", "hardware", "device", "gpu", "threads", "torch"):
         known = [word for other in others if (word := getattr(other, name)) not in (UNKNOWN, "version ?")]
         found[name] = ", ".join(dict.fromkeys([getattr(origin, name), *known]))
+    computed = [one.computed_imports for one in (origin, *others) if one.computed_imports]
+    found["computed_imports"] = "; ".join(dict.fromkeys(computed)) or None
     for other in others:
         found["recipes"] = {**found.get("recipes", origin.recipes), **other.recipes}
         found["plugins"] = _both(found.get("plugins", origin.plugins), other.plugins)

@@ -23,7 +23,7 @@ from memmlp.config.build_motion import build_motion
 from memmlp.config.compose import composed
 from memmlp.config.compose_plan import find_sweep
 from memmlp.config.schema import restored
-from memmlp.runs.environment import code_digest, packages_of_ones_own
+from memmlp.runs.environment import code_digest, computed_imports, packages_of_ones_own
 from memmlp.runs.identity import evaluation_id, evaluation_settings
 from memmlp.runs.run import Run
 from memmlp.sweep.search.search_file import parse_search
@@ -396,6 +396,21 @@ def test_code_that_a_package_imports_is_its_code_too(folder: Path):
     assert any(
         name.startswith("helper:") for name, _ in plugins.texts_outside_memmlp()
     )  # a plan may depend on it
+
+
+def test_imports_by_computed_names_are_recorded_unless_their_package_is_named(folder: Path):
+    registry = "import importlib\nfor name in NAMES: importlib.import_module(f'{__name__}.{name}')\n"
+    write(folder, {"mine.py": "import lab\n", "lab/__init__.py": registry, "lab/part.py": "P = 1\n"})
+    found = packages_of_ones_own(["mine"])
+    assert "computed_imports" not in found["mine"]
+    assert found["lab.__init__"]["computed_imports"] == "__init__.py"
+    assert computed_imports(found) == "lab.__init__: __init__.py"
+    assert computed_imports(packages_of_ones_own(["mine", "lab"])) is None
+    before = packages_of_ones_own(["mine", "lab"])
+    write(folder, {"lab/part.py": "P = 2\n"})
+    assert [name for name, one in packages_of_ones_own(["mine", "lab"]).items() if one != before[name]] == [
+        "lab"
+    ]
 
 
 def test_records_without_what_a_package_imports_are_of_no_other_code(folder: Path):
