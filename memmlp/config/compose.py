@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import functools
 import pickle
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NoReturn, cast
 
@@ -21,6 +21,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
+from hydra.errors import HydraException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -34,6 +35,9 @@ from memmlp.runs.identity import flatten
 
 VERSION_BASE = "1.3"
 CONFIG = "train"
+SEARCHPATH = "hydra.searchpath"
+EXPERIMENT = "experiment"
+"""The group whose options set groups and keys all over the config."""
 
 
 def parse(argv: Sequence[str]) -> tuple[argparse.Namespace, argparse.ArgumentParser]:
@@ -88,22 +92,54 @@ def composed_plain(name: str, overrides: Sequence[str], folder: Path | None = No
         return cast(dict[str, Any], OmegaConf.to_container(compose(name, args.overrides), resolve=True))
 
 
-def set_by_experiments(options: Sequence[str]) -> set[str]:
-    """Return the groups and the dotted keys that options of the group `experiment` set."""
+def set_by_experiments(options: Sequence[str], overrides: Sequence[str] = ()) -> set[str]:
+    """Return the groups and the dotted keys that options of the group `experiment` set.
+
+    Those that an option sets by the configs in its defaults list, such as another experiment, are included.
+
+    Args:
+        options: the options; those that do not exist are left out.
+        overrides: what else is chosen, of which only `hydra.searchpath` acts.
+    """
     args, _ = parse([])
+    register()
     version.setbase(VERSION_BASE)
+    places = [word for word in overrides if word.lstrip("+").startswith(f"{SEARCHPATH}=")]
     found: set[str] = set()
     with _hydra(args):
         loader = GlobalHydra.instance().config_loader()
         assert isinstance(loader, ConfigLoaderImpl)
         for option in options:
-            file = loader.repository.load_config(f"experiment/{option}")
-            if file is None:  # composing says so
-                continue
-            groups = [one for one in file.defaults_list or () if isinstance(one, GroupDefault)]
-            found |= {str(one.group).lstrip("/") for one in groups if one.override}
+            found |= _set_by(f"experiment/{option}", [*places, f"experiment={option}"], loader)
+    return found
+
+
+def _set_by(name: str, words: Sequence[str], loader: ConfigLoaderImpl) -> set[str]:
+    """Return the groups and the dotted keys that a config, and those in its defaults list, set.
+
+    Args:
+        name: the config's name, such as "experiment/paper".
+        words: overrides that choose it.
+        loader: Hydra's loader.
+    """
+    _, files = loader._parse_overrides_and_create_caching_repo(CONFIG, list(words))
+    parents, found = dict[str, str | None](), set[str]()
+    with suppress(HydraException, RecursionError):  # composing says so
+        every = loader.compute_defaults_list(CONFIG, list(words), RunMode.RUN).defaults
+        parents = {str(one.config_path): one.parent for one in every}
+    for config in {name, *(one for one in parents if name in _above(one, parents))}:
+        if file := files.load_config(config):
+            groups = [group for group in file.defaults_list or () if isinstance(group, GroupDefault)]
+            found |= {str(group.group).lstrip("/") for group in groups if group.override}
             found |= flatten(cast(dict[str, Any], OmegaConf.to_container(file.config))).keys()
     return found
+
+
+def _above(config: str, parents: Mapping[str, str | None]) -> Iterator[str]:
+    """Yield the configs whose defaults lists lead to a config, the nearest first."""
+    while above := parents.get(config):
+        yield above
+        config = above
 
 
 def preflight(args: argparse.Namespace) -> list[DictConfig]:
@@ -198,6 +234,7 @@ def help_text(args: argparse.Namespace) -> str:
 @contextmanager
 def _hydra(args: argparse.Namespace) -> Iterator[None]:
     """Initialise Hydra with the search path that the arguments ask for, as when the jobs run."""
+    _check_hidden(args)
     path = create_config_search_path(str(_folder(args.config_path or packaged("conf"), "--config-path")))
     if args.config_dir:
         own = f"file://{_folder(args.config_dir, '--config-dir')}"
@@ -207,6 +244,32 @@ def _hydra(args: argparse.Namespace) -> Iterator[None]:
         yield
     finally:
         GlobalHydra.instance().clear()
+
+
+def _check_hidden(args: argparse.Namespace) -> None:
+    """Raise InputError for a file of the user's that Hydra ignores: an earlier folder has one of its name."""
+    main = _folder(args.config_path or packaged("conf"), "--config-path")
+    before = [main, *(folder for provider, folder in plugins.folders() if provider != plugins.OWN)]
+    for folder in _own_folders(args):
+        for other in before:
+            for path in sorted(other.rglob("*.yaml")):
+                own = folder / path.relative_to(other)
+                if own.is_file() and own.read_bytes() != path.read_bytes():
+                    raise InputError(f"{own}: {path} is used in its place; allowed is a name of its own")
+        before.append(folder)
+
+
+def _own_folders(args: argparse.Namespace) -> Iterator[Path]:
+    """Yield the folders of configs that a command line names, in the order in which Hydra searches them."""
+    if args.config_dir:
+        yield _folder(args.config_dir, "--config-dir")
+    yield from (folder for provider, folder in plugins.folders() if provider == plugins.OWN)
+    words = (word.lstrip("+").partition("=") for word in args.overrides)
+    for value in (value for key, _, value in words if key == SEARCHPATH):
+        for place in value.strip("[] ").split(","):
+            name = place.strip(" '\"")
+            if "://" not in name or name.startswith("file://"):
+                yield Path(name.removeprefix("file://")).absolute()
 
 
 def _folder(name: str | Path, option: str) -> Path:
@@ -220,9 +283,17 @@ def _jobs(args: argparse.Namespace) -> list[list[str]]:
     """Return the overrides of each job: of the single one, or of all jobs of a multirun."""
     with _explained(args.overrides):
         overrides = OverridesParser.create().parse_overrides(args.overrides)
+        _check_experiments([one for one in overrides if one.key_or_group == EXPERIMENT])
         if not args.multirun and "hydra.mode=MULTIRUN" not in args.overrides:
             return [args.overrides]
         return BasicSweeper.split_arguments(overrides, None)[0]
+
+
+def _check_experiments(chosen: Sequence[Override]) -> None:
+    """Raise InputError for more than one word that chooses experiments: Hydra takes the last one alone."""
+    words = [str(one.input_line) for one in chosen]
+    if len(set(words)) > 1:
+        raise InputError(f"{words[-1]}: would replace {words[0]}; allowed is one word, {EXPERIMENT}=[A,B]")
 
 
 @contextmanager

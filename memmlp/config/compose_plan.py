@@ -29,10 +29,6 @@ if TYPE_CHECKING:
     from memmlp.pipeline.experiment import Experiment
 
 
-EXPERIMENT = "experiment"
-"""The group whose options set groups and keys all over the config."""
-
-
 def find_sweep(name: str, overrides: Sequence[str] = ()) -> Sweep:
     """Load the sweep with a path, a shipped file's name, or a table's number.
 
@@ -61,7 +57,7 @@ def check_experiment(sweep: Sweep, arm: Arm) -> None:
     Raises:
         InputError: for such an arm; the message names the sweep, the arm and both overrides.
     """
-    from memmlp.config.compose import set_by_experiments
+    from memmlp.config.compose import EXPERIMENT, set_by_experiments
 
     own = {key_of(word): word for word in arm.overrides or ()}
     chosen = own.get(EXPERIMENT)
@@ -75,7 +71,7 @@ def check_experiment(sweep: Sweep, arm: Arm) -> None:
     if options and (lost := [option for option in before if option not in options]):
         both = ",".join(dict.fromkeys([*before, *options]))
         raise InputError(f"{where} would replace {EXPERIMENT}={lost[0]}; allowed is {EXPERIMENT}=[{both}]")
-    known = set_by_experiments(options)
+    known = set_by_experiments(options, sweep.overrides(arm))
     for key, word in (around | {key_of(word): word for word in others}).items():
         if key in known:
             raise InputError(

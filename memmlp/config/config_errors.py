@@ -31,6 +31,11 @@ def explain(error: Exception, overrides: Sequence[str]) -> str:
         return f"{error.override}: cannot be read; allowed is KEY=VALUE, +KEY=VALUE or ~KEY"
     if isinstance(error, MissingConfigException):
         return _missing_option(error)
+    if isinstance(error, RecursionError):
+        said = (
+            "a defaults list leads back to itself; allowed is '- NAME' for another option of the same group"
+        )
+        return f"{' '.join(overrides)}: {said}"
     below = error.__cause__ or error.__context__
     if isinstance(below, OmegaConfBaseException):
         return _typed(below, _offender(error))

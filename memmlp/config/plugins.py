@@ -36,6 +36,7 @@ from memmlp.runs.recipe_versions import RECIPES
 GROUP = "memmlp.plugins"
 VARIABLE = "MEMMLP_PLUGINS"
 KEY = "plugins"
+OWN = "command-line"  # what Hydra calls the folder of `--config-dir`
 NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
 
 _active: dict[str, Plugin] = {}
@@ -91,7 +92,7 @@ def active() -> Mapping[str, Plugin]:
 def folders() -> list[tuple[str, Path]]:
     """Return the folders of configs searched beside memmlp's: the packages', by name, and the user's."""
     own = _own.get()
-    return [*_folders.items(), *([("command-line", own)] if own else [])]
+    return [*_folders.items(), *([(OWN, own)] if own else [])]
 
 
 @contextmanager

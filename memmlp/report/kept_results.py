@@ -196,7 +196,11 @@ def overrides_of(sweep: Sweep) -> dict[str, tuple[str, ...]]:
 
 def without_paths(overrides: Iterable[str]) -> tuple[str, ...]:
     """Return the overrides with absolute paths shortened to their last part, as they differ by machine."""
-    return tuple(re.sub(r"(?<==)/\S*", lambda found: f".../{PurePath(found[0]).name}", w) for w in overrides)
+
+    def last(found: re.Match[str]) -> str:
+        return f".../{PurePath(found[0]).name}"
+
+    return tuple(re.sub(r"(?<==)/\S*|(?<=file://)/[^\s,\]]*", last, word) for word in overrides)
 
 
 def save(path: Path, kept: Kept) -> None:

@@ -317,6 +317,49 @@ def test_a_bad_file_of_the_users_own(memmlp: Memmlp, tmp_path: Path, value: str,
     assert one_line(memmlp("train", "--config-dir", "mine", "experiment=own"), "model.width", word)
 
 
+@pytest.mark.parametrize("place", ["--config-dir", "hydra.searchpath", "sweep"])
+@pytest.mark.parametrize("option", ["experiment/paper.yaml", "memory/gru.yaml", "train.yaml"])
+def test_an_option_of_ones_own_that_ours_hides_is_refused(
+    memmlp: Memmlp, tmp_path: Path, place: str, option: str
+):
+    """Hydra takes ours, and says nothing."""
+    own = tmp_path / "mine" / option
+    own.parent.mkdir(parents=True)
+    own.write_text(EXTRA.format(16))
+    (tmp_path / "s.yaml").write_text("arms: {a: [experiment=paper]}\n")
+    words = {
+        "--config-dir": ["train", "--config-dir", "mine", "optim.lr=-1"],
+        "hydra.searchpath": ["train", "hydra.searchpath=[file://mine]", "optim.lr=-1"],
+        "sweep": ["sweep", "s.yaml", "--config-dir", "mine", "optim.lr=-1"],
+    }[place]
+    assert one_line(memmlp(*words), f"mine/{option}", f"conf/{option} is used in its place", "its own")
+    own.write_bytes((packaged("conf") / option).read_bytes())  # the same is no other
+    assert one_line(memmlp(*words), "optim.lr=-1")
+
+
+def test_a_folder_hides_no_option_of_another_one(memmlp: Memmlp, tmp_path: Path):
+    for name, width in (("a", 16), ("b", 24)):
+        (tmp_path / name / "experiment").mkdir(parents=True)
+        (tmp_path / name / "experiment" / "own.yaml").write_text(EXTRA.format(width))
+    both = ["hydra.searchpath=['file://a', b]", "experiment=own", "optim.lr=-1"]
+    assert one_line(memmlp("train", *both), "b/experiment/own.yaml", "a/experiment/own.yaml is used")
+
+
+def test_an_experiment_does_not_replace_another_one_in_silence(memmlp: Memmlp):
+    ran = memmlp("train", "experiment=no_codes", "experiment=manual_weights", "optim.lr=-1")
+    assert one_line(ran, "experiment=manual_weights", "would replace experiment=no_codes", "experiment=[A,B]")
+    both = composed(["experiment=[no_codes,manual_weights]"])
+    assert (both.memory.name, both.loss.name) == ("no_codes", "manual")
+
+
+def test_an_experiment_that_leads_back_to_itself_is_refused(memmlp: Memmlp, tmp_path: Path):
+    (tmp_path / "mine" / "experiment").mkdir(parents=True)
+    own = tmp_path / "mine" / "experiment" / "own.yaml"
+    own.write_text("# @package _global_\ndefaults: [{/experiment: no_codes}]\n")
+    ran = memmlp("train", "--config-dir", "mine", "experiment=own")
+    assert one_line(ran, "experiment=own", "leads back to itself", "'- NAME'")
+
+
 def test_a_config_without_the_schema_is_refused(memmlp: Memmlp, tmp_path: Path):
     (tmp_path / "bare.yaml").write_text("seed: 1\n")
     assert one_line(memmlp("train", "--config-dir", ".", "--config-name", "bare"), "/schema/config@_here_")

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from memmlp.common.errors import InputError
+from memmlp.config import plugins
 from memmlp.config.compose_plan import _stamp, find_sweep
 from memmlp.sweep.sweep_file import parse_sweep
 
@@ -28,6 +29,34 @@ def test_a_plan_that_depends_on_the_environment_or_on_other_folders_is_made_anew
         parse_sweep("s", {"base": words, "arms": {"a": []}}),
     ):
         assert (_stamp(sweep, tmp_path) == _stamp(sweep, tmp_path)) == kept
+
+
+NESTED = {
+    "inner": "defaults: [{override /memory: gru}]\nmodel: {width: 24}\n",
+    "middle": "defaults: [inner]\n",
+    "outer": "defaults: [middle, {override /loss: manual}]\noptim: {batch: 7}\n",
+    "absolute": "defaults: [/experiment/inner]\n",
+    "several": "defaults: [{/experiment@_global_: [inner, no_memory]}]\n",
+}
+
+
+@pytest.mark.parametrize("place", ["--config-dir", "hydra.searchpath"])
+@pytest.mark.parametrize("name", NESTED)
+def test_nothing_undoes_what_an_arms_experiment_sets_by_another_one(tmp_path: Path, place: str, name: str):
+    folder = tmp_path / "conf/experiment"
+    folder.mkdir(parents=True)
+    for option, text in NESTED.items():
+        (folder / f"{option}.yaml").write_text(f"# @package _global_\n{text}")
+    path, near = tmp_path / "s.yaml", place == "--config-dir"
+    path.write_text(f"arms: {{a: [], b: [experiment={name}]}}\n")
+    words = [] if near else [f"hydra.searchpath=[file://{folder.parent}]"]
+    with plugins.searching(folder.parent if near else None):
+        for own in ("memory=lstm", "model.width=16"):
+            said = f"experiment={name} sets {own.partition('=')[0]}, and {own} beside it would win"
+            with pytest.raises(InputError, match=said):
+                find_sweep(str(path), [*words, own])
+        assert find_sweep(str(path), [*words, "optim.lr=0.1"])
+    assert find_sweep(str(path), ["memory=lstm"])  # where it is not there, composing says so
 
 
 @pytest.mark.parametrize(

@@ -189,6 +189,8 @@ def test_results_of_several_machines_add_up(sweep: Sweep, kept: Kept, tmp_path: 
 
 def test_kept_results_hold_no_path_of_a_machine():
     words = ("data.root=/home/me/data/cmu", "data.root=outputs/data/cmu", "+data.body=/x/model.npz")
+    places = "hydra.searchpath=[file:///home/me/conf, file://near, file:///x/b]"
+    assert without_paths([places]) == ("hydra.searchpath=[file://.../conf, file://near, file://.../b]",)
     assert without_paths(words) == (
         "data.root=.../cmu",
         "data.root=outputs/data/cmu",
