@@ -87,6 +87,7 @@ def oversee(plan: Plan, fleet: Fleet, board: Board) -> None:
                 fleet.keep(len(left))
                 time.sleep(LOOK)
                 board.update(plan)
+            board.update(plan)  # what ended after the last look
         if plan.stopped:
             fleet.cancel()
     except BaseException:

@@ -80,7 +80,7 @@ def test_the_first_failure_ends_the_workers_where_that_is_wanted(
     shelf = Shelf(Living)
 
     class Looks(Board):
-        """One run fails at the second look, the other one at the third."""
+        """One run fails at the second look, the other one at the third; a last look sees what was left."""
 
         def update(self, plan: Plan) -> None:
             looked.append(len(plan.left()))
@@ -90,8 +90,27 @@ def test_the_first_failure_ends_the_workers_where_that_is_wanted(
 
     looked: list[int] = []
     controller.oversee(plan, Fleet(shelf, lambda: None, 2, tmp_path), Looks())
-    assert len(looked) == (2 if fail_fast else 3)
+    assert len(looked) == (3 if fail_fast else 4)
     assert [handle.cancelled for handle in shelf.handles] == [fail_fast] * 2
+
+
+def test_what_ends_right_after_a_look_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(controller, "LOOK", 0)
+    task = RunTask("1" * 16, "memmlp", {})
+    plan = Plan("trial", tmp_path, (), (task,))
+    told: list[str] = []
+
+    class Looks(Board):
+        """The run fails between the second look and the question what is left."""
+
+        def update(self, plan: Plan) -> None:
+            told.append(plan.states()[task.key])
+            if len(told) == 2:
+                plan.run_of(task).folder.mkdir(parents=True)
+                plan.run_of(task).fail("the loss is nan")
+
+    controller.oversee(plan, Fleet(Shelf(Living), lambda: None, 1, tmp_path), Looks())
+    assert told == ["new", "new", "failed"]
 
 
 @pytest.mark.parametrize(("kind", "line"), [(Dead, "the reason"), (Unfit, Unfit.said)])
