@@ -186,7 +186,9 @@ def _power(table: Table) -> list[str]:
             but = f" but {', '.join(repr(label) for label in blind)}" if blind else ""
             lines.append(f"{metric}: in every arm{but} {what} would have been found, with 80 % power")
         elif seen:
-            lines.append(f"{metric}: too few seeds to have found even a difference as large as the values")
+            lines.append(
+                f"{metric}: too few seeds, in some arm even a difference as large as the values may be missed"
+            )
     return lines
 
 
