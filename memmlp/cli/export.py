@@ -10,6 +10,8 @@ import click
 from memmlp.cli.options import outputs_option, plugins_option
 
 if TYPE_CHECKING:
+    from collections.abc import Sized
+
     from torch import Tensor
 
     from memmlp.networks.motion_model import MotionModel
@@ -176,12 +178,10 @@ def write(run: str, out: Path, outputs: Path, form: Form, clips: int, max_growth
     network = GRAPHS[form.graph](model)
     test = data.open("test").clips()
     if form.precision == "fp32":
-        tell(f"export: write {out}, and compare it with torch on {len(test[: clips or None])} test clips")
+        tell(f"export: write {out}, and compare it with torch on {test_clips(test[: clips or None])}")
         write_exact(model, network, out, found.id, test[: clips or None], form)
     elif isinstance(network, StreamingGraph) and not (form.precision.startswith("int8") and form.full):
-        tell(
-            f"export: write {out} in {form.precision}, and measure what that costs on {len(test)} test clips"
-        )
+        tell(f"export: write {out} in {form.precision}, and measure what that costs on {test_clips(test)}")
         train = data.open("train").clips() if form.precision == "int8" else []
         write_less_precise(model, network, out, found.id, train, test, form, max_growth)
     else:
@@ -230,7 +230,7 @@ def write_exact(
             apart = [parity(model, path, clip) for clip in clips]
             checked = [tolerated(model, path, *one) for one in zip(clips, apart, strict=True)]
         worst = float(np.max(apart))  # NaN as soon as one is NaN, unlike max()
-        said = f"differs from torch by {worst:.1e} at most on {len(clips)} test clips"
+        said = f"differs from torch by {worst:.1e} at most on {test_clips(clips)}"
         if not all(checked):
             wrong = f"{out}: {said}, more than {TOLERANCE:.0e}: not written"
             raise click.ClickException(f"{wrong}; please report it with the run's config.yaml")
@@ -306,6 +306,11 @@ def write_less_precise(
                 raise click.ClickException(f"{said}, more than {FULL_TOLERANCE:g}: not written")
         other.replace(out)
     click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB, on test clips {said}")
+
+
+def test_clips(clips: Sized) -> str:
+    """Return how many test clips there are, in words."""
+    return f"{len(clips)} test clip{'s' * (len(clips) != 1)}"
 
 
 def given(*names: str) -> list[str]:

@@ -234,9 +234,11 @@ def load_clip(given: InputOptions) -> TrackedClip:
     """Load the clip of --clip: an AMASS npz on the network's body, or a test clip of the run.
 
     Raises:
-        InputError: for a test clip if the network is an ONNX file, which has none, or for an unknown name.
+        InputError: for a test clip if the network is an ONNX file, which has none or is not there, or for an
+            unknown name.
     """
     from memmlp.common.errors import InputError
+    from memmlp.deploy.onnx_stream import check_file
     from memmlp.live.exported import ExportedNetwork
     from memmlp.live.session.sources import TrackedClip, npz_frames
 
@@ -244,6 +246,7 @@ def load_clip(given: InputOptions) -> TrackedClip:
         body = ExportedNetwork(network_file(given)[0]).skeleton.rest
         return TrackedClip(Path(given.clip).stem, npz_frames(Path(given.clip), body))
     if given.network.endswith(".onnx"):
+        check_file(Path(given.network))
         raise InputError(
             f"{given.network}: has no test clips; allowed with it are --clip FILE.npz, --udp and --osc"
         )

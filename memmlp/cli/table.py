@@ -168,10 +168,12 @@ def gathered(
         InputError: if none of them can be composed with the command line's overrides.
     """
     from memmlp.cli.sweep_to_show import sweep_to_show
+    from memmlp.common.progress import progress_bar
     from memmlp.tables.build_table import without_runs
 
     found, failures = [], []
-    for sweep, command in find_sweeps(names, overrides):
+    sweeps = find_sweeps(names, overrides)
+    for sweep, command in progress_bar(sweeps, "tables") if len(sweeps) > 1 else sweeps:
         sweep = sweep.with_branch(branch) if branch else sweep
         if untrained:
             from memmlp.config.untrained_costs import check_costs

@@ -93,8 +93,13 @@ def _path(name: str) -> Path:
     stem = f"table{int(name):02d}" if name.isdecimal() else name
     path = folder / f"{stem}.yaml"
     if not path.is_file():
-        known = ", ".join(sorted(file.stem for file in folder.glob("*.yaml")))
-        raise InputError(f"sweep '{name}': no such sweep; allowed are a path ending in .yaml, or {known}")
+        shipped = sorted(file.stem for file in folder.glob("*.yaml"))
+        tables = [int(known.removeprefix("table")) for known in shipped if known.startswith("table")]
+        others = ", ".join(known for known in shipped if not known.startswith("table"))
+        numbers = f"the number of a table of the paper, {min(tables)} to {max(tables)}"
+        raise InputError(
+            f"sweep '{name}': no such sweep; allowed are {numbers}, a path ending in .yaml, or {others}"
+        )
     return path
 
 

@@ -98,14 +98,19 @@ class OnnxStream:
         return binding
 
 
+def check_file(path: Path) -> None:
+    """Raise InputError if there is no such file."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; allowed: what memmlp export writes, or a run's folder")
+
+
 def open_session(path: Path, profile: Path | None = None) -> onnxruntime.InferenceSession:
     """Open an ONNX file in ONNX Runtime on one thread.
 
     Raises:
         InputError: if there is no such file, or it is no ONNX file that runs here.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; allowed: what memmlp export writes, or a run's folder")
+    check_file(path)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     if profile is not None:

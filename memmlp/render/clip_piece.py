@@ -10,13 +10,14 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import FPS, ROOT
-from memmlp.motion.drawn_limbs import RADII
+from memmlp.motion.drawn_limbs import LIMBS, RADII
 from memmlp.render.error_colours import scale
-from memmlp.render.raster import Camera
+from memmlp.render.raster import ELEVATION, Camera
 
-MIDDLE = 0.88  # height of a picture's middle above the floor, metres
+BOTTOM = -0.195  # height of a picture's lower edge above the floor, metres
 SIDE = np.deg2rad(25)  # the camera's angle from the person's front, radians
-METRES = 2.15  # height that a picture covers, metres
+METRES, MOST = 2.15, 2.9  # heights that a picture covers at least and at most, metres
+TIP = max(limb.tip + max(limb.radii) for limb in LIMBS)  # what a limb adds to its joint at most, metres
 FOLLOW = 0.4  # seconds over which the camera's way is smoothed
 
 
@@ -72,6 +73,15 @@ class ClipPiece:
         """The floor's height, metres: where the truth's lowest joints are."""
         return float(np.percentile(self.truth[..., 2].min(1), 5)) - min(RADII)
 
+    @cached_property
+    def metres(self) -> float:
+        """The height that a picture covers, metres: more where somebody's hands are above the head."""
+        joints = np.stack([self.truth, *self.predictions.values()])
+        away = np.linalg.norm(joints[..., :2] - self.truth[:, None, ROOT, :2], axis=-1)
+        up = joints[..., 2] - self.floor + np.tan(ELEVATION) * away  # what is farther away is drawn higher
+        highest = np.nan_to_num(up, nan=0.0, posinf=0.0).max() + TIP
+        return float(np.clip(highest - BOTTOM, METRES, MOST))
+
     def rows(self, frame: int) -> list[tuple[np.ndarray, np.ndarray | None]]:
         """Return joints (22, 3) and their errors (22,) as fractions of the scale's top, for each row.
 
@@ -82,8 +92,8 @@ class ClipPiece:
 
     def camera(self, azimuth: float, place: np.ndarray, width: int, height: int) -> Camera:
         """Return a camera that looks at a person standing at a point (2,) on the floor, metres."""
-        point = np.array([*place, self.floor + MIDDLE])
-        return Camera(point, azimuth, width, height, height / METRES)
+        point = np.array([*place, self.floor + BOTTOM + self.metres / 2])
+        return Camera(point, azimuth, width, height, height / self.metres)
 
     def azimuth(self, frame: int) -> float:
         """Return the azimuth, radians, that shows the true person from the front, slightly from the side."""

@@ -17,6 +17,7 @@ SAMPLES = 2  # samples along a pixel's side
 SPHERES = 18  # spheres of a limb
 LIGHT = np.array([-0.45, 0.65, 0.62]) / np.linalg.norm([-0.45, 0.65, 0.62])  # to the light, camera's axes
 AMBIENT = 0.46
+ELEVATION = np.deg2rad(12)  # by which a camera looks down, radians
 GRID = 0.5  # metres between the floor's lines
 FLOOR = 0.56  # radius of the visible floor, of a picture's width; it fades out towards it
 SHADOW = 0.13  # metres over which a shadow is blurred
@@ -39,7 +40,7 @@ class Camera:
     width: int
     height: int
     scale: float
-    elevation: float = np.deg2rad(12)
+    elevation: float = ELEVATION
 
     @property
     def axes(self) -> np.ndarray:

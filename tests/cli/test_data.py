@@ -60,6 +60,9 @@ def test_import_warns_with_the_same_sentences(source: Path) -> None:
     assert f"warning: b.bvh: {'; '.join(sentences)}" in said.splitlines()
     assert "skipped c.bvh: no MOTION" in said
     assert len(list((source.parent / "out").glob("*.npz"))) == 2
+    assert "1 clip, 0.5 seconds, skeleton cmu_daz" in run(
+        source.parent, "data", "import", "source/a.bvh", "--out", "one"
+    )
 
 
 def test_a_wrong_unit_is_said_by_both(source: Path) -> None:

@@ -145,6 +145,7 @@ def test_a_file_has_no_test_clips(memmlp: Memmlp, finished: Run):
     assert one_line(
         memmlp("live", str(finished.onnx), "--no-browser"), "has no test clips", "--clip FILE.npz"
     )
+    assert one_line(memmlp("live", "nothing.onnx", "--no-browser"), "nothing.onnx: no such file")
 
 
 @pytest.mark.parametrize("option", ["--port", "--udp"])

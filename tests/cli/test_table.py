@@ -70,6 +70,11 @@ def test_command_prints_all_tables(memmlp: Memmlp, planned: None):
     assert "nothing measured: data.root: has no value" in " ".join(out.split())
 
 
+def test_the_progress_of_many_tables_is_told(memmlp: Memmlp, planned: None, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("memmlp.common.progress.EVERY", 0.0)
+    assert "tables: 1 of 17" in memmlp("table", "all", "bad=1").err
+
+
 @pytest.mark.slow
 def test_all_as_json_is_one_list(memmlp: Memmlp, planned: None):
     assert len(json.loads(memmlp("table", "all", "--format", "json").out)) == 17
@@ -78,7 +83,7 @@ def test_all_as_json_is_one_list(memmlp: Memmlp, planned: None):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["99"], ("no such sweep",)),
+        (["99"], ("no such sweep", "the number of a table of the paper, 1 to 17", "memory_control")),
         (["14", "bad=1"], ("data.root",)),
         (["all", "bad=1"], ("data.root",)),
         (["14", "--out", "table.pdf"], ("--out table.pdf", "md, tex, json, html")),

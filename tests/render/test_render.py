@@ -122,6 +122,20 @@ def test_the_camera_goes_along(piece: ClipPiece):
     assert np.ptp(moving.path()[:, 0]) > 1.5
 
 
+def test_a_hand_above_the_head_is_in_the_picture():
+    raised = TRUTH.copy()
+    raised[:, 20] = raised[:, 15] + [0.1, 0.1, 0.6]  # the left wrist, and the head
+    away = np.full_like(TRUTH, np.nan)  # of a network that diverged
+    tall = ClipPiece("clips/one", raised, {"bad": away})
+    for frame in (0, 30):
+        camera = tall.camera(tall.azimuth(frame), raised[frame, 0, :2], 230, 330)
+        edge = 330 / 2 / camera.scale
+        assert np.abs(camera.project(raised[frame])[:, 1]).max() < edge
+    picture = draw(camera, raised[30], None, tall.floor)
+    assert (picture[0] == 255).all()
+    assert ClipPiece("clips/one", TRUTH, {}).metres < tall.metres < 2.9
+
+
 def test_png(tmp_path: Path, piece: ClipPiece):
     heatmap.heatmap_png(tmp_path / "a.png", piece, poses=2)
     with Image.open(tmp_path / "a.png") as image:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from memmlp.cli.data.printing import show_skipped, show_some
+from memmlp.cli.data.printing import amount, show_skipped, show_some
 from memmlp.cli.options import PATH
 from memmlp.common.errors import InputError
 
@@ -64,9 +64,9 @@ def import_(
     show_skipped([f"{file.file}: {file.reason}" for file in report.skipped])
     faulty = [clip for clip in report.clips if clip.faults]
     show_some([f"warning: {clip.source}: {'; '.join(clip.faults)}" for clip in faulty], "clips with warnings")
-    minutes = sum(clip.frames / clip.fps for clip in report.clips) / 60
+    seconds = sum(clip.frames / clip.fps for clip in report.clips)
     maps = ", ".join(sorted({clip.skeleton for clip in report.clips}))
-    click.echo(f"{len(report.clips)} clips, {minutes:.1f} minutes, skeleton {maps}, in {out}")
+    click.echo(f"{amount(len(report.clips), seconds)}, skeleton {maps}, in {out}")
     click.echo(f"next: memmlp train data=mocap data.root={out}")
 
 

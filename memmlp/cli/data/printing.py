@@ -101,5 +101,10 @@ def show_some(lines: list[str], what: str) -> None:
 def show_exported(report: ExportReport, out: Path) -> None:
     """Print what an export skipped and how much it wrote."""
     show_skipped([f"{file.file}: {file.reason}" for file in report.skipped])
-    clips = "1 clip" if len(report.written) == 1 else f"{len(report.written)} clips"
-    click.echo(f"{clips}, {report.seconds / 60:.1f} minutes, in {out}")
+    click.echo(f"{amount(len(report.written), report.seconds)}, in {out}")
+
+
+def amount(clips: int, seconds: float) -> str:
+    """Return a number of clips and their length together, in words."""
+    length = f"{seconds / 60:.1f} minutes" if seconds >= 60 else f"{seconds:.1f} seconds"
+    return f"{clips} clip{'s' * (clips != 1)}, {length}"

@@ -156,7 +156,7 @@ def test_the_command_says_what_it_did(folder: Path, memmlp: Memmlp, tmp_path: Pa
     ran = memmlp("data", "export", str(folder), "--out", "out", "--format", "gltf")
     assert ran.code == 0
     assert ran.out.startswith("skipped bad.npz: no zip")
-    assert ran.out.endswith("\n2 clips, 0.0 minutes, in out\n")
+    assert ran.out.endswith("\n2 clips, 0.1 seconds, in out\n")
     assert memmlp("data", "export", str(folder / "walk.npz"), "--out", "w.bvh", "--fps", "30").code == 0
     assert read_bvh(tmp_path / "w.bvh").fps == 30
 
