@@ -53,6 +53,7 @@ COMMANDS = {
 }
 
 
+INTERRUPTED = 130  # exit code after a Ctrl-C
 REFUSED = {
     errno.EACCES,
     errno.EPERM,
@@ -125,6 +126,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         sys.exit(2)
     except Exception as error:
         code = _exit_code(error)
+        if code is None and _interrupted(error):
+            error, code = click.Abort(), INTERRUPTED
         if code is None or os.environ.get("MEMMLP_TRACEBACK") == "1":
             raise
         _fail(_line(error, arguments), code)
@@ -143,12 +146,19 @@ def _run(arguments: list[str]) -> None:
 def _exit_code(error: Exception) -> int | None:
     """Return the exit code for an error that one line explains; None for a bug, which needs its traceback."""
     if isinstance(error, click.Abort):  # what click makes of Ctrl-C
-        return 130
+        return INTERRUPTED
     if isinstance(error, click.ClickException):
         return error.exit_code
     if isinstance(error, OSError) and error.strerror:
         return 2 if error.errno in REFUSED else 1
     return {InputError: 2, TrainingDiverged: 1, LeaseLost: 1}.get(type(error))
+
+
+def _interrupted(error: BaseException | None) -> bool:
+    """Return whether an error came up because of a Ctrl-C, as where it cuts an import of a library short."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _line(error: Exception, arguments: Sequence[str]) -> str:

@@ -63,6 +63,30 @@ def test_only_what_is_resumed_says_so(monkeypatch: pytest.MonkeyPatch, capsys: p
     assert capsys.readouterr().err.strip() == "memmlp: interrupted"
 
 
+def test_an_error_of_a_library_that_was_interrupted_is_an_interruption(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """As torch's exporter, which names errors of a module whose import a Ctrl-C cut short."""
+
+    def export(*_: object) -> None:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            raise AttributeError("no such attribute of a module that was half imported")  # noqa: B904
+
+    def wrapped(*_: object) -> None:
+        try:
+            export()
+        except AttributeError as error:
+            raise RuntimeError("failed to export") from error
+
+    monkeypatch.setattr("memmlp.runs.lookup.list_runs", wrapped)
+    with pytest.raises(SystemExit) as ended:
+        main(["runs", "list"])
+    assert ended.value.code == 130
+    assert capsys.readouterr().err.strip() == "memmlp: interrupted"
+
+
 QUICK = """
 import sys
 before = set(sys.modules)
