@@ -121,7 +121,7 @@ class Run:
 
     def want(self, stages: Sequence[str]) -> None:
         """Record which evaluations and which deployment are asked for, by their identities."""
-        if self.wanted != tuple(stages):
+        if self.manifest.get("stages") != list(stages):
             self.write_manifest({"stages": list(stages)})
 
     @property

@@ -28,6 +28,7 @@ def test_a_sweep_under_kills_ends_as_an_undisturbed_one(tmp_path: Path, monkeypa
 def finished(outputs: Path, name: str, weights: bytes = b"w") -> Run:
     run = Run.of(outputs, name * 16)
     run.begin("memmlp", {}, data="d", upstream=None)
+    run.want([])  # no evaluation and no export
     run.model.write_bytes(weights)
     run.finish(["model.safetensors"])
     return run

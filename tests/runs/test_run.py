@@ -300,6 +300,14 @@ def test_a_run_that_was_killed_before_its_evaluation_is_trained_and_not_done(tmp
     assert run.status == "done"
 
 
+def test_a_run_of_which_nothing_but_training_is_asked_is_done_then(tmp_path: Path):
+    run = begun(tmp_path, CONFIG | {"evaluation": {"modes": []}})
+    run.model.write_bytes(b"weights")
+    run.finish(["model.safetensors"])
+    run.want([])
+    assert run.status == "done"
+
+
 def test_an_old_run_with_a_damaged_config_is_done_if_it_has_an_evaluation(tmp_path: Path):
     run = complete(tmp_path)
     run.config_path.write_text("a: [b")
