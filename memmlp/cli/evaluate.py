@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from memmlp.cli.options import device_option, outputs_option, plugins_option
+from memmlp.cli.options import check_runs, device_option, outputs_option, plugins_option
 from memmlp.common.errors import InputError
 
 
@@ -42,6 +42,7 @@ def evaluate(
     OVERRIDES are keys of the evaluation or the export, such as evaluation.ik=lbfgs, evaluation.modes=[stream]
     or export.precision=int8. What was not measured so before is measured now; nothing is trained.
     """
+    check_runs(outputs, run)
     from rich.console import Console
 
     from memmlp.cli.train_summary import metrics_table, older_code, source_tables

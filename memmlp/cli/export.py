@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
-from memmlp.cli.options import outputs_option, plugins_option
+from memmlp.cli.options import check_runs, outputs_option, plugins_option
 
 if TYPE_CHECKING:
     from collections.abc import Sized
@@ -141,12 +141,15 @@ def export(
         return
     if out is None and not targets:
         raise InputError("--out: is missing; it may be left out with --check alone")
+    if out is not None and out.suffix != ".onnx":
+        raise InputError(f"--out {out}: the only allowed ending is .onnx")
     if out is not None and not out.parent.is_dir():
         raise InputError(f"--out {out}: there is no folder {out.parent}")
     named = f"--space {space}" if space else f"--rotations {rotations}" if rotations else None
     if scope == "step" and named:
         raise InputError(f"{named}: the network itself knows AMASS' world alone; allowed with --scope full")
     full = (space or "amass", rotations or "matrix") if scope == "full" else None
+    check_runs(outputs, run)
     with tempfile.TemporaryDirectory(prefix="memmlp-export-") as folder:
         path = out or Path(folder) / f"{run.strip('/').rpartition('/')[2]}.onnx"
         write(run, path, outputs, Form(graph, precision, opset, full), clips, max_growth / 100)

@@ -15,6 +15,7 @@ from memmlp.cli.options import (
     Finite,
     Program,
     Sender,
+    check_runs,
     host_option,
     outputs_option,
     page_options,
@@ -134,6 +135,8 @@ def live(network: str, send: bool, save_avatar: Path | None, **options: Any) -> 
     given = InputOptions(network=network, **{key: options.pop(key) for key in FED})
     shown = ShowOptions(**options)
     check_options(given, shown, send)
+    if not network.endswith(".onnx"):
+        check_runs(given.outputs, network)
     with contextlib.suppress(KeyboardInterrupt):
         if save_avatar is not None:
             write_avatar(given, save_avatar)

@@ -156,3 +156,11 @@ format_option = click.option(
 strict_option = click.option(
     "--strict", is_flag=True, help="Stop at the first bad file instead of skipping it."
 )
+
+
+def check_runs(outputs: Path, *names: str) -> None:
+    """Raise InputError for an unknown run, before the imports of what opens runs take their seconds."""
+    from memmlp.runs.lookup import find_run
+
+    for name in names:
+        find_run(outputs, name)

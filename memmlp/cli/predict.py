@@ -9,6 +9,7 @@ import click
 
 from memmlp.cli.options import (
     PATH,
+    check_runs,
     device_option,
     format_option,
     outputs_option,
@@ -60,6 +61,7 @@ def predict(
     SOURCE is an AMASS npz file, a folder of such, or else a test clip's name. Predictions are at 60 Hz on the
     body that the network was trained on; their first frame is the clip's second.
     """
+    check_runs(outputs, run)
     from memmlp.cli.data.printing import show_exported
     from memmlp.config.open_run import OpenedRun, data_of, experiment_of, trained_network
     from memmlp.evaluation.predictions import ClipPredictor

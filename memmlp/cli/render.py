@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import Finite, outputs_option, plugins_option
+from memmlp.cli.options import Finite, check_runs, outputs_option, plugins_option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -79,6 +79,7 @@ def render(
     A PNG has a row for each run and a column for each pose; a GIF or MP4 has them side by side at 30 pictures
     a second. One colour scale holds for all.
     """
+    check_runs(outputs, *runs)
     from memmlp.config.open_run import open_run
     from memmlp.render.figure_or_film import check_picture, write_picture
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import PATH, Finite, outputs_option, plugins_option
+from memmlp.cli.options import PATH, Finite, check_runs, outputs_option, plugins_option
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
@@ -57,6 +57,7 @@ def web(
     shows the wearer's own body in a mirror (docs/guides/web.md). It takes onnxruntime-web and three.js from
     the npm registry, once.
     """
+    check_runs(outputs, *runs)
     from memmlp.common.errors import InputError
     from memmlp.config.open_run import open_run
     from memmlp.live.web.site import Site, check_place

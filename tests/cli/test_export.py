@@ -70,6 +70,7 @@ def test_web_is_all_of_its_backends(memmlp: Memmlp, tmp_path: Path):
         (["step.onnx", "--check", "unity", "--precision", "int8"], "allowed with it is --check alone"),
         (["none.onnx", "--check", "unity"], "none.onnx: no such file"),
         (["0123"], "--out: is missing; it may be left out with --check alone"),
+        (["0123", "--out", "step.txt"], "allowed ending is .onnx"),
         (["0123", "--out", "none/step.onnx"], "there is no folder none"),
         (["0123", "--out", "a.onnx", "--rotations", "quaternion"], "allowed with --scope full"),
     ],

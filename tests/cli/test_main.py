@@ -107,6 +107,29 @@ def test_help_imports_nothing_slow():
     assert all(f"  {name} " in ran.stdout for name in COMMANDS)
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["evaluate"],
+        ["export", "--out", "a.onnx"],
+        ["live"],
+        ["predict", "clip", "--out", "folder"],
+        ["render", "--out", "a.png"],
+        ["web", "--out", "site"],
+    ],
+)
+def test_an_unknown_run_is_told_at_once(tmp_path: Path, words: list[str]):
+    """That is, before torch is imported, which takes seconds."""
+    line = [words[0], "0123", *words[1:], "--outputs", str(tmp_path)]
+    code = (
+        "import sys; from memmlp.cli.main import main\n"
+        f"try: main({line})\n"
+        "except SystemExit as ended: print(ended.code, 'torch' in sys.modules)"
+    )
+    ran = finished([sys.executable, "-c", code])
+    assert ran.stdout == "2 False\n", ran.stderr
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_help(memmlp: Memmlp, name: str):
     ran = memmlp(name, "--help")

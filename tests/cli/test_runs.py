@@ -222,6 +222,25 @@ def test_list_shows_what_differs_as_far_as_there_is_room(
         assert (said in seen["70"]) == (said == "MPJPE [cm]")
 
 
+def test_names_have_the_room_that_there_is_and_seeds_are_said_once(
+    memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch
+):
+    long = "model=avatar_poser · optim.lr=0.004 · optim.warmup=100"
+    for digit in ("d", "e"):
+        config = {"seed": int(digit, 16), "memory": {"layers": [2]}}
+        name = f"{long} · seed {int(digit, 16)}"
+        Run.of(outputs, digit * 16).begin("memmlp", config, data="d" * 64, upstream=None, name=name)
+    monkeypatch.setenv("COLUMNS", "200")
+    wide = memmlp("runs", "list").out
+    assert wide.count(long) == 2
+    assert "· seed" not in wide
+    monkeypatch.setenv("COLUMNS", "90")
+    ran = memmlp("runs", "list")
+    assert lines_up(ran, 90)
+    assert long not in ran.out
+    assert ran.out.count("warmup=100") == 2
+
+
 def test_data_stay_in_a_narrow_list_since_errors_on_others_do_not_compare(
     memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -153,6 +153,7 @@ def show_runs(records: Sequence[Record], keys: Sequence[str], asked: bool) -> li
     while spare and _width(columns) > console().width:
         columns = [column for column in columns if column.name != spare[0]]
         del spare[0]
+    columns = columns if asked else _with_wide_names(columns)
     width = max(console().width, _width(columns))
     Console(highlight=False, markup=False, width=width).print(_lines(columns))
     return [key for key in keys if key not in {column.name for column in columns}]
@@ -178,6 +179,27 @@ def _columns(records: Sequence[Record], keys: Sequence[str], numbers: Mapping[st
         yield Column("tags", ["\n".join(one.get("tag", ())) for one in records])
     for name, key in numbers.items():
         yield Column(name, [number_text(one.get(key)) for one in records], number=True)
+
+
+def _with_wide_names(columns: Sequence[Column]) -> list[Column]:
+    """Return the columns with the names of runs in as few lines as the screen has room for."""
+    narrow = _with_names(columns, NAME)
+    used = max((len(line) for name in _cells(narrow, "name") for line in name.splitlines()), default=0)
+    return _with_names(columns, max(NAME, used + console().width - _width(narrow)))
+
+
+def _with_names(columns: Sequence[Column], width: int) -> list[Column]:
+    """Return the columns with names in lines of a width, without the seed where that has a column."""
+    names = [name.replace("\n", "") for name in _cells(columns, "name")]
+    if names and (seeds := _cells(columns, "seed")):
+        names = [name.removesuffix(f" · seed {seed}") for name, seed in zip(names, seeds, strict=True)]
+    folded = [_folded(name, width) for name in names]
+    return [one._replace(cells=folded) if one.name == "name" else one for one in columns]
+
+
+def _cells(columns: Sequence[Column], name: str) -> list[str]:
+    """Return the cells of the column with a name; empty if there is none."""
+    return next((column.cells for column in columns if column.name == name), [])
 
 
 def _lines(columns: Sequence[Column]) -> Table:
