@@ -121,8 +121,9 @@ def unfitting(split: Mapping[str, Any], names: Collection[str]) -> str:
     patterns = split.get("groups", ())
     if patterns and not any(re.search(one, unpacked(name)) for one in patterns for name in names):
         said += [
-            f"no clip fits any of the {len(patterns)} patterns of groups, data.split.groups (the first is "
-            f"{patterns[0]}): each clip is a group of its own, which may lie in any part"
+            "each clip counts as independent of all others, and clips of one person may lie in training and "
+            f"in test: no clip's name fits the {len(patterns)} patterns of data.split.groups that tie clips "
+            f"together (the first is {patterns[0]}); data.split.groups_file can list who is in which clip"
         ]
     return "; ".join(said)
 

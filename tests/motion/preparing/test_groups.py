@@ -55,10 +55,11 @@ def test_a_group_is_named_by_the_file_else_after_its_first_clip(tmp_path):
 def test_patterns_that_fit_no_clip_are_told():
     split = {"groups": ["^(S[0-9])_", "^([^/]+/[^/]+)/take"]}
     assert unfitting(split, ["ann/1", "ben/2"]) == (
-        "no clip fits any of the 2 patterns of groups, data.split.groups (the first is ^(S[0-9])_): "
-        "each clip is a group of its own, which may lie in any part"
+        "each clip counts as independent of all others, and clips of one person may lie in training and in "
+        "test: no clip's name fits the 2 patterns of data.split.groups that tie clips together (the first is "
+        "^(S[0-9])_); data.split.groups_file can list who is in which clip"
     )
     assert unfitting(split, ["ann/1", "S1_2"]) == unfitting({"groups": []}, ["ann/1"]) == ""
     assert unfitting(split, ["CMU/CMU/01/take1"]) == ""
     mixed = {"kind": "mixed", "sources": {"one": split, "two": {"groups": ["(ann)"]}}}
-    assert unfitting(mixed, ["one/ann/1", "two/ann/2"]).startswith("one: no clip fits any of the 2")
+    assert unfitting(mixed, ["one/ann/1", "two/ann/2"]).startswith("one: each clip counts as independent")
