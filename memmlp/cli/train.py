@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 
 from memmlp.common import distributed
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
-from memmlp.config.compose import CONFIG, VERSION_BASE, help_text, parse, preflight
+from memmlp.config.compose import CONFIG, VERSION_BASE, check_words, help_text, parse, preflight
 from memmlp.config.config_errors import explain
 from memmlp.config.package_data import packaged
 from memmlp.config.schema import check, register
@@ -50,6 +50,8 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
     args, parser = parse(argv)
     register()
     version.setbase(VERSION_BASE)
+    if args.help or args.cfg:
+        check_words(args)
     if args.help:
         click.echo(help_text(args))
         return

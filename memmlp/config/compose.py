@@ -142,6 +142,12 @@ def _above(config: str, parents: Mapping[str, str | None]) -> Iterator[str]:
         config = above
 
 
+def check_words(args: argparse.Namespace) -> None:
+    """Raise InputError for what Hydra would leave out without a word: a hidden file, a second experiment."""
+    _check_hidden(args)
+    _jobs(args)
+
+
 def preflight(args: argparse.Namespace) -> list[DictConfig]:
     """Compose and check the config of every job, so that a bad one is known before the first job starts."""
     configs = []

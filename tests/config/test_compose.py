@@ -317,7 +317,7 @@ def test_a_bad_file_of_the_users_own(memmlp: Memmlp, tmp_path: Path, value: str,
     assert one_line(memmlp("train", "--config-dir", "mine", "experiment=own"), "model.width", word)
 
 
-@pytest.mark.parametrize("place", ["--config-dir", "hydra.searchpath", "sweep"])
+@pytest.mark.parametrize("place", ["--config-dir", "--cfg", "hydra.searchpath", "sweep"])
 @pytest.mark.parametrize("option", ["experiment/paper.yaml", "memory/gru.yaml", "train.yaml"])
 def test_an_option_of_ones_own_that_ours_hides_is_refused(
     memmlp: Memmlp, tmp_path: Path, place: str, option: str
@@ -329,12 +329,14 @@ def test_an_option_of_ones_own_that_ours_hides_is_refused(
     (tmp_path / "s.yaml").write_text("arms: {a: [experiment=paper]}\n")
     words = {
         "--config-dir": ["train", "--config-dir", "mine", "optim.lr=-1"],
+        "--cfg": ["train", "--config-dir", "mine", "--cfg", "job"],
         "hydra.searchpath": ["train", "hydra.searchpath=[file://mine]", "optim.lr=-1"],
         "sweep": ["sweep", "s.yaml", "--config-dir", "mine", "optim.lr=-1"],
     }[place]
     assert one_line(memmlp(*words), f"mine/{option}", f"conf/{option} is used in its place", "its own")
     own.write_bytes((packaged("conf") / option).read_bytes())  # the same is no other
-    assert one_line(memmlp(*words), "optim.lr=-1")
+    ran = memmlp(*words)
+    assert ran.code == 0 if place == "--cfg" else one_line(ran, "optim.lr=-1")
 
 
 def test_a_folder_hides_no_option_of_another_one(memmlp: Memmlp, tmp_path: Path):
@@ -346,8 +348,9 @@ def test_a_folder_hides_no_option_of_another_one(memmlp: Memmlp, tmp_path: Path)
 
 
 def test_an_experiment_does_not_replace_another_one_in_silence(memmlp: Memmlp):
-    ran = memmlp("train", "experiment=no_codes", "experiment=manual_weights", "optim.lr=-1")
-    assert one_line(ran, "experiment=manual_weights", "would replace experiment=no_codes", "experiment=[A,B]")
+    for words in (["optim.lr=-1"], ["--cfg", "job"], ["--help"]):
+        ran = memmlp("train", "experiment=no_codes", "experiment=manual_weights", *words)
+        assert one_line(ran, "experiment=manual_weights", "would replace experiment=no_codes", "=[A,B]")
     both = composed(["experiment=[no_codes,manual_weights]"])
     assert (both.memory.name, both.loss.name) == ("no_codes", "manual")
 
