@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from memmlp.api import Prediction, Runs, TrainedRun, load_run
     from memmlp.common.errors import InputError
-    from memmlp.live.odd_samples import SampleWarning
+    from memmlp.live.sample_warnings import SampleWarning
     from memmlp.live.stream import Offsets, Pose, Stream
 
 __version__ = "0.2.0"
@@ -29,7 +29,7 @@ _HOMES = {
     "Pose": "memmlp.live.stream",
     "Prediction": "memmlp.api",
     "Runs": "memmlp.api",
-    "SampleWarning": "memmlp.live.odd_samples",
+    "SampleWarning": "memmlp.live.sample_warnings",
     "Stream": "memmlp.live.stream",
     "TrainedRun": "memmlp.api",
     "load_run": "memmlp.api",

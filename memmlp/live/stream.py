@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 
 from memmlp.common.errors import InputError
 from memmlp.live.exported import ExportedNetwork
-from memmlp.live.odd_samples import OddSamples
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
+from memmlp.live.sample_warnings import OddSamples
 from memmlp.live.spaces import SpaceName, space_of
 from memmlp.live.tracker_frames import TRACKERS, UPRIGHT, Features, Lost, TrackerFrames, heading_of, t_pose
 from memmlp.live.wearer import wearer

@@ -12,10 +12,10 @@ from memmlp.common.errors import InputError
 from memmlp.common.lease import Lock
 from memmlp.common.lease_fences import publish, temporary
 from memmlp.motion.preparing.cache import ClipFolder, finished_cache, prepare
-from memmlp.motion.preparing.coverage import Coverage
-from memmlp.motion.preparing.find import FoundFiles, clip_name
-from memmlp.motion.preparing.folders import find_all
+from memmlp.motion.preparing.find_clips import FoundFiles, clip_name
 from memmlp.motion.preparing.manifest import Manifest
+from memmlp.motion.preparing.several_folders import find_all
+from memmlp.motion.preparing.split_coverage import Coverage
 
 if TYPE_CHECKING:
     from memmlp.motion.dataset import MotionDataset

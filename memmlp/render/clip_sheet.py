@@ -12,7 +12,7 @@ from memmlp.motion.body import load_rest_joints
 from memmlp.motion.clip import Skipped
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.importing.fidelity import pose
-from memmlp.motion.preparing.find import clip_name, find_clips
+from memmlp.motion.preparing.find_clips import clip_name, find_clips
 from memmlp.render.canvas import Sheet
 from memmlp.render.raster import Camera, draw
 

@@ -13,7 +13,7 @@ from memmlp.config.build import build_experiment
 from memmlp.config.build_motion import build_motion
 from memmlp.config.compose import composed
 from memmlp.config.schema import restored
-from memmlp.motion.preparing.folders import Folders
+from memmlp.motion.preparing.several_folders import Folders
 from memmlp.motion.preparing.splits import MixedSplit, SeededSplit
 from memmlp.runs.recipe_versions import RECIPES
 

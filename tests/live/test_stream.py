@@ -23,8 +23,8 @@ from memmlp.common.errors import InputError
 from memmlp.deploy.export import export
 from memmlp.evaluation.ik import LBFGS
 from memmlp.evaluation.modes import joint_positions, local_rotations, stream
-from memmlp.live.odd_samples import SampleWarning
 from memmlp.live.rotations import matrix_to_quaternion
+from memmlp.live.sample_warnings import SampleWarning
 from memmlp.live.soak import TrackedMotion, repetitions, soak
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Offsets, Stream

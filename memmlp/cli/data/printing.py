@@ -13,8 +13,8 @@ from rich.table import Table
 from memmlp.common.errors import one_line
 from memmlp.motion.body import FPS
 from memmlp.motion.clip import INTERPOLATED
-from memmlp.motion.preparing.folders import source_of
 from memmlp.motion.preparing.groups import unfitting
+from memmlp.motion.preparing.several_folders import source_of
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.live.odd_samples import OddSamples
 from memmlp.live.outputs.output import Outputs
 from memmlp.live.rotations import matrix_to_quaternion
+from memmlp.live.sample_warnings import OddSamples
 from memmlp.live.session.sources import TrackerSource
 from memmlp.live.session.wearer_fitting import Fitting, hips_height
 from memmlp.live.spaces import SPACES, Space

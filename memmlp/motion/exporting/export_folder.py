@@ -15,7 +15,7 @@ from memmlp.motion.clip import Clip, Skipped, resample
 from memmlp.motion.exporting.write import FORMATS, SUFFIXES, Format, format_of, write_motion
 from memmlp.motion.formats.npz import NoMotion, read_clip
 from memmlp.motion.plausibility import check_plausible
-from memmlp.motion.preparing.find import clip_name, find_clips
+from memmlp.motion.preparing.find_clips import clip_name, find_clips
 
 T = TypeVar("T")
 

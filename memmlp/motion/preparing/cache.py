@@ -28,11 +28,11 @@ from memmlp.motion.body import FPS, FRAME_DIM, load_rest_joints
 from memmlp.motion.clip import INTERPOLATED, LINES, SPLINES, Clip, resample
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.preparing.duplicates import assign
-from memmlp.motion.preparing.find import clip_name
+from memmlp.motion.preparing.find_clips import clip_name
 from memmlp.motion.preparing.folder_survey import Survey, survey
-from memmlp.motion.preparing.folders import Folders, Root, find_all
 from memmlp.motion.preparing.imported_body import check_imported_body
 from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manifest, write_manifest
+from memmlp.motion.preparing.several_folders import Folders, Root, find_all
 from memmlp.motion.preparing.splits import PARTS, Split
 from memmlp.motion.torch_threads import one_thread
 from memmlp.runs.recipe_versions import RECIPES

@@ -16,10 +16,10 @@ from memmlp.motion.clip import LINES, Clip, Skipped, resample
 from memmlp.motion.formats.npz import NoMotion, read_clip
 from memmlp.motion.plausibility import check_plausible, unusual
 from memmlp.motion.preparing.duplicates import one_content
-from memmlp.motion.preparing.find import FoundFiles, clip_name
-from memmlp.motion.preparing.folders import Root, find_all
+from memmlp.motion.preparing.find_clips import FoundFiles, clip_name
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
 from memmlp.motion.preparing.resampled_duplicates import first_frame, resampled_copies
+from memmlp.motion.preparing.several_folders import Root, find_all
 from memmlp.motion.preparing.shared_stretches import Marks, marks, sharing
 
 

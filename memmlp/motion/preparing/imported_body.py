@@ -10,7 +10,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import digest
-from memmlp.motion.preparing.folders import Folders, Root
+from memmlp.motion.preparing.several_folders import Folders, Root
 
 RECORD = "import.json"
 """What an import leaves in its folder."""

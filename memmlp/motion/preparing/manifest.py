@@ -13,7 +13,7 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
 from memmlp.motion.clip import Skipped
-from memmlp.motion.preparing.coverage import Coverage
+from memmlp.motion.preparing.split_coverage import Coverage
 
 FORMAT = 7  # number of the cache's format; a new one makes every cache again
 MANIFEST = "manifest.json"

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from memmlp.motion.body import FPS
 from memmlp.motion.clip import LINES, Clip, resample
 from memmlp.motion.formats.npz import read_clip
-from memmlp.motion.preparing.folders import Root
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
+from memmlp.motion.preparing.several_folders import Root
 
 DEGREES, METRES = 1.0, 0.01  # by which a copy is off at most, on average over frames and joints
 

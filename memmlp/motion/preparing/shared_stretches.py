@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from memmlp.motion.clip import LINES, Clip, resample
 from memmlp.motion.formats.npz import read_clip
-from memmlp.motion.preparing.folders import Root
 from memmlp.motion.preparing.manifest import ClipRecord
+from memmlp.motion.preparing.several_folders import Root
 
 REACH = 15  # frames at 60 Hz on either side of a marked one, which are compared
 MOVING = 2.0  # degrees by which joints turn meanwhile on average; who stands still is like many others

@@ -13,7 +13,7 @@ import pytest
 from processes import PATIENCE
 
 from memmlp.common.errors import InputError
-from memmlp.live.odd_samples import JUMPS
+from memmlp.live.sample_warnings import JUMPS
 from memmlp.live.session import page_server as module
 from memmlp.live.session.loop import greeting, run_loop
 from memmlp.live.session.page_server import FILES, Hub, LiveServer

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from memmlp.common.errors import InputError
-from memmlp.motion.preparing.folders import Root
+from memmlp.motion.preparing.several_folders import Root
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from memmlp.common.errors import InputError
-from memmlp.motion.preparing.find import FoundFiles, find_clips
+from memmlp.motion.preparing.find_clips import FoundFiles, find_clips
 
 
 @dataclass(frozen=True)

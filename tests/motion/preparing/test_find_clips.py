@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.motion.preparing.find import clip_name, find_clips
+from memmlp.motion.preparing.find_clips import clip_name, find_clips
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from memmlp.motion.clip import Clip
 from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.preparing.cache import ClipFolder, prepare
-from memmlp.motion.preparing.folders import Folders
+from memmlp.motion.preparing.several_folders import Folders
 from memmlp.motion.preparing.splits import MixedSplit, SeededSplit
 
 

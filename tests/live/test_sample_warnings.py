@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import memmlp
-from memmlp.live.odd_samples import JUMPS, STILL, OddSamples
 from memmlp.live.rotations import matrix_to_quaternion
+from memmlp.live.sample_warnings import JUMPS, STILL, OddSamples
 from memmlp.live.tracker_frames import UPRIGHT
 
 STANDING = np.array([[0, 0, 1.57], [0.7, 0, 1.4], [-0.7, 0, 1.4]])
