@@ -79,15 +79,17 @@ def oversee(plan: Plan, fleet: Fleet, board: Board) -> None:
 
     It waits for runs on which workers of other sweeps are working. If a failure stops the plan, or this
     process is interrupted, the workers are ended.
+
+    Runs that are done are looked at again only when nothing seems left: a sweep may have many, on a disk that
+    others use, too.
     """
     try:
         with board:
-            board.update(plan)
-            while left := plan.left():
+            board.update(plan, states := plan.states())
+            while left := plan.left(states) or plan.left(states := plan.states()):
                 fleet.keep(len(left))
                 time.sleep(LOOK)
-                board.update(plan)
-            board.update(plan)  # what ended after the last look
+                board.update(plan, states := plan.states(states))
         if plan.stopped:
             fleet.cancel()
     except BaseException:

@@ -99,10 +99,22 @@ class Plan:
         run = self.run_of(task)
         return run.done and all(map(run.has, task.stages))
 
-    def states(self) -> dict[str, str]:
-        """Return the state of every task by its key: its run's, or "blocked" if an upstream run failed."""
-        own = {task.key: self.run_of(task).state(self.complete(task)) for task in self.tasks}
+    def states(self, before: Mapping[str, str] | None = None) -> dict[str, str]:
+        """Return the state of every task by its key: its run's, or "blocked" if an upstream run failed.
+
+        Args:
+            before: states found earlier; tasks that were done then are taken to be done, without a look at
+                their runs.
+        """
+        known = before or {}
+        own = {
+            task.key: "done" if known.get(task.key) == "done" else self._state(task) for task in self.tasks
+        }
         return self.with_blocked(own)
+
+    def _state(self, task: RunTask) -> str:
+        """Return the state of a task's run."""
+        return self.run_of(task).state(self.complete(task))
 
     def with_blocked(self, states: Mapping[str, str]) -> dict[str, str]:
         """Return the states with "blocked" for tasks that have a failed run upstream of them."""
@@ -112,14 +124,17 @@ class Plan:
                 found[task.key] = "blocked"
         return found
 
-    def left(self) -> list[RunTask]:
+    def left(self, states: Mapping[str, str] | None = None) -> list[RunTask]:
         """Return the tasks that are still to be done; none if the plan is stopped.
 
         Tasks that are done, failed, blocked or cancelled are left out.
+
+        Args:
+            states: the tasks' states; by default they are looked up.
         """
-        if self.stopped:
+        states = self.states() if states is None else states
+        if self.fail_fast and "failed" in states.values():
             return []
-        states = self.states()
         ended = ("done", "failed", "blocked")
         return [t for t in self.tasks if states[t.key] not in ended and t.id not in self.cancelled]
 

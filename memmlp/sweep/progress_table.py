@@ -65,9 +65,8 @@ class Board(Screen):
 
     before: Mapping[str, str] | None = None
 
-    def update(self, plan: Plan) -> None:
-        """Show the plan as it is now."""
-        states = plan.states()
+    def update(self, plan: Plan, states: Mapping[str, str]) -> None:
+        """Show the plan with its tasks in these states."""
         self.show(lambda: render(plan, states), self._changes(plan, states))
         self.before = states
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -82,8 +83,8 @@ def test_the_first_failure_ends_the_workers_where_that_is_wanted(
     class Looks(Board):
         """One run fails at the second look, the other one at the third; a last look sees what was left."""
 
-        def update(self, plan: Plan) -> None:
-            looked.append(len(plan.left()))
+        def update(self, plan: Plan, states: Mapping[str, str]) -> None:
+            looked.append(len(plan.left(states)))
             for task in plan.tasks[: len(looked) - 1]:
                 plan.run_of(task).folder.mkdir(parents=True, exist_ok=True)
                 plan.run_of(task).fail("the loss is nan")
@@ -103,14 +104,46 @@ def test_what_ends_right_after_a_look_is_told(tmp_path: Path, monkeypatch: pytes
     class Looks(Board):
         """The run fails between the second look and the question what is left."""
 
-        def update(self, plan: Plan) -> None:
-            told.append(plan.states()[task.key])
+        def update(self, plan: Plan, states: Mapping[str, str]) -> None:
+            told.append(states[task.key])
             if len(told) == 2:
                 plan.run_of(task).folder.mkdir(parents=True)
                 plan.run_of(task).fail("the loss is nan")
 
     controller.oversee(plan, Fleet(Shelf(Living), lambda: None, 1, tmp_path), Looks())
     assert told == ["new", "new", "failed"]
+
+
+def test_what_is_done_is_looked_at_again_only_when_nothing_seems_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """So a run that somebody deletes meanwhile is made again."""
+    monkeypatch.setattr(controller, "LOOK", 0)
+    one, two = (RunTask(name * 16, "memmlp", {}) for name in "12")
+    plan = Plan("trial", tmp_path, (), (one, two))
+    done, looks = {one.key}, []
+
+    def complete(self: Plan, task: RunTask) -> bool:
+        looks.append(task.key)
+        return task.key in done
+
+    monkeypatch.setattr(Plan, "complete", complete)
+
+    class Looks(Board):
+        def update(self, plan: Plan, states: Mapping[str, str]) -> None:
+            told.append(sorted(key for key, state in states.items() if state == "done"))
+            if len(told) == 4:
+                done.remove(one.key)
+                done.add(two.key)
+            elif len(told) == 6:
+                done.add(one.key)
+
+    told: list[list[str]] = []
+    controller.oversee(plan, Fleet(Shelf(Living), lambda: None, 1, tmp_path), Looks())
+    both = sorted([one.key, two.key])
+    assert told == [[one.key]] * 4 + [both, [two.key], both]
+    # One is looked at first, when both seem done, until it is done again, and at the end.
+    assert looks == [one.key, two.key, *[two.key] * 4, one.key, two.key, one.key, one.key, one.key, two.key]
 
 
 @pytest.mark.parametrize(("kind", "line"), [(Dead, "the reason"), (Unfit, Unfit.said)])
