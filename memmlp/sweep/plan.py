@@ -106,10 +106,8 @@ class Plan:
             before: states found earlier; tasks that were done then are taken to be done, without a look at
                 their runs.
         """
-        known = before or {}
-        own = {
-            task.key: "done" if known.get(task.key) == "done" else self._state(task) for task in self.tasks
-        }
+        known = {key for key, state in (before or {}).items() if state == "done"}
+        own = {task.key: "done" if task.key in known else self._state(task) for task in self.tasks}
         return self.with_blocked(own)
 
     def _state(self, task: RunTask) -> str:
