@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged, of_the_disk
@@ -43,9 +43,10 @@ def work_off(path: Path, perform: Perform, wanted: Callable[[], bool] = lambda: 
         perform: brings a task's run to its end, or raises.
         wanted: whether to go on.
     """
+    states: Mapping[str, str] = {}
     while wanted():
         plan = Plan.load(path)
-        left = plan.left()
+        left = plan.left(states := plan.states(states))
         if not left and not plan.open:
             return
         if not any(attempt(plan, task, perform) for task in left):

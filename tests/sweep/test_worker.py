@@ -68,6 +68,24 @@ def test_upstream_runs_come_first_and_each_task_once(tmp_path: Path):
     assert len(seen) == 4
 
 
+def test_what_a_worker_saw_done_it_looks_at_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A sweep may have many runs, and many workers that wait at its end, on one disk."""
+    looks: list[str] = []
+    complete = Plan.complete
+
+    def counted(self: Plan, task: RunTask) -> bool:
+        looks.append(task.id)
+        return complete(self, task)
+
+    path = saved(tmp_path, CODES, ONE, TWO, ALONE)
+    finish(Plan.load(path), CODES)
+    finish(Plan.load(path), ALONE)
+    monkeypatch.setattr(Plan, "complete", counted)
+    work_off(path, finish)
+    assert looks.count(ALONE.id) == 1
+    assert looks.count(TWO.id) > 1
+
+
 def test_an_upstream_run_stands_right_before_the_first_that_needs_it():
     other = RunTask("d" * 16, "vqvae", {})
     four = RunTask("4" * 16, "memmlp", {}, other.id)
