@@ -7,6 +7,8 @@ folder that is named by its identity and is either complete or absent.
 from __future__ import annotations
 
 import contextlib
+import copy
+import functools
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -42,6 +44,12 @@ STATUSES = (*STAGE_WORDS.values(), "done", "trained", "lost", "failed", "stopped
 """What the status of a run may be: lost is one whose process died; see `Run.state`."""
 
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # six times as quick, where PyYAML was built with it
+
+
+@functools.lru_cache(maxsize=16)
+def _parsed(text: str) -> Any:
+    """Return what YAML says; a list of runs asks for each config five times."""
+    return yaml.load(text, LOADER)
 
 
 class Run:
@@ -310,7 +318,7 @@ class Run:
             InputError: if the file is damaged.
         """
         try:
-            found = yaml.load(self.config_path.read_text(), LOADER) if self.config_path.exists() else {}
+            found = copy.deepcopy(_parsed(self.config_path.read_text())) if self.config_path.exists() else {}
         except (yaml.YAMLError, UnicodeDecodeError):
             found = None
         if not isinstance(found, dict):

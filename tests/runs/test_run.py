@@ -326,3 +326,12 @@ def test_a_vqvae_s_run_is_done_without_an_evaluation(tmp_path: Path):
 def test_runs_need_neither_torch_nor_hydra():
     code = "import sys, memmlp.runs.run; print([m for m in ('torch', 'hydra', 'mlflow') if m in sys.modules])"
     assert finished([sys.executable, "-c", code]).stdout == "[]\n"
+
+
+def test_a_config_that_was_read_belongs_to_whoever_read_it(tmp_path: Path):
+    run = begun(tmp_path, kind="vqvae")
+    first = run.config
+    first["optim"] = {"lr": 1.0}
+    assert "optim" not in run.config
+    run.config_path.write_text("optim: {lr: 2.0}\n")
+    assert run.config == {"optim": {"lr": 2.0}}
