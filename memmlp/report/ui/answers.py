@@ -75,7 +75,7 @@ class Answers:
         if not ID.fullmatch(rest) or rest not in self.index.runs:
             raise KeyError(name)
         if room == "run":
-            return runs.page(self.index, self.sweeps.known(), self.places(), rest)
+            return runs.page(self.index, self.sweeps.control_of(rest), self.places(), rest)
         if room == "replay":
             return self._replay(rest, query)
         raise KeyError(name)

@@ -14,7 +14,6 @@ from memmlp.runs.evaluation_file import with_solvers
 from memmlp.runs.identity import NEUTRAL, flatten, is_data_path
 from memmlp.runs.lookup import is_trained
 from memmlp.runs.run import Run
-from memmlp.sweep.plan import Plan
 from memmlp.tables.measured_run import load
 from memmlp.tables.table_text import better, unit
 
@@ -169,13 +168,13 @@ def _short(value: float | None) -> float | None:
 
 
 def page(
-    index: Index, plans: Sequence[Plan], every: Mapping[str, Sequence[Mapping[str, Any]]], run_id: str
+    index: Index, control: str | None, every: Mapping[str, Sequence[Mapping[str, Any]]], run_id: str
 ) -> dict[str, Any]:
     """Return everything that a run's page shows. Raises KeyError for an unknown run.
 
     Args:
         index: the runs.
-        plans: the plans of all sweeps.
+        control: the id of the run's control (`Sweeps.control_of`); None for none.
         every: the places of all runs (`places`).
         run_id: the run's id.
     """
@@ -184,7 +183,6 @@ def page(
         known = dict(index.runs)
     run = Run.of(index.outputs, run_id)
     where, config = every.get(run_id, []), whole_config(run)
-    control = control_of(plans, run_id, known)
     return {
         **facts,
         "places": where,
@@ -212,17 +210,6 @@ def whole_config(run: Run) -> dict[str, Any]:
         return flatten(read_config(run.config_path))
     except ValueError:
         return {}
-
-
-def control_of(plans: Sequence[Plan], run_id: str, known: Mapping[str, Any]) -> str | None:
-    """Return the run of the same seed in the first arm of the first sweep that uses a run; None for none."""
-    for plan in plans:
-        seeds = [entry.seed for entry in plan.entries if entry.id == run_id]
-        first = plan.entries[0].label if plan.entries else None
-        for entry in plan.entries:
-            if entry.label == first and entry.seed in seeds and entry.id != run_id and entry.id in known:
-                return entry.id
-    return None
 
 
 def partners(known: Mapping[str, Mapping[str, Any]], run_id: str, control: str | None = None) -> list[str]:

@@ -127,6 +127,24 @@ class Sweeps:
         }
         return self.progress(plan) | found
 
+    def control_of(self, run_id: str) -> str | None:
+        """Return the run of the same seed with which a run's arm is compared; None for none.
+
+        If several sweeps use the run, the first one in which its arm has a control decides.
+        """
+        for plan in self.known():
+            ids = {(entry.label, entry.seed): entry.id for entry in plan.entries}
+            for label, seed in [place for place, used in ids.items() if used == run_id]:
+                control = ids.get((self._control(plan, label), seed), run_id)
+                if control != run_id and control in self.index.runs:
+                    return control
+        return None
+
+    def _control(self, plan: Plan, label: str) -> str:
+        """Return the label of an arm's control; empty for none."""
+        sweep = self._kept(plan.name) or sweep_of_plan(plan)
+        return next((sweep.control_of(arm) or "" for arm in sweep.arms if arm.label == label), "")
+
     def states(self, plan: Plan) -> dict[str, str]:
         """Return every task's state by its key, as `Plan.states` does, from the facts in the index."""
         return plan.with_blocked({task.key: self._state(plan, task) for task in plan.tasks})

@@ -11,6 +11,7 @@ from fake_runs import fake_run
 from report.ui.conftest import begun, run_of
 
 from memmlp.cli.seed_rounds import look
+from memmlp.report.ui.answers import Answers
 from memmlp.report.ui.index import Index
 from memmlp.report.ui.sweeps import NOT_KEPT, OTHERS, ROUNDS, Sweeps
 from memmlp.runs.run import Run
@@ -156,6 +157,22 @@ def test_a_sweep_with_another_control_has_another_table(outputs: Path):
     table = sweeps.page("mine")["table"]
     assert (table["control"], table["metrics"]) == ("gru", ["MPJRE"])
     assert sweeps.stamp() != before
+
+
+def test_a_run_s_control_is_that_of_its_arm_and_not_the_first_arm(outputs: Path):
+    """Most of the paper's tables have a control that does not stand first."""
+    folder, answers = outputs / "sweeps" / "mine", Answers(outputs, kept=False)
+    sweep = kept_sweep(folder)
+    assert sweep is not None
+
+    def control(arm: str) -> dict | None:
+        return answers.of(f"run/{run_of(outputs, arm, 1).id}", {})["control"]
+
+    assert control("none") is None
+    assert control("gru")["id"] == run_of(outputs, "none", 1).id
+    keep_sweep(replace(sweep, control="gru"), folder)
+    assert control("gru") is None
+    assert control("none")["id"] == run_of(outputs, "gru", 1).id
 
 
 def test_a_sweep_that_is_planned_anew_has_another_table(outputs: Path):
