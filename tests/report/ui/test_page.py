@@ -184,6 +184,23 @@ def test_units_and_directions_of_metrics_of_ones_own(
         assert browser.value(best.format("stream MPJPE")) != ""
 
 
+def test_no_difference_is_shown_from_a_control_on_other_data(browser: Browser, tmp_path: Path):
+    """Its means are over other test clips."""
+    made(tmp_path)
+    gru, none = (run_of(tmp_path, arm, 0) for arm in ("gru", "none"))
+    small = "[...document.querySelectorAll('.grid td.n > small')].length"
+    told = "document.body.textContent.includes('The control has other data')"
+    with RunsServer(Answers(tmp_path, kept=False), 0, every=0.05) as running:
+        go(browser, running.url, f"run/{gru.id}", "document.querySelectorAll('.grid').length >= 2")
+        assert browser.value(small) > 0
+        assert not browser.value(told)
+    none.manifest_path.write_text(json.dumps({**none.manifest, "data": "e" * 64}))
+    with RunsServer(Answers(tmp_path, kept=False), 0, every=0.05) as running:
+        go(browser, running.url, f"run/{gru.id}", "document.querySelectorAll('.grid').length >= 2")
+        assert browser.value(told)
+        assert browser.value(small) == 0
+
+
 def test_rounds_of_a_sweep(browser: Browser, tmp_path: Path):
     sweep, folder = made(tmp_path), tmp_path / "sweeps" / "mine"
     look(sweep, tmp_path, new_rounds(sweep), Plan.load(folder / "plan.json"))

@@ -67,14 +67,15 @@ function results(run) {
   const columns = [...new Set(Object.keys(run.metrics).filter(name => name.split('.').length === 3).map(name => name.split('.').slice(0, 2).join('.')))].sort();
   const rows = ordered(Object.keys(run.metrics).filter(name => columns.some(column => name.startsWith(`${column}.`))).map(name => name.split('.').at(-1)));
   if (!rows.length) return Object.keys(run.metrics).some(name => name.startsWith('vqvae.')) ? section('Results', pairs(Object.entries(run.metrics).filter(([name]) => name.startsWith('vqvae.')).map(([name, value]) => [name.slice(6), number(value)]))) : null;
-  const other = run.control && runs.get(run.control.id)?.metrics;
+  // Means over other test clips are no difference of the networks.
+  const other = run.control?.data === run.data ? runs.get(run.control.id)?.metrics : null;
   const cell = (column, metric) => {
     const name = `${column}.${metric}`;
     const value = run.metrics[name];
     const change = value !== undefined && typeof other?.[name] === 'number' ? value - other[name] : null;
     return h('td', { class: 'n' }, metricNumber(name, value), change === null ? null : h('small', { class: judged(metric, change) }, signed(change)));
   };
-  return section('Results', h('p', { class: 'faint' }, 'Means over the test clips; the arrows say what is better.', other ? ' Small: the difference from the control’s run of the same seed, which alone is no verdict.' : ''),
+  return section('Results', h('p', { class: 'faint' }, 'Means over the test clips; the arrows say what is better.', other ? ' Small: the difference from the control’s run of the same seed, which alone is no verdict.' : run.control ? ' The control has other data, so that no difference from it is shown.' : ''),
     h('div', { class: 'scroll' }, h('table', { class: 'grid' },
       h('thead', {}, h('tr', {}, h('th', { scope: 'col' }), columns.map(column => h('th', { scope: 'col', class: 'n' }, column.split('.')[0], h('small', {}, column.split('.')[1]))))),
       h('tbody', {}, rows.map(metric => h('tr', {}, h('th', { scope: 'row' }, metric, h('small', {}, [metricWords(metric).unit, ARROWS[better(metric)]].filter(Boolean).join(' '))), columns.map(column => cell(column, metric))))))));
