@@ -5,6 +5,7 @@ from functools import partial
 
 import pytest
 import tiny
+import torch
 from exported import NETWORKS
 from torch import nn
 
@@ -48,6 +49,17 @@ def test_positions_that_are_not_those_of_the_rotations_are_refused():
     model.output = Displaced(model.output)
     with pytest.raises(InputError, match=r"RecurrentPoser: its positions have an MPJPE of .* clip clip0"):
         STREAM.report(model, TEST, "stream")
+
+
+@pytest.mark.parametrize("lost", [math.nan, math.inf])
+def test_a_network_that_diverged_is_evaluated_as_any_other(lost: float):
+    """Its rotations and the positions that follow from them are no numbers, which is no broken network."""
+    model = tiny.recurrent_poser(Heading())
+    with torch.no_grad():
+        next(model.parameters()).fill_(lost)
+    found = STREAM.report(model, TEST, "stream")
+    means = [found["mean"][branch]["MPJPE"] for branch in ("rotation", "position")]
+    assert not any(map(math.isfinite, means))
 
 
 @pytest.mark.parametrize("broken", [False, True])
