@@ -156,14 +156,12 @@ class Measured:
         """Whether the network predicts rotations alone.
 
         Its positions then follow from the rotations by forward kinematics, so both branches have the same
-        errors.
+        errors. Clips on which the network diverged tell nothing about that.
         """
-        pairs = [
-            [_number(self.means, mode, branch, SHARED) for branch in ("rotation", "position")]
-            for mode in self.means
-        ]
-        known = [(one, other) for one, other in pairs if one is not None and other is not None]
-        return all(math.isclose(one, other, rel_tol=SAME) for one, other in known)
+        names, branches = list(self.clips), ("rotation", "position")
+        sides = [[self.by_clip(names, mode, branch, SHARED) for branch in branches] for mode in self.means]
+        known = [(one, other, np.isfinite(one + other)) for one, other in sides]
+        return all(math.isclose(one[has].sum(), other[has].sum(), rel_tol=SAME) for one, other, has in known)
 
 
 def _means(values: Mapping[str, np.ndarray]) -> dict[str, float]:

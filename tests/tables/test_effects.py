@@ -14,6 +14,7 @@ from fake_table import EFFECTS, cell, printed
 
 from memmlp.runs.evaluation_file import write_report
 from memmlp.sweep.definition import Sweep
+from memmlp.tables.build_table import make_table
 from memmlp.tables.effects import _mean_cost
 from memmlp.tables.measured_run import load
 from memmlp.tables.statistics import Verdict, holm, paired_effects
@@ -107,9 +108,34 @@ def test_one_head_is_told_by_its_positions(tmp_path: Path):
     assert not load(run.folder).one_head
     for mode in ("stream", "window"):
         report = json.loads(run.evaluation(f"{mode}-0").read_text())
-        mean = {"rotation": {"MPJPE": 26.688274383}, "position": {"MPJPE": 26.688272476}}
-        write_report(run.evaluation(f"{mode}-0"), {"mode": mode, "mean": mean, "clips": report["clips"]})
+        same = {"rotation": {"MPJPE": 26.688274383}, "position": {"MPJPE": 26.688272476}}
+        clips = [clip | same for clip in report["clips"]]
+        write_report(run.evaluation(f"{mode}-0"), {"mode": mode, "mean": same, "clips": clips})
     assert load(run.folder).one_head
+
+
+def test_one_head_is_told_where_it_diverged_on_a_clip(sweep: Sweep, tmp_path: Path):
+    """A seed without a mean empties no arm's row; and two heads are not one for having diverged together."""
+    find = fake_sweep(tmp_path, sweep, {"no | memory": 1.2})
+    for label, seed in (("no | memory", 0), ("no | memory", 1), ("full_model", 1)):
+        run = find(next(arm for arm in sweep.arms if arm.label == label), seed)
+        assert run is not None
+        for mode in ("stream", "window"):
+            report = json.loads(run.evaluation(f"{mode}-0").read_text())
+            for errors in (report["mean"], *report["clips"]) if label == "no | memory" else ():
+                errors["position"] = {"MPJPE": errors["rotation"]["MPJPE"]}
+                del errors["combined"]
+            for errors in (report["mean"], report["clips"][0]) if seed == 1 else ():
+                for branch in ("rotation", "position"):
+                    errors[branch] = dict.fromkeys(errors[branch], "nan")
+            write_report(run.evaluation(f"{mode}-0"), {key: report[key] for key in ("mode", "mean", "clips")})
+    runs = runs_of(replace(sweep, seeds=(0, 1)), find)
+    table = make_table(replace(sweep, seeds=(0, 1)).with_branch("combined"), runs)
+    rows = {row.label: row.branch for row in table.rows}
+    assert (rows["no | memory"], rows["full_model"]) == ("rotation", "combined")
+    assert not runs["full_model"][1].one_head
+    assert np.isnan(cell(table, "no | memory", "MPJPE").mean)
+    assert cell(table, "no | memory", "MPJPE").effect.clips == 11
 
 
 def test_another_branch_and_what_has_one_head(sweep: Sweep, tmp_path: Path):
