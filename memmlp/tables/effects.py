@@ -165,11 +165,12 @@ def alike(pairs: Mapping[Key, Paired]) -> Iterator[tuple[list[Key], np.ndarray, 
 def tested(pairs: Mapping[Key, Paired], smallest: Mapping[str, float]) -> dict[Key, Effect]:
     """Return the effects with their own p-values, not corrected yet, in the order of the pairs."""
     found: dict[Key, Effect] = {}
+    comparisons = testable(pairs)
     for keys, differences, groups in alike(pairs):
         size = {"seeds": differences.shape[1], "clips": differences.shape[2], "groups": len(set(groups))}
         margins = np.array([smallest.get(key.metric, np.nan) for key in keys])
         same = equivalence_p(differences, margins, groups)
-        seen = detectable(differences, len(pairs), groups)
+        seen = detectable(differences, comparisons, groups)
         numbers = paired_effects(differences, groups)
         columns = zip(keys, numbers.mean, numbers.low, numbers.high, numbers.p, same, seen, strict=True)
         for key, mean, low, high, p, equal, least in columns:
@@ -177,6 +178,11 @@ def tested(pairs: Mapping[Key, Paired], smallest: Mapping[str, float]) -> dict[K
             known: dict[str, Any] = {name: or_none(number) for name, number in words.items()}
             found[key] = Effect(float(mean), **known, **size)
     return {key: found[key] for key in pairs}
+
+
+def testable(pairs: Mapping[Key, Paired]) -> int:
+    """Return how many comparisons have a p-value, so that Holm's correction is over them."""
+    return sum(len(pair.matrix) > 1 and len(set(pair.groups)) > 1 for pair in pairs.values())
 
 
 def _judged(

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from memmlp.sweep.definition import MODES, Sweep
-from memmlp.tables.effects import RunsBySeed, paired, paper_effect, with_existing_branches
+from memmlp.tables.effects import RunsBySeed, paired, paper_effect, testable, with_existing_branches
 from memmlp.tables.statistics import seeds_needed
 
 
@@ -38,10 +38,10 @@ def needs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str] = M
     """
     seen = with_existing_branches(sweep, runs)
     pairs, arms = paired(seen, runs, modes), {arm.label: arm for arm in seen.arms}
-    found = []
+    found, comparisons = [], testable(pairs)
     for key, pair in pairs.items():
         effect = paper_effect(seen, arms[key.label], key.metric)
         if effect and len(pair.matrix) > 1 and len(set(pair.groups)) > 1:
-            number = seeds_needed(pair.matrix, effect, len(pairs), pair.groups)
+            number = seeds_needed(pair.matrix, effect, comparisons, pair.groups)
             found.append(Need(*key, effect, float(pair.matrix.mean()), len(pair.matrix), number))
     return found

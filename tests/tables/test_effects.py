@@ -47,6 +47,22 @@ def test_correction_is_over_all_modes_and_metrics(table: Table):
     assert smallest.holm == pytest.approx(min(1, smallest.p * len(tested)))
 
 
+def test_what_would_have_been_found_is_so_after_the_table_s_own_correction(sweep: Sweep, tmp_path: Path):
+    """An arm of one seed has no p-values, and so no share in the correction."""
+    find = fake_sweep(tmp_path, sweep, EFFECTS)
+
+    def few(arm, seed):
+        return find(arm, seed) if arm.label != "by position" or seed == 0 else None
+
+    def without(arm, seed):
+        return find(arm, seed) if arm.label != "by position" else None
+
+    tables = [table_of(sweep, some) for some in (few, without, find)]
+    assert [table.comparisons for table in tables] == [6, 6, 10]
+    seen = [cell(table, "no | memory", "MPJPE").effect.detectable for table in tables]
+    assert seen[0] == seen[1] < seen[2]
+
+
 def test_verdicts_follow_from_the_statistics(sweep: Sweep, tmp_path: Path):
     """Interval, correction, equivalence and verdict equal those that are put together here by hand."""
     find = fake_sweep(tmp_path, sweep, {"no | memory": 1.004, "by position": 1.05})

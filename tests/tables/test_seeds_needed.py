@@ -22,6 +22,9 @@ def test_seeds_that_the_papers_effects_need(sweep: Sweep, tmp_path: Path):
         assert need.have == 3
         assert fewer[key].seeds <= (need.seeds or 1000)
     assert fewer["no | memory", "stream", "MPJPE"].seeds <= 3 < found["no | memory", "stream", "MPJPE"].seeds
+    runs = runs_of(sweep, find)
+    alone = needs(sweep, {**runs, "by position": {}})
+    assert needs(sweep, {**runs, "by position": {0: runs["by position"][0]}}) == alone  # it has no p-values
     assert needs(replace(sweep, seeds=(0,)), runs_of(replace(sweep, seeds=(0,)), find)) == []
     one = fake_sweep(tmp_path / "one", sweep, groups=dict.fromkeys(CLIPS, "one"))
     assert needs(sweep, runs_of(sweep, one)) == []
