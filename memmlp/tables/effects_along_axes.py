@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from memmlp.sweep.definition import COMPUTE, COSTS, Arm, Sweep
-from memmlp.tables.effects import Paired, RunsBySeed, control_arm, paired
+from memmlp.tables.effects import Paired, RunsBySeed, control_arm, paired, with_existing_branches
 from memmlp.tables.statistics import holm, paired_effects
 from memmlp.tables.statistics.effect_regression import Estimate, FittedLine, fit
 from memmlp.tables.statistics.paired_differences import LEVEL
@@ -203,7 +203,7 @@ def trends(
         predicted: the FLOPs at which a prediction is made, by its overrides as one line.
     """
     assert sweep.scale is not None
-    pairs = paired(sweep, runs, (MODE,))
+    pairs = paired(with_existing_branches(sweep, runs), runs, (MODE,))
     metrics = [metric for metric in sweep.metrics if metric not in COSTS]
     series = list(dict.fromkeys(arm.series for arm, _ in in_cells(sweep)))
     found = [_trend(sweep, runs, pairs, name, metric) for name in series for metric in metrics]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from fake_cells import STEP, STEPS, cells, steps_of
 
+from memmlp.tables.build_table import make_table
 from memmlp.tables.effects import paired
 from memmlp.tables.effects_along_axes import Trend, TrendVerdict, trends
 from memmlp.tables.statistics.effect_regression import fit
@@ -68,6 +70,21 @@ def test_the_line_is_that_of_the_cells_differences(tmp_path: Path):
     assert trend.slopes["data.split.train_fraction"].change.low == pytest.approx(line.slope(2).low[0])
     assert [point.effect.mean for point in trend.points] == pytest.approx(line.effects.tolist())
     assert (trend.clips, trend.lost) == (12, 0)
+
+
+def test_an_arm_with_one_head_has_its_line_as_it_has_its_row(tmp_path: Path):
+    """Where a table asks for another branch, it shows the arm's rotations; so do the lines."""
+    sweep, runs = cells(tmp_path, course(1.0, 1.3))
+    own = [arm.label for arm in sweep.arms if arm.series == "none"]
+    for run in (run for label in own for run in runs[label].values()):
+        for errors, mode in itertools.product([run.means, *run.clips.values()], run.means):
+            del errors[mode]["combined"]
+            errors[mode]["position"]["MPJPE"] = errors[mode]["rotation"]["MPJPE"]
+    sweep = sweep.with_branch("combined")
+    rows = [row for row in make_table(sweep, runs).rows if row.label in own]
+    for trend in trends(sweep, runs).trends:
+        shown = [row.cells["stream"][trend.metric].effect.mean for row in rows]
+        assert [point.effect.mean for point in trend.points] == shown
 
 
 def test_a_prediction_is_wider_than_the_line(tmp_path: Path):
