@@ -72,13 +72,17 @@ class LBFGS:
         return {"combined": torch.cat([rotations, motion[:, POSITION]], -1)}
 
     def solve(self, normalizer: Normalizer, motion: Tensor, sparse: Tensor) -> Tensor:
-        """Return rotations (N, 132) in 6D that bring each frame's joints nearest to the position branch's."""
+        """Return rotations (N, 132) in 6D that bring each frame's joints nearest to the position branch's.
+
+        A frame whose joints are no numbers has no numbers either: its rotations are fitted to nothing.
+        """
         start = sixd_to_matrix(motion[:, ROTATION].double().unflatten(-1, (N_JOINTS, 6)))
         head = sparse[:, SPARSE_POSITION][:, :3].double()
         target = motion[:, POSITION].double().unflatten(-1, (N_JOINTS, 3)) - head[:, None]
         distance = JointDistance(start, target, normalizer.rest.double())
         increment = minimise(distance, torch.zeros_like(start[..., 0]).flatten(1), self.iterations)
-        return matrix_to_sixd(distance.turned(increment)).flatten(1).to(motion.dtype)
+        solved = matrix_to_sixd(distance.turned(increment)).flatten(1).to(motion.dtype)
+        return torch.where(target.flatten(1).isfinite().all(1, keepdim=True), solved, torch.nan)
 
 
 class Arms:

@@ -63,6 +63,15 @@ def test_only_rotations_that_move_joints_are_changed():
     assert float(change[others].min()) > 1e-3
 
 
+def test_what_diverged_in_the_position_branch_is_no_number_after_it():
+    motion = perturbed(0.1)
+    motion[3, POSITION.start] = torch.nan
+    motion[5, POSITION.stop - 1] = torch.inf
+    known = solve(motion, 3)[:, ROTATION].isfinite()
+    assert known.all(1).logical_not().nonzero()[:, 0].tolist() == [3, 5]
+    assert not known[[3, 5]].any()
+
+
 def test_a_fit_that_is_perfect_already_stays():
     torch.testing.assert_close(local_rotations(solve(MOTION)), local_rotations(MOTION), atol=1e-4, rtol=0)
 
