@@ -25,11 +25,15 @@ export function signed(value, digits = Math.abs(value) >= 1000 ? 0 : 2) {
   return value > 0 ? `+${number(value, digits)}` : number(value, digits);
 }
 
-// The decimals of a difference and its interval: two, or as many as a significant one needs for a digit.
-export function effectDigits({ mean, holm, level }) {
+// The decimals of an error: two, or as many as show two digits of one below 0.1.
+export const decimals = value => (value && Number.isFinite(value) ? Math.max(1 - Math.floor(Math.log10(Math.abs(value))), 2) : 2);
+
+// The decimals of a difference and its interval: those of the arm's value, or as many as a significant one needs for a digit.
+export function effectDigits({ mean, holm, level, value }) {
   const size = Math.abs(mean);
   if (size >= 1000) return 0;
-  return size > 0 && holm !== null && holm < level ? Math.max(2, -Math.floor(Math.log10(size))) : 2;
+  const least = decimals(value);
+  return size > 0 && holm !== null && holm < level ? Math.max(least, -Math.floor(Math.log10(size))) : least;
 }
 
 // An order from the largest error to the smallest: what is no number comes first, what is not there last.
@@ -108,6 +112,7 @@ export function digitsOf(name) {
 
 export function metricNumber(name, value) {
   if (typeof value !== 'number') return number(value); // none, or a word such as nan
+  if (value && Math.abs(value) < 0.1) return Math.abs(value) < 1e-3 ? number(value) : number(value, decimals(value));
   const digits = Math.abs(value) >= 1000 ? 0 : digitsOf(name);
   return digits === 0 ? number(Math.round(value)) : number(value, digits);
 }

@@ -2,7 +2,7 @@
 
 import { h, replace, link, section, select, empty, choice, code } from './dom.js';
 import { address, alone, ask, dataName, nameOf, place, remember, runs } from './store.js';
-import { ago, ARROWS, better, bytes, date, duration, largestFirst, metricNumber, metricWords, number, signed, word } from './format.js';
+import { ago, ARROWS, better, bytes, date, duration, effectDigits, largestFirst, metricNumber, metricWords, number, signed, word } from './format.js';
 import { curvePanel } from './compare.js';
 import { FINISHED, status, tags } from './runs.js';
 
@@ -73,7 +73,7 @@ function results(run) {
     const name = `${column}.${metric}`;
     const value = run.metrics[name];
     const change = value !== undefined && typeof other?.[name] === 'number' ? value - other[name] : null;
-    return h('td', { class: 'n' }, metricNumber(name, value), change === null ? null : h('small', { class: judged(metric, change) }, signed(change)));
+    return h('td', { class: 'n' }, metricNumber(name, value), change === null ? null : h('small', { class: judged(metric, change) }, signed(change, effectDigits({ mean: change, value }))));
   };
   return section('Results', h('p', { class: 'faint' }, 'Means over the test clips; the arrows say what is better.', other ? ' Small: the difference from the control’s run of the same seed, which alone is no verdict.' : run.control ? ' The control has other data, so that no difference from it is shown.' : ''),
     h('div', { class: 'scroll' }, h('table', { class: 'grid' },

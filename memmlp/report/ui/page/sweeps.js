@@ -5,7 +5,7 @@ import { address, alone, ask, nameOf, place, remember, runs } from './store.js';
 import { curvePanel } from './compare.js';
 import { forest } from './charts.js';
 import { AT_WORK, look, state, STATE_WORDS } from './runs.js';
-import { DASH, duration, effectDigits, metricNumber, metricText, number, signed } from './format.js';
+import { DASH, decimals, duration, effectDigits, metricNumber, metricText, number, signed } from './format.js';
 
 const ORDER = ['done', ...AT_WORK, 'trained', 'lost', 'stopped', 'new', 'failed', 'blocked'];
 
@@ -87,7 +87,7 @@ function effects(table, draw) {
   const metric = tested.includes(query.get('metric')) ? query.get('metric') : tested[0];
   const rows = table.rows.filter(row => row.cells[mode]?.[metric]?.effect || (row.cells[mode]?.[metric]?.paper_effect ?? null) !== null).map(row => {
     const cell = row.cells[mode][metric];
-    const effect = cell.effect ?? {}, digits = effectDigits(effect);
+    const effect = cell.effect ?? {}, digits = effectDigits({ ...effect, value: cell.mean });
     const text = effect.mean === undefined ? 'not measured' : `${signed(effect.mean, digits)}${effect.low === null ? '' : ` [${signed(effect.low, digits)}, ${signed(effect.high, digits)}]`}${effect.verdict ? `, ${effect.verdict}` : ''}${effect.decided ? ` at ${effect.decided} seeds` : ''}`;
     const paper = cell.paper_effect === null ? '' : `; the paper: ${signed(cell.paper_effect)}`;
     return { arm: row.label, mean: effect.mean ?? null, low: effect.low ?? null, high: effect.high ?? null, paper: cell.paper_effect, verdict: effect.verdict, significant: effect.holm !== null && effect.holm < effect.level, words: text + paper };
@@ -120,8 +120,8 @@ function results(table) {
 }
 
 function cell(one, metric) {
-  const effect = one.effect, digits = effect ? effectDigits(effect) : 2;
-  const lines = [h('span', { class: 'strong' }, one.mean === null ? DASH : metricNumber(metric, one.mean), one.sd === null ? null : h('small', { class: 'faint' }, ` ± ${number(one.sd, one.mean >= 1000 ? 0 : 2)}`))];
+  const effect = one.effect, digits = effectDigits({ ...effect, value: one.mean });
+  const lines = [h('span', { class: 'strong' }, one.mean === null ? DASH : metricNumber(metric, one.mean), one.sd === null ? null : h('small', { class: 'faint' }, ` ± ${number(one.sd, one.mean >= 1000 ? 0 : decimals(one.mean))}`))];
   if (effect) lines.push(h('span', { class: effect.holm !== null && effect.holm < effect.level ? 'strong' : '' }, signed(effect.mean, digits), effect.low === null ? null : h('small', { class: 'faint' }, ` [${signed(effect.low, digits)}, ${signed(effect.high, digits)}]`)));
   if (effect?.verdict) lines.push(h('span', { class: `verdict ${effect.verdict}` }, effect.verdict), effect.decided ? h('small', { class: 'faint' }, `at ${effect.decided} seeds`) : null);
   if (one.paper !== null) lines.push(h('small', { class: 'faint' }, `paper ${number(one.paper)}`, one.paper_effect === null ? null : ` (${signed(one.paper_effect)})`));
