@@ -22,7 +22,7 @@ from memmlp.tables.error_distributions import Distribution, distributions
 from memmlp.tables.formats import as_html
 from memmlp.tables.measured_run import UNKNOWN, Measured, Origin
 from memmlp.tables.table import Table
-from memmlp.tables.table_text import better, caption
+from memmlp.tables.table_text import better, caption, decimals
 
 ERROR = "MPJRE"  # the error in Fig. 1, by Sec. 4.3
 MOST_POINTS = 200  # about how many points a curve has at most
@@ -207,7 +207,7 @@ def _robust(found: Mapping[str, Sequence[Distribution]]) -> str:
 
 def _robust_words(one: Distribution) -> tuple[str, str]:
     better = "-" if one.improvement is None else f"{one.improvement:.2f}"
-    return ("-" if one.middle is None else f"{one.middle:.2f}"), better
+    return ("-" if one.middle is None else f"{one.middle:.{decimals(one.middle)}f}"), better
 
 
 def _accuracy(chapters: Iterable[Chapter], paper: Sequence[SpeedAndError]) -> list[str]:

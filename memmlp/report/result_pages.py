@@ -21,6 +21,7 @@ from memmlp.tables.table_text import (
     MINUS,
     MISSING,
     caption,
+    decimals,
     effect_words,
     number_words,
     unit,
@@ -343,7 +344,8 @@ def _whole(cell: Cell) -> str:
         return MISSING
     verdict = TURNED.get(cell.effect.verdict, cell.effect.verdict) if cell.effect.verdict else "no verdict"
     printed = "" if cell.paper_effect is None else f"; paper {-cell.paper_effect:+.2f}"
-    return f"{-cell.effect.mean:+.2f}, {verdict}{printed}".replace("-", MINUS)
+    digits = 2 if cell.mean is None else decimals(cell.mean)
+    return f"{-cell.effect.mean:+.{digits}f}, {verdict}{printed}".replace("-", MINUS)
 
 
 def _allowed(what: str, name: str, known: Iterable[str]) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from memmlp.sweep.definition import COMPUTE
 from memmlp.tables.effects_along_axes import MODE, Bounds, Slope, Trend, Trends, TrendVerdict
 from memmlp.tables.formats import escaped
-from memmlp.tables.table_text import decimals_of_interval, signed, with_unit
+from memmlp.tables.table_text import decimals, decimals_of_interval, signed, with_unit
 
 SIGNS = {1: "higher", -1: "lower", 0: "open", None: "no verdict"}
 NEAR = 0.5
@@ -55,7 +55,8 @@ def bounds_words(one: Bounds) -> str:
     """Return a number with its interval, as in +0.42 (0.10 to 0.74)."""
     if not math.isfinite(one.high - one.low):
         return signed(one.mean, "+.2f")
-    digits = decimals_of_interval(one.high - one.low)
+    width = one.high - one.low
+    digits = decimals_of_interval(width, decimals(width))
     low, high = (signed(number, f".{digits}f") for number in (one.low, one.high))
     return f"{signed(one.mean, f'+.{digits}f')} ({low} to {high})"
 

@@ -18,7 +18,7 @@ from processes import finished
 
 from memmlp.common.errors import InputError
 from memmlp.report import figures
-from memmlp.report.html import Chapter, _accuracy, page, published
+from memmlp.report.html import Chapter, _accuracy, _robust_words, page, published
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.plan import Entry, Plan
 from memmlp.sweep.sweep_file import load_sweep
@@ -161,6 +161,11 @@ def test_an_arm_that_diverges_on_hard_clips_does_not_look_better_for_it(tmp_path
     for run in runs["2"].values():
         del run.means["stream"][branch]["MPJPE"]
     assert (of("2").errors.size, of("2").middle) == (0, None)  # not measured, which is not diverged
+
+
+def test_an_interquartile_mean_below_a_tenth_has_two_digits():
+    found = [_robust_words(Distribution("a", np.zeros((1, 1)), middle, None)) for middle in (0.0034, 4.2)]
+    assert found == [("0.0034", "-"), ("4.20", "-")]
 
 
 def test_an_arm_that_diverged_is_no_point_of_accuracy_and_is_named(tmp_path: Path):

@@ -16,10 +16,11 @@ from report.conftest import GROUPS
 from memmlp.cli.results import sources
 from memmlp.common.errors import InputError
 from memmlp.report.kept_results import Kept, dumps, overrides_of
-from memmlp.report.result_pages import KeptTable, Placeholders, origin_words, pages
+from memmlp.report.result_pages import KeptTable, Placeholders, _whole, origin_words, pages
 from memmlp.sweep.definition import Sweep
 from memmlp.tables.build_table import make_table
 from memmlp.tables.statistics import Verdict, holm, paired_effects
+from memmlp.tables.table import Cell, Effect
 from memmlp.tables.table_text import MINUS
 
 ROOT = Path(__file__).parent.parent.parent
@@ -182,6 +183,11 @@ def test_the_way_from_the_first_arm_to_the_last_is_the_sum_of_its_steps(sweep: S
     assert parts[2][1].split("; paper ")[0] == str(words.verdict("t", labels[2], "stream", "MPJPE"))
     plain = Placeholders({"t": source(sweep, Kept("table14", (), runs_of(sweep, find), overrides_of(sweep)))})
     assert plain.way("t") == ""
+
+
+def test_a_way_below_a_tenth_has_two_digits():
+    cell = Cell({0: 0.0034, 1: 0.0036}, effect=Effect(0.0012, verdict=Verdict.HIGHER))
+    assert _whole(cell) == f"{MINUS}0.0012, lower"
 
 
 def test_by_hand_is_what_a_page_has(sweep: Sweep, kept: Kept):

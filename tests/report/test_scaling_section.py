@@ -118,3 +118,4 @@ def test_numbers_in_words():
     assert bounds_words(Bounds(0.42, 0.1, 0.74)) == "+0.42 (0.10 to 0.74)"
     assert bounds_words(Bounds(-0.42, math.nan, math.nan)) == f"{MINUS}0.42"
     assert bounds_words(Bounds(0.0, -1.0, 1.0)) == f"0 ({MINUS}1.00 to 1.00)"
+    assert bounds_words(Bounds(4e-4, 1e-4, 7e-4)) == "+0.00040 (0.00010 to 0.00070)"  # of errors in metres
