@@ -199,6 +199,9 @@ def test_no_difference_is_shown_from_a_control_on_other_data(browser: Browser, t
         go(browser, running.url, f"run/{gru.id}", "document.querySelectorAll('.grid').length >= 2")
         assert browser.value(told)
         assert browser.value(small) == 0
+        go(browser, running.url, f"compare?runs={none.id},{gru.id}", "document.querySelectorAll('.lines')[1]")
+        assert browser.value("document.body.textContent.includes('whose errors do not compare')")
+        assert browser.value("document.querySelectorAll('.least').length") == 0
 
 
 def test_rounds_of_a_sweep(browser: Browser, tmp_path: Path):

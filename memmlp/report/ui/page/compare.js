@@ -100,12 +100,14 @@ function differences(list, keys, names) {
 function results(list, names) {
   const rows = about.metrics.filter(name => list.some(run => typeof run.metrics[name] === 'number') && !name.includes('GT '));
   if (!rows.length) return null;
+  const alike = new Set(list.map(run => run.data)).size === 1; // as in the list of runs, of several data sets no value is the best
   const line = name => {
     const values = list.map(run => run.metrics[name]);
-    const best = bestOf(name, values.filter(value => typeof value === 'number'));
+    const best = alike ? bestOf(name, values.filter(value => typeof value === 'number')) : null;
     return [metricText(name), ...values.map(value => h('span', { class: value !== undefined && value === best ? 'least' : '' }, metricNumber(name, value)))];
   };
-  return section('Measured', matrix(rows.map(line), list, names, 'n'));
+  const told = alike ? null : h('p', { class: 'faint' }, 'These runs are of several data sets, whose errors do not compare.');
+  return section('Measured', told, matrix(rows.map(line), list, names, 'n'));
 }
 
 function matrix(rows, list, names, kind = '') {
