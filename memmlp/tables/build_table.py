@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from memmlp.common.errors import InputError
 from memmlp.sweep.definition import COSTS, MODES, Arm, Sweep
 from memmlp.tables.effects import RunsBySeed, control_arm, effects, paper_effect, with_existing_branches
-from memmlp.tables.flags_of_runs import Say, flags, silent
+from memmlp.tables.flags_of_runs import Say, early_looks, flags, silent
 from memmlp.tables.measured_run import Measured
 from memmlp.tables.table import Cell, Effect, Key, Row, Table
 
@@ -56,6 +56,7 @@ def make_table(
     compared = sum(effect.p is not None for effect in found.values())
     if rounds:
         found, compared = rounds.judged(found), len(rounds.family(sweep))
+    flagged = flags(seen, sweep, runs, command or f"memmlp sweep {sweep.name}", state, older)
     return Table(
         name=sweep.name,
         title=sweep.title,
@@ -68,7 +69,7 @@ def make_table(
         comparisons=compared,
         rows=tuple(_row(seen, arm, runs.get(arm.label), shown, found) for arm in seen.arms),
         notes=(*sweep.notes, *(f"{arm.label}: {arm.note}" for arm in sweep.arms if arm.note)),
-        flags=tuple(flags(seen, sweep, runs, command or f"memmlp sweep {sweep.name}", state, older)),
+        flags=(*flagged, *(() if rounds else early_looks(seen, runs))),
         looks=tuple((look.seeds, look.level) for look in rounds.taken) if rounds else (),
     )
 

@@ -130,6 +130,16 @@ def _older(sweep: Sweep, runs: Mapping[str, RunsBySeed], older: Say) -> Iterable
         yield f"made by an earlier recipe, left out and made again by the sweep: {listed(found)}"
 
 
+def early_looks(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
+    """Flag arms of which some seeds are there and others not yet: another look at them is still to come."""
+    early = [arm.label for arm in sweep.runnable() if len(runs[arm.label]) > 1 and _gaps(sweep, arm, runs)]
+    if early:
+        yield (
+            "not all seeds are there: a table that is looked at again as they come has a star by chance more "
+            f"often than 1 in 20 (--until-decided counts its looks): {quoted(early)}"
+        )
+
+
 def _gaps(sweep: Sweep, arm: Arm, runs: Mapping[str, RunsBySeed]) -> list[int]:
     return [seed for seed in sweep.seeds_of(arm) if seed not in runs[arm.label]]
 

@@ -56,6 +56,8 @@ def test_missing_runs_are_shown_with_the_command(sweep: Sweep, tmp_path: Path):
     assert effect is not None
     assert effect.seeds == 2
     assert cell(table, "by position", "MPJPE").effect is None
+    early = [flag for flag in table.flags if flag.startswith("not all seeds are there")]
+    assert [flag.rpartition(": ")[2] for flag in early] == ["'no | memory'"]
     assert "2/3" in printed(table, 100)
     assert "0/3" in FORMATS["md"](table)
 
