@@ -131,27 +131,28 @@ def _check_space(setup: Setup) -> str:
 
     Returns:
         A text that names the first trial's run, its interval of validations, how its network is used, and
-        with what the ends of the space are trained. It is part of the digest in the name of the search's
-        folder, so that another config or other data makes another search.
+        with what, by which recipes, the ends of the space are trained. It is part of the digest in the name
+        of the search's folder, so that another config or other data makes another search.
 
     Raises:
         InputError: if a searched key is set on the command line or does not change the training, or if the
             config refuses a value.
     """
     from memmlp.common.files import digest
-    from memmlp.runs.identity import inference, trained_by, trained_with
+    from memmlp.runs.identity import inference, trained_with
 
     space = setup.search.space
     for word in setup.words:
         if word.partition("=")[0].lstrip("+") in {one.key for one in space}:
             raise InputError(f"{word}: is searched; leave it out of the space with search.space....=null")
-    configs = [_experiments(setup, {})[0].config]
+    experiments = [_experiments(setup, {})[0]]
     for number in range(max(len(one.corners()) for one in space)):
         corner = {one.key: one.corners()[number % len(one.corners())] for one in space}
         try:
-            configs.append(_experiments(setup, corner)[0].config)
+            experiments.append(_experiments(setup, corner)[0])
         except InputError as error:
             raise InputError(f"search.space: {error}") from None
+    configs = [experiment.config for experiment in experiments]
     _check_validation(configs)
     for one in space:
         counts = any(trained_with(one.key, config) for config in configs)  # some do at other values than 0
@@ -159,7 +160,7 @@ def _check_space(setup: Setup) -> str:
             raise InputError(f"search.space: {one.key}: changes no training; allowed are keys that do")
     first = _tasks(setup, next(iter(setup.search.first_trials()), {}))[0][-1]
     often = f"validated every {first.config['optim']['validate_every']} steps"  # when trials may be pruned
-    trained = digest([trained_by(config) for config in configs])  # what the first trial need not have
+    trained = digest([one.identity("").id for one in experiments])  # what the first trial need not have
     return f"{first.id}, {often}, used with {inference(first.config)}, trained with {trained}"
 
 

@@ -17,6 +17,7 @@ from filelock import FileLock
 
 from memmlp.cli.bench.chaos import examine
 from memmlp.cli.tune import _makes, _tasks, leave, prepare_search, training
+from memmlp.runs.recipe_versions import RECIPES
 from memmlp.runs.run import Run
 from memmlp.sweep.search import results
 from memmlp.sweep.search.search_file import Range
@@ -177,6 +178,18 @@ def test_a_search_is_named_after_what_later_trials_follow_from_too(tmp_path: Pat
         return prepare_search([*TINY, *space, *words], None, tmp_path).folder.name
 
     assert folder("vqvae.lr=1e-3") != folder("vqvae.lr=1e-1")
+
+
+def test_another_recipe_of_what_later_trials_use_makes_another_search(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Trials before it were judged by other code; a component that no trial uses changes nothing."""
+    space = ["search.space.loss=null", "+search.space.memory={choices: [none, vq], first: none}"]
+    before = prepare_search([*TINY, *space], None, tmp_path).folder.name
+    for component, same in {"memory.gru": True, "memory.vq": False, "codebook.ema": False}.items():
+        with monkeypatch.context() as patched:
+            patched.setitem(RECIPES, component, 99)
+            assert (prepare_search([*TINY, *space], None, tmp_path).folder.name == before) == same
 
 
 @pytest.mark.parametrize("words", [["experiment=no_codes"], ["search.base=['experiment=no_codes']"]], ids=str)
