@@ -220,9 +220,20 @@ def search(setup: Setup, study: Study, workers: Workers) -> None:
     from memmlp.sweep.search.progress_table import SearchBoard
 
     plan = Plan(setup.folder.name, setup.outputs, (), (), open=True)
-    director = Director(study, partial(_tasks, setup), plan)
-    path, fleet = hire(setup.folder, plan, workers, {_experiments(setup, {})[0].config["device"]})
+    base = _experiments(setup, {})[0]
+    check = partial(_check_same_clips, base, base.data.prepare().digest)
+    director = Director(study, partial(_tasks, setup), plan, check)
+    path, fleet = hire(setup.folder, plan, workers, {base.config["device"]})
     direct(director, fleet, SearchBoard(setup.outputs), path)
+
+
+def _check_same_clips(base: Experiment, digest: str) -> None:
+    """Raise InputError if the data has another digest now, so that further trials would be judged by it."""
+    if base.data.prepare().digest != digest:
+        raise InputError(
+            f"{base.data.source.root}: its clips changed since the search began; put them back, or start the "
+            "search again, which begins another one"
+        )
 
 
 def leave(setup: Setup, study: Study) -> None:

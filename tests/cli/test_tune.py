@@ -16,11 +16,16 @@ from command_line import run_apart
 from filelock import FileLock
 
 from memmlp.cli.bench.chaos import examine
-from memmlp.cli.tune import _makes, _tasks, leave, prepare_search, training
+from memmlp.cli.tune import _makes, _tasks, leave, prepare_search, search, training
+from memmlp.cli.workers import Workers
+from memmlp.common.errors import InputError
 from memmlp.runs.recipe_versions import RECIPES
 from memmlp.runs.run import Run
+from memmlp.sweep.search import director as director_module
 from memmlp.sweep.search import results
+from memmlp.sweep.search.director import Director
 from memmlp.sweep.search.search_file import Range
+from memmlp.sweep.search.study import Study
 
 TINY = [*BASE, "optim.validate_every=3"]
 
@@ -168,6 +173,25 @@ def test_table_5_is_of_mem_mlp_alone(tmp_path: Path, monkeypatch: pytest.MonkeyP
     for words in ([], [*space, "model=avatar_poser"]):
         leave(prepare_search([*TINY, *words], None, tmp_path), None)
     assert [path.name for path in written] == ["table05.yaml"]
+
+
+def test_a_search_ends_where_its_clips_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Further trials would be judged by other clips than those before, and ranked with them."""
+    command(tmp_path, "data", "synth", "--out", "mine", "--minutes", "2")
+    monkeypatch.chdir(tmp_path)
+    own = [word for word in TINY if "synth" not in word]
+    setup = prepare_search([*own, "data=mocap", "data.root=mine"], None, tmp_path / "outputs")
+    study = Study.opened(setup.search, "mine", tmp_path)
+
+    def replaced(director: Director, *_: object) -> None:
+        director.look(1)
+        next(Path("mine").rglob("*.npz")).unlink()
+        director.look(2)
+
+    monkeypatch.setattr(director_module, "direct", replaced)
+    with pytest.raises(InputError, match="mine: its clips changed since the search began"):
+        search(setup, study, Workers())
+    assert len(study.trials) == 1
 
 
 def test_a_search_is_named_after_what_later_trials_follow_from_too(tmp_path: Path):

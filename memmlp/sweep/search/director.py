@@ -74,10 +74,11 @@ class Director:
         study: owns the trials.
         compose: makes the tasks of a trial.
         plan: an empty, open plan, which is filled with the tasks of the running trials.
+        check: called before each new trial; it raises InputError to end the search.
     """
 
-    def __init__(self, study: Study, compose: Compose, plan: Plan):
-        self.study, self.compose, self.plan = study, compose, plan
+    def __init__(self, study: Study, compose: Compose, plan: Plan, check: Callable[[], None] = lambda: None):
+        self.study, self.compose, self.plan, self.check = study, compose, plan, check
         self.going: dict[int, Going] = {}
         for trial in study.running():
             self._begin(trial)
@@ -86,12 +87,15 @@ class Director:
         """Record ended trials, ask for new ones until `capacity` runs can run at once, and return the plan.
 
         Raises:
-            InputError: if all trials failed, and there are at least HOPELESS of them.
+            InputError: if all trials failed, and there are at least HOPELESS of them, or if `check` refuses
+                a new trial.
         """
         for number in list(self.going):
             if self._ended(self.going[number]):
                 del self.going[number]
-        while self._busy() < capacity and (trial := self.study.ask()):
+        while self._busy() < capacity and not self.study.full:
+            self.check()
+            trial = self.study.ask()
             self._check_hope()
             self._begin(trial)
         return self._planned()

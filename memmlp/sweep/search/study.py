@@ -90,12 +90,14 @@ class Study:
             if trial.state == TrialState.RUNNING:
                 yield self._taken_up(trial)
 
-    def ask(self) -> Trial | None:
-        """Return a new trial; None if there are as many as the search wants."""
-        number = len(self.trials)
-        if number >= self.search.n_trials:
-            return None
-        self.study.sampler = sampler(self.search, number)
+    @property
+    def full(self) -> bool:
+        """Whether there are as many trials as the search wants."""
+        return len(self.trials) >= self.search.n_trials
+
+    def ask(self) -> Trial:
+        """Return a new trial."""
+        self.study.sampler = sampler(self.search, len(self.trials))
         return self._suggested(self.study.ask())
 
     def _taken_up(self, trial: FrozenTrial) -> Trial:
