@@ -249,6 +249,8 @@ def _interval(key: str, node: Mapping[str, Any], where: str) -> Range:
         raise InputError(f"{where}.step={step}: allowed is a number above 0, without log")
     if step is not None and isinstance(low, int) and isinstance(high, int) and not isinstance(step, int):
         raise InputError(f"{where}.step={step}: allowed is a whole number, as low and high are")
+    if first is not None and isinstance(low, int) and isinstance(high, int) and not isinstance(first, int):
+        raise InputError(f"{where}.first={first}: allowed is a whole number, as low and high are")
     if step is not None and step > high - low:
         raise InputError(f"{where}.step={step}: allowed is at most high - low")
     if step is not None and first is not None and abs((first - low) / step % 1 - 0.5) < 0.5 - 1e-9:

@@ -133,6 +133,7 @@ def test_an_objective_that_is_not_validated_is_named():
         ({"space": space(low=1.0, high=2.0, log="maybe")}, "optim.lr.log=maybe: allowed is true or false"),
         ({"space": space(low=4, high=8, step=1.5)}, "optim.lr.step=1.5: allowed is a whole number"),
         ({"space": space(low=4, high=8, step=100)}, "optim.lr.step=100: allowed is at most high - low"),
+        ({"space": space(low=1, high=10, first=1.5)}, "optim.lr.first=1.5: allowed is a whole number"),
         ({"space": space(low=4, high=8, step=2, first=5)}, "optim.lr.first=5: allowed is low or some steps"),
         (
             {"space": space(choices=[1, 1])},
