@@ -14,7 +14,7 @@ from rich.text import Text
 
 from memmlp.runs.run import Run
 from memmlp.sweep.progress_table import Screen, device_name, devices, progress_text
-from memmlp.sweep.search.search_file import Search
+from memmlp.sweep.search.search_file import Search, Value
 from memmlp.sweep.search.study import Study, deviations
 
 SHOWN = 5  # how many of the best trials are shown
@@ -48,7 +48,7 @@ class SearchBoard(Screen):
 def line(search: Search, trial: FrozenTrial, ended: int, outputs: Path) -> str:
     """Say how a trial ended, and on which devices its runs ran."""
     what = trial.user_attrs.get("reason") if trial.state == TrialState.FAIL else figures(trial)
-    params = ", ".join(f"{key}={trial.params[key]:.4g}" for key in trial.params)
+    params = ", ".join(f"{key}={_value(value)}" for key, value in trial.params.items())
     names = ", ".join(dict.fromkeys(filter(None, map(device_name, runs_of(trial, outputs)))))
     how = f"{WORDS[trial.state]} on {names}" if names else WORDS[trial.state]
     return f"{ended} of {search.n_trials}; trial {trial.number} {how}: {what} ({params})"
@@ -114,8 +114,12 @@ def row(table: Table, search: Search, trial: FrozenTrial, state: Text) -> None:
 
 def _shown(search: Search, trial: FrozenTrial) -> Iterable[str]:
     for one in search.space:
-        value = trial.params.get(one.key, "")
-        yield f"{value:.4g}" if isinstance(value, float) else str(value)
+        yield _value(trial.params.get(one.key, ""))
+
+
+def _value(value: Value) -> str:
+    """Return a value that a trial has for a key as a short text."""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def counts(study: Study) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from fake_search import director, finish, open_study
+from fake_search import STEPS, begun, director, finish, log, open_study
 from rich.console import Console
 
 from memmlp.sweep.search.progress_table import line, render
@@ -43,3 +43,17 @@ def test_a_trial_that_ended_says_on_which_device(tmp_path: Path, facts: dict, sa
     plan.run_of(plan.tasks[0]).write_manifest(facts)
     one.look(1)
     assert f"; trial 0 {said}" in line(study.search, study.trials[0], 1, tmp_path)
+
+
+def test_a_trial_that_ended_is_told_with_values_of_any_kind(tmp_path: Path):
+    choices = {"model": {"cell": {"choices": ["gru", "lstm"], "first": "gru"}}}
+    choices |= {"data": {"mirror": {"choices": [False, True], "first": True}}}
+    space = {**choices, "optim": {"lr": {"low": 1e-3, "high": 1e-2, "first": 0.00123456}}}
+    study = open_study(tmp_path, space=space)
+    one = director(study, tmp_path)
+    run = begun(one.look(1))
+    log(run, STEPS, 1.0)
+    run.finish([])
+    one.look(1)
+    said = line(study.search, study.trials[0], 1, tmp_path)
+    assert said.endswith("1.000 (model.cell=gru, data.mirror=True, optim.lr=0.001235)")
