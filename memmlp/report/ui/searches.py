@@ -131,14 +131,20 @@ def _of_study(study: optuna.Study) -> dict[str, Any]:
 
 
 def _trial(trial: FrozenTrial) -> dict[str, Any]:
+    from optuna.trial import TrialState
+
+    from memmlp.sweep.search.study import reason
+
+    # Optuna gives a pruned trial the value of its last step, which is no result.
+    values = trial.values if trial.state == TrialState.COMPLETE else []
     course = sorted(trial.intermediate_values.items())
     return {
         "number": trial.number,
         "state": trial.state.name.lower(),
-        "values": [value if math.isfinite(value) else None for value in trial.values or []],
+        "values": [value if math.isfinite(value) else None for value in values],
         "params": trial.params,
         "runs": list(trial.user_attrs.get("runs", ())),
-        "reason": str(trial.user_attrs.get("reason", "")),
+        "reason": reason(trial),
         "course": [
             [step, value]
             for step, value in course[:: max(len(course) // MOST_STEPS, 1)]

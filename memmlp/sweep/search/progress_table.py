@@ -15,7 +15,7 @@ from rich.text import Text
 from memmlp.runs.run import Run
 from memmlp.sweep.progress_table import Screen, device_name, devices, progress_text
 from memmlp.sweep.search.search_file import Search, Value
-from memmlp.sweep.search.study import Study, deviations
+from memmlp.sweep.search.study import Study, deviations, reason
 
 SHOWN = 5  # how many of the best trials are shown
 WORDS = {TrialState.COMPLETE: "complete", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}
@@ -47,7 +47,7 @@ class SearchBoard(Screen):
 
 def line(search: Search, trial: FrozenTrial, ended: int, outputs: Path) -> str:
     """Say how a trial ended, and on which devices its runs ran."""
-    what = trial.user_attrs.get("reason") if trial.state == TrialState.FAIL else figures(trial)
+    what = figures(trial) if trial.state == TrialState.COMPLETE else reason(trial)
     params = ", ".join(f"{key}={_value(value)}" for key, value in trial.params.items())
     names = ", ".join(dict.fromkeys(filter(None, map(device_name, runs_of(trial, outputs)))))
     how = f"{WORDS[trial.state]} on {names}" if names else WORDS[trial.state]

@@ -19,7 +19,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from memmlp.common.files import atomic_write
 from memmlp.sweep.search.search_file import Search
-from memmlp.sweep.search.study import Study, deviations, values
+from memmlp.sweep.search.study import Study, deviations, reason, values
 
 TABLE = 5  # the paper's table of manual weights against learned ones
 
@@ -28,7 +28,8 @@ def write_trials(study: Study, path: Path) -> None:
     """Write all trials to a CSV file: number, state, objectives, values, runs, and the reason of a failure.
 
     With several seeds the objectives are means, followed by each objective's standard deviation and by the
-    values of the single seeds.
+    values of the single seeds. A pruned trial has none, since that of an earlier step is no result; its
+    reason tells it.
     """
     names = [objective.text for objective in study.search.objectives]
     keys = [one.key for one in study.search.space]
@@ -36,10 +37,10 @@ def write_trials(study: Study, path: Path) -> None:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["trial", "state", *names, *_seed_columns(study.search), *keys, "run", "reason"])
     for trial in study.trials:
-        figures = trial.values or [""] * len(names)
+        figures = trial.values if trial.state == TrialState.COMPLETE else [""] * len(names)
         by_seed = _seed_values(study.search, trial)
         params = [trial.params.get(key, "") for key in keys]
-        extra = [" ".join(trial.user_attrs.get("runs", ())), trial.user_attrs.get("reason", "")]
+        extra = [" ".join(trial.user_attrs.get("runs", ())), reason(trial)]
         writer.writerow([trial.number, trial.state.name.lower(), *figures, *by_seed, *params, *extra])
     atomic_write(path, text.getvalue())
 

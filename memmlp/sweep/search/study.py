@@ -253,6 +253,13 @@ def suggest(trial: Trial, one: Range) -> Value:
     return trial.suggest_float(one.key, one.low, one.high, step=one.step, log=one.log)
 
 
+def reason(trial: FrozenTrial) -> str:
+    """Return why a trial failed, or at which step and with what value it was pruned; else nothing."""
+    if trial.state == TrialState.PRUNED and trial.values:
+        return f"{trial.values[0]:.4g} at step {trial.last_step}"
+    return str(trial.user_attrs.get("reason", ""))
+
+
 def deviations(trial: FrozenTrial) -> list[float]:
     """Return each objective's standard deviation over seeds; empty with fewer than two seeds."""
     by_seed = trial.user_attrs.get("values", [])

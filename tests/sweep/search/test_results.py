@@ -46,6 +46,23 @@ def test_trials_of_several_seeds_as_csv(tmp_path: Path):
     assert row["run"] in path.read_text()
 
 
+def test_a_pruned_trial_has_no_value_in_the_csv(tmp_path: Path):
+    """Optuna gives it that of its last step, which is none of a trained network."""
+    study = open_study(tmp_path, pruner="median", prune_after=1)
+    one = director(study, tmp_path)
+    finished = begun(one.look(1))
+    for step in (10, STEPS):
+        log(finished, step, 5.0)
+    finished.finish([])
+    log(begun(one.look(1)), 10, 9.0)
+    one.look(1)
+    results.write_trials(study, tmp_path / "trials.csv")
+    with open(tmp_path / "trials.csv", newline="") as file:
+        first, second, _ = csv.DictReader(file)
+    assert (first["state"], first["MPJPE"], first["reason"]) == ("complete", "5.0", "")
+    assert (second["state"], second["MPJPE"], second["reason"]) == ("pruned", "", "9 at step 10")
+
+
 @pytest.mark.slow
 def test_two_objectives_give_a_front(tmp_path: Path):
     study = open_study(tmp_path, objectives=["MPJPE", "Jitter"])
