@@ -65,6 +65,8 @@ def _seed_values(search: Search, trial: FrozenTrial) -> list[float | str]:
 def write_experiments(study: Study, folder: Path, groups: Collection[str]) -> list[Path]:
     """Write the best trial to experiment/best.yaml, and the others of a Pareto front to trial-N.yaml.
 
+    Files of trials that are no longer of the front are removed.
+
     Args:
         study: the study.
         folder: the search's folder.
@@ -79,6 +81,8 @@ def write_experiments(study: Study, folder: Path, groups: Collection[str]) -> li
     files = [folder / "experiment" / "best.yaml", *files] if best else []
     for path, trial in zip(files, best, strict=True):
         atomic_write(path, experiment(study, trial, groups))
+    for left in {*(folder / "experiment").glob("trial-[0-9]*.yaml")} - {*files}:
+        left.unlink()
     return files
 
 

@@ -63,6 +63,18 @@ def test_a_pruned_trial_has_no_value_in_the_csv(tmp_path: Path):
     assert (second["state"], second["MPJPE"], second["reason"]) == ("pruned", "", "9 at step 10")
 
 
+def test_a_trial_that_is_no_longer_of_the_front_has_no_file(tmp_path: Path):
+    study = open_study(tmp_path, objectives=["MPJPE", "Jitter"], n_trials=3)
+    one = director(study, tmp_path)
+    for errors in ((1.0, 3.0), (3.0, 1.0), (0.5, 0.5)):
+        run = begun(one.look(1))
+        run.log(STEPS, dict(zip(("rotation MPJPE", "rotation Jitter"), errors, strict=True)), "val")
+        run.finish([])
+        one.look(0)
+        results.write_experiments(study, tmp_path, ["loss"])
+    assert [path.name for path in (tmp_path / "experiment").iterdir()] == ["best.yaml"]
+
+
 @pytest.mark.slow
 def test_two_objectives_give_a_front(tmp_path: Path):
     study = open_study(tmp_path, objectives=["MPJPE", "Jitter"])
