@@ -19,7 +19,10 @@ MOST_STEPS = 60  # so many values of a trial's course are told at most
 
 
 class Searches:
-    """The searches below an outputs folder; each is read again when its journal has grown."""
+    """The searches below an outputs folder; each is read again when its journal has grown.
+
+    One in a storage of the user's own is read again when its director has shown signs of life since.
+    """
 
     def __init__(self, outputs: Path):
         self.outputs = outputs
@@ -69,10 +72,12 @@ class Searches:
 
 def _stamp(folder: Path) -> int:
     """Return when a search last changed, in nanoseconds; 0 if the folder holds no search."""
+    journal = folder / "study.journal"
+    signs = [journal] if journal.exists() else folder.glob("controllers/*.json")
     times = []
-    for file in ("study.journal", "search.json"):
+    for file in (folder / "search.json", *signs):
         try:
-            times.append((folder / file).stat().st_mtime_ns)
+            times.append(file.stat().st_mtime_ns)
         except OSError:
             continue
     return max(times, default=0)

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
-from fake_search import STEPS, begun, director, log, open_study
+from fake_search import STEPS, begun, director, finish, log, open_study
 
 from memmlp.common.files import write_json
 from memmlp.report.ui.searches import Searches
@@ -34,3 +34,18 @@ def test_a_pruned_trial_has_no_value(folder: Path):
     first, second, *_ = Searches(folder.parents[1]).page("mine")["trials"]
     assert (first["state"], first["values"]) == ("complete", [5.0])
     assert (second["state"], second["values"], second["reason"]) == ("pruned", [], "9 at step 10")
+
+
+def test_a_search_in_a_storage_of_ones_own_is_read_again(folder: Path, tmp_path: Path):
+    """It has no journal that grows; its director touches the plan."""
+    study = open_study(folder, storage=f"sqlite:///{tmp_path / 'trials.db'}", n_trials=2)
+    write_json(folder / "search.json", asdict(study.search))
+    one, searches = director(study, folder), Searches(tmp_path / "outputs")
+    plan = folder / "controllers/a.json"
+    one.look(1).save(plan)
+    assert searches.page("mine")["counts"] == {"running": 1}
+    before = searches.stamp()
+    finish(one.look(1))
+    one.look(1).save(plan)
+    assert searches.page("mine")["counts"] == {"complete": 1, "running": 1}
+    assert searches.stamp() != before
