@@ -158,21 +158,34 @@ def fingerprint(run: Run, facts: RunFacts) -> str:
 
 
 class Tail:
-    """Reads a run's logs: first all lines so far, then added lines, a limited number at a time."""
+    """Reads a run's logs: first all lines so far, then added lines, a limited number at a time.
+
+    Attributes:
+        repeated: whether an added line was of a step that was read before, as of a run that was resumed.
+    """
 
     MOST = 1000
 
     def __init__(self, run: Run):
         self.places = {run.metrics_path: 0, run.folder / SYSTEM: 0}
+        self.steps: dict[str, int] = {}  # the last one of each phase
+        self.repeated = False
 
     def history(self) -> list[CurvePoint]:
         """Return all values so far; if a resumed run repeated a step, its last values."""
         entries = {(entry.phase, entry.step): entry for entry in self._entries(sys.maxsize)}
+        for phase, step in entries:
+            self.steps[phase] = max(step, self.steps.get(phase, 0))
         return [point for entry in entries.values() for point in points(entry)]
 
     def read(self) -> list[CurvePoint]:
         """Return the values of lines that were added since the last call."""
-        return [point for entry in self._entries(self.MOST) for point in points(entry)]
+        found: list[CurvePoint] = []
+        for entry in self._entries(self.MOST):
+            self.repeated |= entry.step <= self.steps.get(entry.phase, -1)
+            self.steps[entry.phase] = max(entry.step, self.steps.get(entry.phase, 0))
+            found += points(entry)
+        return found
 
     def _entries(self, most: int) -> Iterator[Metrics]:
         for path in filter(Path.exists, self.places):

@@ -108,6 +108,8 @@ class Session:
             assert self.shown is not None
             while points := self.tail.read():
                 self.shown.log(points)
+            if self.tail.repeated:  # trackers can't take back what the run logged before it was resumed
+                self._begin(facts)
             mark = fingerprint(self.run, facts)
             self.shown.end(facts, final(facts, self.run.step))
             write_json(self.ledger, {"shown": mark})

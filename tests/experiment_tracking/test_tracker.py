@@ -30,3 +30,19 @@ def test_a_result_that_is_measured_again_replaces_what_is_shown(tmp_path: Path):
     assert measured({"a": 6.5}, {"a": 6.5, "b": 1.0}) == 1
     assert measured({"a": 6.5}, {"a": 7.25}) == 2
     assert measured({"a": 6.5}, {}) == 2
+
+
+def test_steps_that_a_resumed_run_repeats_are_shown_once(tmp_path: Path):
+    """With the values of the weights that count, which the last line of a step has."""
+    tracker, run = FakeTracker(), a_run(tmp_path, steps=3)
+    session = Session(tracker, run, tmp_path / "ledgers")
+    session.step()
+    for step in (2, 3, 4):
+        run.log(step, {"loss": 9.0})
+        session.step()
+    run.finish([])
+    session.end()
+    values = [("train/loss", 1, 1.0), *(("train/loss", step, 9.0) for step in (2, 3, 4))]
+    assert tracker.server.values[run.id] == values
+    assert session.up_to_date()
+    session.leave()
