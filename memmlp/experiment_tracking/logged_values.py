@@ -203,7 +203,7 @@ class SweepFacts:
     """The facts in a sweep's folder.
 
     Attributes:
-        name: the sweep's name.
+        name: the name of its folder, which differs between command lines of one sweep file.
         folder: the sweep's folder.
         status: "running", "done" or "failed".
         arms: run id -> the label of its arm.
@@ -229,9 +229,9 @@ class SweepFacts:
         if not {"name", "status", "labels", "aggregates", "verdicts"} <= found.keys():
             return None
         files = tuple(path for path in (folder / "table.md", folder / "table.html") if path.is_file())
-        own = {name: found[name] for name in ("name", "status", "verdicts")}
+        own = {name: found[name] for name in ("status", "verdicts")}
         own["aggregates"] = {key: value for key, value in found["aggregates"].items() if _number(value)}
-        return cls(folder=folder.absolute(), arms=found["labels"], files=files, **own)
+        return cls(folder.name, folder.absolute(), arms=found["labels"], files=files, **own)
 
 
 def _number(value: Any) -> bool:

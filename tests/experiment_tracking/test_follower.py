@@ -255,4 +255,4 @@ def test_a_sweep_is_shown_and_its_failure_told(at: At, tmp_path: Path):
     at.desk.take(event)
     at.server.down = True
     at.desk.take(event)
-    assert (at.server.sweeps, at.events) == (["mine"], ["shown", "missed"])
+    assert (at.server.sweeps, at.events) == ([tmp_path.name], ["shown", "missed"])

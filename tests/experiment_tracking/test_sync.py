@@ -58,13 +58,25 @@ def test_one_run_that_fails_does_not_stop_the_others(tmp_path: Path):
     assert "cannot be read" in said[0]
 
 
+SUMMARY = {"name": "mine", "status": "done", "labels": {}, "aggregates": {}, "verdicts": {}}
+
+
+def test_a_sweep_file_with_two_command_lines_is_two_sweeps(tmp_path: Path):
+    """Each has a folder; under the file's name the one was shown in the place of the other."""
+    tracker, folders = FakeTracker(), [tmp_path / "mine", tmp_path / "mine-9b8d1a20"]
+    for folder in folders:
+        folder.mkdir()
+        write_json(folder / "summary.json", SUMMARY)
+    assert sync_sweeps(tracker, folders, print) == 2
+    assert tracker.server.sweeps == ["mine", "mine-9b8d1a20"]
+
+
 def test_sweeps_that_left_a_summary_are_shown(tmp_path: Path):
     tracker, said = FakeTracker(), []
     folders = [tmp_path / "mine", tmp_path / "other"]
     for folder in folders:
         folder.mkdir()
-    names = {"name": "mine", "status": "done", "labels": {}, "aggregates": {}, "verdicts": {}}
-    write_json(folders[0] / "summary.json", names)
+    write_json(folders[0] / "summary.json", SUMMARY)
     assert sync_sweeps(tracker, folders, said.append) == 1
     tracker.server.down = True
     assert sync_sweeps(tracker, folders, said.append) == 0
