@@ -12,6 +12,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import now, plain, read_json, write_json
 from memmlp.runs.environment import environment
 from memmlp.runs.identity import belongs, evaluation_id_of, solver_of
+from memmlp.runs.recipe_versions import RECIPES, outdated
 
 COMBINED = "combined"
 """The branch of the rotations after inverse kinematics; whose, the settings of the evaluation say."""
@@ -49,6 +50,17 @@ def current(path: Path, report: Mapping[str, Any]) -> bool:
     """Return whether an evaluation was made with the present recipe versions."""
     settings = report.get("settings") or {}
     return {"mode", "ik"} <= settings.keys() and path.stem == evaluation_id_of(settings)
+
+
+def outdated_by(path: Path, report: Mapping[str, Any]) -> str | None:
+    """Say which recipes of an evaluation have changed since, as "mode.window 2 -> 3"; None if none has.
+
+    That is not known of metrics of one's own whose package is not in use.
+    """
+    if "recipes" not in report:  # a report from before they were recorded
+        return None if current(path, report) else "of an earlier version"
+    known = {name: number for name, number in report["recipes"].items() if name in RECIPES}
+    return ", ".join(outdated(known)) or None
 
 
 def preference(path: Path, report: Mapping[str, Any], config: Mapping[str, Any]) -> tuple[bool, bool, str]:

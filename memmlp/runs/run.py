@@ -32,7 +32,14 @@ from memmlp.common.lease import Lease, Lock
 from memmlp.runs import deployment_folder
 from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.environment import changed, changes, environment, host, sources
-from memmlp.runs.evaluation_file import check_report, combined_by, intact, of_one_solver, preference
+from memmlp.runs.evaluation_file import (
+    check_report,
+    combined_by,
+    intact,
+    of_one_solver,
+    outdated_by,
+    preference,
+)
 from memmlp.runs.identity import NETWORK, belongs, used_as_configured
 from memmlp.runs.metrics_log import Metrics, MetricsLog
 from memmlp.runs.resumed_origin import joined
@@ -352,6 +359,14 @@ class Run:
         It is None where that is not known. Raises InputError as `results` does.
         """
         return combined_by(self._own_reports())
+
+    @property
+    def outdated_results(self) -> dict[str, str]:
+        """The modes whose `results` were measured by earlier recipes, each with what has changed since."""
+        last = {
+            report.get("mode"): outdated_by(path, report) for path, report in self._own_evaluations().items()
+        }
+        return {str(mode): changed for mode, changed in last.items() if changed}
 
     @property
     def own_evaluations(self) -> list[Path]:

@@ -10,7 +10,9 @@ import pytest
 from conftest import Memmlp, Ran, one_line
 
 from memmlp.common.files import write_json
-from memmlp.runs.identity import evaluation_id_of
+from memmlp.runs.evaluation_file import write_report
+from memmlp.runs.identity import evaluation_id_of, evaluation_recipes, evaluation_settings
+from memmlp.runs.recipe_versions import RECIPES
 from memmlp.runs.run import Run
 
 A, B, C = ("a" * 16, "b" * 16, "c" * 16)
@@ -172,6 +174,25 @@ def test_diff_tells_of_another_recipe_and_device(memmlp: Memmlp, outputs: Path):
     assert ["recipes.features", "1", "2"] in rows
     assert ["device", "cpu", "cuda"] in rows
     assert not [row for row in rows if row[:1] == ["recipes.memory.vq"]]
+
+
+def test_results_by_an_earlier_recipe_are_told(
+    memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """They stood beside those of today's; of a run that was measured again today's count."""
+    for number, measured in ((1, (A, B)), (RECIPES["mode.window"], (B,))):
+        monkeypatch.setitem(RECIPES, "mode.window", number)
+        for name in measured:
+            settings = evaluation_settings({}, "window")
+            report = {"mode": "window", "settings": settings, "recipes": evaluation_recipes(settings)}
+            report |= {"mean": {"rotation": {"MPJPE": 5.0 + number}}, "clips": []}
+            write_report(Run.of(outputs, name).evaluation(evaluation_id_of(settings)), report)
+    said = f"by an earlier recipe: mode.window 1 -> {number}"
+    listed = memmlp("runs", "list").out
+    assert f"window results {said}; memmlp eval RUN measures them anew: {A[:8]}\n" in listed
+    assert f"window results {said}" in " ".join(memmlp("runs", "show", A).out.split())
+    assert "earlier recipe" not in memmlp("runs", "show", B).out
+    assert f"window results {said} -" in " ".join(memmlp("runs", "diff", A, B).out.split())
 
 
 def test_diff_tells_of_another_machine_of_the_times(memmlp: Memmlp, outputs: Path):

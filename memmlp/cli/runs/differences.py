@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING
 import click
 
 from memmlp.cli.options import outputs_option
-from memmlp.cli.runs.printing import console, measured_numbers, plain_table, recorded, text_of, value_text
+from memmlp.cli.runs.printing import (
+    console,
+    measured_numbers,
+    older_results,
+    plain_table,
+    recorded,
+    text_of,
+    value_text,
+)
 from memmlp.evaluation.units import UNITS
 
 if TYPE_CHECKING:
@@ -69,7 +77,7 @@ def origin_rows(first: Run, second: Run) -> list[tuple[str, ...]]:
 
     a, b = (
         flatten({key: run.manifest.get(key) for key in ORIGIN})
-        | {"latency": timed_on(run.preferred_deployment.record)}
+        | {"latency": timed_on(run.preferred_deployment.record), **older_results(run)}
         for run in (first, second)
     )
     used = {key for key in a | b if not key.startswith("recipes.") or (key in a and key in b)}

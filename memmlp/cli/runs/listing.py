@@ -14,7 +14,15 @@ from rich.console import Console
 from rich.table import Table
 
 from memmlp.cli.options import outputs_option
-from memmlp.cli.runs.printing import age, console, number_text, plain_table, recorded, value_text
+from memmlp.cli.runs.printing import (
+    age,
+    console,
+    number_text,
+    older_results,
+    plain_table,
+    recorded,
+    value_text,
+)
 from memmlp.evaluation.units import UNITS
 from memmlp.runs.identity import NETWORK
 from memmlp.runs.shown_name import kind_words
@@ -39,6 +47,7 @@ LEGEND = {
 }
 SPARED = ("ms", "age", "Jitter", "MPJPE\nwindow")  # what a narrow screen has no room for, first
 FOLD = 12  # characters of a value in a line, where it can be broken
+SHORT = 8  # characters of an id in a line below the table
 NAME = 36  # characters of a run's name in a line
 
 
@@ -77,6 +86,8 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
         listed = sorted_by(listed, records, sort)
     keys = wanted(columns, records, listed)
     hidden = show_runs([{**records[run.id], "age": age(run)} for run in listed], keys, bool(columns))
+    for line in older_results_lines(listed):
+        click.echo(line)
     if hidden:
         click.echo(f"they differ in {', '.join(hidden)}, too: --columns {','.join(hidden)}")
     if upstream := Counter(kind_words(run.manifest["kind"]) for run in there if run not in found):
@@ -86,6 +97,19 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
         click.echo(f"{len(found) - limit} older ones: memmlp runs list --all")
     elif query:
         click.echo(f"{len(listed)} of {len(found)} runs")
+
+
+def older_results_lines(listed: Sequence[Run]) -> list[str]:
+    """Return a line for each mode in which runs were measured by an earlier recipe."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for run in listed:
+        for results, by in older_results(run).items():
+            found.setdefault((results, by), []).append(run.id[:SHORT])
+    return [
+        f"{results} {by}; memmlp eval RUN measures them anew: {', '.join(ids[:NEWEST])}"
+        + (f" and {len(ids) - NEWEST} more" if len(ids) > NEWEST else "")
+        for (results, by), ids in found.items()
+    ]
 
 
 def is_finished_upstream(run: Run) -> bool:

@@ -53,6 +53,15 @@ def measured_numbers(run: Run) -> dict[str, Any]:
     }
 
 
+def older_results(run: Run) -> dict[str, str]:
+    """Return in words which of a run's results were measured by earlier recipes; none for a damaged run."""
+    try:
+        found = run.outdated_results
+    except InputError:  # which `recorded` tells
+        return {}
+    return {f"{mode} results": f"by an earlier recipe: {words}" for mode, words in found.items()}
+
+
 def console() -> Console:
     """Make a console that prints texts unchanged."""
     return Console(highlight=False, markup=False)

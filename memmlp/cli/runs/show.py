@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from memmlp.cli.options import outputs_option
-from memmlp.cli.runs.printing import console, measured_numbers, pairs, recorded
+from memmlp.cli.runs.printing import console, measured_numbers, older_results, pairs, recorded
 
 if TYPE_CHECKING:
     from memmlp.runs.run import Run
@@ -60,6 +60,7 @@ def _summary(run: Run) -> dict[str, Any]:
     attempts = [f"{one['stage']} from step {one['step']}, {one['started']}" for one in _attempts(manifest)]
     if attempts:
         facts["worked on"] = "\n".join(attempts)
+    facts |= older_results(run)
     if changed := run.verify():
         facts["changed since"] = ", ".join(changed)
     return facts
