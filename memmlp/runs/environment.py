@@ -164,8 +164,12 @@ def _module(package: str, file: str) -> str:
     return ".".join([package, *(parts[:-1] if parts[-1] == "__init__" else parts)])
 
 
+@functools.cache
 def _own_digest(path: Path) -> str:
-    """Return a digest of a file's code, or of its bytes if it is not Python of this version."""
+    """Return a digest of a file's code, or of its bytes if it is not Python of this version.
+
+    It stays as it was when this process first asked: what is edited later is not what the process runs.
+    """
     try:
         return code_digest(path.read_text("utf-8"))
     except (SyntaxError, ValueError):

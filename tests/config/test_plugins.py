@@ -23,6 +23,7 @@ from memmlp.config.build_motion import build_motion
 from memmlp.config.compose import composed
 from memmlp.config.compose_plan import find_sweep
 from memmlp.config.schema import restored
+from memmlp.runs import environment
 from memmlp.runs.environment import code_digest, computed_imports, packages_of_ones_own
 from memmlp.runs.identity import evaluation_id, evaluation_settings
 from memmlp.runs.run import Run
@@ -44,6 +45,7 @@ def write(folder: Path, files: dict[str, str]) -> None:
     for name, text in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
+    environment._own_digest.cache_clear()  # as in a process that starts now
 
 
 @pytest.mark.parametrize("how", ["overrides", "environment", "entry point"])

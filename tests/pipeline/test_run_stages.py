@@ -32,6 +32,7 @@ from memmlp.motion.clip import Skipped
 from memmlp.motion.dataset import MotionDataset
 from memmlp.pipeline import run_stages
 from memmlp.pipeline.run_stages import recording_outcome, upstream_run
+from memmlp.runs import environment
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.recipe_versions import RECIPES
@@ -407,4 +408,6 @@ def test_metrics_of_other_code_are_measured_again(tmp_path: Path, monkeypatch: p
         write_report(run.evaluation("window-0"), made | {"mode": "window", "settings": {}})
         assert run_stages.unmeasured(experiment, run) == []
         code.write_text("A = 2\n")
+        assert run_stages.unmeasured(experiment, run) == []  # this process would measure them as before
+        environment._own_digest.cache_clear()
         assert run_stages.unmeasured(experiment, run) == ["stream"]

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
-from memmlp.runs.environment import environment
+import pytest
+
+from memmlp.runs.environment import environment, own_sources
 
 
 def test_environment_says_what_ran_without_the_machines_name():
@@ -14,3 +17,14 @@ def test_environment_says_what_ran_without_the_machines_name():
     assert {"version", "git", "python", "packages", "platform", "cpu", "cores", "host"} == set(found)
     assert found["packages"]["torch"].startswith("2.")
     assert platform.node() not in json.dumps(found)
+
+
+def test_code_that_is_edited_while_it_runs_is_recorded_as_it_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """A worker does many runs with what it imported, whatever its files say later."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "lab_of_mine.py").write_text("A = 1\n")
+    before = own_sources(["lab_of_mine"])
+    (tmp_path / "lab_of_mine.py").write_text("A = 2\n")
+    assert own_sources(["lab_of_mine"]) == before
