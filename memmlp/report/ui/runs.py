@@ -200,6 +200,7 @@ def page(
         "clips": clips(run),
         "latency": latency(run),
         "changed": verified(run),
+        "older": by_earlier_recipes(run),
         "files": files(run.folder),
     }
 
@@ -278,6 +279,14 @@ def latency(run: Run) -> dict[str, Any]:
 def verified(run: Run) -> list[str]:
     """Return the files of a finished run that are missing or have changed since."""
     return run.verify() if run.done else []
+
+
+def by_earlier_recipes(run: Run) -> list[str]:
+    """Return the modes that a run was measured in by an earlier recipe, each with what has changed since."""
+    try:
+        return [f"{mode} ({words})" for mode, words in run.outdated_results.items()]
+    except InputError:  # the facts tell of a damaged file
+        return []
 
 
 def files(folder: Path) -> list[dict[str, Any]]:

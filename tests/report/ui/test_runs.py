@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import pytest
 from own_package import registers_kept
 
 from memmlp.evaluation.units import HIGHER, UNITS
-from memmlp.report.ui.runs import differing, partners, sets, shared, units
+from memmlp.report.ui.runs import by_earlier_recipes, differing, partners, sets, shared, units
+from memmlp.runs.evaluation_file import write_report
+from memmlp.runs.identity import evaluation_id_of, evaluation_recipes, evaluation_settings
+from memmlp.runs.recipe_versions import RECIPES
+from memmlp.runs.run import Run
 
 
 def of(data: str, **config: Any) -> dict[str, Any]:
@@ -70,3 +76,15 @@ def test_runs_of_different_data_that_share_a_name_are_told_apart():
     ]
     assert shared(runs) == ["tiny"]
     assert sets(runs) == {first: "mocap 78bb7c86", second: "synth 877ca548"}
+
+
+def test_what_an_earlier_recipe_measured_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    run, settings = Run(tmp_path / ("a" * 16)), evaluation_settings({}, "window")
+    report = {"mode": "window", "settings": settings, "recipes": evaluation_recipes(settings)}
+    write_report(run.evaluation(evaluation_id_of(settings)), {**report, "mean": {}, "clips": []})
+    assert by_earlier_recipes(run) == []
+    now = RECIPES["mode.window"]
+    monkeypatch.setitem(RECIPES, "mode.window", now + 1)
+    assert by_earlier_recipes(run) == [f"window (mode.window {now} -> {now + 1})"]
+    run.config_path.write_text("[")
+    assert by_earlier_recipes(run) == []
