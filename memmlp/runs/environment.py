@@ -79,10 +79,12 @@ def _in_git(*args: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, timeout=20, check=True).stdout.strip()
 
 
+@functools.cache
 def changes() -> str:
-    """Return a patch from the package's commit to its present code, with the names of new files.
+    """Return a patch from the package's commit to the code of this process, with the names of new files.
 
-    It is empty if nothing was changed, or if the package is not in a checkout.
+    It is empty if nothing was changed, or if the package is not in a checkout. As commit and digests do, it
+    stays as it was when this process first asked: what is edited later is not what the process runs.
     """
     git = _git()
     if not git or not git["dirty"]:

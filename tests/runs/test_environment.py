@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from pathlib import Path
 
 import pytest
 
+from memmlp.runs import environment as module
 from memmlp.runs.environment import environment, own_sources
 
 
@@ -28,3 +30,24 @@ def test_code_that_is_edited_while_it_runs_is_recorded_as_it_runs(
     before = own_sources(["lab_of_mine"])
     (tmp_path / "lab_of_mine.py").write_text("A = 2\n")
     assert own_sources(["lab_of_mine"]) == before
+
+
+def test_a_patch_is_of_the_code_that_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """So it goes with the commit and the digests, which are taken once, too."""
+    for words in (["init", "-q"], ["add", "."], ["commit", "-q", "-m", "first"]):
+        (tmp_path / "__init__.py").write_text("A = 1\n")
+        author = ["-c", "user.name=a", "-c", "user.email=a@b.c", "-c", "commit.gpgsign=false"]
+        subprocess.run(["git", "-C", str(tmp_path), *author, *words], check=True)
+    monkeypatch.setattr(module, "PACKAGE", tmp_path)
+    cached = (module._git, module.changes)
+    try:
+        for one in cached:
+            one.cache_clear()
+        (tmp_path / "__init__.py").write_text("A = 2\n")
+        patch = module.changes()
+        assert "+A = 2" in patch
+        (tmp_path / "__init__.py").write_text("A = 3\n")
+        assert module.changes() == patch
+    finally:
+        for one in cached:
+            one.cache_clear()
