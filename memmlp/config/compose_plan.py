@@ -109,9 +109,18 @@ def is_path(name: str) -> bool:
 
 
 def sweep_folder(sweep: Sweep, outputs: Path) -> Path:
-    """Return the folder of a sweep with its overrides, which holds its plan and its workers' logs."""
-    key = f"-{digest(sweep.command_line)[:8]}" if sweep.command_line else ""
-    return outputs / "sweeps" / f"{sweep.name}{key}"
+    """Return the folder of a sweep with its overrides: its plan, its rounds and its workers' logs.
+
+    It is the same in whatever order the overrides are written. Earlier versions had a folder for each order;
+    one that is there is used.
+    """
+    if not sweep.command_line:
+        return outputs / "sweeps" / sweep.name
+    ordered = tuple(sorted(sweep.command_line, key=lambda word: word.partition("=")[0]))
+    as_written, same_for_all = (
+        outputs / "sweeps" / f"{sweep.name}-{digest(words)[:8]}" for words in (sweep.command_line, ordered)
+    )
+    return as_written if as_written.is_dir() else same_for_all
 
 
 def make_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from memmlp.common.errors import InputError
+from memmlp.common.files import digest
 from memmlp.config import plugins
-from memmlp.config.compose_plan import _stamp, find_sweep
+from memmlp.config.compose_plan import _stamp, find_sweep, sweep_folder
 from memmlp.sweep.sweep_file import parse_sweep
 
 
@@ -100,3 +102,18 @@ def test_nothing_undoes_the_experiment_of_an_arm(
     with pytest.raises(InputError) as caught:
         find_sweep(str(path), words)
     assert said in str(caught.value)
+
+
+def test_a_sweep_has_one_folder_in_whatever_order_it_is_asked_for(tmp_path: Path):
+    """Rounds of seeds that were looked at once would else be looked at again, and counted as the first."""
+    sweep = find_sweep("14", [])
+    a, b, c = (
+        sweep_folder(replace(sweep, command_line=words), tmp_path)
+        for words in (("threads=1", "seed=3"), ("seed=3", "threads=1"), ("seed=3", "seed=4", "threads=1"))
+    )
+    assert a == b != c
+    assert sweep_folder(replace(sweep, command_line=("seed=4", "seed=3", "threads=1")), tmp_path) != c
+    assert sweep_folder(sweep, tmp_path) == tmp_path / "sweeps" / sweep.name
+    earlier = tmp_path / "sweeps" / f"{sweep.name}-{digest(('threads=1', 'seed=3'))[:8]}"
+    earlier.mkdir(parents=True)
+    assert sweep_folder(replace(sweep, command_line=("threads=1", "seed=3")), tmp_path) == earlier
