@@ -150,15 +150,26 @@ def check_key(key: str, records: Iterable[Record], option: str) -> None:
 
 
 class Query(NamedTuple):
-    """A condition and the keys in it."""
+    """A condition, the keys in it, and those among them that it compares with < or > as numbers."""
 
     condition: Condition
     keys: tuple[str, ...]
+    numbers: tuple[str, ...]
 
     def of(self, records: Sequence[Record], option: str = "--where") -> list[bool]:
-        """Return for each record whether it satisfies the condition. Raises InputError for unknown keys."""
+        """Return for each record whether it satisfies the condition.
+
+        Raises:
+            InputError: for unknown keys, and for keys that have words and are compared as numbers.
+        """
         for key in self.keys if records else ():
             check_key(key, records, option)
+        for key in self.numbers:
+            values = [one[key] for one in records if key in one]
+            if values and all(isinstance(value, str | list | tuple) for value in values):
+                raise InputError(
+                    f"{option}: {key} is no number in any run ({as_typed(values[0])}); allowed are = and !="
+                )
         return [self.condition(one) for one in records]
 
 
@@ -173,6 +184,7 @@ class _Parser:
     def __init__(self, text: str):
         self.text, self.place, self.depth = text, 0, 0
         self.keys: list[str] = []
+        self.numbers: list[str] = []
         self.tokens = list(self._tokens(text))
 
     def _tokens(self, text: str) -> Iterable[tuple[str, str]]:
@@ -188,7 +200,7 @@ class _Parser:
         condition = self._or()
         if self.place < len(self.tokens):
             raise self._refusal(f"'{self._peek()[1]}' is not expected")
-        return Query(condition, tuple(dict.fromkeys(self.keys)))
+        return Query(condition, tuple(dict.fromkeys(self.keys)), tuple(dict.fromkeys(self.numbers)))
 
     def _or(self) -> Condition:
         parts = [self._and()]
@@ -235,6 +247,9 @@ class _Parser:
             known = ", ".join([*STATUSES, "damaged"])
             raise InputError(f"--where '{self.text}': status={value}; allowed are {known}")
         self.keys.append(key)
+        if key == "started" and sign in ORDER:  # times in ISO 8601, as much of them as is typed
+            return lambda one: bool(one.get(key)) and ORDER[sign](str(one[key]), value)
+        self.numbers += [key] if sign in ORDER else []
         return lambda one: _holds(one.get(key), sign, value)
 
     def _peek(self) -> tuple[str, str]:
@@ -264,8 +279,6 @@ def _holds(own: Any, sign: str, value: str) -> bool:
     A missing value is neither smaller nor larger than anything, and neither is NaN, which satisfies only !=.
     """
     if sign in ORDER:
-        if isinstance(own, str):
-            return ORDER[sign](own, value)
         number = _number(value)
         known = isinstance(own, int | float) and not isinstance(own, bool)
         return known and number is not None and ORDER[sign](own, number)

@@ -68,6 +68,15 @@ def test_what_is_no_condition_is_one_line(text: str, words: str):
     assert str(error.value).startswith("--where '")
 
 
+@pytest.mark.parametrize("text", ["memory>5", "memory.layers<3 or seed=1", "seed=1 and note>=2"])
+def test_words_are_neither_smaller_nor_larger_than_a_number(text: str):
+    with pytest.raises(InputError, match=r"is no number in any run \(.*\); allowed are = and !="):
+        parse(text).of([ONE])
+    key = "memory" if "memory>" in text else "memory.layers" if "layers" in text else "note"
+    assert parse(f"{key}>1").of([ONE, {**ONE, key: 2.0}]) == [False, True]
+    assert parse("started<2027").of([ONE, {**ONE, "started": None}]) == [True, False]
+
+
 @given(st.text(alphabet='ab1.<>=!()" andort', max_size=30))
 def test_any_text_is_a_condition_or_one_line(text: str):
     with contextlib.suppress(InputError):
