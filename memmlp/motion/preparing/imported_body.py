@@ -10,7 +10,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import digest
-from memmlp.motion.preparing.several_folders import Folders, Root
+from memmlp.motion.preparing.several_folders import Root, find_all
 
 RECORD = "import.json"
 """What an import leaves in its folder."""
@@ -54,5 +54,10 @@ def check_imported_body(root: Root, body: str, rest: np.ndarray) -> None:
 
 
 def _records(root: Root) -> Iterator[Path]:
-    for folder in root.sources.values() if isinstance(root, Folders) else [root]:
-        yield from (path for path in (folder / RECORD, *folder.glob(f"*/{RECORD}")) if path.is_file())
+    """Yield the records of the imports that the clips are from: of each clip, the nearest one above it.
+
+    That may lie deep below the root, or above it, where the root is a folder of an import.
+    """
+    folders = {(root / file).parent.resolve() for file in find_all(root).files}
+    above = ([parent / RECORD for parent in (folder, *folder.parents)] for folder in folders)
+    yield from sorted({path for paths in above if (path := next(filter(Path.is_file, paths), None))})

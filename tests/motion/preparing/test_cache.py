@@ -110,8 +110,7 @@ def test_clips_are_prepared_on_the_body_of_their_import(root, tmp_path):
     rest = builtin_rest_joints()
     model = tmp_path / "model.npz"
     other = body_record(str(model), 1.1 * rest)
-    for folder in (root, root / "below"):
-        folder.mkdir(exist_ok=True)
+    for folder in (root.parent, root, root / "a"):  # the root may be a folder of an import, or hold one
         (folder / RECORD).write_text(json.dumps({**body_record("builtin", rest), "clips": []}))
         prepare(source(root), tmp_path / "cache")
         for record in (other, {"body": "model.npz"}):  # the second as until version 0.2
@@ -119,6 +118,14 @@ def test_clips_are_prepared_on_the_body_of_their_import(root, tmp_path):
             with pytest.raises(InputError, match=r"imported onto the body model\.npz; allowed is data\.body"):
                 prepare(source(root), tmp_path / "cache")
         (folder / RECORD).write_text("[]")  # somebody else's
+        prepare(source(root), tmp_path / "cache")
+
+
+def test_the_record_of_an_import_is_found_however_deep_below_the_root(root, tmp_path):
+    (root / "a" / RECORD).write_text(json.dumps({"body": "model.npz"}))
+    (root / "deep" / "deeper").mkdir(parents=True)
+    shutil.move(root / "a", root / "deep" / "deeper")
+    with pytest.raises(InputError, match=r"imported onto the body model\.npz; allowed is data\.body"):
         prepare(source(root), tmp_path / "cache")
 
 
