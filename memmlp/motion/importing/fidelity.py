@@ -44,6 +44,7 @@ TORSO, TURN = (3, 6, 9, 12, 13, 14, 15), 60.0  # spine, neck, collars, head; deg
 TWIST = 45.0  # degrees by which a knee's or elbow's axis may be off the body's
 SIDES = 1.1  # left over right
 FLOOR = 0.3  # metres: how far from the floor feet may stay through a whole clip
+FEET_STAY = "the feet stay"  # how the fault begins that says so
 STRETCH = 0.02  # metres by which a segment may change its length
 
 
@@ -185,10 +186,15 @@ def _unlike_people(rotations: np.ndarray, positions: np.ndarray, mapped: np.ndar
     if wrong > FORWARD_SHARE:
         yield f"the knees bend forward in {wrong:.0%} of their bends"
     yield from _backward_feet(rotations, positions, mapped)
+    yield from off_the_floor(positions)
+
+
+def off_the_floor(positions: np.ndarray) -> Iterator[str]:
+    """Yield how far the feet stay from the floor, if that is far, in a clip of joints (N, 22, 3), metres."""
     lowest = float(np.quantile(positions[:, [7, 8, 10, 11], 2].min(1), 0.05))
     if abs(lowest) > FLOOR:
         side = "above" if lowest > 0 else "below"
-        yield f"the feet stay {abs(lowest):.2f} m {side} the floor"
+        yield f"{FEET_STAY} {abs(lowest):.2f} m {side} the floor"
 
 
 def _implausible(clip: Clip) -> Iterator[str]:

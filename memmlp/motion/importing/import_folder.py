@@ -21,6 +21,7 @@ from memmlp.motion.clip import FRAME_RATE_RANGE, Skipped
 from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.importing.calibration_frame import JUMP, first_step
 from memmlp.motion.importing.convert import AUTO, convert, lowered
+from memmlp.motion.importing.fidelity import FEET_STAY, off_the_floor, pose
 from memmlp.motion.importing.importable_files import find_recordings, read_recording, tells_rate
 from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.rest_pose import STRAIGHTEST
@@ -150,22 +151,28 @@ def import_folder(source: Path, out: Path, how: ImportSettings | None = None) ->
                 if how.strict or len(files) == 1:
                     raise
                 skipped.append(Skipped(relative.as_posix(), str(error).removeprefix(f"{path}: ")))
+        clips = _one_floor_a_take(clips, takes, folder, rest)
+        if how.sound:
+            clips = _without_faults(clips, folder, skipped, files, how.strict)
         if not clips:
             first = f"the first: {skipped[0].file}: {skipped[0].reason}"
             raise InputError(f"{source}: no usable file of {len(files)}; {first}")
-        clips = _one_floor_a_take(clips, takes, folder)
         notes = (*_take_notes(names, how.takes), *_notes(clips, maps, how))
         report = ImportReport(tuple(clips), notes, tuple(skipped))
         _publish(folder, out, report, body_record(how.body, rest))
     return report
 
 
-def _one_floor_a_take(clips: list[Imported], takes: Mapping[str, str], staging: Path) -> list[Imported]:
+def _one_floor_a_take(
+    clips: Sequence[Imported], takes: Mapping[str, str], staging: Path, rest: np.ndarray
+) -> list[Imported]:
     """Lower the clips of a take by the take's lowest floor, instead of each clip by its own.
 
     The floors are compared at the size that the files have. Two persons of a take stand on the same floor
-    there, but no longer once each was scaled to the body by a factor of his or her own.
+    there, but no longer once each was scaled to the body by a factor of his or her own. Whether a clip's feet
+    stand on the floor is checked again.
     """
+    clips = list(clips)
     floors: dict[str, float] = {}
     for clip in clips:
         if clip.floor is not None:
@@ -176,9 +183,34 @@ def _one_floor_a_take(clips: list[Imported], takes: Mapping[str, str], staging: 
         if lowest is not None and (clip.floor is None or lowest != clip.floor / clip.scale):
             floor = lowest * clip.scale
             path = staging / clip.clip
-            write_clip(path, lowered(read_clip(path, clip.clip), floor - (clip.floor or 0.0)))
-            clips[index] = replace(clip, floor=floor)
+            motion = lowered(read_clip(path, clip.clip), floor - (clip.floor or 0.0))
+            write_clip(path, motion)
+            others = (fault for fault in clip.faults if not fault.startswith(FEET_STAY))
+            faults = (*others, *off_the_floor(pose(motion, rest)[1]))
+            clips[index] = replace(clip, floor=floor, faults=faults)
     return clips
+
+
+def _without_faults(
+    clips: Sequence[Imported], staging: Path, skipped: list[Skipped], files: Mapping[Path, Path], strict: bool
+) -> list[Imported]:
+    """Return the clips without faults; the others are removed and `skipped`, or raise if `strict`.
+
+    Raises:
+        InputError: for the first clip with faults if `strict`.
+    """
+    for clip in clips:
+        if clip.faults:
+            wrong = _unsound(clip.faults)
+            if strict:
+                raise InputError(f"{files[Path(clip.source)]}: {wrong}")
+            skipped.append(Skipped(clip.source, wrong))
+            (staging / clip.clip).unlink()
+    return [clip for clip in clips if not clip.faults]
+
+
+def _unsound(faults: Sequence[str]) -> str:
+    return f"{'; '.join(faults)}; allowed: no faults (--sound)"
 
 
 def _npz(relative: Path) -> Path:
@@ -235,9 +267,7 @@ def _import_file(
     name = relative.with_suffix("").as_posix()
     converted = convert(recording, skeleton, rest, name=name, fps=rate.fps, floor=how.floor)
     if how.sound and converted.fidelity.faults:
-        raise InputError(
-            f"{recording.path}: {'; '.join(converted.fidelity.faults)}; allowed: no faults (--sound)"
-        )
+        raise InputError(f"{recording.path}: {_unsound(converted.fidelity.faults)}")
     write_clip(folder / _npz(relative), converted.clip)
     return Imported(
         source=relative.as_posix(),

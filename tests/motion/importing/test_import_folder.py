@@ -257,6 +257,23 @@ def test_clips_of_a_take_share_its_lowest_floor(takes: Path, tmp_path: Path) -> 
     assert heights["2a"] == pytest.approx(0.02, abs=0.01)
 
 
+def test_clips_that_hang_above_the_floor_of_their_take_have_that_fault(takes: Path, tmp_path: Path) -> None:
+    report = import_folder(takes, tmp_path / "out", ImportSettings(takes=["a$"]))
+    assert [clip.faults for clip in report.clips[:2]] == [(), ()]
+    assert report.clips[2].faults == ("the feet stay 0.62 m above the floor",)
+    sound = import_folder(takes, tmp_path / "sound", ImportSettings(takes=["a$"], sound=True))
+    assert (
+        [clip.clip for clip in sound.clips]
+        == ["1a.npz", "1b.npz"]
+        == sorted(path.name for path in (tmp_path / "sound").glob("*.npz"))
+    )
+    assert [(file.file, file.reason) for file in sound.skipped] == [
+        ("2a.bvh", "the feet stay 0.62 m above the floor; allowed: no faults (--sound)")
+    ]
+    with refuse(f"{takes / '2a.bvh'}: the feet stay 0.62 m above the floor"):
+        import_folder(takes, tmp_path / "strict", ImportSettings(takes=["a$"], sound=True, strict=True))
+
+
 def test_a_takes_floor_is_one_of_the_files_whose_persons_differ_in_size(takes: Path, tmp_path: Path) -> None:
     """Of two persons in one room the floor is as high, whatever the body's size is in multiples of theirs."""
     chosen, walk = load_skeleton("cmu_daz"), synthesize_clip("walking", 1, seconds=2.0)
