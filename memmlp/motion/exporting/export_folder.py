@@ -16,6 +16,7 @@ from memmlp.motion.exporting.write import FORMATS, SUFFIXES, Format, format_of, 
 from memmlp.motion.formats.npz import NoMotion, read_clip
 from memmlp.motion.plausibility import check_plausible
 from memmlp.motion.preparing.find_clips import clip_name, find_clips
+from memmlp.motion.preparing.imported_body import check_imported_body
 
 T = TypeVar("T")
 
@@ -190,9 +191,12 @@ def export(
         strict: whether a bad file raises; otherwise it is skipped and reported, if there are other files.
 
     Raises:
-        InputError: for a bad body, if no clip could be read, or a file cannot be written.
+        InputError: for a bad body, or one that the clips were not imported onto where the format has bones;
+            if no clip could be read, or a file cannot be written.
     """
     rest = load_rest_joints(body)
+    if plan.format.has_bones:
+        check_imported_body([target.source for target in plan.targets], str(body), rest, "--body")
     written: list[Path] = []
     skipped = list(plan.skipped)
     seconds = 0.0

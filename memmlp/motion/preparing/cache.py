@@ -78,7 +78,8 @@ def prepare(source: ClipFolder, out: Path) -> Manifest:
             f"data.min_frames: {source.min_frames}; allowed: 2 or more (one frame has no velocity)"
         )
     rest = load_rest_joints(source.body)
-    check_imported_body(source.root, str(source.body), rest)
+    clips = [source.root / file for file in find_all(source.root).files]
+    check_imported_body(clips, source.body, rest)
     try:
         out.mkdir(parents=True, exist_ok=True)
         with Lock(out).hold():

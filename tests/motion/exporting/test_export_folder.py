@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from memmlp.motion.exporting.export_folder import export, plan_export
 from memmlp.motion.exporting.write import FORMATS, format_of, write_motion
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.npz import read_clip, write_clip
+from memmlp.motion.preparing.imported_body import RECORD
 
 REST = builtin_rest_joints()
 
@@ -80,6 +82,17 @@ def test_npz_is_the_clip_without_its_hands(folder: Path, tmp_path: Path):
     before, after = read_clip(folder / "walk.npz", "walk"), read_clip(tmp_path / "again.npz", "walk")
     np.testing.assert_array_equal(after.poses, before.poses)
     np.testing.assert_array_equal(after.trans, before.trans)
+
+
+def test_clips_of_an_import_are_exported_on_its_body(folder: Path, tmp_path: Path):
+    (folder / RECORD).write_text(json.dumps({"body": "model.npz"}))
+    for source, out, name in ((folder, "out", "bvh"), (folder / "walk.npz", "walk.glb", None)):
+        wrong = rf"^{folder.resolve()}: was imported onto the body model\.npz; allowed is --body of the same"
+        with pytest.raises(InputError, match=wrong):
+            export(plan_export(source, tmp_path / out, name))
+    export(plan_export(folder / "walk.npz", tmp_path / "walk.npz"), fps=30)  # has no bones
+    (folder / RECORD).write_text(json.dumps({"body": "builtin"}))
+    export(plan_export(folder / "walk.npz", tmp_path / "walk.glb"))
 
 
 def test_what_is_no_person_is_skipped(folder: Path, tmp_path: Path):
