@@ -90,12 +90,18 @@ class Bvh:
 
     @property
     def fps(self) -> float:
-        """Frames per second, rounded to a whole number or a usual rate where the header's digits allow it."""
-        rate = 1 / self.frame_time
+        """Frames per second, rounded to a whole number or a usual rate where the header's digits allow it.
+
+        The header's time may be rounded to its last digit, or cut off after it: 0.0167 and 0.0166 are 60 Hz.
+        """
+        rate, coarsest = 1 / self.frame_time, COARSEST * self.frame_time
         if abs(rate - round(rate)) <= RATE_DIGITS * rate:
             return float(round(rate))
-        off, usual = min((abs(1 / usual - self.frame_time), float(usual)) for usual in USUAL_RATES)
-        return usual if off <= self.rounding <= COARSEST * self.frame_time else rate
+        usual = min(USUAL_RATES, key=lambda usual: abs(1 / usual - self.frame_time))
+        lacking, digit = 1 / usual - self.frame_time, 2 * self.rounding
+        rounded = abs(lacking) <= self.rounding <= coarsest
+        cut_off = 0 < lacking < digit <= coarsest
+        return float(usual) if rounded or cut_off else rate
 
     def zero_pose(self) -> np.ndarray:
         """Return positions (J+E, 3) of the nodes with all rotations zero and the root at the origin."""

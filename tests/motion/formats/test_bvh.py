@@ -183,7 +183,12 @@ def test_motion_headers(tmp_path: Path, frames: str, time: str) -> None:
         ("0.03337", 1 / 0.03337),  # 29.97, and so not 30
         ("0.0334", 1 / 0.0334),
         ("0.03330", 1 / 0.03330),  # with a digit more it is not 30
+        ("0.0166", 60),  # cut off, not rounded
+        ("0.01666", 60),
+        ("0.0416", 24),
+        ("0.0041", 240),
         ("0.0160", 62.5),
+        ("0.016", 62.5),
         ("0.008", 125),
         ("0.006", 1 / 0.006),  # one digit tells no rate
     ],
