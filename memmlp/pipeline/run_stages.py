@@ -82,7 +82,8 @@ def divided_subjects_remark(config: Mapping[str, Any], clips: Sequence[ClipRecor
     if not divided or config.get("sources") or "folder" in config["split"]:
         return ""
     more = f" and {len(divided) - 1} more" if len(divided) > 1 else ""
-    return f"clips of {divided[0]}{more} are in training and in test; data=amass_s3 keeps subjects apart"
+    apart = "data=amass_s3 with one release of AMASS keeps subjects apart"
+    return f"clips of {divided[0]}{more} are in training and in test; {apart}"
 
 
 def low_rates_remark(manifest: Manifest, clips: Sequence[ClipRecord], what: str) -> str | None:

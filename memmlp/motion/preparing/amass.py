@@ -41,16 +41,15 @@ S2_TRAIN = (
 S2_TEST = ("HumanEva", "Transitions_mocap")
 """Protocol S2: the subsets to train on, and to test on."""
 
-AMASS = frozenset(map(subset, (*S2_TRAIN, *S2_TEST)))
-"""The subsets of protocol S2 as `subset` names them."""
-
-
 FOLDERS = frozenset((
     *S2_TRAIN, *S2_TEST, "PosePrior", "EyesJapanDataset", "BMLrub", "MoSh", "HDM05", "Transitions",
     "DFaust_67", "DFaust", "DanceDB", "SSM_synced", "SSM", "TCD_handMocap", "TCDHands", "BMLhandball", "CNRS",
     "GRAB", "HUMAN4D", "MOYO", "SOMA", "WEIZMANN",
 ))  # fmt: skip
 """The subsets' folders as the releases spell them, by which one is told in a folder of another name."""
+
+AMASS = frozenset(map(subset, FOLDERS))
+"""The subsets as `subset` names them."""
 
 
 def unpacked(name: str) -> str:
@@ -72,12 +71,16 @@ def clip_key(name: str) -> str:
 def divided_subjects(parts: Iterable[tuple[str, str]]) -> list[str]:
     """Return the AMASS subjects, SUBSET/SUBJECT, that have clips in both training and test.
 
+    A subject is the same one under all names that the subset ever had, and is given by the first that occurs.
+
     Args:
         parts: clips' names and parts.
     """
+    names: dict[tuple[str, str], str] = {}
     found: dict[str, set[str]] = defaultdict(set)
     for name, part in parts:
         folders = unpacked(name).split("/")[:-1]
         if len(folders) >= 2 and subset(folders[0]) in AMASS:
-            found["/".join(folders[:2])].add(part)
+            subject = subset(folders[0]), folders[1].replace(" ", "_")
+            found[names.setdefault(subject, "/".join(folders[:2]))].add(part)
     return sorted(subject for subject, of in found.items() if {"train", "test"} <= of)
