@@ -288,7 +288,7 @@ def serve(given: InputOptions, shown: ShowOptions) -> None:
         files = page_files(shown.avatar, stream)
         outputs = outputs_of(shown, stream)
         words = greeting(source, name, outputs)
-        hub = Hub(with_avatar(words, stream.rest) if shown.avatar else words)
+        hub = Hub(with_avatar(words) if shown.avatar else words)
         fitting = Fitting(stream, source.space, shown.calibration, hub.tell) if source.worn else None
         ask = fitting.ask if fitting else None
         with (

@@ -14,10 +14,10 @@ from memmlp.live.outputs.output import Outputs
 from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.sample_warnings import OddSamples
 from memmlp.live.session.sources import TrackerSource
-from memmlp.live.session.wearer_fitting import Fitting, hips_height
+from memmlp.live.session.wearer_fitting import Fitting
 from memmlp.live.spaces import SPACES, Space
 from memmlp.live.stream import Pose, Stream
-from memmlp.motion.body import FPS, JOINTS, PARENTS
+from memmlp.motion.body import FPS, JOINTS, PARENTS, ROOT
 from memmlp.motion.drawn_limbs import LIMBS
 from memmlp.motion.formats.humanoid_bones import VRM
 from memmlp.render.error_colours import HEAT
@@ -37,15 +37,9 @@ def greeting(source: TrackerSource, network: str, outputs: Outputs | None = None
     return words | {"limbs": limbs, "heat": HEAT, "top": TOP, "worn": source.worn}
 
 
-def with_avatar(words: Mapping[str, Any], rest: np.ndarray) -> dict[str, Any]:
-    """Return a greeting with an avatar's bones and the height of the wearer's hips, metres, added.
-
-    Args:
-        words: the greeting.
-        rest: the wearer's joints in the rest pose (22, 3), metres, SMPL's body frame.
-    """
-    avatar = {"bones": VRM, "parents": PARENTS, "hips": round(hips_height(rest), 4), "unit": UNIT}
-    return dict(words) | {"avatar": avatar}
+def with_avatar(words: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a greeting with an avatar's bones added."""
+    return dict(words) | {"avatar": {"bones": VRM, "parents": PARENTS, "unit": UNIT}}
 
 
 def run_loop(
@@ -73,7 +67,7 @@ def run_loop(
         stopped: ends the loop.
         outputs: get the frames first.
         fitting: fits the stream to its wearer between the samples.
-        avatar: whether messages have the joints' rotations as well.
+        avatar: whether messages have what an avatar needs as well (`avatar_message`).
         tell: gets a line if samples are odd (`OddSamples`), or the first time that one is refused.
     """
     stream.odd = OddSamples(tell)
@@ -115,7 +109,7 @@ def run_loop(
             | refusals_message(dropped, *told)
             | joints_message(stream.space, pose, source.truth(pose.time))
         )
-        publish(message | (rotations_message(stream.space, pose) if avatar else {}))
+        publish(message | (avatar_message(stream.space, pose, stream.rest) if avatar else {}))
         number += 1
 
 
@@ -137,11 +131,19 @@ def millimetres(space: Space, joints: np.ndarray | None) -> list[int] | None:
     return (1000 * positions).round().astype(int).ravel().tolist()
 
 
-def rotations_message(space: Space, pose: Pose) -> dict[str, Any]:
-    """Return the part of a message with the joints' rotations: 22 quaternions xyzw as 88 whole numbers.
+def avatar_message(space: Space, pose: Pose, rest: np.ndarray) -> dict[str, Any]:
+    """Return the part of a message for an avatar: the joints' rotations, and the wearer's hips, metres.
 
-    They are relative to VRM's T-pose, which is SMPL's: Y up, facing +Z. The root's is in the page's axes.
+    The rotations are 22 quaternions xyzw as 88 whole numbers, relative to VRM's T-pose, which is SMPL's: Y up,
+    facing +Z. The root's is in the page's axes. The height of the hips in the rest pose (22, 3) gives the
+    avatar its size; the wearer may change it on the page at any time.
     """
     local = space.pose_in(pose.rotations)
     local[0] = PAGE_SPACE.world.T @ local[0]
-    return {"turns": (UNIT * matrix_to_quaternion(local)).round().astype(int).ravel().tolist()}
+    turns = (UNIT * matrix_to_quaternion(local)).round().astype(int).ravel().tolist()
+    return {"turns": turns, "hips": round(hips_height(rest), 4)}
+
+
+def hips_height(rest: np.ndarray) -> float:
+    """Return the height of the hips above the lowest joint, in a rest pose (22, 3), metres."""
+    return float(rest[ROOT, 1] - rest[:, 1].min())

@@ -21,7 +21,6 @@ from memmlp.live.session.packets import QuaternionPoses
 from memmlp.live.spaces import SpaceName
 from memmlp.live.stream import Stream
 from memmlp.live.wearer import stature
-from memmlp.motion.body import ROOT
 
 COUNTDOWN = 5.0  # seconds
 LONGEST = 60.0  # seconds of a countdown
@@ -183,7 +182,6 @@ class Fitting:
         state = {
             "height": round(100 * stream.wearer.height, 1),
             "floor": round(100 * stream.wearer.floor, 1),
-            "hips": round(hips_height(stream.rest), 4),
             "calibrated": stream.offsets is not None,
             "waiting": waiting and {"action": waiting.action, "seconds": left},
             "said": said,
@@ -191,8 +189,3 @@ class Fitting:
             "file": self.path and self.path.name,
         }
         self.tell("wearer", state)
-
-
-def hips_height(rest: np.ndarray) -> float:
-    """Return the height of the hips above the lowest joint, in a rest pose (22, 3), metres."""
-    return float(rest[ROOT, 1] - rest[:, 1].min())

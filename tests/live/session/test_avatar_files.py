@@ -16,8 +16,17 @@ from scipy.spatial.transform import Rotation
 from memmlp.common.errors import InputError
 from memmlp.live.rotations import BodyTree
 from memmlp.live.session.avatar_files import avatar_files, mannequin_vrm, read_vrm
-from memmlp.live.session.loop import UNIT, joints_message, millimetres, rotations_message, with_avatar
+from memmlp.live.session.loop import (
+    UNIT,
+    avatar_message,
+    greeting,
+    joints_message,
+    millimetres,
+    refusals_message,
+    with_avatar,
+)
 from memmlp.live.session.page_server import FILES, Hub, LiveServer
+from memmlp.live.session.sources import ClipSource, TrackedClip
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Pose
 from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
@@ -96,20 +105,21 @@ def test_an_avatar_s_bones_are_where_the_joints_are(browser: Browser, own: bytes
         pytest.skip(str(error))
     person, space = pose(), SPACES["amass"]
     person = person._replace(positions=person.positions * size)
-    words = with_avatar({}, REST * size)["avatar"]
-    given = joints_message(space, person, None) | rotations_message(space, person)
+    words = with_avatar({})["avatar"]
+    given = joints_message(space, person, None) | avatar_message(space, person, REST * size)
     joints = np.array(given["joints"]).reshape(22, 3) / 1000
     script = """
       import('./avatar.js').then(async ({ Avatar }) => {
         const avatar = await Avatar.load('avatar.vrm', WORDS);
-        avatar.pose(TURNS, JOINTS);
+        avatar.pose(TURNS, JOINTS, HIPS);
         avatar.scene.updateMatrixWorld(true);
         const at = node => node.getWorldPosition(node.position.clone()).toArray();
         const bones = WORDS.bones.map(name => avatar.vrm.humanoid.getRawBoneNode(name));
         window.found = bones.map(node => node && at(node));
       }).catch(error => { window.failed = String(error.stack); }); 0
     """
-    for name, value in (("WORDS", words), ("TURNS", given["turns"]), ("JOINTS", joints.ravel().tolist())):
+    values = {"WORDS": words, "TURNS": given["turns"], "JOINTS": joints.ravel().tolist()}
+    for name, value in {**values, "HIPS": given["hips"]}.items():
         script = script.replace(name, json.dumps(value))
     with LiveServer(Hub({}), 0, files=files) as server:
         browser.open(f"{server.url}style.css")
@@ -129,13 +139,39 @@ def test_an_avatar_s_bones_are_where_the_joints_are(browser: Browser, own: bytes
         assert np.linalg.norm(np.array(found) - joints, axis=1).max() < 2e-3
 
 
+@pytest.mark.slow
+def test_an_avatar_is_as_tall_as_the_wearer_of_the_frame(browser: Browser, own: bytes, clip: TrackedClip):
+    """Also on a page that was loaded after the wearer's height was changed there."""
+    try:
+        files = avatar_files(own)
+    except InputError as error:
+        pytest.skip(str(error))
+    person, space = pose(), SPACES["amass"]
+    with LiveServer(Hub(with_avatar(greeting(ClipSource(clip, 60), "tiny"))), 0, files=files) as server:
+        browser.open(server.url)
+        browser.wait("document.documentElement.dataset.avatar == 'there'")
+        browser.resolved("""import('./avatar.js').then(({ Avatar }) => {
+          const { pose } = Avatar.prototype;
+          Avatar.prototype.pose = function (...words) {
+            pose.apply(this, words);
+            window.size = this.scene.scale.x;
+          };
+        })""")
+        for number, size in enumerate((1.2, 0.9)):
+            told = avatar_message(space, person, REST * size) | joints_message(space, person, None)
+            times = {"number": number, "time": 0.0, "held": [], "jumping": False, "ms": 1.0, "whole": 1.0}
+            server.hub.publish(told | times | refusals_message(0, 0, 0))
+            browser.wait(f"Math.abs(window.size - {size}) < 1e-3")
+    assert browser.errors == []
+
+
 def test_the_rotations_of_a_message_are_those_of_vrm_s_t_pose():
     """Who looks along the page's +Z in T-pose, which is AMASS' -Y, has the identity."""
     still = np.tile(np.eye(3), (22, 1, 1))
     still[0] = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     for space in SPACES.values():
         person = Pose(0.0, np.zeros((22, 3)), space.pose_out(still), np.zeros((22, 3)), (), True, False)
-        found = np.array(rotations_message(space, person)["turns"]).reshape(22, 4)
+        found = np.array(avatar_message(space, person, REST)["turns"]).reshape(22, 4)
         np.testing.assert_array_equal(np.abs(found), np.tile([0, 0, 0, UNIT], (22, 1)))
     assert millimetres(SPACES["amass"], np.array([[1.0, 2, 3]])) == [1000, 3000, -2000]
 

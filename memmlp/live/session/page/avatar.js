@@ -13,7 +13,7 @@ export class Avatar {
     return new Avatar(vrm, words);
   }
 
-  // words: bones by joint, their parents, the wearer's hips [m], and the unit of quaternions.
+  // words: bones by joint, their parents, and the unit of quaternions.
   constructor(vrm, words) {
     Object.assign(this, words, { vrm, scene: vrm.scene });
     this.nodes = words.bones.map(name => vrm.humanoid.getNormalizedBoneNode(name));
@@ -26,9 +26,9 @@ export class Avatar {
     this.then = performance.now();
   }
 
-  // turns: 22 quaternions xyzw as whole numbers; joints: 22 positions as 66 numbers, metres.
-  pose(turns, joints) {
-    const size = this.hips / this.rest;
+  // turns: 22 quaternions xyzw as whole numbers; joints: 22 positions as 66 numbers; hips: the height of the wearer's; metres.
+  pose(turns, joints, hips) {
+    const size = hips / this.rest;
     const side = this.mirrored ? -1 : 1;
     this.scene.scale.setScalar(size);
     this.nodes.forEach((node, joint) => this.turn(node, joint, turns, side));

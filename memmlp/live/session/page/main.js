@@ -17,11 +17,7 @@ let foreign = 0;
 
 const events = new EventSource('events');
 events.addEventListener('greeting', event => greet(JSON.parse(event.data)));
-events.addEventListener('wearer', event => {
-  const state = JSON.parse(event.data);
-  wearer.show(state);
-  if (avatar) avatar.hips = state.hips;
-});
+events.addEventListener('wearer', event => wearer.show(JSON.parse(event.data)));
 events.addEventListener('frame', event => {
   const frame = JSON.parse(event.data);
   ({ malformed, foreign } = frame);

@@ -68,7 +68,7 @@ export class Stage {
     if (this.avatar) this.avatar.scene.visible = dressed;
     this.prediction.group.visible = !dressed;
     this.truth.group.visible = known && !dressed;
-    if (dressed) this.avatar.pose(frame.turns, joints);
+    if (dressed) this.avatar.pose(frame.turns, joints, frame.hips);
     else this.prediction.pose(joints, known ? this.heat.bind(null, errors) : () => this.grey);
     if (known && !dressed) this.truth.pose(truth, () => this.grey);
     this.follow(truth ?? joints, frame.restarted);
