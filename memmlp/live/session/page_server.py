@@ -23,7 +23,8 @@ from memmlp.common.errors import InputError
 from memmlp.common.page_access import Access
 from memmlp.live.session.sources import EVERYWHERE, HOST
 
-QUEUED = 240  # the most frames that wait for a watcher; beyond, its oldest are dropped
+QUEUED = 240  # the most events that wait for a watcher; beyond, its oldest frames are dropped
+FRAME = b"event: frame\n"  # how a frame's event begins
 QUIET = 2.0  # seconds without a frame after which a comment shows that the connection lives
 LARGEST = 1000  # bytes of an order
 SCRIPT, STYLE, HTML = (
@@ -113,13 +114,17 @@ class Hub:
 
 
 def _put(watcher: queue.Queue[bytes | None], line: bytes | None) -> None:
-    """Append a line to a watcher's queue; if the queue is full, drop its oldest line."""
-    try:
-        watcher.put_nowait(line)
-    except queue.Full:
-        with contextlib.suppress(queue.Empty):
-            watcher.get_nowait()
-        watcher.put_nowait(line)
+    """Append a line to a watcher's queue; if the queue is full, drop its oldest frame.
+
+    States stay, since a page would go on showing the one before. Only of a queue without frames the oldest
+    line is dropped.
+    """
+    with watcher.mutex:
+        waiting = watcher.queue
+        if len(waiting) >= watcher.maxsize:
+            frames = (at for at, one in enumerate(waiting) if one and one.startswith(FRAME))
+            del waiting[next(frames, 0)]
+    watcher.put_nowait(line)
 
 
 def event(name: str, value: Mapping[str, Any]) -> bytes:

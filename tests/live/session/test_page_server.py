@@ -166,12 +166,27 @@ def test_a_slow_watcher_loses_the_oldest_frames(monkeypatch):
     monkeypatch.setattr(module, "QUEUED", 4)
     hub = Hub({})
     with hub.watch() as watcher:
+        watcher.get_nowait()  # the greeting
         for number in range(10):
             hub.publish({"number": number})
         assert [watcher.get_nowait() for _ in range(4)] == [
             f'event: frame\ndata: {{"number":{n}}}\n\n'.encode() for n in range(6, 10)
         ]
     assert hub.watchers == set()
+
+
+def test_a_slow_watcher_loses_no_state(monkeypatch):
+    monkeypatch.setattr(module, "QUEUED", 4)
+    hub = Hub({})
+    with hub.watch() as watcher:
+        hub.tell("wearer", {"calibrated": True})
+        for number in range(10):
+            hub.publish({"number": number})
+        found = [watcher.get_nowait().split(b"\n")[0] for _ in range(4)]
+        assert found == [b"event: greeting", b"event: wearer", b"event: frame", b"event: frame"]
+        for _ in range(6):
+            hub.tell("wearer", {})
+        assert watcher.qsize() == 4
 
 
 def test_the_pages_files_are_there(server: LiveServer):
