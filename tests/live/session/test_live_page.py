@@ -90,6 +90,29 @@ def test_it_says_what_it_waits_for_and_when_the_command_has_ended(browser: Brows
     browser.wait("document.querySelector('#status').textContent == 'not connected'")
 
 
+def frame(number: int) -> dict[str, object]:
+    """Return a frame's message."""
+    counts = {"held": [], "jumping": False, "dropped": 0, "malformed": 0, "foreign": 0}
+    joints = np.random.default_rng(0).integers(0, 1500, 66).tolist()
+    return {"number": number, "time": 0.0, "ms": 1.0, "whole": 1.0, "joints": joints, "truth": None, **counts}
+
+
+def test_another_command_at_the_address_gets_a_page_of_its_own(browser: Browser, clip: TrackedClip):
+    """Nothing of the network before is left: not its frames, which would be told as the new one's."""
+    source, about = ClipSource(clip, 60), "document.querySelector('#about').textContent"
+    with LiveServer(Hub(greeting(source, "tiny")), 0) as server:
+        port = server.server_port
+        browser.open(server.url)
+        browser.wait(f"{about} == 'tiny · person at 60 Hz'")
+        server.hub.publish(frame(5))
+        browser.wait(f"{SHOWN} == 5")
+    with LiveServer(Hub(greeting(source, "other")), port) as server:
+        browser.wait(f"{about} == 'other · person at 60 Hz'")
+        server.hub.publish(frame(100))
+        browser.wait(f"{SHOWN} == 100 && {NEWEST} == 100")
+        assert browser.value("document.querySelector('#scrub').min") == "100"
+
+
 class Worn(ClipSource):
     """A clip that counts as somebody's devices."""
 

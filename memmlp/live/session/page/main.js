@@ -11,12 +11,17 @@ const wearer = new Wearer();
 let stage = null;
 let avatar = null;
 let greeting = null;
+let greeted = null; // the greeting as it came
 let arrived = -Infinity;
 let malformed = 0;
 let foreign = 0;
 
 const events = new EventSource('events');
-events.addEventListener('greeting', event => greet(JSON.parse(event.data)));
+events.addEventListener('greeting', event => {
+  if (greeted !== null && event.data !== greeted) return location.reload(); // another command is there now
+  greeted = event.data;
+  greet(JSON.parse(event.data));
+});
 events.addEventListener('wearer', event => wearer.show(JSON.parse(event.data)));
 events.addEventListener('frame', event => {
   const frame = JSON.parse(event.data);
