@@ -148,6 +148,14 @@ def export(
     named = f"--space {space}" if space else f"--rotations {rotations}" if rotations else None
     if scope == "step" and named:
         raise InputError(f"{named}: the network itself knows AMASS' world alone; allowed with --scope full")
+    if precision == "fp32" and given("max_growth"):
+        raise InputError(
+            f"--max-growth {max_growth:g}: is of less precision; allowed with --precision fp16, int8 or int8_blocks"
+        )
+    if precision != "fp32" and given("clips"):
+        raise InputError(
+            f"--clips {clips}: --precision {precision} is measured on all test clips; allowed with fp32 alone"
+        )
     full = (space or "amass", rotations or "matrix") if scope == "full" else None
     check_runs(outputs, run)
     with tempfile.TemporaryDirectory(prefix="memmlp-export-") as folder:

@@ -73,6 +73,11 @@ def test_web_is_all_of_its_backends(memmlp: Memmlp, tmp_path: Path):
         (["0123", "--out", "step.txt"], "allowed ending is .onnx"),
         (["0123", "--out", "none/step.onnx"], "there is no folder none"),
         (["0123", "--out", "a.onnx", "--rotations", "quaternion"], "allowed with --scope full"),
+        (
+            ["0123", "--out", "a.onnx", "--max-growth", "2"],
+            "allowed with --precision fp16, int8 or int8_blocks",
+        ),
+        (["0123", "--out", "a.onnx", "--precision", "int8", "--clips", "3"], "measured on all test clips"),
     ],
 )
 def test_what_does_not_go_together_is_refused(
