@@ -180,12 +180,13 @@ def write(run: str, out: Path, outputs: Path, form: Form, clips: int, max_growth
     from memmlp.common.progress import tell
     from memmlp.config.open_run import open_run
     from memmlp.deploy.deployment import GRAPHS
-    from memmlp.networks.streaming import StreamingGraph
+    from memmlp.networks.streaming import StreamingGraph, check_streams
     from memmlp.runs.lookup import find_run
 
     found = find_run(outputs, run)
     _, experiment, data = open_run(outputs, run)
     model = experiment.architecture.load(found.weights())
+    check_streams(model)
     network = GRAPHS[form.graph](model)
     test = data.open("test").clips()
     if form.precision == "fp32":

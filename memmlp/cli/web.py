@@ -92,13 +92,16 @@ def clips_of(opened: OpenedRun, count: int, seconds: float) -> list[SiteClip]:
 def network_of(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:
     """Return a run's network in the form that a site needs."""
     from memmlp.live.web.networks import SiteNetwork
+    from memmlp.networks.streaming import check_streams
     from memmlp.runs.identity import flatten
     from memmlp.runs.shown_name import run_name
 
+    network = opened.network()
+    check_streams(network)
     run, config = opened.run, flatten(opened.run.config)
     name, model = run_name(run.manifest, config).removeprefix("default · "), config["model.name"]
     name = name if f"model={model}" in name else f"{model} {name}"
-    return SiteNetwork(run.id, name, run.id, opened.network(), tuple(clip.key for clip in clips))
+    return SiteNetwork(run.id, name, run.id, network, tuple(clip.key for clip in clips))
 
 
 def base() -> SiteNetwork:

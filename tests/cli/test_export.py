@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import onnx
 import pytest
+import tiny
 from conftest import Memmlp, one_line
 from onnx import TensorProto, helper
 
+from memmlp.cli.export import Form
+from memmlp.cli.export import write as write_run
+from memmlp.common.errors import InputError
 from memmlp.runs.lookup import is_trained, list_runs
 
 
@@ -87,6 +92,22 @@ def test_what_does_not_go_together_is_refused(
     write(tmp_path / "step.onnx", "Relu")
     assert one_line(memmlp("export", *line), words)
     assert [path.name for path in tmp_path.iterdir()] == ["step.onnx"]
+
+
+@pytest.mark.parametrize("graph", ["auto", "naive"])
+def test_a_network_that_makes_frames_with_later_ones_has_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, graph: str
+):
+    """A step of it would make another motion than was evaluated."""
+    model = tiny.baseline("bodiffusion", offline=True, sampling_steps=2, depth=1)
+    experiment = SimpleNamespace(architecture=SimpleNamespace(load=lambda _: model))
+    data = SimpleNamespace(open=lambda _: tiny.frames((10,)))
+    monkeypatch.setattr("memmlp.config.open_run.open_run", lambda *_: (None, experiment, data))
+    run = SimpleNamespace(id="0123", weights=lambda: None)
+    monkeypatch.setattr("memmlp.runs.lookup.find_run", lambda *_: run)
+    monkeypatch.setattr("memmlp.cli.export.write_exact", lambda *_: None)  # takes seconds
+    with pytest.raises(InputError, match=r"model\.offline=true"):
+        write_run("0123", tmp_path / "step.onnx", tmp_path, Form(graph, "fp32", 18, None), 1, 0.01)
 
 
 @pytest.mark.slow

@@ -42,7 +42,7 @@ from memmlp.networks.streaming.recurrent_poser import RecurrentPoserStream
 from memmlp.networks.streaming.refined import RefinedStream
 from memmlp.networks.streaming.sage_net import SAGENetStream
 
-__all__ = ["StreamingGraph", "has_stream", "streaming"]
+__all__ = ["StreamingGraph", "check_streams", "has_stream", "streaming"]
 
 STREAMS: dict[type[MotionModel], type[StreamingGraph]] = {
     MemMLP: MemMLPStream,
@@ -77,8 +77,7 @@ def streaming(model: MotionModel) -> StreamingGraph:
             "a memory of one's own), which no such graph can carry; allowed is export.graph=naive, or "
             "memory.history=first"
         )
-    if not model.streams:
-        raise InputError("model.offline=true: makes frames with later ones; allowed is model.offline=false")
+    check_streams(model)
     if not has_stream(model):
         raise InputError(
             "export.graph=streaming: a part of one's own has none; allowed is export.graph=naive"
@@ -86,6 +85,12 @@ def streaming(model: MotionModel) -> StreamingGraph:
     if isinstance(model, Refined):
         return RefinedStream(model, streaming(model.network))
     return STREAMS[type(model)](model)
+
+
+def check_streams(model: MotionModel) -> None:
+    """Raise InputError for a network that makes frames with later ones: no live step makes its motion."""
+    if not model.streams:
+        raise InputError("model.offline=true: makes frames with later ones; allowed is model.offline=false")
 
 
 def has_stream(model: MotionModel) -> bool:
