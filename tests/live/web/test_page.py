@@ -23,6 +23,14 @@ pytestmark = pytest.mark.slow
 HEADSET = Path(__file__).with_name("headset.js")
 SITE = "document.documentElement.dataset"
 COPY = "if (navigator.clipboard) navigator.clipboard.writeText = async text => { window.copied = text; }"
+NOTE = """{
+  const write = CanvasRenderingContext2D.prototype.fillText;
+  CanvasRenderingContext2D.prototype.fillText = function (...words) {
+    if (words[0] == 'Not calibrated:') window.refused = true;
+    return write.apply(this, words);
+  };
+}"""
+"""What notes that the mirror's words have told of a calibration that is none."""
 TOLERANCE = 1e-4  # metres
 
 
@@ -56,6 +64,7 @@ def test_it_is_worn_played_timed_and_copied_without_the_server(site: Made, tmp_p
     with Browser(360, 280) as browser:
         browser.before(script.decode() + HEADSET.read_text())
         browser.before(COPY)
+        browser.before(NOTE)
         server = Server(site.folder)
         try:
             browser.open(server.url)
@@ -103,7 +112,10 @@ def t_pose(site: Made) -> list[dict[str, Any]]:
 
 
 def worn(browser: Browser, site: Made) -> dict[str, Any]:
-    """Enter VR, calibrate in T-pose, move as the clip does, leave, and save the recording."""
+    """Enter VR, calibrate in T-pose, move as the clip does, leave, and save the recording.
+
+    A calibration before, with exchanged hands and another height, is refused, and changes nothing.
+    """
     go(browser, "wear", f"{SITE}.wear == 'ready'")
     height = json.loads((site.folder / "site.json").read_text())["networks"][0]["body"]["height"]
     browser.value(f"document.querySelector('#height').value = {100 * height}")
@@ -115,7 +127,16 @@ def worn(browser: Browser, site: Made) -> dict[str, Any]:
         "import('./headset.js').then(module => { window.offsets = module.usualOffsets('controllers'); })"
     )
     browser.value(f"window.tPose = {json.dumps(t_pose(site))}")
-    browser.resolved("headset.play([tPose], offsets)")  # the countdown does not wait for a slow machine
+    browser.value("document.querySelector('#height').value = 200")
+    exchanged = "[[tPose[0], tPose[2], tPose[1]]]"
+    browser.resolved(f"headset.play({exchanged}, offsets)")  # the countdown does not wait for a slow machine
+    browser.resolved("headset.pull()")
+    browser.resolved(f"headset.play({exchanged}, offsets, () => window.refused)")
+    seen = browser.value("Number(document.querySelector('#frames').textContent)")
+    later = f"Number(document.querySelector('#frames').textContent) > {seen} + 20"
+    browser.resolved(f"headset.play([tPose], offsets, () => {later})")
+    assert browser.value("document.querySelector('#tall').textContent") == f"{height:.2f}"
+    browser.value(f"document.querySelector('#height').value = {100 * height}")
     browser.resolved("headset.pull()")
     browser.resolved(f"headset.play([tPose], offsets, () => {SITE}.calibrated)")
     browser.resolved(f"headset.play({json.dumps(joints())}, offsets)")

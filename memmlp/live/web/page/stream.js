@@ -51,11 +51,12 @@ export class Stream {
 
   // Learn the offsets from a person who stands upright in T-pose, and use them from now on. The line between the hands
   // tells which way the person looks; the network's body in that pose is laid as near to the devices as possible.
-  calibrate(head, left, right) {
+  // scale: the one to use from now on, as in the constructor. An error leaves offsets and scale as they were.
+  calibrate(head, left, right, scale = this.scale) {
     const devices = [head, left, right].map(read);
     const missing = TRACKERS.filter((_, i) => devices[i].lost);
     if (missing.length) throw new Error(`no pose of ${missing.join(', ')}; all three are needed`);
-    const world = devices.map(device => times(device.position, this.scale));
+    const world = devices.map(device => times(device.position, scale));
     const across = minus(world[1], world[2]);
     if (Math.hypot(across[0], across[2]) < APART) throw new Error('the hands are not apart; stand in T-pose, the arms to the sides');
     const heading = Math.atan2(across[2], -across[0]);
@@ -66,11 +67,11 @@ export class Stream {
     const away = [0, 1, 2].map(axis => mean(world.map((place, i) => place[axis] - pose.positions[i][axis])));
     const offsets = {
       positions: devices.map((device, i) =>
-        rotate(inverse(device.rotation), minus(times(plus(pose.positions[i], away), 1 / this.scale), device.position))),
+        rotate(inverse(device.rotation), minus(times(plus(pose.positions[i], away), 1 / scale), device.position))),
       rotations: devices.map((device, i) => multiply(inverse(device.rotation), pose.rotations[i])),
     };
     checkWorn(offsets);
-    this.offsets = offsets;
+    Object.assign(this, { offsets, scale });
     this.reset();
     return offsets;
   }

@@ -97,13 +97,13 @@ class Wear {
 
   begin(session, mode) {
     const { body, fps } = this.network;
+    const tall = this.tall(null);
     this.worn = {
-      session, kind: null, placed: false, calibrated: false, due: null, waiting: 0, frames: 0, dropped: 0, skipped: 0, last: null, passed: [], times: [],
+      session, tall, kind: null, placed: false, calibrated: false, due: null, waiting: 0, frames: 0, dropped: 0, skipped: 0, last: null, passed: [], times: [],
       tape: this.record.checked ? [] : null,
-      stream: new Stream({ fps, body, offsets: usualOffsets(null), run: frame => this.remote.call('pose', ['wear', frame]) }),
+      stream: new Stream({ fps, body, offsets: usualOffsets(null), scale: body.height / tall, run: frame => this.remote.call('pose', ['wear', frame]) }),
     };
     this.seen.hidden = false;
-    this.scaled(null);
     this.mirror.through(mode === 'immersive-ar');
     this.mirror.tell(...INVITE);
     session.addEventListener('select', () => { this.worn.due ??= performance.now() + 1000 * COUNTDOWN; });
@@ -163,9 +163,9 @@ class Wear {
     if (left > 0) return mirror.tell(`T-pose ... ${Math.ceil(left)}`, INVITE[1]);
     worn.due = null;
     try {
-      if (!trackers.includes(null)) this.scaled(trackers[0]);
-      worn.stream.calibrate(...trackers);
-      worn.calibrated = true;
+      const tall = this.tall(trackers[0]);
+      worn.stream.calibrate(...trackers, this.network.body.height / tall);
+      Object.assign(worn, { tall, calibrated: true });
       document.documentElement.dataset.calibrated = 'yes';
       this.stand(trackers[0]);
       mirror.tell(`Calibrated, ${worn.tall.toFixed(2)} m tall.`, 'Pull a trigger or pinch to do it again.');
@@ -175,14 +175,13 @@ class Wear {
     }
   }
 
-  // How tall the wearer is over the network's body: as typed in, else by the headset's height over the floor.
-  scaled(head) {
+  // How tall the wearer is, metres: as typed in, else by the headset's height over the floor, else as the network's body.
+  tall(head) {
     const { body } = this.network;
     const typed = this.height.valueAsNumber / 100;
     const tall = typed > 0 ? typed : head ? head.position[1] / body.eyes : body.height;
     if (!(tall >= SHORTEST && tall <= TALLEST)) throw new Error(`${tall.toFixed(2)} m tall; stand upright, or type in your height`);
-    this.worn.tall = tall;
-    this.worn.stream.scale = body.height / tall;
+    return tall;
   }
 
   feed(trackers, time) {
