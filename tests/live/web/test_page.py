@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from chromium import Browser
-from live.web.conftest import PERSON, Made, package_files
+from live.web.conftest import PERSON, RUN, Made, package_files
 
 from memmlp.common.npm import IWER
 from memmlp.live.stream import Offsets, Stream
@@ -31,6 +31,15 @@ NOTE = """{
   };
 }"""
 """What notes that the mirror's words have told of a calibration that is none."""
+TWO = """Promise.all([import('./wear.js'), fetch('site.json')]).then(async ([{ wear }, answer]) => {
+  const site = await answer.json();
+  site.networks.push({ ...site.networks[0], key: 'other', name: 'other', run: 'other' });
+  const page = document.createElement('div');
+  document.querySelector('#content').replaceChildren(page);
+  delete document.documentElement.dataset.wear;
+  wear(page, site);
+})"""
+"""The wearer's page anew, with a second network to choose."""
 TOLERANCE = 1e-4  # metres
 
 
@@ -112,11 +121,13 @@ def t_pose(site: Made) -> list[dict[str, Any]]:
 
 
 def worn(browser: Browser, site: Made) -> dict[str, Any]:
-    """Enter VR, calibrate in T-pose, move as the clip does, leave, and save the recording.
+    """Enter VR, calibrate in T-pose, move as the clip does, leave, choose another network, and save.
 
     A calibration before, with exchanged hands and another height, is refused, and changes nothing.
     """
     go(browser, "wear", f"{SITE}.wear == 'ready'")
+    browser.resolved(TWO)
+    browser.wait(f"{SITE}.wear == 'ready'")
     height = json.loads((site.folder / "site.json").read_text())["networks"][0]["body"]["height"]
     browser.value(f"document.querySelector('#height').value = {100 * height}")
     browser.value("document.querySelector('#record').click()")
@@ -141,12 +152,15 @@ def worn(browser: Browser, site: Made) -> dict[str, Any]:
     browser.resolved(f"headset.play([tPose], offsets, () => {SITE}.calibrated)")
     browser.resolved(f"headset.play({json.dumps(joints())}, offsets)")
     browser.resolved("headset.session.end()")
+    choose = "s.value = 'other'; s.dispatchEvent(new Event('change'))"
+    browser.value(f"(s => {{ {choose} }})(document.querySelector('#content select'))")
     browser.value("document.querySelector('#save').click()")
     return json.loads(browser.wait("headset.saved")) | {"worn": browser.value("offsets")}
 
 
 def check_wearer(recording: dict[str, Any], site: Made) -> None:
     """The samples that the page recorded, through Python's Stream: the same joints to 1e-4 m."""
+    assert recording["run"] == RUN
     calibrated = [sample for sample in recording["samples"] if "calibrated" in sample]
     assert len(calibrated) == 1
     begun = recording["samples"].index(calibrated[0])

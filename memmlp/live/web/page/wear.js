@@ -48,6 +48,7 @@ class Wear {
       h('h1', {}, 'Your body, from head and hands'),
       h('div', { class: 'entry' }, this.buttons,
         this.site.networks.length > 1 && select('Network', this.site.networks.map(({ key, name }) => [key, name]), this.network.key, key => {
+          this.worn?.session.end();
           this.network = this.site.networks.find(network => network.key === key);
           this.ready();
         }),
@@ -99,7 +100,7 @@ class Wear {
     const { body, fps } = this.network;
     const tall = this.tall(null);
     this.worn = {
-      session, tall, kind: null, placed: false, calibrated: false, due: null, waiting: 0, frames: 0, dropped: 0, skipped: 0, last: null, passed: [], times: [],
+      session, network: this.network, tall, kind: null, placed: false, calibrated: false, due: null, waiting: 0, frames: 0, dropped: 0, skipped: 0, last: null, passed: [], times: [],
       tape: this.record.checked ? [] : null,
       stream: new Stream({ fps, body, offsets: usualOffsets(null), scale: body.height / tall, run: frame => this.remote.call('pose', ['wear', frame]) }),
     };
@@ -164,7 +165,7 @@ class Wear {
     worn.due = null;
     try {
       const tall = this.tall(trackers[0]);
-      worn.stream.calibrate(...trackers, this.network.body.height / tall);
+      worn.stream.calibrate(...trackers, worn.network.body.height / tall);
       Object.assign(worn, { tall, calibrated: true });
       document.documentElement.dataset.calibrated = 'yes';
       this.stand(trackers[0]);
@@ -177,7 +178,7 @@ class Wear {
 
   // How tall the wearer is, metres: as typed in, else by the headset's height over the floor, else as the network's body.
   tall(head) {
-    const { body } = this.network;
+    const { body } = this.worn?.network ?? this.network;
     const typed = this.height.valueAsNumber / 100;
     const tall = typed > 0 ? typed : head ? head.position[1] / body.eyes : body.height;
     if (!(tall >= SHORTEST && tall <= TALLEST)) throw new Error(`${tall.toFixed(2)} m tall; stand upright, or type in your height`);
@@ -219,6 +220,7 @@ class Wear {
   ended() {
     this.tell();
     this.tape = this.worn.tape;
+    this.recorded = this.worn.network.run;
     this.save.hidden = !this.tape?.length;
     this.worn = null;
     this.mirror.visible(false);
@@ -231,7 +233,7 @@ class Wear {
   // the last ones, which still waited for the network.
   saved() {
     const samples = this.tape.filter(({ held, calibrated }) => held || calibrated);
-    const content = JSON.stringify({ format: 'memmlp web recording 1', run: this.network.run, joints: this.site.joints, samples });
+    const content = JSON.stringify({ format: 'memmlp web recording 1', run: this.recorded, joints: this.site.joints, samples });
     const address = URL.createObjectURL(new Blob([content], { type: 'application/json' }));
     h('a', { href: address, download: 'recording.json' }).click();
     setTimeout(() => URL.revokeObjectURL(address), 10000);
