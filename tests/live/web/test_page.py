@@ -135,7 +135,7 @@ def worn(browser: Browser, site: Made) -> dict[str, Any]:
     browser.wait("window.headset.session && Number(document.querySelector('#frames').textContent) > 0")
     browser.resolved("headset.learn()")
     browser.resolved(
-        "import('./headset.js').then(module => { window.offsets = module.usualOffsets('controllers'); })"
+        "import('./headset.js').then(module => { window.offsets = module.usualOffsets([null, null]); })"
     )
     browser.value(f"window.tPose = {json.dumps(t_pose(site))}")
     browser.value("document.querySelector('#height').value = 200")

@@ -4,7 +4,7 @@
 // Hands are controllers' grips, or wrists where the device tracks hands.
 export function trackersOf(frame, space, sources) {
   const hand = side => {
-    const source = [...sources].find(({ handedness, gripSpace, hand }) => handedness === side && (gripSpace || hand));
+    const source = sourceOf(side, sources);
     if (!source) return null;
     const pose = source.hand ? frame.getJointPose(source.hand.get('wrist'), space) : frame.getPose(source.gripSpace, space);
     return tracker(pose);
@@ -12,12 +12,15 @@ export function trackersOf(frame, space, sources) {
   return [tracker(frame.getViewerPose(space)), hand('left'), hand('right')];
 }
 
-// "hands" or "controllers"; null where there is neither. Each sits differently on the wrists.
-export function kindOf(sources) {
-  const held = [...sources].filter(({ handedness, gripSpace, hand }) => handedness !== 'none' && (gripSpace || hand));
-  if (!held.length) return null;
-  return held.some(({ hand }) => hand) ? 'hands' : 'controllers';
-}
+// "hands" or "controllers" for left and right, each of which sits differently on a wrist; null where there is neither.
+// A headset may track one hand beside the other's controller.
+export const kindsOf = sources => ['left', 'right'].map(side => {
+  const source = sourceOf(side, sources);
+  return source && (source.hand ? 'hands' : 'controllers');
+});
+
+const sourceOf = (side, sources) =>
+  [...sources].find(({ handedness, gripSpace, hand }) => handedness === side && (gripSpace || hand)) ?? null;
 
 // A device that sees a hand no longer guesses for a while where it is, which is taken; then it gives no pose.
 function tracker(pose) {
@@ -41,8 +44,8 @@ const SITS = {
   ],
 };
 
-// About where head and wrists are on the devices, until a calibration finds out.
-export function usualOffsets(kind) {
-  const parts = [HEAD, ...SITS[kind ?? 'controllers']];
+// About where head and wrists are on the devices of these kinds, left and right, until a calibration finds out.
+export function usualOffsets(kinds) {
+  const parts = [HEAD, ...kinds.map((kind, side) => SITS[kind ?? 'controllers'][side])];
   return { positions: parts.map(({ position }) => position), rotations: parts.map(({ rotation }) => rotation) };
 }

@@ -1,7 +1,7 @@
 // Enter VR or AR: the wearer's head and hands become a body, computed here, in front of a mirror.
 
 import { h, replace, select } from './dom.js';
-import { kindOf, trackersOf, usualOffsets } from './headset.js';
+import { kindsOf, trackersOf, usualOffsets } from './headset.js';
 import { Mirror } from './mirror.js';
 import { Remote } from './remote.js';
 import { heading, Stream } from './stream.js';
@@ -100,9 +100,9 @@ class Wear {
     const { body, fps } = this.network;
     const tall = this.tall(null);
     this.worn = {
-      session, network: this.network, tall, kind: null, placed: false, calibrated: false, due: null, waiting: 0, frames: 0, dropped: 0, skipped: 0, last: null, passed: [], times: [],
+      session, network: this.network, tall, kinds: [null, null], placed: false, calibrated: false, due: null, waiting: 0, frames: 0, dropped: 0, skipped: 0, last: null, passed: [], times: [],
       tape: this.record.checked ? [] : null,
-      stream: new Stream({ fps, body, offsets: usualOffsets(null), scale: body.height / tall, run: frame => this.remote.call('pose', ['wear', frame]) }),
+      stream: new Stream({ fps, body, offsets: usualOffsets([null, null]), scale: body.height / tall, run: frame => this.remote.call('pose', ['wear', frame]) }),
     };
     this.seen.hidden = false;
     this.mirror.through(mode === 'immersive-ar');
@@ -118,7 +118,7 @@ class Wear {
     if (frame && space && this.worn) {
       this.count(time);
       const trackers = trackersOf(frame, space, this.worn.session.inputSources);
-      this.change(kindOf(this.worn.session.inputSources));
+      this.change(kindsOf(this.worn.session.inputSources));
       if (trackers[0] && !this.worn.placed) this.stand(trackers[0]);
       this.calibrate(trackers);
       this.feed(trackers, time / 1000);
@@ -141,13 +141,15 @@ class Wear {
   }
 
   // Controllers and hands sit differently on the wrists: what was calibrated with one does not hold for the other.
-  change(kind) {
+  // A side where there is neither keeps what was there.
+  change(seen) {
     const { worn } = this;
-    if (kind === null || kind === worn.kind) return;
-    if (worn.kind !== null && worn.calibrated) this.mirror.tell(`Now ${kind}:`, ...INVITE);
-    Object.assign(worn, { kind, calibrated: false });
+    const kinds = seen.map((kind, side) => kind ?? worn.kinds[side]);
+    if (kinds.every((kind, side) => kind === worn.kinds[side])) return;
+    if (worn.calibrated) this.mirror.tell(`Now ${[...new Set(kinds)].join(' and ')}:`, ...INVITE);
+    Object.assign(worn, { kinds, calibrated: false });
     delete document.documentElement.dataset.calibrated;
-    worn.stream.offsets = usualOffsets(kind);
+    worn.stream.offsets = usualOffsets(kinds);
     worn.stream.reset();
   }
 
