@@ -150,7 +150,8 @@ def export(
         raise InputError(f"{named}: the network itself knows AMASS' world alone; allowed with --scope full")
     if precision == "fp32" and given("max_growth"):
         raise InputError(
-            f"--max-growth {max_growth:g}: is of less precision; allowed with --precision fp16, int8 or int8_blocks"
+            f"--max-growth {max_growth:g}: is of less precision; "
+            "allowed with --precision fp16, int8 or int8_blocks"
         )
     if precision != "fp32" and given("clips"):
         raise InputError(
