@@ -5,6 +5,8 @@ from __future__ import annotations
 import gzip
 import json
 import re
+import subprocess
+from importlib import resources
 from pathlib import Path
 
 import pytest
@@ -104,3 +106,28 @@ def test_comments_for_developers_are_left_out_and_licences_kept():
     licence = b"/**\n * @license\n * MIT\n */\nconst a = '/** no comment */';\n"
     source = licence + b"\t/**\n\t * Adds.\n\t */\n\tadd() {}\n"
     assert _bare(source) == licence + b"\tadd() {}\n"
+
+
+def test_a_new_version_keeps_other_sites_below_its_address(node: str, tmp_path: Path):
+    """They stay offline; what is deleted are the site's own earlier versions."""
+    (tmp_path / "sw.js").write_bytes(
+        resources.files("memmlp.live.web").joinpath("page", "sw.js").read_bytes()
+    )
+    (tmp_path / "package.json").write_text('{"type": "module"}')
+    kept = [
+        f"memmlp https://a.org/{place}" for place in ("one/ old", "one/ new", "one/two/ old", "three/ old")
+    ]
+    script = f"""
+      const [heard, deleted] = [{{}}, []];
+      Object.assign(globalThis, {{
+        VERSION: 'new', FILES: [], registration: {{ scope: 'https://a.org/one/' }}, clients: {{ claim() {{}} }},
+        caches: {{ keys: async () => {json.dumps(kept)}, delete: async name => deleted.push(name) }},
+        addEventListener(kind, listener) {{ heard[kind] = listener; }},
+      }});
+      await import('./sw.js');
+      await new Promise(resolve => heard.activate({{ waitUntil: done => done.then(resolve) }}));
+      console.log(JSON.stringify(deleted));
+    """
+    command = [node, "--input-type=module", "-e", script]
+    said = subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, timeout=60).stdout
+    assert json.loads(said) == kept[:1]
