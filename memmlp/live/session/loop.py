@@ -134,9 +134,9 @@ def millimetres(space: Space, joints: np.ndarray | None) -> list[int] | None:
 def avatar_message(space: Space, pose: Pose, rest: np.ndarray) -> dict[str, Any]:
     """Return the part of a message for an avatar: the joints' rotations, and the wearer's hips, metres.
 
-    The rotations are 22 quaternions xyzw as 88 whole numbers, relative to VRM's T-pose, which is SMPL's: Y up,
-    facing +Z. The root's is in the page's axes. The height of the hips in the rest pose (22, 3) gives the
-    avatar its size; the wearer may change it on the page at any time.
+    The rotations are 22 quaternions xyzw as 88 whole numbers, relative to VRM's T-pose, which is SMPL's: Y
+    up, facing +Z. The root's is in the page's axes. The height of the hips in the rest pose (22, 3), metres,
+    gives the avatar its size; the wearer may change it on the page at any time.
     """
     local = space.pose_in(pose.rotations)
     local[0] = PAGE_SPACE.world.T @ local[0]

@@ -13,8 +13,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from memmlp.common.errors import InputError
 from memmlp.live.calibration_file import Calibration, save_calibration
 from memmlp.live.session.packets import QuaternionPoses

@@ -110,17 +110,16 @@ def test_comments_for_developers_are_left_out_and_licences_kept():
 
 def test_a_new_version_keeps_other_sites_below_its_address(node: str, tmp_path: Path):
     """They stay offline; what is deleted are the site's own earlier versions."""
-    (tmp_path / "sw.js").write_bytes(
-        resources.files("memmlp.live.web").joinpath("page", "sw.js").read_bytes()
-    )
+    worker = resources.files("memmlp.live.web").joinpath("page", "sw.js")
+    (tmp_path / "sw.js").write_bytes(worker.read_bytes())
     (tmp_path / "package.json").write_text('{"type": "module"}')
-    kept = [
-        f"memmlp https://a.org/{place}" for place in ("one/ old", "one/ new", "one/two/ old", "three/ old")
-    ]
+    places = ("one/ old", "one/ new", "one/two/ old", "three/ old")
+    kept = [f"memmlp https://a.org/{place}" for place in places]
     script = f"""
       const [heard, deleted] = [{{}}, []];
       Object.assign(globalThis, {{
-        VERSION: 'new', FILES: [], registration: {{ scope: 'https://a.org/one/' }}, clients: {{ claim() {{}} }},
+        VERSION: 'new', FILES: [], clients: {{ claim() {{}} }},
+        registration: {{ scope: 'https://a.org/one/' }},
         caches: {{ keys: async () => {json.dumps(kept)}, delete: async name => deleted.push(name) }},
         addEventListener(kind, listener) {{ heard[kind] = listener; }},
       }});
