@@ -121,9 +121,10 @@ def test_an_unknown_clip_lists_the_test_clips(memmlp: Memmlp, finished: Run, cli
     assert all(name in ran.err for name in clips)
 
 
-def test_without_pyav_nothing_is_computed(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
+def test_without_pyav_nothing_is_computed(memmlp: Memmlp, finished: Run, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "av", None)
-    assert one_line(memmlp("render", "no-such-run", "--out", "a.mp4"), "memmlp[video]")
+    monkeypatch.delattr("memmlp.config.open_run.open_found")
+    assert one_line(memmlp("render", finished.id, "--out", "a.mp4"), "memmlp[video]")
 
 
 @pytest.mark.parametrize(
