@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import command_line
 import pytest
+import tiny
 
+from memmlp.cli.web import network_of
 from memmlp.common.errors import InputError
 from memmlp.common.npm import ONNXRUNTIME_WEB, THREE, tarball
 from memmlp.runs.lookup import is_trained, list_runs
@@ -36,6 +39,12 @@ def test_a_site_to_play_and_wear(home: Path):
     size = sum(path.stat().st_size for path in (home / "site").rglob("*") if path.is_file())
     assert size < 25_000_000
     assert f"site: {size / 1e6:.1f} MB" in said
+
+
+def test_a_network_that_makes_frames_with_later_ones_is_on_no_site():
+    model = tiny.baseline("bodiffusion", offline=True, sampling_steps=2, depth=1)
+    with pytest.raises(InputError, match=r"model\.offline=true"):
+        network_of(SimpleNamespace(network=lambda: model), [])
 
 
 def test_what_it_refuses(home: Path):
