@@ -80,3 +80,16 @@ def begun(plan: Plan) -> Run:
 
 def seeded(study: Study, folder: Path) -> Director:
     return director(study, folder, partial(compose, seeds=study.search.seeds))
+
+
+def with_a_pruned_trial(folder: Path) -> Study:
+    """Return a search in a folder with a trial that ended at 5, one that was pruned at 9, and one begun."""
+    study = open_study(folder, pruner="median", prune_after=1)
+    one = director(study, folder)
+    finished = begun(one.look(1))
+    for step in (10, STEPS):
+        log(finished, step, 5.0)
+    finished.finish([])
+    log(begun(one.look(1)), 10, 9.0)
+    one.look(1)
+    return study

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
-from fake_search import STEPS, begun, director, finish, log, open_study
+from fake_search import director, finish, open_study, with_a_pruned_trial
 
 from memmlp.common.files import write_json
 from memmlp.report.ui.searches import Searches
@@ -22,15 +22,8 @@ def folder(tmp_path: Path) -> Path:
 
 def test_a_pruned_trial_has_no_value(folder: Path):
     """That of its last step stood among those of trained networks."""
-    study = open_study(folder, pruner="median", prune_after=1)
+    study = with_a_pruned_trial(folder)
     write_json(folder / "search.json", asdict(study.search))
-    one = director(study, folder)
-    finished = begun(one.look(1))
-    for step in (10, STEPS):
-        log(finished, step, 5.0)
-    finished.finish([])
-    log(begun(one.look(1)), 10, 9.0)
-    one.look(1)
     first, second, *_ = Searches(folder.parents[1]).page("mine")["trials"]
     assert (first["state"], first["values"]) == ("complete", [5.0])
     assert (second["state"], second["values"], second["reason"]) == ("pruned", [], "9 at step 10")

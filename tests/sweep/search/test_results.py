@@ -18,6 +18,7 @@ from fake_search import (
     open_study,
     seeded,
     to_the_end,
+    with_a_pruned_trial,
 )
 
 from memmlp.sweep.search import results
@@ -48,14 +49,7 @@ def test_trials_of_several_seeds_as_csv(tmp_path: Path):
 
 def test_a_pruned_trial_has_no_value_in_the_csv(tmp_path: Path):
     """Optuna gives it that of its last step, which is none of a trained network."""
-    study = open_study(tmp_path, pruner="median", prune_after=1)
-    one = director(study, tmp_path)
-    finished = begun(one.look(1))
-    for step in (10, STEPS):
-        log(finished, step, 5.0)
-    finished.finish([])
-    log(begun(one.look(1)), 10, 9.0)
-    one.look(1)
+    study = with_a_pruned_trial(tmp_path)
     results.write_trials(study, tmp_path / "trials.csv")
     with open(tmp_path / "trials.csv", newline="") as file:
         first, second, _ = csv.DictReader(file)
