@@ -66,6 +66,7 @@ def predict(
     from memmlp.config.open_run import OpenedRun, data_of, experiment_of, trained_network
     from memmlp.evaluation.predictions import ClipPredictor
     from memmlp.motion.exporting.export_folder import plan_export
+    from memmlp.motion.preparing.imported_body import check_networks_body
     from memmlp.runs.lookup import find_run
 
     found = find_run(outputs, run)
@@ -76,7 +77,10 @@ def predict(
         trained_network(found, experiment), mode, chosen, experiment.evaluation, interpolation
     )
     if Path(source).exists():
-        report = predictor.export(plan_export(Path(source), out, format_), strict=strict)
+        plan = plan_export(Path(source), out, format_)
+        if body := found.manifest.get("body"):  # which early runs did not record
+            check_networks_body([target.source for target in plan.targets], body)
+        report = predictor.export(plan, strict=strict)
     else:
         opened = OpenedRun(found, experiment, data_of(found, experiment))
         report = predict_test_clip(predictor, opened, source, out, format_)

@@ -77,6 +77,9 @@ def test_foreign_clips_need_the_run_alone(home: Path, run: str, tmp_path: Path):
     assert "skipped bad.npz: " in said
     assert names(tmp_path / "out", "glb") == names(tmp_path / "clips", "npz") - {"bad"} != set()
     assert not (tmp_path / "outputs" / "cache").exists()
+    (tmp_path / "clips" / "import.json").write_text('{"body": "model.npz"}')
+    line = command_line.run(tmp_path, "predict", run, "clips", "--out", "b", "--format", "gltf", code=2)
+    assert "was imported onto the body model.npz, and the network was trained on builtin" in line
 
 
 def names(folder: Path, suffix: str) -> set[str]:

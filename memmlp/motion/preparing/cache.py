@@ -30,7 +30,7 @@ from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.preparing.duplicates import assign
 from memmlp.motion.preparing.find_clips import clip_name
 from memmlp.motion.preparing.folder_survey import Survey, survey
-from memmlp.motion.preparing.imported_body import check_imported_body
+from memmlp.motion.preparing.imported_body import body_name, check_imported_body
 from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manifest, write_manifest
 from memmlp.motion.preparing.several_folders import Folders, Root, find_all
 from memmlp.motion.preparing.splits import PARTS, Split
@@ -116,7 +116,7 @@ def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Mani
     manifest = Manifest(
         digest=_digest(clips, rest, source),
         request=request,
-        body=_body(source.body, rest),
+        body=body_name(source.body, rest),
         rest_joints=tuple(map(tuple, rest.tolist())),
         split=split.describe(),
         min_frames=source.min_frames,
@@ -194,11 +194,6 @@ def frame_blocks(clip: Clip, rest: np.ndarray) -> Iterator[np.ndarray]:
     for start in range(0, len(clip) - 1, CHUNK):
         block = slice(start, start + CHUNK + 1)  # one frame more than comes out, as the first has no velocity
         yield motion_frames(poses[block], trans[block], joints).numpy().astype("<f4")
-
-
-def _body(body: str, rest: np.ndarray) -> str:
-    """Return a body's name; a model's includes a digest, since all bodies' model files have the same name."""
-    return "builtin" if body == "builtin" else f"{Path(body).name} {_hash(rest.tolist())[:8]}"
 
 
 def _place(

@@ -25,6 +25,16 @@ def body_record(body: str, rest: np.ndarray) -> dict[str, str]:
     return {"body": Path(body).name, "rest_joints": digest(rest.tolist())}
 
 
+def body_name(body: str, rest: np.ndarray) -> str:
+    """Return a body's name; a model's includes a digest, since all bodies' model files have the same name.
+
+    Args:
+        body: `builtin`, or the path of an SMPL-H model.
+        rest: its rest joints (22, 3), metres.
+    """
+    return "builtin" if body == "builtin" else f"{Path(body).name} {digest(rest.tolist())[:8]}"
+
+
 def check_imported_body(clips: Iterable[Path], body: str, rest: np.ndarray, key: str = "data.body") -> None:
     """Check that clips which memmlp imported are used with the body that they were imported onto.
 
@@ -40,21 +50,45 @@ def check_imported_body(clips: Iterable[Path], body: str, rest: np.ndarray, key:
         InputError: if they were imported onto another.
     """
     here = body_record(body, rest)
-    for path in _records(clips):
-        try:
-            record = json.loads(path.read_text("utf-8"))
-            there = {key: record[key] for key in here if key in record}
-        except (OSError, ValueError, TypeError):
-            continue  # somebody else's file
+    for folder, there in _recorded(clips):
         if not there.items() <= here.items():
             raise InputError(
-                f"{path.parent}: was imported onto the body {there.get('body')}; allowed is {key} of the "
+                f"{folder}: was imported onto the body {there.get('body')}; allowed is {key} of the "
                 "same, or another import with --body"
             )
 
 
-def _records(clips: Iterable[Path]) -> Iterator[Path]:
-    """Yield the records of the imports that the clips are from: of each clip, the nearest one above it."""
+def check_networks_body(clips: Iterable[Path], body: str) -> None:
+    """Check that clips which memmlp imported are on the body that a network was trained on.
+
+    Args:
+        clips: the clips' files.
+        body: that body's name (`body_name`).
+
+    Raises:
+        InputError: if they were imported onto another.
+    """
+    for folder, there in _recorded(clips):
+        name, joints = there.get("body", body), there.get("rest_joints", "")
+        if name != "builtin" and joints:
+            name = f"{name} {joints[:8]}"
+        if name != body and name != body.rpartition(" ")[0]:
+            raise InputError(
+                f"{folder}: was imported onto the body {name}, and the network was trained on {body}; "
+                "allowed are clips imported onto that body, with --body"
+            )
+
+
+def _recorded(clips: Iterable[Path]) -> Iterator[tuple[Path, dict[str, str]]]:
+    """Yield the folders of the imports that the clips are from, each with what it records of its body.
+
+    Of each clip, that is the nearest record above it.
+    """
     folders = {clip.parent.resolve() for clip in clips}
     above = ([parent / RECORD for parent in (folder, *folder.parents)] for folder in folders)
-    yield from sorted({path for paths in above if (path := next(filter(Path.is_file, paths), None))})
+    for path in sorted({path for paths in above if (path := next(filter(Path.is_file, paths), None))}):
+        try:
+            record = json.loads(path.read_text("utf-8"))
+            yield path.parent, {key: record[key] for key in ("body", "rest_joints") if key in record}
+        except (OSError, ValueError, TypeError):
+            continue  # somebody else's file
