@@ -91,7 +91,7 @@ def facts_of(run: Run, running: bool = False) -> RunFacts:
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
     status = "running" if running else _status(run)
-    results = flatten(with_solvers(run.results, run.combined_by))
+    results = flatten(with_solvers(run.results, run.own_evaluations.combined_by))
     started = _seconds(manifest.get("started"))
     own = (
         run.config_path, run.results_path, run.picture, run.folder / "code.patch",

@@ -23,7 +23,6 @@ from memmlp.common.files import (
     atomic_write,
     file_digest,
     now,
-    number_of,
     read_json,
     sync_folder,
     write_json,
@@ -32,16 +31,10 @@ from memmlp.common.lease import Lease, Lock
 from memmlp.runs import deployment_folder
 from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.environment import changed, changes, environment, host, sources
-from memmlp.runs.evaluation_file import (
-    check_report,
-    combined_by,
-    intact,
-    of_one_solver,
-    outdated_by,
-    preference,
-)
+from memmlp.runs.evaluation_file import intact
 from memmlp.runs.identity import NETWORK, belongs, used_as_configured
 from memmlp.runs.metrics_log import Metrics, MetricsLog
+from memmlp.runs.own_evaluations import OwnEvaluations
 from memmlp.runs.resumed_origin import joined
 
 STAGE_WORDS = {"training": "training", "evaluation": "evaluating", "deployment": "exporting"}
@@ -337,57 +330,20 @@ class Run:
         """The results with the run's own settings: mode -> branch -> metric, and "latency".
 
         A VQ-VAE's run has its own results instead. Where a branch was evaluated by several kinds of inverse
-        kinematics, that of the run's config counts, else the last one (`combined_by`); tables ask for an
-        evaluation by its identity.
+        kinematics, that of the run's config counts, else the last one (`own_evaluations.combined_by`); tables
+        ask for an evaluation by its identity.
 
         Raises:
             InputError: if the file of an evaluation is damaged.
         """
-        found = read_json(self.results_path)
-        for report in of_one_solver(self._own_reports()):
-            branches = found.setdefault(report["mode"], {})
-            for branch, errors in report["mean"].items():  # those of one's own metrics may be in one alone
-                numbers = {name: number_of(value) for name, value in errors.items()}
-                branches[branch] = {**branches.get(branch, {}), **numbers}
+        found = read_json(self.results_path) | self.own_evaluations.results
         latency = self.preferred_deployment.record
         return found | ({"latency": latency} if latency else {})
 
     @property
-    def combined_by(self) -> dict[str, str | None]:
-        """The inverse kinematics of the branch `combined` in `results`, by mode: "arms", "lbfgs-15".
-
-        It is None where that is not known. Raises InputError as `results` does.
-        """
-        return combined_by(self._own_reports())
-
-    @property
-    def outdated_results(self) -> dict[str, str]:
-        """The modes whose `results` were measured by earlier recipes, each with what has changed since."""
-        last = {
-            report.get("mode"): outdated_by(path, report) for path, report in self._own_evaluations().items()
-        }
-        return {str(mode): changed for mode, changed in last.items() if changed}
-
-    @property
-    def own_evaluations(self) -> list[Path]:
-        """The evaluations with the settings of the run's config, the one that counts last (`preference`)."""
-        return list(self._own_evaluations())
-
-    def _own_evaluations(self) -> dict[Path, dict[str, Any]]:
-        """Return what is in the files of `own_evaluations`, unchecked."""
-        config = self.config
-        every = {path: read_json(path) for path in sorted(self.evaluations.glob("*.json"))}
-        own = {
-            path: one for path, one in every.items() if used_as_configured(one.get("settings", {}), config)
-        }
-        return dict(sorted(own.items(), key=lambda one: preference(one[0], one[1], config)))
-
-    def _own_reports(self) -> list[dict[str, Any]]:
-        """Return the reports of `own_evaluations`. Raises InputError if one is damaged."""
-        found = self._own_evaluations()
-        for path, report in found.items():
-            check_report(path, report)
-        return list(found.values())
+    def own_evaluations(self) -> OwnEvaluations:
+        """The evaluations with the settings of the run's config, as they are now."""
+        return OwnEvaluations(self.evaluations, self.config)
 
     @property
     def changed_sources(self) -> list[str]:

@@ -21,10 +21,8 @@ from memmlp.runs.identity import (
     deployment_id,
     deployment_settings,
     evaluation_id,
-    evaluation_id_of,
     evaluation_settings,
 )
-from memmlp.runs.query import record
 from memmlp.runs.run import Run
 from memmlp.tables.measured_run import load
 
@@ -114,41 +112,6 @@ def test_todays_recipes_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert run.results["stream"]["rotation"]["MPJPE"] == 2.0
     assert load(run.folder).means["stream"]["rotation"]["MPJPE"] == 2.0
     assert run.preferred_onnx.read_bytes() == b"new"
-
-
-def solved(run: Run, ik: str, value: float, iterations: int | None = None, made: str = "1") -> None:
-    """Write an evaluation with inverse kinematics."""
-    settings = {"mode": "stream", "ik": ik} | ({"ik_iterations": iterations} if iterations else {})
-    errors = {"rotation": {"MPJPE": 9.0}, "combined": {"MPJPE": value, f"of {ik}": value}}
-    clips = [{"name": "a", "frames": 60, **errors}]
-    report = {"mode": "stream", "settings": settings, "mean": errors, "clips": clips, "made": made}
-    run.evaluations.mkdir(exist_ok=True)
-    write_json(run.evaluation(evaluation_id_of(settings)), report)
-
-
-def test_combined_is_of_one_inverse_kinematics_which_is_named(tmp_path: Path):
-    """That of the run's config, or else the last one; nothing is joined of two."""
-    run = begun(tmp_path)
-    run.begin("memmlp", {"evaluation": {"ik": "off"}}, data="d", upstream=None)
-    solved(run, "lbfgs", 1.0, 15, made="1")
-    solved(run, "arms", 2.0, made="2")
-
-    def found() -> tuple[dict, dict, dict, dict]:
-        read = load(run.folder)
-        keys = {key: value for key, value in record(run).items() if "combined" in key}
-        return run.results["stream"]["combined"], read.means["stream"]["combined"], run.combined_by, keys
-
-    both = {"MPJPE": 2.0, "of arms": 2.0}
-    named = {f"stream.combined-arms.{key}": value for key, value in both.items()}
-    assert found() == (both, both, {"stream": "arms"}, named)
-    assert load(run.folder).clips["a"]["stream"]["combined"] == both
-    run.begin("memmlp", {"evaluation": {"ik": "lbfgs", "ik_iterations": 15}}, data="d", upstream=None)
-    own = {"MPJPE": 1.0, "of lbfgs": 1.0}
-    named = {f"stream.combined-lbfgs-15.{key}": value for key, value in own.items()}
-    assert found() == (own, own, {"stream": "lbfgs-15"}, named)
-    assert facts(run.folder)["metrics"] == {"stream.rotation.MPJPE": 9.0, **named}
-    solved(run, "lbfgs", 3.0, 2, made="3")  # others of the same kind
-    assert found()[0] == own
 
 
 def test_a_run_without_its_artifact_cannot_finish(tmp_path: Path):

@@ -249,10 +249,11 @@ def clips(run: Run) -> list[dict[str, Any]]:
     if not is_trained(run):
         return []
     try:
-        found, by = load(run.folder).clips, run.combined_by
+        found, evaluations = load(run.folder).clips, run.own_evaluations
+        by = evaluations.combined_by
         own = {
             report["name"]: report.get("frames")
-            for path in run.own_evaluations
+            for path in evaluations.paths
             for report in read_json(path).get("clips", [])
         }
     except (InputError, KeyError, TypeError):
@@ -284,7 +285,7 @@ def verified(run: Run) -> list[str]:
 def by_earlier_recipes(run: Run) -> list[str]:
     """Return the modes that a run was measured in by an earlier recipe, each with what has changed since."""
     try:
-        return [f"{mode} ({words})" for mode, words in run.outdated_results.items()]
+        return [f"{mode} ({words})" for mode, words in run.own_evaluations.outdated.items()]
     except InputError:  # the facts tell of a damaged file
         return []
 
