@@ -19,10 +19,13 @@ from glb import Glb
 from processes import PATIENCE, hearing_interrupts, started
 
 from memmlp.cli.live import InputOptions, ShowOptions, known_of, load_clip
+from memmlp.common.errors import InputError
+from memmlp.common.files import write_json
 from memmlp.live.calibration_file import Calibration, save_calibration
 from memmlp.live.stream import Offsets, Stream
-from memmlp.motion.body import PARENTS
+from memmlp.motion.body import PARENTS, builtin_rest_joints
 from memmlp.motion.formats.npz import read_clip, write_clip
+from memmlp.motion.preparing.imported_body import RECORD, body_record
 from memmlp.motion.synthetic import synthesize_clip
 
 
@@ -80,6 +83,12 @@ def test_a_clip_of_a_file_is_on_the_network_s_body(step: Path, clip: Path, tmp_p
     for joint, parent in enumerate(PARENTS[1:], 1):
         bone = np.linalg.norm(joints[:, joint] - joints[:, parent], axis=-1)
         np.testing.assert_allclose(bone, np.linalg.norm(rest[joint] - rest[parent]), atol=1e-5)
+    (tmp_path / "mine").mkdir()
+    copied = tmp_path / "mine" / clip.name
+    copied.write_bytes(clip.read_bytes())
+    write_json(tmp_path / "mine" / RECORD, body_record("builtin", builtin_rest_joints()))
+    with pytest.raises(InputError, match=r"mine: was imported onto the body builtin, and the network"):
+        load_clip(given._replace(clip=str(copied)))
 
 
 @pytest.mark.slow

@@ -124,7 +124,7 @@ def npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
         rest: the body's joints in the rest pose (22, 3), metres, SMPL's body frame.
 
     Raises:
-        InputError: for a clip of fewer than 3 frames at 60 Hz.
+        InputError: for a clip of fewer than 3 frames at 60 Hz, or one that was imported onto another body.
     """
     import torch
 
@@ -132,8 +132,10 @@ def npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
     from memmlp.motion.features import motion_frames
     from memmlp.motion.formats.npz import read_clip
     from memmlp.motion.plausibility import check_plausible
+    from memmlp.motion.preparing.imported_body import check_networks_joints
 
     recorded = read_clip(path, path.stem)
+    check_networks_joints([path], rest)
     check_plausible(path, recorded)
     clip, _ = resample(recorded)
     if len(clip) < 3:

@@ -5,24 +5,29 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import digest
+from memmlp.motion.body import builtin_rest_joints
 
 RECORD = "import.json"
 """What an import leaves in its folder."""
 
+BODY_KEYS = ("body", "rest_joints", "joints")
+"""What of it tells of the body."""
 
-def body_record(body: str, rest: np.ndarray) -> dict[str, str]:
-    """Return what an import records of its body.
+
+def body_record(body: str, rest: np.ndarray) -> dict[str, Any]:
+    """Return what an import records of its body: its name, a digest of its rest joints, and these joints.
 
     Args:
         body: `builtin`, or the path of an SMPL-H model.
         rest: its rest joints (22, 3), metres.
     """
-    return {"body": Path(body).name, "rest_joints": digest(rest.tolist())}
+    return {"body": Path(body).name, "rest_joints": digest(rest.tolist()), "joints": rest.round(6).tolist()}
 
 
 def body_name(body: str, rest: np.ndarray) -> str:
@@ -79,7 +84,41 @@ def check_networks_body(clips: Iterable[Path], body: str) -> None:
             )
 
 
-def _recorded(clips: Iterable[Path]) -> Iterator[tuple[Path, dict[str, str]]]:
+def check_networks_joints(clips: Iterable[Path], rest: np.ndarray) -> None:
+    """Check the same of a network of which the body's joints are known, and no name.
+
+    Of earlier imports onto a model, which did not record joints, all that is known is that the built-in body
+    is another one.
+
+    Args:
+        clips: the clips' files.
+        rest: the joints of the network's body in the rest pose (22, 3), metres.
+
+    Raises:
+        InputError: if they were imported onto another body.
+    """
+    builtin = builtin_rest_joints()
+    for folder, there in _recorded(clips):
+        name = there.get("body")
+        joints = builtin if name == "builtin" else there.get("joints")
+        same = _are_alike(joints, rest) if joints is not None else not _are_alike(builtin, rest)
+        if name is not None and not same:
+            raise InputError(
+                f"{folder}: was imported onto the body {name}, and the network was trained on another; "
+                "allowed are clips imported onto the network's body, with --body"
+            )
+
+
+def _are_alike(one: Any, other: np.ndarray) -> bool:
+    """Return whether two bodies have the same joints, to a tenth of a millimetre; networks have float32."""
+    try:
+        joints = np.asarray(one, np.float64)
+    except (ValueError, TypeError):  # a record that somebody has changed
+        return False
+    return joints.shape == other.shape and bool(np.allclose(joints, other, rtol=0, atol=1e-4))
+
+
+def _recorded(clips: Iterable[Path]) -> Iterator[tuple[Path, dict[str, Any]]]:
     """Yield the folders of the imports that the clips are from, each with what it records of its body.
 
     Of each clip, that is the nearest record above it.
@@ -89,6 +128,6 @@ def _recorded(clips: Iterable[Path]) -> Iterator[tuple[Path, dict[str, str]]]:
     for path in sorted({path for paths in above if (path := next(filter(Path.is_file, paths), None))}):
         try:
             record = json.loads(path.read_text("utf-8"))
-            yield path.parent, {key: record[key] for key in ("body", "rest_joints") if key in record}
+            yield path.parent, {key: record[key] for key in BODY_KEYS if key in record}
         except (OSError, ValueError, TypeError):
             continue  # somebody else's file
