@@ -9,6 +9,7 @@ under their numbers.
 from __future__ import annotations
 
 import json
+import math
 import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -129,6 +130,9 @@ class Study:
         """
         trial.set_user_attr("values", [list(seed) for seed in values])
         means = [fmean(of_seeds) for of_seeds in zip(*values, strict=True)]
+        names = [objective.text for objective in self.search.objectives]
+        if none := [name for name, mean in zip(names, means, strict=True) if math.isnan(mean)]:
+            trial.set_user_attr("reason", f"{' and '.join(none)} is no number")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             self.study.tell(trial.number, means, skip_if_finished=True)

@@ -28,7 +28,7 @@ from memmlp.sweep.plan import RunTask
 from memmlp.sweep.search import study as study_module
 from memmlp.sweep.search.progress_table import figures
 from memmlp.sweep.search.search_file import Value
-from memmlp.sweep.search.study import Study
+from memmlp.sweep.search.study import Study, reason
 
 
 def test_a_search_has_the_trials_it_wants_and_the_papers_first(tmp_path: Path):
@@ -174,6 +174,7 @@ def test_a_value_that_is_no_number_is_a_failure(tmp_path: Path):
     run.finish([])
     one.look(1)
     assert study.trials[0].state == TrialState.FAIL
+    assert reason(study.trials[0]) == "MPJPE is no number"
 
 
 def test_a_pruned_trials_run_is_wanted_again_by_one_with_its_values(tmp_path: Path):
