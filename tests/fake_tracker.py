@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from memmlp.experiment_tracking.logged_values import CurvePoint, RunFacts, SweepFacts
+from memmlp.runs.evaluation_file import write_report
+from memmlp.runs.identity import evaluation_id_of
 from memmlp.runs.run import Run
 
 
@@ -143,3 +145,12 @@ def a_run(outputs: Path, name: str = "0" * 16, steps: int = 3, **config: object)
 def losses(steps: int) -> list[tuple[str, int, float]]:
     """What a tracker has of a run's steps."""
     return [("train/loss", step, 1 / step) for step in range(1, steps + 1)]
+
+
+def an_outdated_evaluation(run: Run) -> Path:
+    """Write an evaluation by an earlier recipe, and return its file."""
+    settings = {"mode": "stream", "ik": "off"}
+    path = run.evaluation(evaluation_id_of(settings))
+    recipes = {"mode.stream": 0}
+    write_report(path, {"mode": "stream", "settings": settings, "mean": {}, "clips": [], "recipes": recipes})
+    return path

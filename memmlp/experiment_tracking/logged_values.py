@@ -58,6 +58,7 @@ class RunFacts:
         note: the users' note; empty for none.
         data: name and digest of its data.
         results: its results by name, as curves of one point.
+        earlier: which of these are by earlier recipes, with what has changed since; else empty.
         files: the small files that are worth showing.
     """
 
@@ -74,6 +75,7 @@ class RunFacts:
     note: str
     data: tuple[str, str]
     results: Mapping[str, float]
+    earlier: str
     files: tuple[Path, ...]
 
     @property
@@ -91,7 +93,8 @@ def facts_of(run: Run, running: bool = False) -> RunFacts:
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
     status = "running" if running else _status(run)
-    results = flatten(with_solvers(run.results, run.own_evaluations.combined_by))
+    evaluations = run.own_evaluations
+    results = flatten(with_solvers(run.results, evaluations.combined_by))
     started = _seconds(manifest.get("started"))
     own = (
         run.config_path, run.results_path, run.picture, run.folder / "code.patch",
@@ -111,6 +114,7 @@ def facts_of(run: Run, running: bool = False) -> RunFacts:
         note=notes.note,
         data=(str((config.get("data") or {}).get("name") or "data"), str(manifest.get("data"))),
         results={k.replace(".", "/"): float(v) for k, v in results.items() if _number(v)},
+        earlier="; ".join(f"{mode} ({changes})" for mode, changes in evaluations.outdated.items()),
         files=tuple(path for path in own if path.is_file()),
     )
 

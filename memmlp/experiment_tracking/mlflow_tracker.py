@@ -214,7 +214,7 @@ def describe(client: MlflowClient, run: MlflowRun, facts: RunFacts) -> None:
         client.log_batch(name, params=part)
     for part in _chunks(changed, PARAMS):
         client.log_batch(name, tags=part)
-    ours = ("memmlp.label.", "memmlp.failure", "mlflow.note.content")
+    ours = ("memmlp.label.", "memmlp.failure", "memmlp.by_an_earlier_recipe", "mlflow.note.content")
     for key in run.data.tags:
         if key.startswith(ours) and key not in tags:
             client.delete_tag(name, key)
@@ -246,6 +246,7 @@ def _run_tags(facts: RunFacts) -> dict[str, str]:
         "mlflow.user": facts.origin.get("user"),
         "mlflow.note.content": facts.note or None,
         "memmlp.failure": facts.reason,
+        "memmlp.by_an_earlier_recipe": facts.earlier or None,
     }
     tags |= {key: value for key, value in given.items() if value is not None}
     return {key: value[:TAG_LENGTH] for key, value in tags.items()}

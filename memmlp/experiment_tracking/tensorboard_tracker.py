@@ -80,6 +80,7 @@ class ShownInTensorBoard:
         self.log(results)
         config = "\n".join(f"| {key} | {value} |" for key, value in facts.config.items())
         texts = {"status": facts.status, "reason": facts.reason, "note": facts.note}
+        texts |= {"results by an earlier recipe": facts.earlier}
         texts |= {"tags": ", ".join(facts.tags), "config": f"| key | value |\n|---|---|\n{config}"}
         for key, text in texts.items():
             if text:

@@ -119,6 +119,8 @@ class ShownInWandB:
         """Write results into the run's summary, and end it with the run's own status."""
         self.run.summary.update({point.key: point.value for point in results})
         self.run.summary.update({"status": facts.status, "reason": facts.reason})
+        if facts.earlier:
+            self.run.summary.update({"results by an earlier recipe": facts.earlier})
         for path in facts.files:
             self.run.save(str(path), base_path=str(facts.folder), policy="now")
         self.run.finish(exit_code=0 if facts.status == "done" else 1)

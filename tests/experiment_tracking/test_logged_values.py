@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from fake_tracker import a_run
+from fake_tracker import a_run, an_outdated_evaluation
 
 from memmlp.common.files import write_json
 from memmlp.experiment_tracking.logged_values import SYSTEM, SweepFacts, Tail, facts_of, final, fingerprint
 from memmlp.runs.metrics_log import MetricsLog
 from memmlp.runs.notes import add_tags, set_note
+from memmlp.runs.recipe_versions import RECIPES
 
 
 def test_status_is_that_of_the_folder(tmp_path: Path):
@@ -55,6 +56,17 @@ def test_name_origin_data_labels_and_note(tmp_path: Path):
     assert (facts.tags, facts.note) == (("good",), "a note")
     assert (facts.origin["user"], facts.origin["commit"]) == ("somebody", "abc")
     assert facts.config["memory.layers"] == "[2]"
+
+
+def test_results_by_an_earlier_recipe_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    run = a_run(tmp_path, evaluation={"ik": "off"})
+    an_outdated_evaluation(run)
+    monkeypatch.setitem(RECIPES, "mode.stream", 0)
+    now = fingerprint(run, facts_of(run))
+    assert facts_of(run).earlier == ""
+    monkeypatch.setitem(RECIPES, "mode.stream", 1)
+    assert facts_of(run).earlier == "stream (mode.stream 0 -> 1)"
+    assert fingerprint(run, facts_of(run)) != now
 
 
 def test_results_lie_at_the_last_step(tmp_path: Path):

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fake_tracker import an_outdated_evaluation
 from processes import finished
 
 from memmlp.common.files import write_json
@@ -106,14 +107,18 @@ def test_tags_and_notes_come_and_go(projected: Path):
     tracking, run = MLflow(None, projected), Run.of(projected, "0" * 16)
     add_tags(run, ["good"])
     set_note(run, "a note")
+    outdated = an_outdated_evaluation(run)
     project(tracking, run)
-    (found,) = shown(projected)
-    assert (found.data.tags["memmlp.label.good"], found.data.tags["mlflow.note.content"]) == ("yes", "a note")
+    tags = shown(projected)[0].data.tags
+    assert (tags["memmlp.label.good"], tags["mlflow.note.content"]) == ("yes", "a note")
+    assert tags["memmlp.by_an_earlier_recipe"].startswith("stream (mode.stream 0 -> ")
     remove_tags(run, ["good"])
     set_note(run, "")
+    outdated.unlink()
     project(tracking, run)
     (found,) = shown(projected)
-    assert {"memmlp.label.good", "mlflow.note.content"} & set(found.data.tags) == set()
+    gone = {"memmlp.label.good", "mlflow.note.content", "memmlp.by_an_earlier_recipe"}
+    assert gone & set(found.data.tags) == set()
 
 
 def test_no_step_twice(projected: Path):

@@ -6,7 +6,7 @@ import struct
 from pathlib import Path
 
 import pytest
-from fake_tracker import a_run
+from fake_tracker import a_run, an_outdated_evaluation
 
 from memmlp.experiment_tracking.logged_values import SweepFacts
 from memmlp.experiment_tracking.sync import sync
@@ -75,11 +75,13 @@ def test_it_tells_how_a_run_ended_and_what_people_said(tmp_path: Path):
     tracker, run = TensorBoard(tmp_path), a_run(tmp_path)
     run.fail("loss is nan")
     set_note(run, "a note")
+    an_outdated_evaluation(run)
     sync(tracker, [run], tmp_path, print)
     (folder,) = Path(tracker.place).iterdir()
     texts = {tag.split("/")[0]: text for tag, _, text in events(folder) if isinstance(text, str)}
     assert (texts["status"], texts["reason"], texts["note"]) == ("failed", "loss is nan", "a note")
     assert "| seed | 0 |" in texts["config"]
+    assert texts["results by an earlier recipe"].startswith("stream (mode.stream 0 -> ")
 
 
 def test_a_run_that_is_gone_from_it_is_shown_again(tmp_path: Path):

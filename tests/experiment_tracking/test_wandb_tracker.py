@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_tracker import a_run
+from fake_tracker import a_run, an_outdated_evaluation
 from processes import until
 
 from memmlp.common.files import write_json
@@ -77,6 +77,16 @@ def rows(found: list[Any], axis: str, key: str) -> list[tuple[float, float]]:
     return [(row[axis], row[key]) for row in history if key in row]
 
 
+def summary(found: list[Any]) -> dict[str, Any]:
+    """A run's summary."""
+    return {
+        item.key or "/".join(item.nested_key): json.loads(item.value_json)
+        for record in found
+        if record.WhichOneof("record_type") == "summary"
+        for item in record.summary.update
+    }
+
+
 def test_a_failed_run_with_its_curve_name_tags_and_machine_once(tmp_path: Path):
     tracker, run = WandB("mine", tmp_path), a_run(tmp_path, steps=2)
     run.write_manifest({"name": "memory=gru · seed 1"})
@@ -89,6 +99,7 @@ def test_a_failed_run_with_its_curve_name_tags_and_machine_once(tmp_path: Path):
     session.step()
     session.leave()
     run.fail("loss is nan")
+    an_outdated_evaluation(run)
     assert sync(tracker, [run], tmp_path, print) == {"shown": 1}
     assert sync(tracker, [run], tmp_path, print) == {"same": 1}
     found = records(tracker, run.id)
@@ -98,6 +109,7 @@ def test_a_failed_run_with_its_curve_name_tags_and_machine_once(tmp_path: Path):
     assert (begun.display_name, begun.project, list(begun.tags)) == ("memory=gru · seed 1", "mine", ["good"])
     (end,) = [record.exit for record in found if record.WhichOneof("record_type") == "exit"]
     assert end.exit_code == 1
+    assert summary(found)["results by an earlier recipe"].startswith("stream (mode.stream 0 -> ")
 
 
 def test_each_sample_of_the_machine_and_each_step_is_kept_at_its_own_place(tmp_path: Path):
@@ -127,12 +139,7 @@ def test_a_sweep_is_a_run_with_its_verdicts(tmp_path: Path):
         tracker.sweep(facts)
     (folder,) = Path(tracker.place).glob("offline-run-*")
     found = records(tracker, folder.name.rsplit("-", 1)[-1])
-    kept = {
-        item.key or "/".join(item.nested_key): json.loads(item.value_json)
-        for record in found
-        if record.WhichOneof("record_type") == "summary"
-        for item in record.summary.update
-    }
+    kept = summary(found)
     assert (kept["a/stream/MPJPE"], kept["verdict/a/stream/MPJPE"]) == (6.5, "holds")
 
 
