@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,6 +24,13 @@ if TYPE_CHECKING:
 @click.command("sweep")
 @click.argument("name")
 @click.argument("overrides", nargs=-1)
+@click.option(
+    "--arm",
+    "arms",
+    metavar="LABEL",
+    multiple=True,
+    help="Run this arm alone, with what it builds on; may be given again.",
+)
 @worker_options
 @click.option("--status", is_flag=True, help="Show how far the sweep is, and run nothing.")
 @click.option(
@@ -47,6 +54,7 @@ if TYPE_CHECKING:
 def sweep(
     name: str,
     overrides: tuple[str, ...],
+    arms: tuple[str, ...],
     workers: Workers,
     status: bool,
     dry_run: bool,
@@ -75,36 +83,41 @@ def sweep(
     seed_rounds.check(overrides, until_decided, max_seeds)
     if again and (until_decided or status or dry_run):
         raise InputError("--again: allowed is without --until-decided, --status and --dry-run")
+    if arms and until_decided:
+        raise InputError("--arm: allowed is without --until-decided, which chooses arms itself")
     chosen = find_sweep(name, overrides)
+    labels = chosen.labels_of(arms)
     outputs = outputs.absolute()
     rounds = seed_rounds.current_rounds(chosen, outputs, max_seeds) if until_decided else None
     spent = rounds.spent(chosen) if rounds else chosen
     plan = make_plan(spent, outputs, prepare=not (status or dry_run))
+    wanted = plan.of_arms(labels)
     if status or dry_run:
-        show(spent, plan)
+        show(spent, plan, labels)
         if rounds:
             click.echo("\n".join([seed_rounds.schedule(rounds), *seed_rounds.progress_lines(rounds, chosen)]))
         if dry_run:
-            show_forecast(spent, plan, workers.number(workers.shares(devices(plan))))
+            show_forecast(spent, wanted, labels, workers.number(workers.shares(devices(wanted))))
             click.echo(workers.script(sweep_folder(chosen, outputs)) or "", nl=False)
         return
     if retry:
-        for task in plan.tasks:
-            plan.run_of(task).retry()
+        for task in wanted.tasks:
+            wanted.run_of(task).retry()
     if again:
-        reset(plan)
+        reset(wanted)
     work = partial(run_workers, workers=workers)
     if rounds:
         rounds, plan = seed_rounds.run_until_decided(chosen, outputs, rounds, work, fail_fast)
-        show_outcome(SweepToShow(rounds.spent(chosen), plan, rounds), [name, *overrides], chosen)
+        show_outcome(SweepToShow(rounds.spent(chosen), plan, rounds), [name, *overrides], chosen, labels)
         return
-    plan = replace(plan, fail_fast=fail_fast)
-    if plan.left():
-        work(chosen, plan)
+    wanted = replace(wanted, fail_fast=fail_fast)
+    if wanted.left():
+        work(chosen, wanted)
     show_outcome(
-        SweepToShow(chosen, plan, None, spent_before(chosen, outputs)),
+        SweepToShow(chosen, replace(plan, fail_fast=fail_fast), None, spent_before(chosen, outputs)),
         [name, *overrides],
         chosen,
+        labels,
     )
 
 
@@ -130,39 +143,46 @@ def devices(plan: Plan) -> set[str]:
     return {task.config["device"] for task in plan.tasks}
 
 
-def show(chosen: Sweep, plan: Plan) -> None:
-    """Print the board once, what older code made, and runs left over from earlier versions of the file."""
+def show(chosen: Sweep, plan: Plan, labels: Collection[str]) -> None:
+    """Print the board once, what older code made, and runs left over from earlier versions of the file.
+
+    Args:
+        chosen: the sweep.
+        plan: its plan.
+        labels: the labels of the arms that are shown.
+    """
     from rich.console import Console
 
     from memmlp.config.compose_plan import orphans
     from memmlp.sweep.progress_table import render
     from memmlp.tables.flags_of_code import older_code
 
-    if plan.entries:
-        states = plan.states()
-        Console(highlight=False).print(render(plan, states))
-        done = [(e.label, plan.run_of(e).manifest) for e in plan.entries if states[e.key] == "done"]
+    shown = plan.of_arms(labels)
+    if shown.entries:
+        states = shown.states()
+        Console(highlight=False).print(render(shown, states))
+        done = [(e.label, shown.run_of(e).manifest) for e in shown.entries if states[e.key] == "done"]
         for line in older_code((label, m.get("sources", {}), m.get("plugins", ())) for label, m in done):
             click.echo(line)
-    if found := unprepared(chosen, plan):
+    if found := unprepared(chosen, shown, labels):
         click.echo(f"{found} runs: their data is not prepared yet; the sweep does that first")
     for entry in orphans(chosen, plan):
         click.echo(f"orphan: run {entry.id} was '{entry.label}' seed {entry.seed} in an earlier version")
 
 
-def unprepared(chosen: Sweep, plan: Plan) -> int:
-    """Return how many of the sweep's runs the plan lacks because their data is not prepared yet."""
-    return len(chosen.arm_seeds()) - len(plan.entries)
+def unprepared(chosen: Sweep, plan: Plan, labels: Collection[str]) -> int:
+    """Return how many runs of these arms their plan lacks because their data is not prepared yet."""
+    return sum(one.label in labels for one in chosen.arm_seeds()) - len(plan.entries)
 
 
-def show_forecast(chosen: Sweep, plan: Plan, workers: int) -> None:
+def show_forecast(chosen: Sweep, plan: Plan, labels: Collection[str], workers: int) -> None:
     """Print how long the remaining runs may take.
 
     VQ-VAEs are counted only for runs whose data is prepared.
     """
     from memmlp.sweep.forecast import forecast
 
-    left, later = plan.left(), unprepared(chosen, plan)
+    left, later = plan.left(), unprepared(chosen, plan, labels)
     besides = ", and the VQ-VAEs that they need" if later else ""
     line = f"{len(left) + later} of {len(plan.tasks) + later} runs to do{besides}, {workers} at once"
     if not later and (found := forecast(plan)):
@@ -174,10 +194,10 @@ def show_forecast(chosen: Sweep, plan: Plan, workers: int) -> None:
     click.echo(line)
 
 
-def show_outcome(shown: SweepToShow, words: Sequence[str], chosen: Sweep) -> None:
+def show_outcome(shown: SweepToShow, words: Sequence[str], chosen: Sweep, labels: Collection[str]) -> None:
     """Print the table, finished and failed runs, and the next command.
 
-    Exits with 1 if something failed.
+    Exits with 1 if something failed that the arms with these labels need.
     """
     from memmlp.cli.seed_rounds import closing
     from memmlp.cli.table import SHOWN_MODES, on_screen, table_of_plan
@@ -188,7 +208,7 @@ def show_outcome(shown: SweepToShow, words: Sequence[str], chosen: Sweep) -> Non
 
     plan, rounds, words = shown.plan, shown.rounds, [*words, *plugins.config_dir_words()]
     states = plan.states()
-    failed = [task for task in plan.tasks if states[task.key] in ("failed", "blocked")]
+    failed = [task for task in plan.of_arms(labels).tasks if states[task.key] in ("failed", "blocked")]
     command = " ".join(["memmlp sweep", *words])
     found = table_of_plan(shown, SHOWN_MODES["both"], command, load)
     show_in_trackers(plan, sweep_folder(chosen, plan.outputs), found.table)

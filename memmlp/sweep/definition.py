@@ -185,6 +185,19 @@ class Sweep:
         """Return the arms that can be run: all except those with only the paper's values."""
         return tuple(arm for arm in self.arms if arm.overrides is not None)
 
+    def labels_of(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Return the labels of the arms that are named, of all that can be run if none is.
+
+        Raises:
+            InputError: for a name that no arm has, or an arm with only the paper's values.
+        """
+        known = [arm.label for arm in self.runnable()]
+        if missing := [name for name in names if name not in known]:
+            raise InputError(
+                f"sweep {self.name}: no arm '{missing[0]}' that can be run; allowed are {', '.join(known)}"
+            )
+        return tuple(names) or tuple(known)
+
     def arm_seeds(self) -> list[ArmSeed]:
         """Return the trainings that the sweep needs, arm by arm."""
         return [

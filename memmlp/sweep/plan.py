@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -80,6 +80,16 @@ class Plan:
     open: bool = False
     cancelled: tuple[str, ...] = ()
     fail_fast: bool = False
+
+    def of_arms(self, labels: Iterable[str]) -> Plan:
+        """Return the part of the plan that arms with these labels need: their runs, and those upstream."""
+        chosen = set(labels)
+        entries = tuple(entry for entry in self.entries if entry.label in chosen)
+        wanted = {entry.key for entry in entries}
+        for task in reversed(self.tasks):  # each before those that it needs, whose keys are their ids
+            if task.key in wanted and task.upstream:
+                wanted.add(task.upstream)
+        return replace(self, entries=entries, tasks=tuple(task for task in self.tasks if task.key in wanted))
 
     def run(self, label: str, seed: int) -> Run | None:
         """Return the run of an arm with a seed, finished or not; None if its identity is not known."""

@@ -95,6 +95,18 @@ def test_status_and_dry_run_show_and_do_nothing(home: Path):
     assert stamps(home) == before
 
 
+def test_arms_that_are_named_are_run_alone(home: Path):
+    before = stamps(home)
+    assert "1 of 2 runs to do" in command(home, "seed=0,1", "--arm", "none", "--dry-run", "--workers", "1")
+    said = command(home, "--status", "--arm", "none")
+    assert "1 done" in said
+    assert "wild" not in said
+    said = command(home, "--arm", "none", "--arm", "full")  # the failure of another arm is none of theirs
+    assert "3 of 4 runs done" in said
+    assert "again with: --retry" in command(home, "--arm", "wild", code=1)
+    assert stamps(home) == before
+
+
 def test_a_first_dry_run_counts_the_runs_whose_data_is_not_prepared(tmp_path: Path):
     (tmp_path / "trial.yaml").write_text("axes: {seed: [5, 6]}")
     said = command(tmp_path, "--dry-run", "--workers", "2")
@@ -265,6 +277,8 @@ def test_an_interrupted_sweep_ends_its_workers_and_goes_on_later(tmp_path: Path,
         (["99"], "sweep '99': no such sweep"),
         (["missing.yaml"], "missing.yaml: no such file; allowed"),
         (["trial.yaml", "memory=nosuch"], "memory=nosuch"),
+        (["trial.yaml", "--arm", "non"], "sweep trial: no arm 'non' that can be run; allowed are full, none"),
+        (["trial.yaml", "--arm", "none", "--until-decided"], "--arm: allowed is without --until-decided"),
         (["trial.yaml", "executor=cloud"], "executor=cloud: allowed is local, slurm, ray or dask"),
         (["trial.yaml", "slurm.partition=x"], "slurm.partition: goes with executor=slurm"),
         (["trial.yaml", "executor=slurm", "slurm.nodes=2"], "slurm.nodes: allowed is none"),
