@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Self
 
 from rich import box
@@ -32,8 +32,17 @@ WORDS = {
 ARM_WIDTH = 20  # columns that an arm's name has at least, or as many as it needs
 
 
+QUIET = 300.0  # seconds without a line, in a log, after which the progress of what runs is told
+
+
 class Screen:
-    """Shows content that changes: in place on a terminal, elsewhere as one line for every change."""
+    """Shows content that changes: in place on a terminal, elsewhere as one line for every change.
+
+    Where nothing changes for long, and at the beginning, there are lines of the progress of what runs.
+    """
+
+    last_line: float | None = None
+    """When the last line was printed, by time.monotonic."""
 
     def __init__(self, console: Console | None = None):
         self.console = console or Console(highlight=False, stderr=True)
@@ -48,16 +57,25 @@ class Screen:
         if self.console.is_terminal:
             self.live.stop()
 
-    def show(self, whole: Callable[[], RenderableType], changes: Iterable[str]) -> None:
+    def show(
+        self,
+        whole: Callable[[], RenderableType],
+        changes: Sequence[str],
+        progress: Callable[[], Sequence[str]],
+    ) -> None:
         """Show the whole content on a terminal; elsewhere print the lines about what changed.
 
-        `whole` is called only if its result is shown.
+        `whole` and `progress` are called only if their results are shown.
         """
         if self.console.is_terminal:
             self.live.update(whole())
-        else:
-            for line in changes:
-                self.console.print(line, soft_wrap=True, markup=False)
+            return
+        now = time.monotonic()
+        if not changes and (self.last_line is None or now - self.last_line >= QUIET):
+            changes = progress()
+        for line in changes:
+            self.console.print(line, soft_wrap=True, markup=False)
+            self.last_line = now
 
 
 class Board(Screen):
@@ -67,7 +85,7 @@ class Board(Screen):
 
     def update(self, plan: Plan, states: Mapping[str, str]) -> None:
         """Show the plan with its tasks in these states."""
-        self.show(lambda: render(plan, states), self._changes(plan, states))
+        self.show(lambda: render(plan, states), self._changes(plan, states), lambda: progress(plan, states))
         self.before = states
 
     def _changes(self, plan: Plan, states: Mapping[str, str]) -> list[str]:
@@ -75,8 +93,18 @@ class Board(Screen):
         if self.before is None:
             return []
         changed = [task for task in plan.tasks if self.before.get(task.key) != states[task.key]]
-        done = sum(state == "done" for state in states.values())
-        return [f"{done} of {len(states)} done; {_change(plan, t, states[t.key])}" for t in changed]
+        return [f"{_done(states)}; {_change(plan, task, states[task.key])}" for task in changed]
+
+
+def progress(plan: Plan, states: Mapping[str, str]) -> list[str]:
+    """Return a line about each running run, or one that none runs yet."""
+    running = [task for task in plan.tasks if states[task.key] == "running"]
+    lines = [f"{name(plan, task)}: {progress_text(plan.run_of(task), total_steps(task))}" for task in running]
+    return [f"{_done(states)}; {line}" for line in lines or ["workers are starting"]]
+
+
+def _done(states: Mapping[str, str]) -> str:
+    return f"{sum(state == 'done' for state in states.values())} of {len(states)} done"
 
 
 def _change(plan: Plan, task: RunTask, state: str) -> str:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
 from memmlp.runs.metrics_log import Metrics
 from memmlp.runs.run import Run
+from memmlp.sweep import progress_table
 from memmlp.sweep.plan import Entry, Plan, RunTask
-from memmlp.sweep.progress_table import device_name, progress_text, render, time_left
+from memmlp.sweep.progress_table import QUIET, Board, device_name, progress_text, render, time_left
 
 CARD = {"device": "cuda", "gpu": "A card", "gpu_index": "1"}
 
@@ -33,6 +36,31 @@ def test_running_runs_are_counted_by_device(plan: Plan, capsys: pytest.CaptureFi
     assert "running on GPU 1 (A card): 2, cpu: 1" in capsys.readouterr().out
     Console(width=200).print(render(plan, dict.fromkeys(states, "done")))
     assert "running on" not in capsys.readouterr().out
+
+
+def test_a_log_is_not_silent_while_runs_go_on(plan: Plan, monkeypatch: pytest.MonkeyPatch):
+    clock = SimpleNamespace(monotonic=lambda: clock.now, time=lambda: 1.0, now=100.0)
+    monkeypatch.setattr(progress_table, "time", clock)
+    board, said = Board(), io.StringIO()
+    board.console = Console(file=said, width=200)
+    keys = [task.key for task in plan.tasks]
+
+    def told(*states: str) -> list[str]:
+        said.seek(0)
+        said.truncate()
+        board.update(plan, dict(zip(keys, states, strict=True)))
+        return said.getvalue().splitlines()
+
+    assert told("new", "new", "new", "done") == ["1 of 4 done; workers are starting"]
+    assert told("new", "new", "new", "done") == []
+    clock.now += QUIET - 1
+    assert told("running", "new", "new", "done") == ["1 of 4 done; arm seed 0: running"]
+    clock.now += QUIET - 1
+    assert told("running", "new", "new", "done") == []
+    plan.run_of(plan.tasks[0]).log(3, {"loss": 0.5})
+    clock.now += 1
+    assert told("running", "new", "new", "done") == ["1 of 4 done; arm seed 0: 3/9 loss 0.5"]
+    assert told("running", "new", "new", "done") == []
 
 
 def test_what_a_finished_cell_shows_is_said_below(

@@ -41,6 +41,7 @@ class SearchBoard(Screen):
         self.show(
             lambda: render(study, self.outputs),
             [line(study.search, trial, len(ended), self.outputs) for trial in new],
+            lambda: progress(study, self.outputs),
         )
         self.told = {trial.number for trial in ended}
 
@@ -52,6 +53,18 @@ def line(search: Search, trial: FrozenTrial, ended: int, outputs: Path) -> str:
     names = ", ".join(dict.fromkeys(filter(None, map(device_name, runs_of(trial, outputs)))))
     how = f"{WORDS[trial.state]} on {names}" if names else WORDS[trial.state]
     return f"{ended} of {search.n_trials}; trial {trial.number} {how}: {what} ({params})"
+
+
+def progress(study: Study, outputs: Path) -> list[str]:
+    """Return a line about each trial of which a run is worked on, or one that none is yet."""
+    going = [(trial, runs_of(trial, outputs)) for trial in study.trials if trial.state not in WORDS]
+    lines = [
+        f"trial {trial.number}: {_going(trial, runs)}"
+        for trial, runs in going
+        if any(run.doing for run in runs)
+    ]
+    ended = sum(trial.state in WORDS for trial in study.trials)
+    return [f"{ended} of {study.search.n_trials}; {line}" for line in lines or ["workers are starting"]]
 
 
 def runs_of(trial: FrozenTrial, outputs: Path) -> list[Run]:

@@ -8,7 +8,7 @@ import pytest
 from fake_search import STEPS, begun, director, finish, log, open_study
 from rich.console import Console
 
-from memmlp.sweep.search.progress_table import line, render
+from memmlp.sweep.search.progress_table import line, progress, render
 
 CARD = {"device": "cuda", "gpu": "A card", "gpu_index": "1"}
 
@@ -30,6 +30,9 @@ def test_the_devices_of_runs_under_way_are_counted(tmp_path: Path):
         run.write_manifest(facts)
     with runs[0].lock(), runs[1].lock(), runs[2].lock():
         assert "running on GPU 1 (A card): 2, cpu: 1" in drawn(study, tmp_path)
+        lines = progress(study, tmp_path)
+        assert [text.partition(";")[2][:9] for text in lines] == [" trial 0:", " trial 1:", " trial 2:"]
+    assert progress(study, tmp_path) == [f"0 of {study.search.n_trials}; workers are starting"]
 
 
 @pytest.mark.parametrize(
