@@ -80,12 +80,16 @@ def render(
     a second. One colour scale holds for all.
     """
     check_runs(outputs, *runs)
+    from memmlp.common.progress import tell
+
+    tell("render: read the runs and their test clips")
     from memmlp.config.open_run import open_run
     from memmlp.render.figure_or_film import check_picture, write_picture
 
     check_picture(out, "--out")
     check_labels(runs, labels)
     piece = piece_of([open_run(outputs, run) for run in runs], labels, clip, (begin, end), branch, mode)
+    tell(f"render: draw {out}")
     write_picture(out, piece, frames, "--out")
     errors = ", ".join(f"{label} {error.mean():.1f} cm" for label, error in piece.errors.items())
     click.echo(f"{out}: {piece.title}, {errors}")
@@ -123,6 +127,7 @@ def piece_of(
     import numpy as np
 
     from memmlp.common.errors import InputError
+    from memmlp.common.progress import tell
     from memmlp.config.open_run import clip_of
     from memmlp.render.clip_piece import ClipPiece, span
 
@@ -133,6 +138,7 @@ def piece_of(
     first, last = span(len(clip_of(runs[0].test, title)), title, *times, ("--from", "--to"))
     truths, predictions = [], {}
     for label, run in zip(names, runs, strict=True):
+        tell(f"render: {label} on {title}")
         truth, motion = predicted(run, title, last, branch, mode)
         truths.append(truth[first:])
         predictions[label] = motion[first:]
