@@ -16,6 +16,7 @@ from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import parity
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
+from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import CodeMemory, GRUMemory, JointCodeMemory, LSTMMemory, NoCodesMemory, NoMemory
 from memmlp.networks.predictor_slot import RotationOnly, TwoBranch, TwoBranchMemory
 from memmlp.networks.streaming import StreamingGraph, streaming
@@ -51,6 +52,15 @@ def test_the_stream_is_the_network(kind, changes, predictor):
     if kind is NoMemory and predictor is TwoBranchMemory:
         return
     assert largest_difference(tiny.model(kind, predictor, **changes).double(), CLIP.double()) < 1e-11
+
+
+@pytest.mark.parametrize("predictor", [TwoBranch, RotationOnly])
+@torch.no_grad()
+def test_of_branches_without_blocks(predictor):
+    slot = tiny.memory()
+    head = predictor(0, **tiny.SIZES)
+    model = MemMLP(tiny.normalizer(), slot, head, depth=tiny.DEPTH, **tiny.SIZES).eval().double()
+    assert largest_difference(model, CLIP.double()) < 1e-11
 
 
 @pytest.mark.slow

@@ -141,7 +141,7 @@ class FrameGRU(nn.Module):
 
 
 class StreamedBranch(nn.Module):
-    """A predictor's branch whose last block and linear layer compute the newest frame alone."""
+    """A predictor's branch whose last block, if any, and linear layer compute the newest frame alone."""
 
     def __init__(self, blocks: Sequence[StreamingBlock], linear: nn.Linear):
         super().__init__()
@@ -149,10 +149,11 @@ class StreamedBranch(nn.Module):
 
     def forward(self, h: Tensor, contributions: Sequence[Tensor], count: int) -> Tensor:
         """Map the window (T, d) to the newest frame's outputs (1, size); `count` is always 1."""
-        *earlier, last = self.blocks
-        for block in earlier:
+        for block in self.blocks[:-1]:
             h = block(h, contributions)
-        return self.linear(last(h, contributions, newest))
+        for block in self.blocks[-1:]:
+            h = block(h, contributions, newest)
+        return self.linear(newest(h))
 
 
 class Converter:
