@@ -14,7 +14,7 @@ from memmlp.networks.baselines.diffusion import Noising, at, linear_schedule
 Step = Callable[[Tensor, int], tuple[Tensor, Tensor]]
 """Maps a noisy signal and the number of its sampling step to the next one's mean and deviation."""
 
-QUIET = 50  # so many last steps of a sample take the mean
+QUIET = 50  # so many last steps of a sample take the mean; in BoDiffusion's released code 49
 BIN = 2 / 255  # the width of the bins of the first step's likelihood: a pixel's, as BoDiffusion's code has it
 
 

@@ -34,8 +34,9 @@ class EgoPoser(AvatarPoser):
 
     It has 4,126,340 parameters at the paper's sizes (T = 80, otherwise AvatarPoser's); the released code has
     a further layer of 7,808 that nothing uses. Positions are relative to the point of the floor below the
-    head in the same frame, and how far the trackers moved on the floor since the window's first frame is
-    appended to each frame's inputs.
+    head in the same frame, and how far these moved since the window's first frame is appended to each frame's
+    inputs: the head's not at all. In the released code the hands' positions and movements are the world's
+    (docs/readings.md).
     """
 
     inputs: ClassVar[int] = SPARSE_DIM + PLACES
