@@ -71,7 +71,7 @@ def bent_to(goal: Tensor, side: Tensor, upper: Tensor, lower: Tensor) -> tuple[T
         upper: lengths of the upper bones (2, 1).
         lower: lengths of the lower ones (2, 1).
     """
-    distance = goal.norm(dim=-1, keepdim=True).clamp_min(1e-4)
+    distance = goal.norm(dim=-1, keepdim=True).clamp_min(1e-9)
     axis = goal / distance
     most, least = (upper + lower) * (1 - SLACK), (upper - lower).abs() + upper * SLACK
     reach = distance.minimum(most).maximum(least)

@@ -58,6 +58,16 @@ def test_hands_come_to_their_trackers_and_bones_keep_their_lengths(share: float)
     torch.testing.assert_close(turned @ turned.mT, torch.eye(3).double().expand_as(turned))
 
 
+def test_a_hand_on_its_shoulder_leaves_bones_as_long_and_turned_as_they_lie():
+    """As near as that, an arm is folded in the hand's direction."""
+    rotations, joints = body()
+    turned, placed = reached(rotations, joints, inputs(joints, within_reach(joints, 1e-6)), REST)
+    for joint, child, length in zip((SHOULDERS, ELBOWS), (ELBOWS, WRISTS), LENGTHS, strict=True):
+        bones = turned[:, joint] @ (REST[child] - REST[joint])[..., None]
+        torch.testing.assert_close(placed[:, joint] + bones[..., 0], placed[:, child])
+        torch.testing.assert_close(bones.norm(dim=-2)[..., 0], length.expand(len(placed), 2))
+
+
 def test_the_elbow_stays_on_its_side_of_the_way_to_the_hand():
     rotations, joints = body()
     hands = within_reach(joints, 0.7)
