@@ -9,7 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from memmlp.motion.body import ROTATION
+from memmlp.motion.body import N_JOINTS, ROTATION
+from memmlp.motion.geometry import matrix_to_sixd
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import State
 from memmlp.networks.windowless_model import WindowlessModel
@@ -18,7 +19,8 @@ from memmlp.networks.windowless_model import WindowlessModel
 class StillPose(WindowlessModel):
     """A learned pose, which the coordinates alone turn and carry along: by default with the head.
 
-    It has 132 parameters: the joints' local rotations, at first those of the normalizer's mean.
+    It has 132 parameters: the joints' local rotations, at first those of the normalizer's mean, or none where
+    it has no mean (`frame.normalize=false`).
 
     Args:
         normalizer: converts between the world and network space.
@@ -28,6 +30,8 @@ class StillPose(WindowlessModel):
     def __init__(self, normalizer: Normalizer, *, frames: int):
         super().__init__(normalizer, frames)
         self.pose = nn.Parameter(torch.zeros(ROTATION.stop))
+        if not normalizer.mean.any():  # zeros would be no rotations then, and their gradient has no bound
+            self.pose.data.copy_(matrix_to_sixd(torch.eye(3)).repeat(N_JOINTS))
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         """Take in the newest frames, each on its own; see MotionModel.
