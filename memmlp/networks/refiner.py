@@ -51,7 +51,9 @@ class Refined(MotionModel):
     """A network followed by recurrent layers that correct its rotations; a stream in both evaluation modes.
 
     With 2 layers of width 512 the refiner has 2,635,908 parameters. Rotations are corrected in the world.
-    Learned positions stay as they are; others follow from the corrected rotations.
+    Learned positions stay as they are; others follow from the corrected rotations. Hands that the network
+    itself put on their trackers (RecurrentPoser, MANIKIN) do not stay there; `evaluation.ik=arms` brings them
+    back.
 
     Args:
         network: the network; it is not trained further.

@@ -210,6 +210,12 @@ def test_what_makes_no_sense_is_refused_in_one_line(overrides, word):
 
 
 @pytest.mark.slow
+def test_arms_that_a_refiner_has_moved_may_reach_again():
+    cfg = composed(["model=recurrent_poser", "refiner=sage", "evaluation.ik=arms"])
+    assert (cfg.model.output, cfg.evaluation.ik) == ("reaching", "arms")
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("profile", ["tiny", "small", "paper"])
 def test_profiles_and_the_papers_experiment_fit(name, profile):

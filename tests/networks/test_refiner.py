@@ -10,7 +10,9 @@ from torch.utils.flop_counter import FlopCounterMode
 from memmlp.config.build import build_architecture, untrained
 from memmlp.config.compose import composed
 from memmlp.evaluation import modes
-from memmlp.motion.body import POSITION, ROTATION, SPARSE_DIM
+from memmlp.evaluation.ik import Arms
+from memmlp.evaluation.modes import joint_positions
+from memmlp.motion.body import HANDS, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.network_coordinates import Heading
 from memmlp.networks.network_families import RefinedArchitecture
 from memmlp.networks.refiner import HIDDEN, Refined
@@ -97,3 +99,19 @@ def test_a_step_is_a_few_products_more():
 def test_what_has_no_stream_has_none_with_a_refiner():
     assert has_stream(tiny.refined(tiny.baseline("rpm")))
     assert not has_stream(tiny.refined(tiny.baseline("manikin_l", offline=True)))
+
+
+@torch.no_grad()
+def test_arms_that_it_moves_off_their_trackers_reach_again_by_inverse_kinematics():
+    """The trackers are where the network's own hands are, so that its arms reach them."""
+    model, clip = tiny.refined(tiny.recurrent_poser(Heading(), output="reaching")), tiny.clip(9)
+    (first,) = modes.stream(model.network, [clip])
+    hands = joint_positions(first)[:, list(HANDS)]
+    clip[:, SPARSE_POSITION.start + 3 : SPARSE_POSITION.stop] = hands.flatten(1)
+    (reaching,), (moved,) = modes.stream(model.network, [clip]), modes.stream(model, [clip])
+    again = Arms().solutions(model.normalizer, moved, clip[:, :SPARSE_DIM])["combined"]
+    found = [model.normalizer.pose(motion, clip[:, :SPARSE_DIM]) for motion in (reaching, again, moved)]
+    away = [float((joints[:, list(HANDS)] - hands).norm(dim=-1).mean()) for joints in found]
+    assert away[0] < 0.001
+    assert away[1] < 0.02
+    assert away[2] > 0.1

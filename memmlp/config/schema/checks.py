@@ -203,7 +203,8 @@ def _check_baseline(cfg: DictConfig) -> None:
         raise InputError(
             f"evaluation.ik=lbfgs needs positions, and {name} has rotations alone: allowed is off or arms"
         )
-    if cfg.evaluation.ik == "arms" and cfg.model.get("output") == "reaching":
+    reaching = cfg.model.get("output") == "reaching" and cfg.refiner is None  # a refiner moves arms again
+    if cfg.evaluation.ik == "arms" and reaching:
         raise InputError("evaluation.ik=arms: model.output=reaching has such arms already; allowed is off")
     for heads, width in (("heads", "width"), ("code_heads", "code_width")):
         if heads in cfg.model and cfg.model[width] % cfg.model[heads]:
