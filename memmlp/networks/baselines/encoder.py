@@ -85,11 +85,11 @@ class EncoderLayer(nn.Module):
 def draw_weights(part: nn.Module) -> None:
     """Draw initial weights of linear layers as AvatarPoser's released code, and code derived from it, does.
 
-    They have Kaiming's normal distribution (He et al. 2015, Eq. 10) times 0.2. Biases are 0, so that a
-    network begins near the mean pose; the released code leaves them as torch draws them, and keeps weights
-    within 0.2. In torch's own attention, queries, keys and values share one matrix,
-    which the released code leaves as torch draws it, by Xavier's uniform distribution (Glorot & Bengio 2010,
-    Eq. 16).
+    They have Kaiming's normal distribution (He et al. 2015, Eq. 10) times 0.2, so that a network begins with
+    small outputs: near the mean pose where there are z-scores. Biases are 0; the released code leaves them as
+    torch draws them, and keeps weights within 0.2. In torch's own attention, queries, keys and values share
+    one matrix, which the released code leaves as torch draws it, by Xavier's uniform distribution (Glorot &
+    Bengio 2010, Eq. 16).
     """
     for layer in part.modules():
         if isinstance(layer, nn.Linear):
