@@ -149,11 +149,12 @@ class StreamedBranch(nn.Module):
 
     def forward(self, h: Tensor, contributions: Sequence[Tensor], count: int) -> Tensor:
         """Map the window (T, d) to the newest frame's outputs (1, size); `count` is always 1."""
-        for block in self.blocks[:-1]:
+        if not len(self.blocks):
+            return self.linear(newest(h))
+        *earlier, last = self.blocks
+        for block in earlier:
             h = block(h, contributions)
-        for block in self.blocks[-1:]:
-            h = block(h, contributions, newest)
-        return self.linear(newest(h))
+        return self.linear(last(h, contributions, newest))
 
 
 class Converter:
