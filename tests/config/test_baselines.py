@@ -195,6 +195,10 @@ REFUSED = [
     (["loss=terms"], "loss=terms is of rotations alone"),
     (["model=agrol_mlp", "loss=terms", "loss.jerk=-1"], "loss.jerk=-1"),
     (["model=agrol_mlp", "loss=terms", "loss.jerks=1"], "loss.jerks"),
+    (["model=avatar_poser", "loss=kinematic"], "loss.velocity: needs 2 frames of each window"),
+    (["model=manikin_s", "loss=terms", "loss.contact=1"], "loss.contact: needs 2 frames"),
+    (["model=sage", "loss=terms", "loss.jerk=1"], "loss.jerk: needs 4 frames"),
+    (["model=hmd_poser", "model.frames=3", "loss=calm"], "allowed is loss.velocity_3=null"),
     (["model=agrol_mlp", "export.precision=int8", "export.graph=naive"], "allowed is auto or streaming"),
     (["model=recurrent_poser", "evaluation.ik=arms"], "model.output=reaching has such arms already"),
 ]

@@ -7,6 +7,7 @@ import torch
 from plain_body import posed
 
 from memmlp.common.errors import InputError
+from memmlp.config.schema.checks import TERM_FRAMES
 from memmlp.motion.body import PARENTS, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.geometry import axis_angle_to_matrix, matrix_to_sixd
 from memmlp.motion.network_coordinates import World
@@ -32,6 +33,10 @@ def bodies() -> tuple[np.ndarray, np.ndarray]:
         rooted = posed(MADE[b, t, ROTATION].numpy())
         made[b, t] = rooted + TRUE[b, t, SPARSE_POSITION][:3].numpy() - rooted[15]
     return made, TRUE[..., SPARSE_DIM:][..., ROTATION.stop :].unflatten(-1, (22, 3)).double().numpy()
+
+
+def test_the_config_s_check_knows_how_many_frames_each_term_needs():
+    assert {name: frames for name, (_, frames) in TERMS.items() if frames > 1} == TERM_FRAMES
 
 
 def test_terms_of_positions(bodies):

@@ -15,9 +15,11 @@ from memmlp.common.errors import InputError
 from memmlp.config.schema.config import SCHEMAS, Config
 from memmlp.config.schema.network import (
     AvatarJLMConfig,
+    AvatarPoserConfig,
     BaselineConfig,
     BoDiffusionConfig,
     EgoPoserConfig,
+    ManikinSConfig,
     NoMemoryConfig,
     RecurrentPoserConfig,
     RPMConfig,
@@ -37,6 +39,15 @@ from memmlp.runs.identity import SLOTS
 
 WITHOUT_STREAM = ("naive", "off")
 """The values of `export.graph` with which no streaming graph is exported."""
+
+TERM_FRAMES = {
+    "sixd_velocity": 2, "turn": 2, "velocity": 2, "velocity_3": 4, "velocity_5": 6, "acceleration": 3,
+    "jerk": 4, "contact": 2, "foot_height": 2,
+}  # fmt: skip
+"""The loss terms that need several frames (memmlp.training.losses.terms.TERMS, without importing torch)."""
+
+NEWEST_ALONE = (AvatarPoserConfig, EgoPoserConfig, ManikinSConfig, SAGEConfig)
+"""The networks that learn the newest frame of a window alone; subclasses are others."""
 
 
 def check(cfg: DictConfig) -> None:
@@ -133,6 +144,7 @@ def _check_combinations(cfg: DictConfig) -> None:
         _check_baseline(cfg)
     else:
         _check_slots(cfg)
+    _check_terms(cfg)
     if "streams" in cfg.rollout and cfg.rollout.streams < cfg.optim.batch:
         raise InputError(
             f"rollout.streams={cfg.rollout.streams}: allowed is at least optim.batch={cfg.optim.batch}"
@@ -253,6 +265,19 @@ def _check_foreign_loss(cfg: DictConfig, predictor: str) -> None:
             f"loss={cfg.loss.name} is of rotations alone: allowed is predictor=rotation_only with hand=off, "
             "or loss=uncertainty or loss=manual"
         )
+
+
+def _check_terms(cfg: DictConfig) -> None:
+    """Raise InputError for a term of the loss that needs more frames than the network learns of a window."""
+    if not _is(cfg.loss, TermsLossConfig):
+        return
+    frames = 1 if OmegaConf.get_type(cfg.model) in NEWEST_ALONE else cfg.model.frames
+    for name, needed in TERM_FRAMES.items():
+        if cfg.loss.get(name) is not None and frames < needed:
+            raise InputError(
+                f"loss.{name}: needs {needed} frames of each window, and this network learns {frames}; "
+                f"allowed is loss.{name}=null"
+            )
 
 
 def _check_slots(cfg: DictConfig) -> None:
