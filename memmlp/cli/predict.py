@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--branch", type=click.Choice(["rotation", "combined", "truth"]),
-    help="The rotation branch, the rotations that inverse kinematics brought to the position branch, or the "
-    "clip itself.  [default: combined with inverse kinematics, else rotation]",
+    help="The rotation branch, its rotations after inverse kinematics, or the clip itself.  "
+    "[default: combined with inverse kinematics, else rotation]",
 )  # fmt: skip
 @strict_option
 @device_option
