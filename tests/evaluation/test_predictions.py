@@ -94,6 +94,12 @@ def test_the_truth_is_what_came_in():
     np.testing.assert_allclose(joints(truth), joints(clip)[1:], atol=1e-5)
 
 
+def test_the_truth_costs_no_prediction(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(NETWORK, "advance", None)
+    (truth,) = predictor(branch="truth").predict(["clip"], [frames(source(30))])
+    assert len(truth) == 29
+
+
 def test_inverse_kinematics_brings_it_to_the_position_branch():
     given, ik = frames(source(12)), LBFGS(5)
     (clip,) = predictor(branch="combined", ik=ik).predict(["clip"], [given])
