@@ -19,9 +19,12 @@ from memmlp.motion.motion_source import Prepared
 from memmlp.networks.motion_model import MotionModel
 from memmlp.pipeline.devices import device
 from memmlp.pipeline.experiment import Experiment
-from memmlp.runs.identity import trained_by
+from memmlp.runs.identity import DEPLOYMENT, EVALUATION, INFERENCE, trained_by
 from memmlp.runs.lookup import find_run
 from memmlp.runs.run import Run
+
+ACTING = (*EVALUATION, *DEPLOYMENT, "data", "paths", "plugins", "tracking")
+"""The groups whose keys have an effect on a finished run; so have the keys of INFERENCE."""
 
 
 class OpenedRun(NamedTuple):
@@ -51,8 +54,8 @@ def open_run(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequ
         overrides: KEY=VALUE for keys of the evaluation and the export.
 
     Raises:
-        InputError: if there is no such run, an override would change its training, or its data has changed
-            since it was trained and tested.
+        InputError: if there is no such run, an override would change its training or nothing at all, or its
+            data has changed since it was trained and tested.
     """
     return open_found(find_run(outputs, name), device_name, overrides)
 
@@ -81,7 +84,18 @@ def experiment_of(run: Run, device_name: str = "cpu", overrides: Sequence[str] =
     if trained_by(run.config) != trained_by(experiment.config):
         words = ", ".join(overrides)
         raise InputError(f"{words}: changes the training; allowed are keys of evaluation and export")
+    _check_acting(overrides)
     return experiment
+
+
+def _check_acting(overrides: Sequence[str]) -> None:
+    """Raise InputError for an override that has no effect on a finished run, such as force=true."""
+    for word in overrides:
+        key = word.partition("=")[0]
+        if key.split(".")[0] not in ACTING and key not in INFERENCE:
+            raise InputError(
+                f"{word}: no effect on a finished run; allowed are keys of evaluation and export"
+            )
 
 
 def trained_network(run: Run, experiment: Experiment) -> MotionModel:
