@@ -129,15 +129,13 @@ def run_training(cfg: DictConfig) -> Outcome | None:
     Returns:
         The outcome; None in the processes that trained along.
     """
-    import torch
-
     from memmlp.cli.train_summary import show
     from memmlp.config.build import build_experiment
+    from memmlp.pipeline.devices import use_threads
     from memmlp.pipeline.run_in_processes import run_in_processes
 
     check(cfg)
-    if cfg.threads:
-        torch.set_num_threads(cfg.threads)
+    use_threads(cfg.threads)
     if outcome := run_in_processes(build_experiment(cfg)):
         show(outcome)
     return outcome

@@ -72,19 +72,18 @@ def perform(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
         Cancelled: if the plan no longer wants the run.
         InputError: if data or code changed since the plan was made.
     """
-    import torch
     from omegaconf import OmegaConf
 
     from memmlp.config.build import build_experiment
     from memmlp.config.plugins import activate
+    from memmlp.pipeline.devices import use_threads
     from memmlp.pipeline.run_stages import run_experiment, upstream_run
     from memmlp.runs.identity import NETWORK
 
     activate(task.config.get("plugins") or ())
     experiment = build_experiment(OmegaConf.create(dict(task.config)))
     check_identity(experiment, task)
-    if chosen := experiment.config["threads"] or threads:
-        torch.set_num_threads(chosen)
+    use_threads(experiment.config["threads"] or threads)
     if task.kind != NETWORK:
         upstream_run(experiment, experiment.data.prepare(), task.id)
     else:

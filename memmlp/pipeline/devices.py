@@ -1,7 +1,8 @@
-"""The device of a run: chosen by its name, checked, and described for the run's manifest."""
+"""The device of a run: chosen by its name, checked, and described for the run's manifest; torch's threads."""
 
 from __future__ import annotations
 
+import functools
 import os
 from typing import Any
 
@@ -58,6 +59,21 @@ def described(used: torch.device) -> dict[str, Any]:
     names = [name.strip() for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name.strip()]
     shown = names[index] if index < len(names) else str(index)
     return {"device": "cuda", "gpu": torch.cuda.get_device_name(used), "gpu_index": shown}
+
+
+def use_threads(number: int) -> None:
+    """Let torch use this many threads on the CPU; 0 for as many as it takes by itself.
+
+    A process may perform several runs, one after another, so 0 undoes what an earlier run asked for.
+    """
+    own = _own_threads()
+    torch.set_num_threads(number or own)
+
+
+@functools.cache
+def _own_threads() -> int:
+    """Return the number of threads at the first call, before any run has asked for another number."""
+    return torch.get_num_threads()
 
 
 def missing_gpu() -> str | None:

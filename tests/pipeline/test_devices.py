@@ -8,7 +8,7 @@ import torch
 from memmlp.common import distributed
 from memmlp.common.errors import InputError
 from memmlp.config.schema.rules import DEVICE
-from memmlp.pipeline.devices import described, device, missing_gpu
+from memmlp.pipeline.devices import described, device, missing_gpu, use_threads
 
 
 @pytest.fixture
@@ -80,3 +80,14 @@ def test_a_gpu_is_named_as_the_machine_knows_it(gpus, monkeypatch, visible, inde
 def test_others_have_no_gpu():
     assert described(torch.device("cpu")) == {"device": "cpu", "gpu": None, "gpu_index": None}
     assert described(torch.device("mps"))["device"] == "mps"
+
+
+def test_threads_left_to_torch_are_not_those_of_an_earlier_run():
+    before = torch.get_num_threads()
+    try:
+        use_threads(before + 1)
+        assert torch.get_num_threads() == before + 1
+        use_threads(0)
+        assert torch.get_num_threads() == before
+    finally:
+        torch.set_num_threads(before)
