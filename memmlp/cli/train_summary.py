@@ -23,7 +23,7 @@ COLUMNS = [(mode, branch) for mode in ("stream", "window") for branch in BRANCHE
 
 def show(outcome: Outcome) -> None:
     """Print a run's metrics in both modes, its latency and sizes if it has any, and where its files are."""
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)  # a folder's name may have brackets
     run, results = outcome.run, outcome.results
     console.print(said(outcome), soft_wrap=True)
     if partial := run.manifest.get("partial"):

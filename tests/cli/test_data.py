@@ -51,6 +51,8 @@ def test_verify_of_sound_files_succeeds(source: Path) -> None:
     said = run(source.parent, "data", "verify", "source/a.bvh")
     assert said.startswith("1 file without a fault")
     assert "a.bvh" in run(source.parent, "data", "verify", "source/a.bvh", "--all")
+    (source / "a.bvh").rename(source / "[a].bvh")
+    assert "[a].bvh" in run(source.parent, "data", "verify", "source/[a].bvh", "--all")
 
 
 def test_import_warns_with_the_same_sentences(source: Path) -> None:

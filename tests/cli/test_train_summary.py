@@ -12,7 +12,7 @@ import pytest
 from fake_runs import fake_run
 from rich.console import Console
 
-from memmlp.cli.train_summary import show_latency, show_side_by_side, size, source_tables
+from memmlp.cli.train_summary import show, show_latency, show_side_by_side, size, source_tables
 from memmlp.pipeline.run_stages import Outcome
 from memmlp.runs.evaluation_file import write_report
 
@@ -45,6 +45,12 @@ def test_tables_of_sources_are_of_the_evaluation_that_is_shown(tmp_path: Path):
     assert len(first("stream-0")) == 2
     for once, thrice in zip(first("stream-0"), first("stream-1"), strict=True):
         assert abs(thrice - 3 * once) < 0.03
+
+
+def test_brackets_in_a_folders_name_are_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    run = fake_run(tmp_path / "[old]", "a")
+    show(Outcome(run, (), {}, ()))
+    assert f"run      {run.folder}\n" in capsys.readouterr().out
 
 
 def test_times_and_size_are_those_of_the_file_that_was_asked_for():

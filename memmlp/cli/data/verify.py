@@ -48,7 +48,7 @@ def verify(source: Path, skeleton: str | None, body: str, up: str | None, every:
             numbers = (str(row.frames), f"{row.mm.value:.4f}", f"{row.degrees.value:.4f}")
             table.add_row(row.name, row.skeleton, *numbers, f"{row.mm}\n{row.degrees}")
     if table.row_count:
-        Console(highlight=False).print(table)
+        Console(highlight=False, markup=False).print(table)  # a file's name may have brackets
     for line in bad:
         click.echo(line)
     deviation = f"; worst {worst[0]:.4f} mm, {worst[1]:.4f} degrees" if measured else ""

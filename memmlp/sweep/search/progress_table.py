@@ -122,7 +122,7 @@ def short(keys: Iterable[str]) -> list[str]:
 
 def row(table: Table, search: Search, trial: FrozenTrial, state: Text) -> None:
     """Add a trial's row to a table."""
-    table.add_row(str(trial.number), state, *_shown(search, trial))
+    table.add_row(str(trial.number), state, *map(Text, _shown(search, trial)))
 
 
 def _shown(search: Search, trial: FrozenTrial) -> Iterable[str]:

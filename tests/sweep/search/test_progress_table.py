@@ -60,3 +60,10 @@ def test_a_trial_that_ended_is_told_with_values_of_any_kind(tmp_path: Path):
     one.look(1)
     said = line(study.search, study.trials[0], 1, tmp_path)
     assert said.endswith("1.000 (model.cell=gru, data.mirror=True, optim.lr=0.001235)")
+
+
+def test_brackets_of_a_value_are_shown(tmp_path: Path):
+    choices = {"evaluation": {"modes": {"choices": ["[stream]", "[window]"], "first": "[stream]"}}}
+    study = open_study(tmp_path, space=choices)
+    director(study, tmp_path).look(1)
+    assert "[stream]" in drawn(study, tmp_path)
