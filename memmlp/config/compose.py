@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import functools
 import pickle
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -19,7 +20,7 @@ from hydra.core.config_search_path import ConfigSearchPath, SearchPathQuery
 from hydra.core.default_element import GroupDefault
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import ChoiceSweep, Override
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
@@ -158,6 +159,7 @@ def preflight(args: argparse.Namespace) -> list[DictConfig]:
             check(configs[-1])
             _check_plugins(configs[-1])
             _check_fractions(configs[-1], overrides)
+    _check_texts(configs[0], args.overrides)
     return configs
 
 
@@ -210,6 +212,24 @@ def _check_fractions(cfg: DictConfig, overrides: Sequence[str]) -> None:
         own = [one.get(part) for one in sources] if key != part and part in ("test", "val") else [None]
         if own and None not in own:
             raise InputError(f"{word}: each source has its own; allowed is data.sources.NAME.{part}")
+
+
+def _check_texts(cfg: DictConfig, words: Sequence[str]) -> None:
+    """Raise InputError for a text that Hydra reads as a number or bool and writes in another way.
+
+    A folder 2024_11 would be 202411, and 1e3 would be 1000.0.
+    """
+    for override in OverridesParser.create().parse_overrides(list(words)):
+        value, kept = override.value(), OmegaConf.select(cfg, override.key_or_group)
+        texts = list(kept) if OmegaConf.is_list(kept) else [kept]
+        items = (
+            value.list if isinstance(value, ChoiceSweep) else value if isinstance(value, list) else [value]
+        )
+        word = str(override.input_line)
+        key, _, written = word.partition("=")
+        for item in items if all(isinstance(text, str) for text in texts) else ():
+            if isinstance(item, int | float) and str(item) not in re.split(r"[\[\],\s]+", written):
+                raise InputError(f"{word}: would become {item}; allowed is in quotes, \"{key}='{written}'\"")
 
 
 HELP = """memmlp train trains, evaluates, exports and times one configuration.

@@ -153,6 +153,12 @@ def test_the_last_of_several_choices_wins():
     assert composed(["memory=vq", "memory=none"]).memory._target_ == "memmlp.networks.memory.NoMemory"
 
 
+@pytest.mark.parametrize("word", ["'2024_11'", "2024", "2024_a", "007", "[x]_1", "True"])
+def test_a_text_is_kept_as_it_was_written(word: str):
+    kept = composed([f"save_predictions={word}"] if "[" not in word else [f"save_predictions='{word}'"])
+    assert kept.save_predictions == word.strip("'")
+
+
 def test_outputs_come_from_the_environment(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("MEMMLP_OUTPUTS", "/somewhere")
     assert composed([]).data.root == "/somewhere/data/synth"
@@ -242,6 +248,13 @@ BAD = [
     (["rollout=streams", "rollout.streams=4"], ["rollout.streams=4", "optim.batch"]),
     (["data.split.test=0.6", "data.split.val=0.4"], ["data.split.val=0.4", "data.split.test"]),
     (["data=mocap", "data.root=.", "data.synth.minutes=3"], ["data.synth.minutes=3"]),
+    # texts that would be others
+    (["save_predictions=2024_11"], ["save_predictions=2024_11", "202411", "\"save_predictions='2024_11'\""]),
+    (["paths.outputs=1e3"], ["paths.outputs=1e3", "1000.0", "in quotes"]),
+    (["paths.outputs=true"], ["paths.outputs=true", "True", "in quotes"]),
+    (["-m", "seed=0,1", "paths.outputs=2024_11"], ["paths.outputs=2024_11", "202411"]),
+    (["-m", "save_predictions=a,1_0"], ["save_predictions=a,1_0", "10", "in quotes"]),
+    (["data=mocap", "data.root=.", "data.split.groups=[a,10_01]"], ["data.split.groups=[a,10_01]", "1001"]),
     # missing
     (["data=mocap"], ["data.root", "no value"]),
     (["data=amass_s1", "data.root=."], ["data.split.folder", "no value"]),
