@@ -23,9 +23,9 @@ from memmlp.runs.recipe_versions import RECIPES
 def build_motion(cfg: DictConfig) -> MotionSource:
     """Build the source of an experiment's motion.
 
-    A synthetic folder's name contains its length and seed, and the generator's recipe version after the
-    first, or the path and settings of a custom generator, so that other settings and generators never find
-    stale files.
+    A synthetic folder's name contains its length and seed, or the path and settings of a custom generator,
+    and the generator's recipe version after the first, so that other settings and generators never find
+    stale files. A custom generator's recipe has the name of its option, such as "data.walks".
 
     Raises:
         InputError: if a list of groups can't be read, two folders of a list have the same name, or the
@@ -37,18 +37,24 @@ def build_motion(cfg: DictConfig) -> MotionSource:
     if data.synth is not None and "_target_" in data.synth:
         path = str(data.synth._target_)
         settings = {str(key): value for key, value in data.synth.items() if key != "_target_"}
-        root = Path(data.root) / "-".join([path, *(f"{key}{value}" for key, value in settings.items())])
+        made = "-".join([path, *(f"{key}{value}" for key, value in settings.items())])
+        root = Path(data.root) / f"{made}{_version(f'data.{data.name}')}"
         generate = partial(located(path, "data.synth"), **settings)
     elif data.synth is not None:
-        version = RECIPES["synthetic"]
-        made = f"{data.synth.minutes:g}min-seed{data.synth.seed}" + (f"-v{version}" if version > 1 else "")
-        root = Path(data.root) / made
+        made = f"{data.synth.minutes:g}min-seed{data.synth.seed}"
+        root = Path(data.root) / f"{made}{_version('synthetic')}"
         generate = partial(_synthesize, minutes=data.synth.minutes, seed=data.synth.seed)
 
     interpolation = data.get("interpolation", LINES)  # recorded configs from before the key mean lines
     source = ClipFolder(root, split, str(data.body), data.min_frames, data.strict, interpolation)
     caches = Path(cfg.paths.outputs) / "cache"
     return MotionSource(source, generate, caches, partial=data.get("partial", False))
+
+
+def _version(recipe: str) -> str:
+    """Return what a folder's name says of a generator's recipe version: nothing of the first, else "-v2"."""
+    version = RECIPES.get(recipe, 1)
+    return f"-v{version}" if version > 1 else ""
 
 
 def _synthesize(folder: Path, minutes: float, seed: int) -> None:

@@ -299,6 +299,13 @@ def test_a_data_source_of_ones_own(folder: Path):
     assert other.cache != source.cache
 
 
+def test_a_new_recipe_of_a_data_source_makes_its_clips_anew(folder: Path):
+    newer = WALKS.replace("Plugin(", 'Plugin(recipes={"data.walks": 2}, ')
+    write(folder, {"mine/__init__.py": newer, "mine/conf/data/walks.yaml": WALKS_YAML})
+    source = build_motion(composed(["plugins=[mine]", "data=walks"]))
+    assert source.source.root == Path("made/mine.walks-minutes1.0-seed0-v2")
+
+
 def test_an_executor_of_ones_own(folder: Path):
     from memmlp.cli.workers import Workers, executor
 
