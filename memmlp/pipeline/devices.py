@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import functools
 import os
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from memmlp.common import distributed
 from memmlp.common.errors import InputError
+
+NVIDIA = Path("/dev/nvidiactl")
+"""What the driver of NVIDIA's GPUs makes on Linux."""
 
 
 def device(name: str) -> torch.device:
@@ -74,6 +78,21 @@ def use_threads(number: int) -> None:
 def _own_threads() -> int:
     """Return the number of threads at the first call, before any run has asked for another number."""
     return torch.get_num_threads()
+
+
+def overlooked_gpu(name: str) -> str | None:
+    """Return a line if the device `auto` is the CPU of a machine with a GPU of NVIDIA; None otherwise.
+
+    It may be that torch was installed without CUDA, or does not fit the driver. GPUs that
+    CUDA_VISIBLE_DEVICES hides are hidden on purpose.
+    """
+    hidden = os.environ.get("CUDA_VISIBLE_DEVICES", "all").strip() in ("", "-1")
+    if name != "auto" or hidden or torch.cuda.is_available() or not NVIDIA.exists():
+        return None
+    return (
+        f"device=auto: the CPU, since torch {torch.__version__} cannot use this machine's GPU; "
+        "device=cpu says that this is meant"
+    )
 
 
 def missing_gpu() -> str | None:

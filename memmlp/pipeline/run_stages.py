@@ -30,7 +30,7 @@ from memmlp.motion.motion_source import Prepared
 from memmlp.motion.preparing.amass import divided_subjects
 from memmlp.motion.preparing.groups import unfitting
 from memmlp.motion.preparing.manifest import ClipRecord, Manifest
-from memmlp.pipeline.devices import described
+from memmlp.pipeline.devices import described, overlooked_gpu
 from memmlp.pipeline.experiment import Experiment, UpstreamTraining
 from memmlp.runs.environment import computed_imports, packages_of_ones_own
 from memmlp.runs.evaluation_file import read_report, write_report
@@ -143,6 +143,8 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
     if not run.done:
         experiment.training.optim.check_installed()
+        if overlooked := overlooked_gpu(experiment.config["device"]):
+            remark(overlooked)
     upstream = upstream_run(experiment, data)
     with run.lock():
         if experiment.force:

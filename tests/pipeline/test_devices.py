@@ -8,7 +8,7 @@ import torch
 from memmlp.common import distributed
 from memmlp.common.errors import InputError
 from memmlp.config.schema.rules import DEVICE
-from memmlp.pipeline.devices import described, device, missing_gpu, use_threads
+from memmlp.pipeline.devices import described, device, missing_gpu, overlooked_gpu, use_threads
 
 
 @pytest.fixture
@@ -80,6 +80,28 @@ def test_a_gpu_is_named_as_the_machine_knows_it(gpus, monkeypatch, visible, inde
 def test_others_have_no_gpu():
     assert described(torch.device("cpu")) == {"device": "cpu", "gpu": None, "gpu_index": None}
     assert described(torch.device("mps"))["device"] == "mps"
+
+
+@pytest.mark.parametrize(
+    ("name", "visible", "count", "driver", "said"),
+    [
+        ("auto", None, 0, True, True),
+        ("auto", "0", 0, True, True),
+        ("auto", None, 1, True, False),  # torch uses it
+        ("auto", "", 0, True, False),  # hidden on purpose
+        ("auto", "-1", 0, True, False),
+        ("auto", None, 0, False, False),  # there is none
+        ("cpu", None, 0, True, False),
+    ],
+)
+def test_a_gpu_that_torch_cannot_use_is_told(gpus, monkeypatch, tmp_path, name, visible, count, driver, said):
+    gpus(count)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if visible is not None:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    monkeypatch.setattr("memmlp.pipeline.devices.NVIDIA", tmp_path / ("." if driver else "none"))
+    assert bool(line := overlooked_gpu(name)) == said
+    assert not line or "cannot use this machine's GPU; device=cpu" in line
 
 
 def test_threads_left_to_torch_are_not_those_of_an_earlier_run():
