@@ -31,7 +31,8 @@ NOT_NUMBERS = (
     "tables",
 )
 """Folders of the package on whose code no result depends; `live` alone measures one, whole poses' times."""
-WIRING = ("config/build.py", "config/instantiate.py")  # they decide what reaches the constructors
+WIRING = ("config/build.py", "config/build_motion.py", "config/instantiate.py")
+"""Files of these folders that count all the same, since they decide what reaches the constructors."""
 PATCH = 1_000_000  # at most so many characters of changes are kept with a run
 
 
