@@ -112,12 +112,19 @@ def _raising(overrides: Sequence[str]) -> Iterator[None]:
 def _collecting(
     job: Callable[[DictConfig], object], failures: list[Exception]
 ) -> Callable[[DictConfig], None]:
-    """Wrap the job so that its expected failures are kept, and the other jobs of a multirun still run."""
+    """Wrap the job so that its expected failures are kept, and the other jobs of a multirun still run.
+
+    A launcher that runs jobs in other processes has only copies of the list there. So failures are raised in
+    these, and Hydra passes the first one on.
+    """
+    collector = os.getpid()
 
     def task(cfg: DictConfig) -> None:
         try:
             job(cfg)
         except (InputError, TrainingDiverged, LeaseLost, OSError) as failure:
+            if os.getpid() != collector:
+                raise
             failures.append(failure)
 
     return task

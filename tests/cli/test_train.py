@@ -4,8 +4,33 @@ from __future__ import annotations
 
 import pytest
 import torch
+from omegaconf import DictConfig
 
 from memmlp.cli.train import train
+from memmlp.common.errors import InputError
+
+
+def test_a_failure_in_a_process_of_a_launcher_is_not_lost(monkeypatch: pytest.MonkeyPatch):
+    """Launchers such as joblib's run jobs in other processes, whose lists of failures nobody sees."""
+
+    def job(cfg: DictConfig) -> None:
+        monkeypatch.setattr("os.getpid", lambda: -1)
+        raise InputError(f"seed {cfg.seed} fails")
+
+    with pytest.raises(InputError, match="seed 3 fails"):
+        train(["-m", "seed=3,4"], job)
+
+
+def test_failures_in_this_process_let_the_others_run():
+    seeds = []
+
+    def job(cfg: DictConfig) -> None:
+        seeds.append(cfg.seed)
+        raise InputError(f"seed {cfg.seed} fails")
+
+    with pytest.raises(InputError, match="seed 4 fails"):
+        train(["-m", "seed=3,4"], job)
+    assert seeds == [3, 4]
 
 
 def test_threads_that_one_job_asks_for_are_not_those_of_the_next(monkeypatch: pytest.MonkeyPatch):
