@@ -81,7 +81,9 @@ def _runs(args: argparse.Namespace) -> bool:
 
 
 def _check_predictions(jobs: Sequence[DictConfig]) -> None:
-    """Raise InputError if several jobs of a multirun would save their predictions in one folder."""
+    """Raise InputError for a folder without a name, or one in which several jobs would save predictions."""
+    if any(cfg.save_predictions is not None and not cfg.save_predictions.strip() for cfg in jobs):
+        raise InputError("save_predictions=: allowed is a folder, or null to save none")
     folders = [cfg.save_predictions for cfg in jobs if cfg.save_predictions]
     for folder in folders:
         if folders.count(folder) > 1:

@@ -248,6 +248,7 @@ BAD = [
     (["rollout=streams", "rollout.streams=4"], ["rollout.streams=4", "optim.batch"]),
     (["data.split.test=0.6", "data.split.val=0.4"], ["data.split.val=0.4", "data.split.test"]),
     (["data=mocap", "data.root=.", "data.synth.minutes=3"], ["data.synth.minutes=3"]),
+    (["save_predictions="], ["save_predictions=:", "a folder, or null"]),
     # texts that would be others
     (["save_predictions=2024_11"], ["save_predictions=2024_11", "202411", "\"save_predictions='2024_11'\""]),
     (["paths.outputs=1e3"], ["paths.outputs=1e3", "1000.0", "in quotes"]),
