@@ -20,7 +20,8 @@ def device(name: str) -> torch.device:
     """Return the torch device with a given name: auto, cpu, cuda, cuda:INDEX or mps.
 
     The name auto stands for a CUDA GPU where there is one, else for the CPU. If several processes train one
-    run together, each has the GPU whose index is the process's own number.
+    run together, each has the GPU whose index is the process's own number. On a GPU float32 stays float32:
+    by default cuDNN rounds what GRUs and LSTMs multiply to TF32's ten bits.
 
     Raises:
         InputError: if there is no such device.
@@ -34,6 +35,7 @@ def device(name: str) -> torch.device:
         if kind == "cuda":
             raise InputError(f"device={name}: there is no CUDA device; allowed here is cpu or auto")
         return torch.device("cpu")
+    torch.backends.cudnn.allow_tf32 = False
     return torch.device("cuda", _checked(name, int(index)) if index else distributed.local_rank())
 
 

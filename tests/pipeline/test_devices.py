@@ -43,6 +43,16 @@ def test_with_two_gpus(gpus):
     assert missing_gpu() is None
 
 
+def test_float32_is_no_tf32_on_a_gpu(gpus, monkeypatch: pytest.MonkeyPatch):
+    gpus(1)
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)
+    device("cpu")
+    assert torch.backends.cudnn.allow_tf32
+    device("auto")
+    assert not torch.backends.cudnn.allow_tf32
+    assert not torch.backends.cuda.matmul.allow_tf32
+
+
 def test_without_gpus(gpus, monkeypatch: pytest.MonkeyPatch):
     gpus(0)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
