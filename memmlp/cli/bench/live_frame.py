@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import outputs_option
+from memmlp.cli.options import outputs_option, plugins_option
 
 if TYPE_CHECKING:
     from memmlp.live.spaces import SpaceName
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Format of the rotations that come out: matrix or quaternion.",
 )
+@plugins_option
 @outputs_option
 @click.argument("overrides", nargs=-1)
 def live_frame(
