@@ -81,8 +81,6 @@ def render(
     """
     check_runs(outputs, *runs)
     from memmlp.common.progress import tell
-
-    tell("render: read the runs and their test clips")
     from memmlp.config.open_run import open_run
     from memmlp.render.figure_or_film import check_picture, write_picture
 
