@@ -23,7 +23,7 @@ RECIPES: dict[str, int] = {
     "model.mem_mlp": 1,
     "model.agrol_mlp": 1,
     "model.agrol_diffusion": 1,
-    "model.bodiffusion": 1,
+    "model.bodiffusion": 2,
     "model.avatar_poser": 2,
     "model.ego_poser": 2,
     "model.hmd_poser": 1,

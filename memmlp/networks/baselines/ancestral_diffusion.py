@@ -14,7 +14,7 @@ from memmlp.networks.baselines.diffusion import Noising, at, linear_schedule
 Step = Callable[[Tensor, int], tuple[Tensor, Tensor]]
 """Maps a noisy signal and the number of its sampling step to the next one's mean and deviation."""
 
-QUIET = 50  # so many last steps of a sample take the mean; in BoDiffusion's released code 49
+QUIET = 50  # a sample takes the mean from this time of the noise schedule on; in BoDiffusion's released code 49
 BIN = 2 / 255  # the width of the bins of the first step's likelihood: a pixel's, as BoDiffusion's code has it
 
 
@@ -70,8 +70,12 @@ class AncestralDiffusion(Noising):
 
     @property
     def draws(self) -> int:
-        """How many draws of noise a sample takes: one for its start, one for each step but the last 50."""
-        return 1 + max(len(self.times) - QUIET, 0)
+        """How many draws of noise a sample takes: one for its start, one for each step that adds noise.
+
+        The last step adds none, nor do those in the last 50 times of the schedule, of which a sample of few
+        steps has hardly any: without noise its steps' means are no sample of what the network has learned.
+        """
+        return 1 + sum(time >= QUIET for time in self.times[:-1])
 
     def clean(self, noisy: Tensor, noise: Tensor, time: Tensor) -> Tensor:
         """Return the clean signals (B, ...) of noisy ones, given their noise (B, ...) and times (B,)."""

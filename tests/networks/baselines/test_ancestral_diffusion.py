@@ -40,7 +40,7 @@ def made(noisy: torch.Tensor, time: torch.Tensor) -> Denoised:
 
 @pytest.mark.parametrize("count", [1, 4, 53])
 def test_sampling_is_an_independent_numpy_computation(count):
-    """Estimates are kept within limits but for the last; noise is added but in the last 50 steps."""
+    """Estimates are kept within limits but for the last; noise is added but at the end and below time 50."""
     diffusion, rng = AncestralDiffusion(60, count).double(), np.random.default_rng(0)
     noise = rng.normal(size=(diffusion.draws, 2, 4, 3))
     limits = torch.tensor(-1.0), torch.tensor(1.5)
@@ -58,10 +58,28 @@ def test_sampling_is_an_independent_numpy_computation(count):
         clean = (x - np.sqrt(1 - kept(60)[t]) * (0.7 * x + 0.01 * t)) / np.sqrt(kept(60)[t])
         share = (0.1 * x - 0.3 + 1) / 2
         x = first[i] * (np.clip(clean, -1, 1.5) if i else clean) + second[i] * x
-        if i >= 50:
+        if i and t >= 50:
             x = x + np.sqrt(largest[i] ** share * least[i] ** (1 - share)) * noise[count - i]
-    assert len(noise) == {1: 1, 4: 1, 53: 4}[count]
+    assert len(noise) == {1: 1, 4: 2, 53: 9}[count]
     np.testing.assert_allclose(found.numpy(), x, atol=1e-4)
+
+
+def test_few_steps_sample_what_many_do():
+    """Of a Gaussian, by its best denoiser, signals of about its spread; by means alone they are all alike."""
+    spread = 0.5
+    found = []
+    for count in (10, 1000):
+        diffusion = AncestralDiffusion(1000, count).double()
+
+        def step(x: torch.Tensor, index: int) -> tuple[torch.Tensor, torch.Tensor]:
+            signal = diffusion.signal[diffusion.times[index]]  # noqa: B023
+            best = (1 - signal).sqrt() / (signal * spread**2 + 1 - signal) * x
+            mean, variance = diffusion.step(x, Denoised(best, -torch.ones_like(x)), index, OPEN)  # noqa: B023
+            return mean, variance.sqrt()
+
+        noise = torch.randn(diffusion.draws, 4000, generator=torch.Generator().manual_seed(0)).double()
+        found.append(float(diffusion.sample(step, noise).std()))
+    assert 0.6 * spread < found[0] < found[1] < spread
 
 
 def test_the_share_says_where_a_variance_lies_between_the_least_and_the_largest():
