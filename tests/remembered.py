@@ -48,14 +48,16 @@ def _without_extras(export: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(export)
     def exported(*arguments: Any, **options: Any) -> Any:
-        config, collecting = torch.fx.config, gc.isenabled()
-        noting, config.do_not_emit_stack_traces = config.do_not_emit_stack_traces, True
+        collecting, noting = gc.isenabled(), getattr(torch.fx.config, SILENT, None)
         gc.disable()
         try:
+            if noting is not None:
+                setattr(torch.fx.config, SILENT, True)
             with _use_lazy_graph_module(True):
                 return export(*arguments, **options)
         finally:
-            config.do_not_emit_stack_traces = noting
+            if noting is not None:
+                setattr(torch.fx.config, SILENT, noting)
             if collecting:
                 gc.enable()
 

@@ -242,7 +242,8 @@ def _outdated(kept: Kept) -> list[str]:
 
 
 def _count(runs: Mapping[str, RunsBySeed]) -> int:
-    return sum(map(len, runs.values()))
+    """Return the number of runs; arms that differ in their evaluation alone have the same ones."""
+    return len({run.id for by_seed in runs.values() for run in by_seed.values()})
 
 
 def _merged(path: Path, before: Kept, kept: Kept, ids: Mapping[tuple[str, int], str]) -> Kept:

@@ -62,9 +62,9 @@ def flags(
     if set(sweep.metrics) - set(COSTS):
         yield from _resampled(every)
     for attribute, what in ORIGIN.items():
-        yield from flags_of_difference(
-            what, [(getattr(run.origin, attribute), label) for label, run in every]
-        )
+        told = {UNKNOWN: "none"} if attribute == "gpu" else {}
+        values = [(getattr(run.origin, attribute), label) for label, run in every]
+        yield from flags_of_difference(what, [(told.get(value, value), label) for value, label in values])
     yield from flags_of_code.other_files(every)
     yield from flags_of_code.older_code((label, run.code, run.origin.plugins) for label, run in every)
     if TIMES & set(sweep.metrics):

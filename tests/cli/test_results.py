@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import fake_cells
 import pytest
 from conftest import Memmlp, one_line
 from fake_runs import fake_sweep
 
+from memmlp.cli.results import _count
 from memmlp.config import compose_plan
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.plan import Entry, Plan
@@ -43,6 +45,11 @@ def test_kept_results_become_pages(memmlp: Memmlp, planned: None):
     page = Path("docs/results/table14.md")
     assert page.read_text().count("| 3/3 |") == 8
     assert ", open" in Path("docs/results/README.md").read_text()
+
+
+def test_a_run_of_two_arms_is_one():
+    run = SimpleNamespace(id="a")
+    assert _count({"plain": {0: run}, "inverse kinematics": {0: run}}) == 1  # type: ignore[dict-item]
 
 
 def test_one_kept_seed_of_three_is_no_finished_table(memmlp: Memmlp, planned: None):

@@ -227,7 +227,7 @@ def test_groups_that_differ_between_runs_are_said(sweep: Sweep, tmp_path: Path):
         ({"cpu": "Another one"}, ("hardware differs", "Another one of 'by position'")),
         ({"git": None}, ("code differs", "version 0.3.0 of 'by position'")),
         ({"device": "cuda"}, ("device differs", "cuda of 'by position'", "cpu of 'no | memory'")),
-        ({"gpu": "A card"}, ("GPU differs", "A card of 'by position'")),
+        ({"gpu": "A card"}, ("GPU differs", "A card of 'by position'", "none of ")),
         ({"processes": 2}, ("processes differs", "2 of 'by position'", "1 of 'no | memory'")),
         ({"threads": 2}, ("threads differs", "2 of 'by position'")),
         ({"packages": {"torch": "3.0"}}, ("torch differs", "3.0 of 'by position'")),

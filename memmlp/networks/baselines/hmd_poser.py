@@ -6,6 +6,7 @@ All bodies here have the mean shape, so the predicted shape does not enter the j
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -32,6 +33,9 @@ from memmlp.networks.windowless_model import WindowlessModel
 HANDS, OTHERS = 2, 3  # tokens of hands in the head's frame, and of the sensors that there are none of
 TOKENS = len(TRACKED) + HANDS + OTHERS
 SHAPE = 16  # components of a body's shape
+
+# On a GPU cuDNN copies an LSTM's weights into one piece. They are made anew at each call, so nothing can be kept.
+warnings.filterwarnings("ignore", message="RNN module weights are not part of single contiguous chunk")
 
 
 def by_tracker(sparse: Tensor) -> list[Tensor]:
