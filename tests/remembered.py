@@ -13,6 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+SILENT = "do_not_emit_stack_traces"  # torch.fx's, in newer versions
+
 
 def remember() -> None:
     """Do so from now on with what is imported by now; to import it for this would cost more than it saves."""

@@ -14,7 +14,7 @@ from memmlp.networks.baselines.diffusion import Noising, at, linear_schedule
 Step = Callable[[Tensor, int], tuple[Tensor, Tensor]]
 """Maps a noisy signal and the number of its sampling step to the next one's mean and deviation."""
 
-QUIET = 50  # a sample takes the mean from this time of the noise schedule on; in BoDiffusion's released code 49
+QUIET = 50  # from this time of the noise schedule on a sample takes the mean; BoDiffusion's code has 49
 BIN = 2 / 255  # the width of the bins of the first step's likelihood: a pixel's, as BoDiffusion's code has it
 
 

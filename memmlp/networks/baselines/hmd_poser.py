@@ -34,7 +34,7 @@ HANDS, OTHERS = 2, 3  # tokens of hands in the head's frame, and of the sensors 
 TOKENS = len(TRACKED) + HANDS + OTHERS
 SHAPE = 16  # components of a body's shape
 
-# On a GPU cuDNN copies an LSTM's weights into one piece. They are made anew at each call, so nothing can be kept.
+# On a GPU cuDNN copies an LSTM's weights into one piece: at each call, as they are made anew.
 warnings.filterwarnings("ignore", message="RNN module weights are not part of single contiguous chunk")
 
 
