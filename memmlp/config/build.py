@@ -286,6 +286,8 @@ def _override(cfg: DictConfig, word: str) -> None:
         raise InputError(f"{word}: allowed is KEY=VALUE")
     try:
         override = OverridesParser.create().parse_override(word)  # a bare off is text, not false
+        if override.is_sweep_override():
+            raise InputError(f"{word}: allowed is one value; a list is [in,brackets]")
         OmegaConf.update(cfg, key, override.value(), merge=True)
     except (OmegaConfBaseException, HydraException) as error:
         raise InputError(f"{key}: {str(error).splitlines()[0]}") from None

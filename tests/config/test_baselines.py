@@ -188,6 +188,7 @@ REFUSED = [
     (["model=bodiffusion", "model.noise=0"], "model.noise=0"),
     (["model=sage", "upstream=null"], "upstream=null"),
     (["upstream=sage"], "allowed with this model is upstream=null"),
+    (["model=sage", "model.frames=21"], "model.frames=21: allowed for SAGENet is an even number"),
     (["model=sage", "model.code_heads=3"], "model.code_heads=3"),
     (["model=sage", "model.code_width=21", "model.code_heads=1"], "model.code_width=21"),
     (["model=sage", "upstream.decoder.drop=0"], "upstream.decoder.drop=0"),
@@ -223,7 +224,7 @@ def test_arms_that_a_refiner_has_moved_may_reach_again():
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("profile", ["tiny", "small", "paper"])
 def test_profiles_and_the_papers_experiment_fit(name, profile):
-    cfg = composed([f"model={name}", "experiment=paper", f"profile={profile}", "model.frames=21"])
-    assert cfg.model.frames == 21
+    cfg = composed([f"model={name}", "experiment=paper", f"profile={profile}", "model.frames=22"])
+    assert cfg.model.frames == 22
     assert (cfg.memory, cfg.predictor, cfg.hand) == (None, None, None)
     assert build_experiment(cfg).config["model"]["_target_"].startswith("memmlp.networks.baselines.")

@@ -46,3 +46,8 @@ def test_keys_of_what_follows_a_training_may_have_other_values(trained: Run, wor
 def test_a_key_that_would_do_nothing_is_refused(trained: Run, word: str):
     with pytest.raises(InputError, match=f"{word}: .*allowed are keys of evaluation and export"):
         experiment_of(trained, "cpu", ["evaluation.ik=arms", word])
+
+
+def test_several_values_of_a_key_are_refused(trained: Run):
+    with pytest.raises(InputError, match=r"^evaluation\.ik=off,arms: allowed is one value"):
+        experiment_of(trained, "cpu", ["evaluation.ik=off,arms"])

@@ -91,3 +91,16 @@ def test_a_custom_term_has_its_own_weight_also_under_the_name_of_a_term_that_is_
     weighting.build(["rotation", "hand"], {"hand": 7.0})
     terms = {"rotation": torch.tensor(1.0), "hand": torch.tensor(1.0)}
     assert float(weighting(terms)) == pytest.approx(1 + 7)
+
+
+def test_a_term_that_is_0_keeps_its_weight():
+    """The regulariser alone would make the weight of a term without an error grow for ever."""
+    weighting = Uncertainty(lr=0.05)
+    weighting.build(["position", "penetration"])
+    optimiser = torch.optim.AdamW(weighting.parameter_groups())
+    for _ in range(50):
+        optimiser.zero_grad()
+        weighting({"position": torch.tensor(0.3), "penetration": torch.tensor(0.0)}).backward()
+        optimiser.step()
+    assert weighting.weights()["penetration"] == 1
+    assert weighting.weights()["position"] > 1.5

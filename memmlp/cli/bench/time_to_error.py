@@ -76,7 +76,11 @@ def train(
     import os
     import shlex
 
+    from memmlp.common.errors import InputError
+
     own = tuple(shlex.split(recipe))
+    if any(word.lstrip("+").startswith("threads=") for word in own):
+        raise InputError("--recipe threads: allowed is among OVERRIDES, which are of both arms")
     if breakdown:
         os.environ.setdefault(
             "KINETO_LOG_LEVEL", "99"

@@ -218,6 +218,9 @@ def _check_baseline(cfg: DictConfig) -> None:
     reaching = cfg.model.get("output") == "reaching" and cfg.refiner is None  # a refiner moves arms again
     if cfg.evaluation.ik == "arms" and reaching:
         raise InputError("evaluation.ik=arms: model.output=reaching has such arms already; allowed is off")
+    if _is(cfg.model, SAGEConfig) and cfg.model.frames % 2:
+        # Its codes are of two frames each: the decoder would make a frame less than the window has.
+        raise InputError(f"model.frames={cfg.model.frames}: allowed for {name} is an even number")
     for heads, width in (("heads", "width"), ("code_heads", "code_width")):
         if heads in cfg.model and cfg.model[width] % cfg.model[heads]:
             raise InputError(

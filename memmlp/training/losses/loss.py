@@ -77,6 +77,9 @@ class Manual(Fixed):
 class Uncertainty(nn.Module):
     """Weights by homoscedastic uncertainty (Kendall et al. 2018, reading 8): e^-s L + s, with one s per term.
 
+    A term that is exactly 0, such as penetration where no foot is below the floor, leaves its s as it is: no
+    weight would be the largest beside it, and e^-s would grow without bound.
+
     Args:
         lr: learning rate of the s; with the model's learning rate they would settle too slowly.
     """
@@ -97,7 +100,7 @@ class Uncertainty(nn.Module):
     def forward(self, terms: Terms) -> Tensor:
         """Return the weighted sum of the terms."""
         return torch.stack(
-            [(-self.s[name]).exp() * term + self.s[name] for name, term in terms.items()]
+            [(-(s := self.s[name])).exp() * term + s * (term.detach() != 0) for name, term in terms.items()]
         ).sum()
 
     def weights(self) -> Mapping[str, float]:

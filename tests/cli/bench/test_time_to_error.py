@@ -71,3 +71,7 @@ def test_a_profile_has_every_part_of_both(memmlp: Memmlp):
     assert ran.code == 0, ran.err
     assert ran.out.count("matrix products") == 4
     assert "recipe: " in ran.out
+
+
+def test_threads_are_of_both_recipes(memmlp: Memmlp):
+    assert one_line(memmlp("bench", "train", "--recipe", "threads=2"), "--recipe threads", "OVERRIDES")
