@@ -302,8 +302,15 @@ class Run:
         self.write_manifest({"attempts": [*self.manifest.get("attempts", []), begun]})
 
     def write_manifest(self, fields: Mapping[str, Any]) -> None:
-        """Add fields to the manifest, or replace them."""
-        write_json(self.manifest_path, self.manifest | dict(fields))
+        """Add fields to the manifest, or replace them.
+
+        Raises:
+            InputError: if the manifest that is there can't be read: what it had would be lost.
+        """
+        known = self.manifest
+        if not known and self.manifest_path.exists():
+            raise InputError(f"{self.manifest_path}: damaged; allowed is a manifest, or no folder of the run")
+        write_json(self.manifest_path, known | dict(fields))
 
     @property
     def manifest(self) -> dict[str, Any]:

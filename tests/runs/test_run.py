@@ -298,3 +298,12 @@ def test_a_config_that_was_read_belongs_to_whoever_read_it(tmp_path: Path):
     assert run.config == before
     run.config_path.write_text("optim: {lr: 2.0}\n")
     assert run.config == {"optim": {"lr": 2.0}}
+
+
+def test_a_damaged_manifest_is_not_replaced(tmp_path: Path):
+    run = begun(tmp_path)
+    run.manifest_path.write_bytes(content := run.manifest_path.read_bytes()[:-2])
+    for write in (lambda: run.took("training", 1.0), lambda: run.attempt("training")):
+        with pytest.raises(InputError, match=r"manifest\.json: damaged"):
+            write()
+    assert run.manifest_path.read_bytes() == content
