@@ -147,7 +147,7 @@ def test_reset_removes_the_runs_files_and_no_others(tmp_path: Path):
     for name in Run.FILES:
         path = run.folder / name.replace("*", "0")
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("{}")
+        path.write_text('{"any": 1}')
     (run.folder / ".checkpoint.safetensors.123.tmp").touch()
     (run.folder / "notes.txt").touch()
     run.finish(["results.json"])
