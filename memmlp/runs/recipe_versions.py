@@ -72,7 +72,7 @@ RECIPES: dict[str, int] = {
     "loss.own": 1,
     "loss.rpm": 1,
     "loss.terms": 1,
-    "weighting.learned": 1,
+    "weighting.learned": 2,
     "hand.position": 1,
     "hand.fk": 1,
     "hand.off": 1,
