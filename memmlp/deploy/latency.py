@@ -21,6 +21,7 @@ from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.streaming import StreamingGraph
+from memmlp.networks.vqvae import EMACodebook
 
 WARM_UP = 30  # steps before the timed ones
 SETTLING = 3  # untimed steps of a file at the start of each round
@@ -110,7 +111,9 @@ def profile(path: Path, steps: int = 100) -> list[tuple[str, str, float, float]]
 def size(model: MotionModel, step: MotionModel | StreamingGraph, path: Path) -> dict[str, Any]:
     """Measure a network: its parameters, MACs and FLOPs, the MACs of its exported step, the file's bytes.
 
-    "macs" and "flops" are the network's, which papers count; "step_macs" are those of the exported graph.
+    "parameters" are those that training changes; "parameters_with_vqvae" are all, with frozen ones and
+    code-vectors. "macs" and "flops" are the network's, which papers count; "step_macs" are those of the
+    exported graph.
     Only matrix products are counted; a FLOP is one multiplication or addition, a MAC is one of each.
 
     Args:
@@ -121,12 +124,17 @@ def size(model: MotionModel, step: MotionModel | StreamingGraph, path: Path) -> 
     multiplied = macs(model.cpu().eval())
     return {
         "parameters": model.count_parameters(),
-        "parameters_with_vqvae": sum(p.numel() for p in model.parameters()),
+        "parameters_with_vqvae": sum(p.numel() for p in model.parameters()) + running_means(model),
         "macs": multiplied,
         "flops": 2 * multiplied,
         "step_macs": macs(step.cpu().eval()),
         "onnx_bytes": path.stat().st_size,
     }
+
+
+def running_means(model: MotionModel) -> int:
+    """Count the numbers of a network's code-vectors that are learned as running means, and so no parameters."""
+    return sum(part.vectors.numel() for part in model.modules() if isinstance(part, EMACodebook))
 
 
 @torch.no_grad()

@@ -16,6 +16,7 @@ from memmlp.deploy.parity import TOLERANCE, parity
 from memmlp.motion.body import JOINTS, SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading
 from memmlp.networks.memory import NoMemory
+from memmlp.networks.vqvae import VQVAE
 
 pytestmark = pytest.mark.slow
 
@@ -88,6 +89,15 @@ def test_latency_and_size(exported):
     size = latency.size(model, model, path)
     assert size["flops"] == 2 * size["macs"] > 0
     assert size["onnx_bytes"] == path.stat().st_size
+
+
+@pytest.mark.parametrize("codebook", ["ema", "gradient"])
+def test_code_vectors_are_counted_however_they_are_learned(codebook, tmp_path):
+    model = tiny.model(codes=VQVAE(codes=5, width=16, encoder_depth=1, codebook=codebook))
+    (file := tmp_path / "step.onnx").touch()
+    size = latency.size(model, model, file)
+    encoder, decoder = 252 * 16 + 16 + 2 * 16 + 16 * 16 + 16, 2 * 16 + 16 * 16 + 16 + 16 * 132 + 132
+    assert size["parameters_with_vqvae"] - size["parameters"] == encoder + 5 * 16 + decoder
 
 
 def test_a_thread_without_a_core_is_seen(exported, monkeypatch):
