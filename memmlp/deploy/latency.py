@@ -133,7 +133,7 @@ def size(model: MotionModel, step: MotionModel | StreamingGraph, path: Path) -> 
 
 
 def running_means(model: MotionModel) -> int:
-    """Count the numbers of a network's code-vectors that are learned as running means, and so no parameters."""
+    """Count the numbers of code-vectors that are learned as running means, and so are no parameters."""
     return sum(part.vectors.numel() for part in model.modules() if isinstance(part, EMACodebook))
 
 
