@@ -11,9 +11,9 @@ from matplotlib.lines import Line2D
 
 from memmlp.common.files import atomic_write
 from memmlp.motion.drawn_limbs import RADII
-from memmlp.motion.importing.file_stance import FileStance
 from memmlp.motion.importing.names import without_namespace
 from memmlp.motion.importing.skeleton_map import Z_UP
+from memmlp.motion.importing.stance_with_all_nodes import StanceWithAllNodes
 from memmlp.render.canvas import DPI, FAINT, INK, Sheet, png
 from memmlp.render.raster import Camera, draw
 
@@ -25,7 +25,7 @@ SPACING = 21  # pixels from a name to the next
 LEFT, RIGHT, MIDDLE, BARE = "#1f6fd0", "#d0561f", "#2a8c4a", "#b4bac1"
 
 
-def skeleton_png(path: Path, stance: FileStance, title: str) -> None:
+def skeleton_png(path: Path, stance: StanceWithAllNodes, title: str) -> None:
     """Write a PNG of a stance: the file's nodes from the front and from the right, and the body, too.
 
     All nodes are grey; those mapped to a body joint are coloured, and named `body joint = node`.
@@ -71,7 +71,7 @@ def _colour(joint: str) -> str:
     return {"left": LEFT, "right": RIGHT}.get(joint.split("_")[0], MIDDLE)
 
 
-def _bones(sheet: Sheet, stance: FileStance, places: np.ndarray, near: np.ndarray) -> None:
+def _bones(sheet: Sheet, stance: StanceWithAllNodes, places: np.ndarray, near: np.ndarray) -> None:
     """Draw all nodes grey, with lines to their parents, and the mapped ones in their colours.
 
     Nodes that are not `near` (nodes,) are left out: a root at the origin may be far from the person.
@@ -84,7 +84,9 @@ def _bones(sheet: Sheet, stance: FileStance, places: np.ndarray, near: np.ndarra
         _line(sheet, places[[node]], color=_colour(joint), lw=0, marker="o", ms=7)
 
 
-def _names(sheet: Sheet, stance: FileStance, places: np.ndarray, side: str, x: float, align: str) -> None:
+def _names(
+    sheet: Sheet, stance: StanceWithAllNodes, places: np.ndarray, side: str, x: float, align: str
+) -> None:
     """Write the names of one side's joints below each other, each joined to its node by a line."""
     joints = [joint for joint in stance.mapped if _colour(joint) == _colour(side or "pelvis")]
     joints.sort(key=lambda joint: places[stance.mapped[joint], 1])
@@ -116,7 +118,7 @@ def spread(wanted: Sequence[float], least: float, low: float, high: float) -> li
     return places
 
 
-def _body(sheet: Sheet, stance: FileStance) -> None:
+def _body(sheet: Sheet, stance: StanceWithAllNodes) -> None:
     """Draw the built-in body in the same stance, from the front and from the right."""
     joints = stance.body @ Z_UP.T
     joints = joints - [0, 0, joints[:, 2].min() - min(RADII)]

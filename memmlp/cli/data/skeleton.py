@@ -54,15 +54,15 @@ def show(file: Path, which: str | None, out: Path) -> None:
     Beside it stands the built-in body in the same stance: where the two differ, the map is wrong.
     """
     from memmlp.motion.body import load_rest_joints
-    from memmlp.motion.importing.file_stance import find_stance
     from memmlp.motion.importing.importable_files import read_recording
     from memmlp.motion.importing.skeleton_map import find_skeleton, load_skeleton
+    from memmlp.motion.importing.stance_with_all_nodes import find_stance_with_all_nodes
     from memmlp.render.figure_or_film import check_picture
     from memmlp.render.skeleton_picture import skeleton_png
 
     check_picture(out, "--out", (".png",))
     recording = read_recording(file)
     chosen = find_skeleton(recording, None if which is None else load_skeleton(which))
-    stance = find_stance(recording, chosen, load_rest_joints("builtin"))
+    stance = find_stance_with_all_nodes(recording, chosen, load_rest_joints("builtin"))
     skeleton_png(out, stance, f"{file.name}: {chosen.name}")
     click.echo(f"{chosen.name}, read from {stance.source}: {out}")

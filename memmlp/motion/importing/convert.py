@@ -29,7 +29,7 @@ class Converted:
         floor: height of the floor in the recording, metres on the body's scale, which was subtracted; None if
             it is unknown or was not asked for.
         scale: the body's size, as a multiple of the recording's.
-        rest_pose: the pose from which the skeleton was read, in words.
+        stance_words: the stance from which the skeleton was read, in words.
         unit: the file's unit, metres, given or found.
         up: the file's up axis, given or found.
     """
@@ -39,7 +39,7 @@ class Converted:
     fidelity: Fidelity
     floor: float | None
     scale: float
-    rest_pose: str
+    stance_words: str
     unit: float
     up: str
 
@@ -81,7 +81,7 @@ def convert(
         fidelity=compare(clip, mapped_motion, rest, skeleton.name),
         floor=height,
         scale=fitted.scale,
-        rest_pose=fitted.rest_pose,
+        stance_words=fitted.stance_words,
         unit=float(settled.unit or 1.0),
         up=str(settled.up),
     )

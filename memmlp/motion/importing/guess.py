@@ -265,7 +265,7 @@ def check(recording: Recording, proposed: Guess, body: str = "builtin") -> tuple
         InputError: if the file can't be imported with this map.
     """
     done = convert(recording, proposed.skeleton, load_rest_joints(body), name=proposed.skeleton.name)
-    return done.rest_pose, done.fidelity.faults
+    return done.stance_words, done.fidelity.faults
 
 
 def as_yaml(proposed: Guess, recording: Recording) -> str:

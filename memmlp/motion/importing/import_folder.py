@@ -23,8 +23,8 @@ from memmlp.motion.importing.calibration_frame import JUMP, first_step
 from memmlp.motion.importing.convert import AUTO, convert, lowered
 from memmlp.motion.importing.fidelity import FEET_STAY, off_the_floor, pose
 from memmlp.motion.importing.importable_files import find_recordings, read_recording, tells_rate
+from memmlp.motion.importing.reading_stance import STRAIGHTEST
 from memmlp.motion.importing.recording import Recording
-from memmlp.motion.importing.rest_pose import STRAIGHTEST
 from memmlp.motion.importing.skeleton_map import SkeletonMap, find_skeleton, is_number, load_skeleton
 from memmlp.motion.importing.true_rate import HEADER, SIDECAR, folder_key, true_rate
 from memmlp.motion.preparing.groups import Grouping
@@ -43,7 +43,7 @@ class Imported:
         skeleton: name of the skeleton map.
         unit: the file's unit, metres.
         up: the file's up axis, `y` or `z`.
-        rest_pose: the pose from which the skeleton was read, in words.
+        rest_pose: the stance from which the skeleton was read, in words; a key of the record.
         frames: number of frames.
         header_fps: frame rate in the file's header, Hz.
         fps: frame rate of the clip, Hz.
@@ -276,7 +276,7 @@ def _import_file(
         skeleton=skeleton.name,
         unit=converted.unit,
         up=converted.up,
-        rest_pose=converted.rest_pose,
+        rest_pose=converted.stance_words,
         frames=len(converted.clip),
         header_fps=recording.fps,
         fps=rate.fps,

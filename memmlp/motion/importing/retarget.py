@@ -1,7 +1,7 @@
 """Brings a recording's motion to the 22-joint tree, by a skeleton map.
 
 The global rotation of a file's node is that of the body joint it is mapped to, up to a constant correction on
-the right. The corrections come from one pose in which the person stands (`rest_pose`): in that pose the
+the right. The corrections come from one pose in which the person stands (`reading_stance`): in that pose the
 rotations of the body's joints are known (`anatomy.orientations`), whatever the file's zero pose is. Where an
 unmapped joint between two mapped ones turns, the correction is not constant: the segment between them is then
 turned by the least rotation to where the file has it. A body joint without a counterpart takes its parent's
@@ -21,8 +21,8 @@ from memmlp.motion.clip import Clip
 from memmlp.motion.importing import anatomy
 from memmlp.motion.importing.anatomy import HINGES, HIPS, LEGS, LIMBS, Segment, least_rotation, segments
 from memmlp.motion.importing.mapped_motion import MappedMotion
+from memmlp.motion.importing.reading_stance import Stance, find_stance
 from memmlp.motion.importing.recording import Recording
-from memmlp.motion.importing.rest_pose import RestPose, find_rest_pose
 from memmlp.motion.importing.skeleton_map import Z_UP, SkeletonMap
 
 POSITION_LIMIT = 1e4  # metres, as `read_clip` has it
@@ -36,12 +36,12 @@ class Retargeting:
     Attributes:
         corrections: (22, 3, 3), on the right of the rotations of the mapped nodes, in Y-up axes.
         scale: the body's leg length divided by the recording's.
-        rest_pose: where the corrections are from, in words.
+        stance_words: where the corrections are from, in words.
     """
 
     corrections: np.ndarray
     scale: float
-    rest_pose: str
+    stance_words: str
 
 
 def fit(
@@ -52,7 +52,7 @@ def fit(
     Raises:
         InputError: if no pose is found in which the person stands, or left and right contradict each other.
     """
-    stance = find_rest_pose(recording, skeleton, mapped_motion)
+    stance = find_stance(recording, skeleton, mapped_motion)
     turned = anatomy.orientations(stance.positions, mapped_motion.mapped, rest)
     if not stance.straight:
         turned = _turned_to_hinges(turned, stance, mapped_motion, rest)
@@ -105,7 +105,7 @@ def _aimed(mapped_motion: MappedMotion, turned: np.ndarray, rest: np.ndarray) ->
 
 
 def _turned_to_hinges(
-    turned: np.ndarray, stance: RestPose, mapped_motion: MappedMotion, rest: np.ndarray
+    turned: np.ndarray, stance: Stance, mapped_motion: MappedMotion, rest: np.ndarray
 ) -> np.ndarray:
     """Turn thighs and upper arms about themselves, so that knees and elbows bend about their axes.
 

@@ -86,7 +86,7 @@ def test_any_zero_pose_is_as_in_the_file(tmp_path: Path, walking: Clip, skeleton
     path = write(tmp_path, performed(chosen, walking, turns=turns).text())
     converted = check(path, chosen, chosen.unit or 0.01, chosen.up or "y")
     assert converted.fidelity.faults == ()
-    assert ("frame" in converted.rest_pose) == (not given)
+    assert ("frame" in converted.stance_words) == (not given)
 
 
 @pytest.mark.parametrize("skeleton", shipped_skeletons())

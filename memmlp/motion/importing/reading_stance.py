@@ -1,4 +1,4 @@
-"""The pose of a file in which the person is known to stand, from which its skeleton is read.
+"""The stance of a file: a pose in which the person is known to stand, from which its skeleton is read.
 
 A zero pose may be a T-pose, or a pose that no standing person has: bones along one axis, a folded body, a
 person who lies. Then a frame of the motion is used, or rotations that the skeleton map gives.
@@ -21,7 +21,7 @@ TRIED = 500  # frames of a file, evenly spread, among which a stance is looked f
 
 
 @dataclass(frozen=True)
-class RestPose:
+class Stance:
     """A stance, turned so that the person faces +Z (Y up, metres).
 
     Attributes:
@@ -37,8 +37,8 @@ class RestPose:
     straight: bool
 
 
-def find_rest_pose(recording: Recording, skeleton: SkeletonMap, mapped_motion: MappedMotion) -> RestPose:
-    """Find the pose in which the person stands: the map's, else the zero pose, else the straightest frame.
+def find_stance(recording: Recording, skeleton: SkeletonMap, mapped_motion: MappedMotion) -> Stance:
+    """Find the stance of a file: the map's, else the zero pose, else the straightest frame.
 
     Raises:
         InputError: if there is no such pose, or left and right contradict each other in it.
@@ -50,30 +50,30 @@ def find_rest_pose(recording: Recording, skeleton: SkeletonMap, mapped_motion: M
     why = anatomy.why_no_stance(mapped_motion.zero)
     if why is None:
         eyes = np.tile(np.eye(3), (len(mapped_motion.zero), 1, 1))
-        rest = _turned(eyes, mapped_motion.zero, "the zero pose", straight=True)
-        _check_sides(mapped_motion, rest)
-        if not anatomy.arms_lifted(rest.positions):
-            return rest
+        stance = _turned(eyes, mapped_motion.zero, "the zero pose", straight=True)
+        _check_sides(mapped_motion, stance)
+        if not anatomy.arms_lifted(stance.positions):
+            return stance
         why = "an arm is more than 100 degrees from a T-pose's"
     return _straightest(mapped_motion, why)
 
 
-def _given(recording: Recording, skeleton: SkeletonMap, mapped_motion: MappedMotion) -> RestPose:
-    """Return the pose whose joints have the map's rotations."""
+def _given(recording: Recording, skeleton: SkeletonMap, mapped_motion: MappedMotion) -> Stance:
+    """Return the stance whose joints have the map's rotations."""
     assert isinstance(skeleton.rest, dict)
     rotations, positions = (array[mapped_motion.nodes] for array in recording.posed(skeleton.rest))
     upright = skeleton.upright
     pose = skeleton.unit * positions @ upright.T
-    rest = _turned(upright @ rotations @ upright.T, pose, "the map's rest pose", straight=False)
-    why = anatomy.why_no_stance(rest.positions)
+    stance = _turned(upright @ rotations @ upright.T, pose, "the map's rest pose", straight=False)
+    why = anatomy.why_no_stance(stance.positions)
     if why is not None:
         wrong = f"rest of skeleton {skeleton.name} is no person who stands: {why}"
         raise InputError(f"{recording.path}: {wrong}; allowed: rotations of a stance")
-    _check_sides(mapped_motion, rest)
-    return rest
+    _check_sides(mapped_motion, stance)
+    return stance
 
 
-def _straightest(mapped_motion: MappedMotion, why: str) -> RestPose:
+def _straightest(mapped_motion: MappedMotion, why: str) -> Stance:
     """Return the frame in which the person stands straightest; `why` is what is wrong with the zero pose."""
     frames = np.unique(np.linspace(0, len(mapped_motion) - 1, TRIED).astype(int))
     order = frames[np.argsort(anatomy.unevenness(mapped_motion.positions[frames]), kind="stable")]
@@ -90,11 +90,11 @@ def _straightest(mapped_motion: MappedMotion, why: str) -> RestPose:
     )
 
 
-def _frame(mapped_motion: MappedMotion, frame: int, how: str) -> RestPose:
+def _frame(mapped_motion: MappedMotion, frame: int, how: str) -> Stance:
     pose, rotations = mapped_motion.positions[frame], mapped_motion.rotations[frame]
-    rest = _turned(rotations, pose, f"frame {frame}, {how}", straight=False)
-    _check_sides(mapped_motion, rest)
-    return rest
+    stance = _turned(rotations, pose, f"frame {frame}, {how}", straight=False)
+    _check_sides(mapped_motion, stance)
+    return stance
 
 
 def _checked_frame(mapped_motion: MappedMotion, frame: int) -> int:
@@ -111,14 +111,14 @@ def _checked_frame(mapped_motion: MappedMotion, frame: int) -> int:
     return frame
 
 
-def _turned(rotations: np.ndarray, positions: np.ndarray, source: str, straight: bool) -> RestPose:
+def _turned(rotations: np.ndarray, positions: np.ndarray, source: str, straight: bool) -> Stance:
     """Turn a stance about the vertical to face +Z."""
     turn = anatomy.facing(positions)
-    return RestPose(turn @ rotations, positions @ turn.T, source, straight)
+    return Stance(turn @ rotations, positions @ turn.T, source, straight)
 
 
-def _check_sides(mapped_motion: MappedMotion, rest: RestPose) -> None:
-    why = anatomy.wrong_sides(rest.positions, mapped_motion.mapped)
+def _check_sides(mapped_motion: MappedMotion, stance: Stance) -> None:
+    why = anatomy.wrong_sides(stance.positions, mapped_motion.mapped)
     if why is not None:
         allowed = "a map with left on the left, and the file's true up axis"
-        raise InputError(f"{mapped_motion.path}: in {rest.source}, {why}; allowed: {allowed}")
+        raise InputError(f"{mapped_motion.path}: in {stance.source}, {why}; allowed: {allowed}")

@@ -10,14 +10,14 @@ from memmlp.motion.body import JOINTS, PARENTS
 from memmlp.motion.importing import anatomy
 from memmlp.motion.importing.axes import settle
 from memmlp.motion.importing.mapped_motion import MappedMotion, pick_joints
+from memmlp.motion.importing.reading_stance import Stance, find_stance
 from memmlp.motion.importing.recording import Recording
-from memmlp.motion.importing.rest_pose import RestPose, find_rest_pose
 from memmlp.motion.importing.retarget import fit
 from memmlp.motion.importing.skeleton_map import SkeletonMap
 
 
 @dataclass(frozen=True)
-class FileStance:
+class StanceWithAllNodes:
     """A person who stands and faces +Z, Y up, left on +X, in metres; the root is where the file has it.
 
     Attributes:
@@ -36,7 +36,9 @@ class FileStance:
     source: str
 
 
-def find_stance(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -> FileStance:
+def find_stance_with_all_nodes(
+    recording: Recording, skeleton: SkeletonMap, rest: np.ndarray
+) -> StanceWithAllNodes:
     """Return the stance from which `import` reads a file's skeleton.
 
     Args:
@@ -49,17 +51,17 @@ def find_stance(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -
     """
     settled = settle(recording, skeleton)
     mapped_motion = pick_joints(recording, settled)
-    pose = find_rest_pose(recording, settled, mapped_motion)
-    turned = pose.rotations @ fit(recording, settled, mapped_motion, rest).corrections
+    stance = find_stance(recording, settled, mapped_motion)
+    turned = stance.rotations @ fit(recording, settled, mapped_motion, rest).corrections
     mapped = {joint: int(mapped_motion.nodes[JOINTS.index(joint)]) for joint in skeleton.joints}
-    positions = _all_nodes(recording, settled, mapped_motion, pose)
-    return FileStance(
-        recording.nodes, recording.node_parents, positions, mapped, _posed(turned, rest), pose.source
+    positions = _all_nodes(recording, settled, mapped_motion, stance)
+    return StanceWithAllNodes(
+        recording.nodes, recording.node_parents, positions, mapped, _posed(turned, rest), stance.source
     )
 
 
 def _all_nodes(
-    recording: Recording, skeleton: SkeletonMap, mapped_motion: MappedMotion, pose: RestPose
+    recording: Recording, skeleton: SkeletonMap, mapped_motion: MappedMotion, stance: Stance
 ) -> np.ndarray:
     """Return the positions (nodes, 3) of all nodes in a pose that is known for the mapped nodes only.
 
@@ -70,7 +72,7 @@ def _all_nodes(
     assert skeleton.unit is not None
     poses = np.concatenate([recording.zero_pose()[None], recording.posed(given)[1][None], frames])
     poses = skeleton.unit * poses @ skeleton.upright.T
-    off = np.abs(poses[:, mapped_motion.nodes, 1] - pose.positions[:, 1]).max(1)
+    off = np.abs(poses[:, mapped_motion.nodes, 1] - stance.positions[:, 1]).max(1)
     best = poses[off.argmin()]
     return best @ anatomy.facing(best[mapped_motion.nodes]).T
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.importing.mapped_motion import pick_joints
-from memmlp.motion.importing.rest_pose import RestPose, find_rest_pose
+from memmlp.motion.importing.reading_stance import Stance, find_stance
 from memmlp.motion.importing.skeleton_map import SkeletonMap, load_skeleton
 from memmlp.motion.synthetic import synthesize_clip
 
@@ -30,10 +30,10 @@ def walk() -> Clip:
 
 def found(
     folder: Path, clip: Clip, chosen: SkeletonMap, written: SkeletonMap = DAZ, turns: np.ndarray | None = None
-) -> RestPose:
+) -> Stance:
     """The stance of a file written by one map and read by another."""
     bvh = read_bvh(write(folder, performed(written, clip, turns=turns).text()))
-    return find_rest_pose(bvh, chosen, pick_joints(bvh, chosen))
+    return find_stance(bvh, chosen, pick_joints(bvh, chosen))
 
 
 def whole(turn: Rotation) -> np.ndarray:
@@ -44,19 +44,19 @@ def whole(turn: Rotation) -> np.ndarray:
 @pytest.mark.parametrize("degrees", [0, 90, 180, -37])
 def test_a_zero_pose_that_stands_serves(tmp_path: Path, walk: Clip, degrees: float) -> None:
     """Whichever way it faces, it is turned to face +Z."""
-    rest = found(tmp_path, walk, DAZ, turns=whole(Rotation.from_euler("y", degrees, degrees=True)))
-    assert (rest.source, rest.straight) == ("the zero pose", True)
-    left = rest.positions[1] - rest.positions[2]
+    stance = found(tmp_path, walk, DAZ, turns=whole(Rotation.from_euler("y", degrees, degrees=True)))
+    assert (stance.source, stance.straight) == ("the zero pose", True)
+    left = stance.positions[1] - stance.positions[2]
     np.testing.assert_allclose(left / np.linalg.norm(left), [1, 0, 0], atol=1e-6)
-    assert (rest.positions[10] - rest.positions[7])[2] > 0
+    assert (stance.positions[10] - stance.positions[7])[2] > 0
 
 
 @pytest.mark.parametrize("axis", ["x", "z"])
 @pytest.mark.parametrize("degrees", [90, 180, -90])
 def test_a_zero_pose_that_lies_does_not_serve(tmp_path: Path, walk: Clip, axis: str, degrees: float) -> None:
-    rest = found(tmp_path, walk, DAZ, turns=whole(Rotation.from_euler(axis, degrees, degrees=True)))
-    assert rest.source.endswith("the straightest")
-    assert not rest.straight
+    stance = found(tmp_path, walk, DAZ, turns=whole(Rotation.from_euler(axis, degrees, degrees=True)))
+    assert stance.source.endswith("the straightest")
+    assert not stance.straight
 
 
 def test_a_runner_whose_feet_point_back_is_no_stance(tmp_path: Path, walk: Clip) -> None:
@@ -69,14 +69,14 @@ def test_a_runner_whose_feet_point_back_is_no_stance(tmp_path: Path, walk: Clip)
     for ankle, toes in ((7, 10), (8, 11)):
         foot = mapped_motion.positions[frame, toes] - mapped_motion.positions[frame, ankle]
         mapped_motion.positions[frame, toes] -= 2 * foot * [1, 0, 1]
-    other = find_rest_pose(bvh, DAZ, mapped_motion)
+    other = find_stance(bvh, DAZ, mapped_motion)
     assert other.source.endswith("the straightest")
     assert other.source != first.source
 
 
 def test_a_given_frame(tmp_path: Path, walk: Clip) -> None:
-    rest = found(tmp_path, walk, replace(DAZ, rest=7))
-    assert rest.source == "frame 7, given"
+    stance = found(tmp_path, walk, replace(DAZ, rest=7))
+    assert stance.source == "frame 7, given"
     with refuse(tmp_path / "clip.bvh", "no frame 60 for rest"):
         found(tmp_path, walk, replace(DAZ, rest=60))
 
@@ -110,10 +110,10 @@ def test_hips_at_one_place_are_refused(tmp_path: Path) -> None:
     chosen = load_skeleton("cmu_daz")
     flat = replace(bvh, offsets=offsets)
     with refuse(bvh.path, "the hips are at the same place"):
-        find_rest_pose(flat, chosen, pick_joints(flat, chosen))
+        find_stance(flat, chosen, pick_joints(flat, chosen))
     nothing = replace(bvh, offsets=bvh.offsets * 0, values=bvh.values * 0)
     with refuse(bvh.path, "pelvis and head are at the same place"):
-        find_rest_pose(nothing, chosen, pick_joints(nothing, chosen))
+        find_stance(nothing, chosen, pick_joints(nothing, chosen))
 
 
 # Left and right
@@ -160,7 +160,7 @@ def test_mirrored_bones_are_refused(tmp_path: Path) -> None:
     bvh, chosen = read(tmp_path, "cmu_daz"), load_skeleton("cmu_daz")
     behind = replace(bvh, offsets=bvh.offsets * [-1, 1, 1])
     with refuse(bvh.path, "the feet point backward, so left and right may be swapped"):
-        find_rest_pose(behind, chosen, pick_joints(behind, chosen))
+        find_stance(behind, chosen, pick_joints(behind, chosen))
 
 
 # A map's rest
@@ -168,8 +168,8 @@ def test_mirrored_bones_are_refused(tmp_path: Path) -> None:
 
 def test_the_pose_of_a_map(tmp_path: Path, walk: Clip) -> None:
     turns = rest_turns(BANDAI, own_tree(BANDAI))
-    rest = found(tmp_path, walk, BANDAI, BANDAI, turns)
-    assert (rest.source, rest.straight) == ("the map's rest pose", False)
+    stance = found(tmp_path, walk, BANDAI, BANDAI, turns)
+    assert (stance.source, stance.straight) == ("the map's rest pose", False)
 
 
 def leaning(degrees: float) -> list[float]:

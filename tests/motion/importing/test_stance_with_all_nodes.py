@@ -11,15 +11,15 @@ from skeleton_families import walking
 
 from memmlp.motion.body import JOINTS, builtin_rest_joints
 from memmlp.motion.formats.bvh import read_bvh
-from memmlp.motion.importing.file_stance import FileStance, find_stance
 from memmlp.motion.importing.skeleton_map import find_skeleton
+from memmlp.motion.importing.stance_with_all_nodes import StanceWithAllNodes, find_stance_with_all_nodes
 
 REST = builtin_rest_joints()
 
 
-def stance(folder: Path, name: str, turned: bool) -> FileStance:
+def stance(folder: Path, name: str, turned: bool) -> StanceWithAllNodes:
     bvh = read_bvh(write(folder, walking(name, turned).text()))
-    return find_stance(bvh, find_skeleton(bvh), REST)
+    return find_stance_with_all_nodes(bvh, find_skeleton(bvh), REST)
 
 
 @pytest.mark.parametrize(
