@@ -354,7 +354,7 @@ def outputs_of(shown: ShowOptions, stream: Stream) -> Outputs:
     from memmlp.live.outputs import vmc, vrchat
     from memmlp.live.outputs.osc import Receiver
     from memmlp.live.outputs.output import Outputs
-    from memmlp.live.outputs.recording import Recorder
+    from memmlp.live.outputs.recorder import Recorder
 
     found: list[Output] = [vmc.VMC(Receiver(host, port or vmc.PORT, "--vmc")) for host, port in shown.vmc]
     found += [vrchat.VRChat(Receiver(host, port or vrchat.PORT, "--vrchat")) for host, port in shown.vrchat]

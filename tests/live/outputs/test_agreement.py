@@ -17,7 +17,7 @@ from vmc_receiver import Marionette, posed
 
 from memmlp.live.outputs.osc import Receiver
 from memmlp.live.outputs.output import Outputs
-from memmlp.live.outputs.recording import Recorder
+from memmlp.live.outputs.recorder import Recorder
 from memmlp.live.outputs.vmc import VMC
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream

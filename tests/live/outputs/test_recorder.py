@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
 from memmlp.live.outputs.output import BodyFrame
-from memmlp.live.outputs.recording import Recorder
+from memmlp.live.outputs.recorder import Recorder
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.formats.npz import read_clip
 
