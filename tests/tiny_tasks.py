@@ -16,7 +16,7 @@ from memmlp.runs.run import Run
 from memmlp.training.losses import HandPosition, MotionLoss, TermsLoss, Uncertainty
 from memmlp.training.optim import Optim
 from memmlp.training.rollout import OwnPredictions, PersistentStreams, TeacherForcing
-from memmlp.training.sage_losses import objective
+from memmlp.training.sage_part_losses import objective
 from memmlp.training.train_network import MotionTask, NetworkTraining
 from memmlp.training.train_sage import PARTS, PartTask, Windows
 from memmlp.training.train_vqvae import VQVAETask

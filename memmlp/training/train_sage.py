@@ -27,7 +27,7 @@ from memmlp.networks.network_families import Architecture, PartedArchitecture
 from memmlp.runs.run import Run
 from memmlp.training.loop import StepResult, train
 from memmlp.training.optim import Optim
-from memmlp.training.sage_losses import Objective, objective
+from memmlp.training.sage_part_losses import Objective, objective
 from memmlp.training.train_network import NetworkTraining
 
 PARTS = ("upper_codes", "lower_codes", "upper_diffusion", "lower_diffusion", "decoder")

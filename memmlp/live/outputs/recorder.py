@@ -1,4 +1,4 @@
-"""The recorder of a live body: files of the wearer's motion, written at the end from frames that were kept on disk.
+"""The recorder: writes files of the wearer's motion at the end, from frames that it kept on disk.
 
 All files contain the same frames. Formats with a skeleton (BVH, glTF) have the wearer's height. An npz has no
 body, and its readers use one of the network's size, so it holds the motion of the network's body.

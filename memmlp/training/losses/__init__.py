@@ -1,6 +1,6 @@
 """The training losses: Mem-MLP's, the baselines', and a library of terms that any network's loss can take."""
 
-from memmlp.training.losses.authors_losses import (
+from memmlp.training.losses.baseline_losses import (
     AGRoLLoss,
     AvatarPoserLoss,
     OwnLoss,
