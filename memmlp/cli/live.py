@@ -182,7 +182,7 @@ class ShowOptions(NamedTuple):
 def check_options(given: InputOptions, shown: ShowOptions, send: bool) -> None:
     """Raise InputError for options that contradict each other, or need something that is not installed."""
     from memmlp.common.errors import InputError
-    from memmlp.common.page_access import check_token
+    from memmlp.common.request_access import check_token
     from memmlp.live.session.packets import needs_osc
 
     ports = [number for number in (given.udp, given.osc) if number is not None]

@@ -67,8 +67,8 @@ def one_file(chapters: Sequence[Chapter], outputs: Path, extra: str, replays: bo
     """Return the page of these sweeps as one file, with further HTML on a page of its own."""
     from memmlp.cli.ui import predict
     from memmlp.config.compose_plan import sweep_folder
-    from memmlp.report.ui.answers import Answers
     from memmlp.report.ui.one_file import ReportedSweep, page_text
+    from memmlp.report.ui.routes import Answers
 
     answers = Answers(outputs, predict, kept=False)
     shown = [ReportedSweep(sweep_folder(one.sweep, outputs).name, one.table) for one in chapters]

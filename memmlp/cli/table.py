@@ -17,7 +17,7 @@ from memmlp.common.errors import InputError
 from memmlp.sweep.definition import BRANCHES
 
 if TYPE_CHECKING:
-    from memmlp.cli.sweep_to_show import SweepToShow
+    from memmlp.cli.sweep_with_rounds import SweepWithRounds
     from memmlp.sweep.definition import Sweep
     from memmlp.tables.effects import RunsBySeed
     from memmlp.tables.runs_of_plan import Read
@@ -167,7 +167,7 @@ def gathered(
     Raises:
         InputError: if none of them can be composed with the command line's overrides.
     """
-    from memmlp.cli.sweep_to_show import sweep_to_show
+    from memmlp.cli.sweep_with_rounds import sweep_with_rounds
     from memmlp.common.progress import progress_bar
     from memmlp.tables.build_table import without_runs
 
@@ -180,7 +180,7 @@ def gathered(
 
             check_costs(sweep)
         try:
-            known = sweep_to_show(sweep, overrides, outputs.absolute())
+            known = sweep_with_rounds(sweep, overrides, outputs.absolute())
             found.append(table_of_plan(known, modes, command, read, source, untrained))
         except InputError as error:
             failures.append(error)
@@ -192,7 +192,7 @@ def gathered(
 
 
 def table_of_plan(
-    shown: SweepToShow,
+    shown: SweepWithRounds,
     modes: Sequence[str],
     command: str,
     read: Read,

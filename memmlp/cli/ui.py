@@ -31,8 +31,8 @@ def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path)
     """
     import webbrowser
 
-    from memmlp.common.page_access import check_token
-    from memmlp.report.ui.answers import Answers
+    from memmlp.common.request_access import check_token
+    from memmlp.report.ui.routes import Answers
     from memmlp.report.ui.server import RunsServer
 
     check_token(host, token)

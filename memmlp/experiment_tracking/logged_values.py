@@ -93,7 +93,7 @@ def facts_of(run: Run, running: bool = False) -> RunFacts:
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
     status = "running" if running else _status(run)
-    evaluations = run.own_evaluations
+    evaluations = run.evaluations_as_configured
     results = flatten(with_solvers(run.results, evaluations.combined_by))
     started = _seconds(manifest.get("started"))
     own = (

@@ -44,7 +44,7 @@ def record(run: Run) -> dict[str, Any]:
     Times and size are those of the file in the precision that was asked for.
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
-    found = with_solvers(run.results, run.own_evaluations.combined_by)
+    found = with_solvers(run.results, run.evaluations_as_configured.combined_by)
     results = flatten(found) | flatten(_times_as_deployed(found.get("latency", {})), "latency.")
     results = {key: number_of(value) for key, value in results.items()}
     flat = flatten(config)

@@ -32,9 +32,9 @@ from memmlp.runs import deployment_folder
 from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.environment import changed, changes, environment, host, sources
 from memmlp.runs.evaluation_file import intact
+from memmlp.runs.evaluations_as_configured import EvaluationsAsConfigured
 from memmlp.runs.identity import NETWORK, belongs, used_as_configured
 from memmlp.runs.metrics_log import Metrics, MetricsLog
-from memmlp.runs.own_evaluations import OwnEvaluations
 from memmlp.runs.resumed_origin import joined
 
 STAGE_WORDS = {"training": "training", "evaluation": "evaluating", "deployment": "exporting"}
@@ -337,20 +337,20 @@ class Run:
         """The results with the run's own settings: mode -> branch -> metric, and "latency".
 
         A VQ-VAE's run has its own results instead. Where a branch was evaluated by several kinds of inverse
-        kinematics, that of the run's config counts, else the last one (`own_evaluations.combined_by`); tables
-        ask for an evaluation by its identity.
+        kinematics, that of the run's config counts, else the last one
+        (`evaluations_as_configured.combined_by`); tables ask for an evaluation by its identity.
 
         Raises:
             InputError: if the file of an evaluation is damaged.
         """
-        found = read_json(self.results_path) | self.own_evaluations.results
+        found = read_json(self.results_path) | self.evaluations_as_configured.results
         latency = self.preferred_deployment.record
         return found | ({"latency": latency} if latency else {})
 
     @property
-    def own_evaluations(self) -> OwnEvaluations:
+    def evaluations_as_configured(self) -> EvaluationsAsConfigured:
         """The evaluations with the settings of the run's config, as they are now."""
-        return OwnEvaluations(self.evaluations, self.config)
+        return EvaluationsAsConfigured(self.evaluations, self.config)
 
     @property
     def changed_sources(self) -> list[str]:

@@ -267,7 +267,7 @@ def _evaluations(run: Run, stages: Sequence[str] | None) -> list[Path]:
     """
     if wanted := [path for name in stages or () if (path := run.evaluation(name)).is_file()]:
         return wanted
-    return run.own_evaluations.paths
+    return run.evaluations_as_configured.paths
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -60,7 +60,7 @@ def first_answer(outputs: Path) -> float:
     """Return the seconds from a new server's start to its answer with all runs."""
     from urllib.request import urlopen
 
-    from memmlp.report.ui.answers import Answers
+    from memmlp.report.ui.routes import Answers
     from memmlp.report.ui.server import RunsServer
 
     began = time.perf_counter()
@@ -73,7 +73,7 @@ def first_answer(outputs: Path) -> float:
 
 def in_browser(outputs: Path, browser: str) -> tuple[float, float]:
     """Return the seconds until a browser shows the table, and those of a filter that matches few runs."""
-    from memmlp.report.ui.answers import Answers
+    from memmlp.report.ui.routes import Answers
     from memmlp.report.ui.server import RunsServer
 
     told: dict[str, float] = {}

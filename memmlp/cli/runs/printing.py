@@ -45,7 +45,7 @@ def measured_numbers(run: Run) -> dict[str, Any]:
     from memmlp.runs.identity import flatten
 
     results = with_solvers(
-        run.results, run.own_evaluations.combined_by
+        run.results, run.evaluations_as_configured.combined_by
     )  # which hold settings and digests, too
     numbers = {key: value for key, value in flatten(results).items() if isinstance(value, int | float)}
     return {
@@ -58,7 +58,7 @@ def measured_numbers(run: Run) -> dict[str, Any]:
 def older_results(run: Run) -> dict[str, str]:
     """Return in words which of a run's results were measured by earlier recipes; none for a damaged run."""
     try:
-        found = run.own_evaluations.outdated
+        found = run.evaluations_as_configured.outdated
     except InputError:  # which `recorded` tells
         return {}
     return {f"{mode} results": f"by an earlier recipe: {words}" for mode, words in found.items()}

@@ -38,7 +38,7 @@ def show(run: str, config: bool, outputs: Path) -> None:
     console().print(pairs(_summary(found)))
     if is_trained(found):
         for source, measured in load(found.folder).by_source().items():
-            means = with_solvers(measured.means, found.own_evaluations.combined_by)
+            means = with_solvers(measured.means, found.evaluations_as_configured.combined_by)
             console().print(pairs(flatten(means), title=f"results on {source}"))
     if found.results:
         console().print(pairs(measured_numbers(found), title="results"))

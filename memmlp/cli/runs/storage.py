@@ -13,7 +13,7 @@ from memmlp.cli.options import PATH, Finite, outputs_option
 from memmlp.cli.runs.printing import age, console, plain_table
 
 if TYPE_CHECKING:
-    from memmlp.runs.unneeded import Garbage
+    from memmlp.runs.garbage_runs import Garbage
 
 
 @click.command("gc")
@@ -33,7 +33,7 @@ def gc(kinds: tuple[str, ...], yes: bool, outputs: Path) -> None:
     uses, a folder in which nothing began. Runs with a tag or a note, runs that are going on, and what other
     runs build upon stay.
     """
-    from memmlp.runs.unneeded import REASONS, delete, garbage
+    from memmlp.runs.garbage_runs import REASONS, delete, garbage
 
     found = garbage(outputs, kinds or REASONS)
     if not found:

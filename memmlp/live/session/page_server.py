@@ -20,7 +20,7 @@ from importlib import resources
 from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError
-from memmlp.common.page_access import Access
+from memmlp.common.request_access import Access
 from memmlp.live.session.sources import EVERYWHERE, HOST
 
 QUEUED = 240  # the most events that wait for a watcher; beyond, its oldest frames are dropped
@@ -145,7 +145,7 @@ class LiveHandler(BaseHTTPRequestHandler):
             if not access.allows(self.path, self.headers, port):
                 self.send_error(403)
             elif token := access.given(url.query):
-                self._head(303, "text/plain", access.settled(token, port))
+                self._head(303, "text/plain", access.redirect_headers(token, port))
             elif name == "events":
                 self._events()
             elif name in self.server.files:

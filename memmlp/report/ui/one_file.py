@@ -8,9 +8,9 @@ from collections.abc import Collection, Iterable, Mapping
 from typing import Any, NamedTuple
 
 from memmlp.report.ui import pages
-from memmlp.report.ui.answers import MODES, Answers
 from memmlp.report.ui.curves import thinned
 from memmlp.report.ui.replay import body
+from memmlp.report.ui.routes import MODES, Answers
 from memmlp.report.ui.sweeps import table_words
 from memmlp.tables.table import Table
 

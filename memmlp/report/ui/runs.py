@@ -249,7 +249,7 @@ def clips(run: Run) -> list[dict[str, Any]]:
     if not is_trained(run):
         return []
     try:
-        found, evaluations = load(run.folder).clips, run.own_evaluations
+        found, evaluations = load(run.folder).clips, run.evaluations_as_configured
         by = evaluations.combined_by
         own = {
             report["name"]: report.get("frames")
@@ -285,7 +285,7 @@ def verified(run: Run) -> list[str]:
 def by_earlier_recipes(run: Run) -> list[str]:
     """Return the modes that a run was measured in by an earlier recipe, each with what has changed since."""
     try:
-        return [f"{mode} ({words})" for mode, words in run.own_evaluations.outdated.items()]
+        return [f"{mode} ({words})" for mode, words in run.evaluations_as_configured.outdated.items()]
     except InputError:  # the facts tell of a damaged file
         return []
 

@@ -17,9 +17,9 @@ from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import plain
-from memmlp.common.page_access import LOCAL, Access
+from memmlp.common.request_access import LOCAL, Access
 from memmlp.report.ui import pages
-from memmlp.report.ui.answers import Answers
+from memmlp.report.ui.routes import Answers
 from memmlp.runs.identity import ID
 
 QUIET = 15.0  # seconds without news after which a comment shows that the connection lives
@@ -80,7 +80,7 @@ class RunsHandler(BaseHTTPRequestHandler):
                     b"not allowed; open the address that memmlp ui printed\n",
                 )
             elif "token" in query:
-                self._send(303, "text/plain", b"", access.settled(query["token"], port))
+                self._send(303, "text/plain", b"", access.redirect_headers(query["token"], port))
             else:
                 self._route(urllib.parse.unquote(url.path).lstrip("/"), query)
 

@@ -15,8 +15,8 @@ from report.ui.test_replay import motion
 
 from memmlp.cli.seed_rounds import look
 from memmlp.evaluation.units import UNITS
-from memmlp.report.ui.answers import Answers
 from memmlp.report.ui.one_file import ReportedSweep, page_text, query, rounded
+from memmlp.report.ui.routes import Answers
 from memmlp.report.ui.server import RunsServer
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan

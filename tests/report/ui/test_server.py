@@ -14,7 +14,7 @@ from report.ui.conftest import begun, run_of
 
 from memmlp.common.errors import InputError
 from memmlp.report.ui import pages
-from memmlp.report.ui.answers import Answers
+from memmlp.report.ui.routes import Answers
 from memmlp.report.ui.server import RunsServer
 
 TOKEN = "a token of many letters"

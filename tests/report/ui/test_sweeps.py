@@ -11,8 +11,8 @@ from fake_runs import fake_run
 from report.ui.conftest import begun, run_of
 
 from memmlp.cli.seed_rounds import look
-from memmlp.report.ui.answers import Answers
 from memmlp.report.ui.index import Index
+from memmlp.report.ui.routes import Answers
 from memmlp.report.ui.sweeps import NOT_KEPT, OTHERS, ROUNDS, Sweeps
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan, RunTask

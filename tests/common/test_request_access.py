@@ -8,7 +8,7 @@ from urllib.parse import quote
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.common.page_access import COOKIE, Access, check_token, loopback
+from memmlp.common.request_access import COOKIE, Access, check_token, loopback
 
 TOKEN = "a token of many letters"
 

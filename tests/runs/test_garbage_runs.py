@@ -8,9 +8,9 @@ import pytest
 
 from memmlp.common.files import write_json
 from memmlp.common.liveness import myself
+from memmlp.runs.garbage_runs import delete, garbage
 from memmlp.runs.notes import add_tags
 from memmlp.runs.run import Run
-from memmlp.runs.unneeded import delete, garbage
 
 FAILED, OLD, GONE, CODES, USED, GOOD, EMPTY = (f"{letter}" * 16 for letter in "0123456")
 

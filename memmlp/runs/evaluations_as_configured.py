@@ -11,7 +11,7 @@ from memmlp.runs.evaluation_file import check_report, combined_by, of_one_solver
 from memmlp.runs.identity import used_as_configured
 
 
-class OwnEvaluations:
+class EvaluationsAsConfigured:
     """The evaluations with the settings of a run's config.
 
     Attributes:
@@ -19,7 +19,7 @@ class OwnEvaluations:
     """
 
     def __init__(self, folder: Path, config: Mapping[str, Any]):
-        """Look for them.
+        """Read the evaluations of a folder that match the config.
 
         Args:
             folder: the run's folder of evaluations.

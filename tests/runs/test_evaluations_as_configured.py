@@ -12,8 +12,8 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.report.ui.run_facts import facts
 from memmlp.runs.evaluation_file import write_report
+from memmlp.runs.evaluations_as_configured import EvaluationsAsConfigured
 from memmlp.runs.identity import evaluation_id_of
-from memmlp.runs.own_evaluations import OwnEvaluations
 from memmlp.runs.query import record
 from memmlp.runs.run import Run
 from memmlp.tables.measured_run import load
@@ -42,7 +42,7 @@ def test_combined_is_of_one_inverse_kinematics_which_is_named(tmp_path: Path):
         return (
             run.results["stream"]["combined"],
             read.means["stream"]["combined"],
-            run.own_evaluations.combined_by,
+            run.evaluations_as_configured.combined_by,
             keys,
         )
 
@@ -64,14 +64,14 @@ def test_a_mode_that_was_measured_by_an_earlier_recipe_says_so(tmp_path: Path, m
     report = {"mode": "stream", "settings": settings, "mean": {}, "clips": [], "recipes": {"mode.stream": 1}}
     write_report(tmp_path / f"{evaluation_id_of(settings)}.json", report)
     monkeypatch.setitem(memmlp.runs.recipe_versions.RECIPES, "mode.stream", 1)
-    assert OwnEvaluations(tmp_path, {}).outdated == {}
+    assert EvaluationsAsConfigured(tmp_path, {}).outdated == {}
     monkeypatch.setitem(memmlp.runs.recipe_versions.RECIPES, "mode.stream", 2)
-    assert OwnEvaluations(tmp_path, {}).outdated == {"stream": "mode.stream 1 -> 2"}
+    assert EvaluationsAsConfigured(tmp_path, {}).outdated == {"stream": "mode.stream 1 -> 2"}
 
 
 def test_a_damaged_file_is_named_by_what_reads_its_numbers(tmp_path: Path):
     write_json(tmp_path / "stream.json", {"mode": "stream"})
-    found = OwnEvaluations(tmp_path, {})
+    found = EvaluationsAsConfigured(tmp_path, {})
     assert found.paths == [tmp_path / "stream.json"]
     for read in (lambda: found.results, lambda: found.combined_by):
         with pytest.raises(InputError, match=r"stream\.json: cannot be read"):

@@ -56,7 +56,7 @@ class Access:
         """Return the token in the query of an address, or nothing."""
         return dict(urllib.parse.parse_qsl(query)).get("token", "")
 
-    def settled(self, token: str, port: int) -> Mapping[str, str]:
+    def redirect_headers(self, token: str, port: int) -> Mapping[str, str]:
         """Return the headers that redirect to the page with the token in a cookie instead of the address."""
         named = f"{COOKIE}_{port}={urllib.parse.quote(token)}"
         return {"Location": "/", "Set-Cookie": f"{named}; HttpOnly; SameSite=Strict; Path=/"}
