@@ -31,9 +31,7 @@ from memmlp.experiment_tracking.follower_pipe import Tracking
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.network_coordinates import Coordinates, Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.memory import Memory
-from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.network_families import (
+from memmlp.networks.architectures import (
     VQVAE_SETTINGS,
     Architecture,
     MemMLPArchitecture,
@@ -41,6 +39,8 @@ from memmlp.networks.network_families import (
     PlainArchitecture,
     RefinedArchitecture,
 )
+from memmlp.networks.memory import Memory
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.vqvae import VQVAE
 from memmlp.pipeline.devices import device
 from memmlp.pipeline.experiment import Experiment, UpstreamTraining

@@ -13,7 +13,7 @@ from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.experiment_tracking.follower_pipe import Tracking
 from memmlp.motion.motion_source import MotionSource, Prepared
-from memmlp.networks.network_families import VQVAE_SETTINGS, Architecture
+from memmlp.networks.architectures import VQVAE_SETTINGS, Architecture
 from memmlp.runs.identity import NETWORK, Identity, deployment_id, evaluation_id
 from memmlp.runs.run import Run
 from memmlp.training.train_network import NetworkTraining

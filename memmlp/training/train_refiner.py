@@ -16,8 +16,8 @@ from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.motion.mirror import MirroredDataset
 from memmlp.motion.motion_source import Prepared
 from memmlp.networks import checkpoint
+from memmlp.networks.architectures import Architecture, RefinedArchitecture
 from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.network_families import Architecture, RefinedArchitecture
 from memmlp.networks.refiner import HIDDEN, Refined, SAGERefiner
 from memmlp.runs.run import Run
 from memmlp.training.loop import StepResult, Watch, train, unwatched

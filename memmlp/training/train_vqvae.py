@@ -16,7 +16,7 @@ from memmlp.motion.mirror import MirroredDataset
 from memmlp.motion.motion_source import Prepared
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import checkpoint
-from memmlp.networks.network_families import Architecture
+from memmlp.networks.architectures import Architecture
 from memmlp.networks.vqvae import VQVAE, rotation_error
 from memmlp.runs.run import Run
 from memmlp.training.loop import StepResult, train

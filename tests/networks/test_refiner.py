@@ -14,7 +14,7 @@ from memmlp.evaluation.ik import Arms
 from memmlp.evaluation.modes import joint_positions
 from memmlp.motion.body import HANDS, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.network_coordinates import Heading
-from memmlp.networks.network_families import RefinedArchitecture
+from memmlp.networks.architectures import RefinedArchitecture
 from memmlp.networks.refiner import HIDDEN, Refined
 from memmlp.networks.streaming import has_stream, streaming
 

@@ -17,8 +17,8 @@ from memmlp.motion.body import HEAD, N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.network_coordinates import World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import checkpoint
+from memmlp.networks.architectures import PartedArchitecture
 from memmlp.networks.baselines.sage_parts import LOWER, UPPER
-from memmlp.networks.network_families import PartedArchitecture
 from memmlp.training import sage_part_losses
 from memmlp.training.loop import train_step
 from memmlp.training.train_sage import PARTS, DroppingOptim
