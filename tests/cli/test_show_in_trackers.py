@@ -8,6 +8,7 @@ import pytest
 from conftest import Memmlp, one_line
 from fake_tracker import FakeTracker, Server, a_run
 
+from memmlp.cli import show_in_trackers
 from memmlp.common.files import write_json
 
 
