@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from memmlp.runs.environment import NOT_NUMBERS, PACKAGE, WIRING, sources
+from memmlp.runs.environment import NOT_NUMBERS, PACKAGE, WIRING, code_digests
 
 ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "docs" / "architecture.md"
@@ -69,7 +69,7 @@ def test_rooms_that_make_no_numbers_are_there():
 
 def test_wiring_counts_among_the_sources_of_a_run():
     """A renamed file must not drop out of what a run's numbers come from."""
-    assert set(WIRING) <= set(sources())
+    assert set(WIRING) <= set(code_digests())
 
 
 def test_refusals_are_asserted():

@@ -138,7 +138,7 @@ def docs(folder: Path, check: bool) -> None:
     """
     from memmlp.report.result_pages import check_claims, pages
 
-    found = sources(folder)
+    found = kept_tables(folder)
     made = pages(found, _templates(folder))
     drawn = _pictures(folder, found)
     if PROSE.exists():
@@ -159,7 +159,7 @@ def docs(folder: Path, check: bool) -> None:
     )
 
 
-def sources(folder: Path) -> dict[str, KeptTable]:
+def kept_tables(folder: Path) -> dict[str, KeptTable]:
     """Return the tables of all results kept below a folder, by the stems of their files."""
     from memmlp.report.kept_results import load_kept
     from memmlp.report.result_pages import KeptTable

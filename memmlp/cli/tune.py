@@ -63,7 +63,7 @@ def tune(
         write_json(setup.folder / "search.json", asdict(setup.search))
         study = Study.opened(setup.search, setup.folder.name, setup.folder)
         search(setup, study, workers)
-        leave(setup, study)
+        write_results(setup, study)
     summary(setup, study)
 
 
@@ -231,12 +231,12 @@ def _check_same_clips(base: Experiment, digest: str) -> None:
     """Raise InputError if the data has another digest now, so that further trials would be judged by it."""
     if base.data.prepare().digest != digest:
         raise InputError(
-            f"{base.data.source.root}: its clips changed since the search began; put them back, or start the "
+            f"{base.data.clips.root}: its clips changed since the search began; put them back, or start the "
             "search again, which begins another one"
         )
 
 
-def leave(setup: Setup, study: Study) -> None:
+def write_results(setup: Setup, study: Study) -> None:
     """Write the results of the search into its folder."""
     from memmlp.config.package_data import packaged
     from memmlp.runs.identity import option_in_slot

@@ -46,9 +46,9 @@ def build_motion(cfg: DictConfig) -> MotionSource:
         generate = partial(_synthesize, minutes=data.synth.minutes, seed=data.synth.seed)
 
     interpolation = data.get("interpolation", LINES)  # recorded configs from before the key mean lines
-    source = ClipFolder(root, split, str(data.body), data.min_frames, data.strict, interpolation)
+    clips = ClipFolder(root, split, str(data.body), data.min_frames, data.strict, interpolation)
     caches = Path(cfg.paths.outputs) / "cache"
-    return MotionSource(source, generate, caches, partial=data.get("partial", False))
+    return MotionSource(clips, generate, caches, partial=data.get("partial", False))
 
 
 def _version(recipe: str) -> str:

@@ -71,7 +71,7 @@ def data_of(run: Run, experiment: Experiment) -> Prepared:
     # What it was trained on may be looked at, however much of its list that is: the digest proves it.
     data = replace(experiment.data, partial=True).prepare()
     if data.digest != run.manifest["data"]:
-        root = experiment.data.source.root
+        root = experiment.data.clips.root
         raise InputError(f"run {run.id}: its data has changed since (data.root={root})")
     return data
 

@@ -29,7 +29,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.plugin import Plugin
 from memmlp.config.package_data import packaged
 from memmlp.evaluation.units import HIGHER, SMALLEST, UNITS
-from memmlp.runs.environment import own_sources
+from memmlp.runs.environment import own_code_digests
 from memmlp.runs.identity import flatten
 from memmlp.runs.recipe_versions import RECIPES
 
@@ -115,7 +115,7 @@ def texts_outside_memmlp() -> list[tuple[str, str]]:
     """Return code and configs from outside memmlp, as (name, text), on which a plan depends."""
     found = [
         (f"{name}:{file}", text)
-        for name, files in own_sources(_active).items()
+        for name, files in own_code_digests(_active).items()
         for file, text in files.items()
     ]
     paths = [path for _, folder in folders() for path in sorted(folder.rglob("*.yaml"))]

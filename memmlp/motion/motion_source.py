@@ -61,27 +61,27 @@ class MotionSource:
     """One or more folders of clips and their cache; synthetic clips are generated.
 
     Attributes:
-        source: the folder of clips, or several, with its split and body.
+        clips: the folder of clips, or several, with its split and body.
         generate: makes a synthetic folder; None for the user's own.
         caches: folder of all caches.
         partial: whether it is allowed that only a part of the split's entries have clips.
     """
 
-    source: ClipFolder
+    clips: ClipFolder
     generate: Callable[[Path], object] | None
     caches: Path
     partial: bool = False
 
     @property
     def cache(self) -> Path:
-        """The folder of the cache; each combination of source and settings has its own."""
-        key = repr(replace(self.source, root=self.source.root.resolve())) + (self.groups_digest or "")
-        return self.caches / f"{self.source.root.name}-{hashlib.sha256(key.encode()).hexdigest()[:8]}"
+        """The folder of the cache; each combination of clips and settings has its own."""
+        key = repr(replace(self.clips, root=self.clips.root.resolve())) + (self.groups_digest or "")
+        return self.caches / f"{self.clips.root.name}-{hashlib.sha256(key.encode()).hexdigest()[:8]}"
 
     @property
     def groups_digest(self) -> str | None:
         """A digest of the column file that says which clips belong together; None without one."""
-        return self.source.split.groups_digest
+        return self.clips.split.groups_digest
 
     def prepare(self) -> Prepared:
         """Return the cache with its manifest; it is made if it is missing or out of date.
@@ -91,24 +91,24 @@ class MotionSource:
                 no clip. A missing file is reported before any file is read.
         """
         if self.generate is not None:
-            _make_once(Path(str(self.source.root)), self.generate)
+            _make_once(Path(str(self.clips.root)), self.generate)
         if not self.partial:
-            self._listed().check(self.source.root)
-        found = Prepared(self.cache, prepare(self.source, self.cache))
+            self._listed().check(self.clips.root)
+        found = Prepared(self.cache, prepare(self.clips, self.cache))
         if not self.partial:
-            found.manifest.coverage.check(self.source.root)
+            found.manifest.coverage.check(self.clips.root)
         return found
 
     def _listed(self) -> Coverage:
         """Return how many entries of the split have a file, whatever the file contains."""
-        split = self.source.split
-        found = find_all(self.source.root) if split.listed else FoundFiles()
+        split = self.clips.split
+        found = find_all(self.clips.root) if split.listed else FoundFiles()
         names = [clip_name(file) for file in (*found.files, *found.links)]
         return Coverage.of(split.listed, split.missing(names))
 
     def digest(self) -> str | None:
         """Return the digest of the prepared data; None if the cache is missing or out of date."""
-        manifest = finished_cache(self.source, self.cache)
+        manifest = finished_cache(self.clips, self.cache)
         return manifest.digest if manifest else None
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.motion.body import load_rest_joints
 from memmlp.motion.clip import Skipped
+from memmlp.motion.clip_kinematics import clip_kinematics
 from memmlp.motion.formats.npz import read_clip
-from memmlp.motion.importing.fidelity import pose
 from memmlp.motion.preparing.find_clips import clip_name, find_clips
 from memmlp.render.canvas import Sheet
 from memmlp.render.raster import Camera, draw
@@ -45,7 +45,7 @@ def some_clips(
         except InputError as error:
             skipped.append(Skipped(file, str(error).removeprefix(f"{top / file}: ")))
         else:
-            clips.append((clip.name, pose(clip, rest)[1]))
+            clips.append((clip.name, clip_kinematics(clip, rest)[1]))
     if not clips:
         first = f"{skipped[0].file}: {skipped[0].reason}"
         raise InputError(f"{source}: no clip in {len(skipped)} files, the first: {first}")

@@ -97,18 +97,20 @@ def changes() -> str:
     return ""
 
 
-def sources(packages: Iterable[str] = ()) -> dict[str, str]:
+def code_digests(packages: Iterable[str] = ()) -> dict[str, str]:
     """Return a digest of the code in each file on which a run's numbers depend.
 
     Comments and docstrings don't matter. Files of the user's own packages, and of what these import, are
     named PACKAGE:FILE.
     """
-    own = own_sources(packages).items()
-    return _sources() | {f"{name}:{file}": digest for name, files in own for file, digest in files.items()}
+    own = own_code_digests(packages).items()
+    return _code_digests() | {
+        f"{name}:{file}": digest for name, files in own for file, digest in files.items()
+    }
 
 
 def changed(before: Mapping[str, str], after: Mapping[str, str]) -> list[str]:
-    """Return the files whose code differs between two records (`sources`).
+    """Return the files whose code differs between two records (`code_digests`).
 
     A file that is in one of them alone is not compared: what is new runs only if other code, or the config,
     names it, and records of earlier versions lack what packages import.
@@ -117,13 +119,13 @@ def changed(before: Mapping[str, str], after: Mapping[str, str]) -> list[str]:
 
 
 @functools.cache
-def _sources() -> dict[str, str]:
+def _code_digests() -> dict[str, str]:
     """Return the digests of this package's files."""
     files = [path for path in sorted(PACKAGE.rglob("*.py")) if _counts(path.relative_to(PACKAGE))]
     return {path.relative_to(PACKAGE).as_posix(): code_digest(path.read_text("utf-8")) for path in files}
 
 
-def own_sources(packages: Iterable[str]) -> dict[str, dict[str, str]]:
+def own_code_digests(packages: Iterable[str]) -> dict[str, dict[str, str]]:
     """Return digests of the Python files of users' packages, by package and file; nothing is imported.
 
     Modules of the user's own that these import (`imported_modules`) follow, each by itself: of a package only
@@ -136,7 +138,7 @@ def own_sources(packages: Iterable[str]) -> dict[str, dict[str, str]]:
 
 
 def _own_files(packages: Iterable[str]) -> dict[str, dict[str, Path]]:
-    """Return the files of `own_sources`, by package and file."""
+    """Return the files of `own_code_digests`, by package and file."""
     files = {name: _package_files(name) for name in packages}
     modules = {_module(name, file): path for name, own in files.items() for file, path in own.items()}
     imported = {
@@ -195,7 +197,7 @@ def packages_of_ones_own(names: Iterable[str]) -> dict[str, dict[str, str | None
         found = [f for f, path in files.items() if imports_by_computed_names(modules[f], path, packages)]
         return {"computed_imports": ", ".join(found)} if found else {}
 
-    own, digests = _own_files(packages), own_sources(packages)
+    own, digests = _own_files(packages), own_code_digests(packages)
     return {
         name: {"version": _own_version(name), "digest": digest(digests[name]), **computed(name, files)}
         for name, files in own.items()

@@ -30,7 +30,7 @@ from memmlp.common.files import (
 from memmlp.common.lease import Lease, Lock
 from memmlp.runs import deployment_folder
 from memmlp.runs.deployment_folder import DeploymentFolder
-from memmlp.runs.environment import changed, changes, environment, host, sources
+from memmlp.runs.environment import changed, changes, code_digests, environment, host
 from memmlp.runs.evaluation_file import intact
 from memmlp.runs.evaluations_as_configured import EvaluationsAsConfigured
 from memmlp.runs.identity import NETWORK, belongs, used_as_configured
@@ -285,7 +285,7 @@ class Run:
             atomic_write(self.folder / "code.patch", patch)
         identity = {"id": self.id, "kind": kind, "data": data, "upstream": upstream}
         before = self.manifest if self.checkpoint.exists() else {}
-        made = joined(before, {**facts, **environment(), "sources": sources(facts.get("plugins", ()))})
+        made = joined(before, {**facts, **environment(), "sources": code_digests(facts.get("plugins", ()))})
         self.attempt("training")
         times = {"started": self.manifest.get("started", now()), "finished": None, "seconds": {}}
         self.write_manifest(identity | times | made)
@@ -359,7 +359,7 @@ class Run:
         Files of the user's packages that are found, and of what these import, are included.
         """
         before, packages = self.manifest.get("sources", {}), self.manifest.get("plugins", ())
-        return changed(before, sources(packages)) if before else []
+        return changed(before, code_digests(packages)) if before else []
 
     def log(self, step: int, values: Mapping[str, float], phase: str = "train") -> None:
         """Append one line to the metrics log, in one write: a kill damages at most that line."""

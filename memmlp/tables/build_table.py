@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from memmlp.common.errors import InputError
 from memmlp.sweep.definition import COSTS, MODES, Arm, Sweep
 from memmlp.tables.effects import RunsBySeed, control_arm, effects, paper_effect, with_existing_branches
-from memmlp.tables.flags_of_runs import Say, early_looks, flags, silent
+from memmlp.tables.flags_of_runs import DescribeRun, early_looks, flags, silent
 from memmlp.tables.measured_run import Measured
 from memmlp.tables.table import Cell, Effect, Key, Row, Table
 
@@ -32,8 +32,8 @@ def make_table(
     runs: Mapping[str, RunsBySeed],
     modes: Sequence[str] = MODES,
     command: str | None = None,
-    state: Say = silent,
-    older: Say = silent,
+    state: DescribeRun = silent,
+    older: DescribeRun = silent,
     rounds: Rounds | None = None,
 ) -> Table:
     """Make the table of a sweep.

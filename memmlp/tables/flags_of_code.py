@@ -7,7 +7,7 @@ import hashlib
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 
-from memmlp.runs.environment import changed, sources
+from memmlp.runs.environment import changed, code_digests
 from memmlp.tables.flag_words import flags_of_difference, listed, quoted, unique
 from memmlp.tables.measured_run import Measured
 
@@ -47,10 +47,10 @@ def older_code(runs: Iterable[tuple[str, Mapping[str, str], Iterable[str]]]) -> 
     """Flag runs that were made before code changed, though no recipe version was raised.
 
     Args:
-        runs: for each run its arm's label, the digests of its code (`sources`; empty where these are not
+        runs: for each run its arm's label, the digests of its code (`code_digests`; empty where these are not
             known), and the users' packages that it uses.
     """
-    today = functools.cache(sources)
+    today = functools.cache(code_digests)
     found = [(label, changed(code, today(tuple(packages)))) for label, code, packages in runs if code]
     names = sorted({name for _, files in found for name in files})
     if names:

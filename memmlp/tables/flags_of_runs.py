@@ -15,7 +15,7 @@ from memmlp.tables.effects import RunsBySeed, control_arm, one_and_the_same
 from memmlp.tables.flag_words import flags_of_difference, listed, quoted, unique
 from memmlp.tables.measured_run import SHARED, UNKNOWN, Measured
 
-Say = Callable[[Arm, int], str | None]
+DescribeRun = Callable[[Arm, int], str | None]
 BUILT_IN = "builtin"
 TIMES = {"ms", "network ms", "pose ms", "ratio", "FPS"}
 CORE = 0.9  # how much of a measurement the thread has to have a core for its times to be the network's
@@ -29,11 +29,16 @@ ORIGIN = {
 
 
 def silent(arm: Arm, seed: int) -> None:
-    """Return None, as there is nothing to say about a run: the default for a `Say`."""
+    """Return None, as there is nothing to say about a run: the default for a `DescribeRun`."""
 
 
 def flags(
-    sweep: Sweep, asked: Sweep, runs: Mapping[str, RunsBySeed], command: str, state: Say, older: Say
+    sweep: Sweep,
+    asked: Sweep,
+    runs: Mapping[str, RunsBySeed],
+    command: str,
+    state: DescribeRun,
+    older: DescribeRun,
 ) -> Iterable[str]:
     """Yield the flags of a table.
 
@@ -102,7 +107,7 @@ def _other_data(sweep: Sweep) -> Iterable[str]:
         yield f"a table of {own}, shown with {chosen}: its errors do not compare with the paper's"
 
 
-def _missing(sweep: Sweep, runs: Mapping[str, RunsBySeed], command: str, state: Say) -> Iterable[str]:
+def _missing(sweep: Sweep, runs: Mapping[str, RunsBySeed], command: str, state: DescribeRun) -> Iterable[str]:
     """Flag the missing runs, with their states, and the command that makes them."""
     gaps = {}
     for arm in sweep.runnable():
@@ -118,7 +123,7 @@ def _missing(sweep: Sweep, runs: Mapping[str, RunsBySeed], command: str, state: 
         yield f"missing: {every if alike else listed(told)}; fill with: {command}"
 
 
-def _older(sweep: Sweep, runs: Mapping[str, RunsBySeed], older: Say) -> Iterable[str]:
+def _older(sweep: Sweep, runs: Mapping[str, RunsBySeed], older: DescribeRun) -> Iterable[str]:
     """Flag missing runs for which a run with an earlier recipe exists."""
     found = [
         f"'{arm.label}' seed {seed} ({run})"

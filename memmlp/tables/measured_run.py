@@ -95,7 +95,8 @@ class Measured:
         run: the run's folder; None for results that were kept without it.
         training: what its training took, as far as known: `seconds`; `frames`, the frames seen, each counted
             as often as it was drawn in a window; and `flops` for kept results.
-        code: a digest of the code of each file with which it was trained (`sources`); empty for kept results.
+        code: a digest of the code of each file with which it was trained (`code_digests`); empty for
+            kept results.
     """
 
     id: str

@@ -12,7 +12,7 @@ from memmlp.runs.run import Run
 from memmlp.sweep.definition import Arm
 from memmlp.sweep.plan import Plan
 from memmlp.tables.build_table import Find
-from memmlp.tables.flags_of_runs import Say
+from memmlp.tables.flags_of_runs import DescribeRun
 from memmlp.tables.measured_run import Measured
 
 Read = Callable[[Path, tuple[str, ...]], Measured]
@@ -31,7 +31,7 @@ def run_finder(plan: Plan, read: Read) -> Find:
     return find
 
 
-def state_finder(plan: Plan) -> Say:
+def state_finder(plan: Plan) -> DescribeRun:
     """Return a function that describes the state of an unfinished run of the plan, once it has begun."""
 
     entries = {(entry.label, entry.seed): entry for entry in plan.entries}
@@ -49,7 +49,7 @@ def state_finder(plan: Plan) -> Say:
     return state
 
 
-def older_run_finder(plan: Plan) -> Say:
+def older_run_finder(plan: Plan) -> DescribeRun:
     """Return a function that names a finished run that differs from a planned one only in recipe versions."""
     whats = {task.key: task.what for task in plan.tasks}
     entries = {(entry.label, entry.seed): entry for entry in plan.entries}

@@ -1,4 +1,4 @@
-"""The rollout slot: how the history that a training step sees is made.
+"""The rollout slot: draws the training batch of a step, and makes the history that it sees.
 
 A network that is trained on true history alone comes to rely on it, but has none at run time (exposure bias).
 So the history may be made by the network itself, as it will be in a live stream.
@@ -18,7 +18,7 @@ from memmlp.networks.memory import State
 from memmlp.networks.motion_model import MotionModel
 
 
-class Call(NamedTuple):
+class TrainingCall(NamedTuple):
     """The arguments of a training call: `model.learn(sparse, state, truth)` should return the true motion.
 
     Attributes:
@@ -43,7 +43,9 @@ class Rollout(nn.Module):
     def begin(self, model: MotionModel) -> None:
         """Make room for what is kept between a network's training steps; by default nothing is kept."""
 
-    def draw(self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
+    def draw(
+        self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int
+    ) -> TrainingCall:
         """Draw the training call of a step."""
         raise NotImplementedError
 
@@ -54,13 +56,15 @@ class Rollout(nn.Module):
 class TeacherForcing(Rollout):
     """A rollout with the true motion as history: the paper's training (Sec. 3.2.1)."""
 
-    def draw(self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
+    def draw(
+        self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int
+    ) -> TrainingCall:
         """Draw the training call of a step."""
         clips, end = map(distributed.own_rows, sampler.draw(step))
         past, stride = model.length, model.stride
         segment = dataset.segments(clips, end, past + stride)
         state = model.true_state(segment[:, :past])
-        return Call(segment[:, past:, :SPARSE_DIM], state, segment[:, -model.frames :], clips)
+        return TrainingCall(segment[:, past:, :SPARSE_DIM], state, segment[:, -model.frames :], clips)
 
 
 class OwnPredictions(Rollout):
@@ -74,7 +78,9 @@ class OwnPredictions(Rollout):
         super().__init__()
         self.max_passes = max_passes
 
-    def draw(self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
+    def draw(
+        self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int
+    ) -> TrainingCall:
         """Draw the training call of a step, after the calls that make its history."""
         clips, end = map(distributed.own_rows, sampler.draw(step))
         past, stride = model.length, model.stride
@@ -89,7 +95,7 @@ class OwnPredictions(Rollout):
                 _, state = model.advance(sparse[:, start : start + stride], state, stride)
         torch.clear_autocast_cache()  # weights that were cast without a gradient would have none below
         model.train()
-        return Call(sparse[:, -stride:], state, segment[:, -model.frames :], clips)
+        return TrainingCall(sparse[:, -stride:], state, segment[:, -model.frames :], clips)
 
 
 class PersistentStreams(Rollout):
@@ -124,7 +130,9 @@ class PersistentStreams(Rollout):
         for name, tensor in model.initial_state(1).items():
             self.register_buffer(f"state_{name}", tensor.repeat(self.streams, *[1] * (tensor.dim() - 1)))
 
-    def draw(self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
+    def draw(
+        self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int
+    ) -> TrainingCall:
         """Draw the training call of a step: the next streams, each moved on by one stride."""
         clips, end = sampler.draw(step)
         who = (step * len(clips) + torch.arange(len(clips), device=clips.device)) % self.streams
@@ -142,7 +150,9 @@ class PersistentStreams(Rollout):
         for name, tensor in fresh.items():
             kept = self.get_buffer(f"state_{name}")[mine]
             state[name] = torch.where(going.view(-1, *[1] * (tensor.dim() - 1)), kept, tensor)
-        return Call(segment[:, past:, :SPARSE_DIM], state, segment[:, -model.frames :], self.clip[mine])
+        return TrainingCall(
+            segment[:, past:, :SPARSE_DIM], state, segment[:, -model.frames :], self.clip[mine]
+        )
 
     def keep(self, state: State) -> None:
         """Keep the streams' states after the training call."""

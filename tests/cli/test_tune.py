@@ -16,7 +16,7 @@ from command_line import run_apart
 from filelock import FileLock
 
 from memmlp.cli.bench.chaos import examine
-from memmlp.cli.tune import _makes, _tasks, leave, prepare_search, search, training
+from memmlp.cli.tune import _makes, _tasks, prepare_search, search, training, write_results
 from memmlp.cli.workers import Workers
 from memmlp.common.errors import InputError
 from memmlp.runs.recipe_versions import RECIPES
@@ -171,7 +171,7 @@ def test_table_5_is_of_mem_mlp_alone(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(results, "write_table", lambda _study, _shipped, path: written.append(path))
     space = ["search.base=[]", "search.space.loss=null", "+search.space.optim.lr={low: 1e-4, high: 1e-2}"]
     for words in ([], [*space, "model=avatar_poser"]):
-        leave(prepare_search([*TINY, *words], None, tmp_path), None)
+        write_results(prepare_search([*TINY, *words], None, tmp_path), None)
     assert [path.name for path in written] == ["table05.yaml"]
 
 

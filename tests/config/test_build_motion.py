@@ -45,11 +45,11 @@ def with_source(**keys) -> dict:
 def test_a_list_of_one_folder_is_that_folder():
     one, listed = (build_motion(composed(["data=mocap", f"data.root={root}"])) for root in ("a", "[a]"))
     assert one == listed
-    assert isinstance(one.source.split, SeededSplit)
+    assert isinstance(one.clips.split, SeededSplit)
 
 
 def test_a_list_of_folders_names_sources_after_them():
-    source = build_motion(composed(["data=mocap", "data.root=[b,a]", "data.split.test=0.2"])).source
+    source = build_motion(composed(["data=mocap", "data.root=[b,a]", "data.split.test=0.2"])).clips
     assert source.root == Folders({"b": Path("b"), "a": Path("a")})
     assert isinstance(source.split, MixedSplit)
     assert {split.test for split in source.split.splits.values()} == {0.2}
@@ -58,7 +58,7 @@ def test_a_list_of_folders_names_sources_after_them():
 
 
 def test_named_sources_have_fractions_of_their_own():
-    split = build_motion(mix(with_source(test=0.35), "data.split.val=0.05")).source.split
+    split = build_motion(mix(with_source(test=0.35), "data.split.val=0.05")).clips.split
     assert isinstance(split, MixedSplit)
     held_out = {name: (own.test, own.val) for name, own in split.splits.items()}
     assert held_out == {"cmu": (0.35, 0.05), "bandai": (0.1, 0.05)}
@@ -76,7 +76,7 @@ def test_a_fraction_that_each_source_has_itself_is_refused():
 
 
 def test_named_sources_have_groups_of_their_own():
-    split = build_motion(mix(None, "data.split.val=0.2")).source.split
+    split = build_motion(mix(None, "data.split.val=0.2")).clips.split
     assert split.splits["cmu"].groups[0] == "salsa/(?:01|16)$"
     (last,) = set(split.splits["bandai"].groups) - set(split.splits["cmu"].groups)
     kinds = [(d, style, n) for d in (1, 2) for style in ("sad", "old") for n in (1, 2)]
@@ -87,7 +87,7 @@ def test_named_sources_have_groups_of_their_own():
     }
     Path("groups.csv").write_text("clip,group\nsalsa/01,ann\n")
     own = build_motion(mix(with_source(groups_file="groups.csv")))
-    assert own.source.split.splits["cmu"].grouping.rows == {"salsa/01": "ann"}
+    assert own.clips.split.splits["cmu"].grouping.rows == {"salsa/01": "ann"}
     assert own.groups_digest != build_motion(mix()).groups_digest
 
 
@@ -157,6 +157,6 @@ def test_a_run_on_a_mix_is_restored():
 
 
 def test_another_generator_never_finds_the_motion_of_an_older_one(monkeypatch: pytest.MonkeyPatch):
-    before = build_motion(composed(["profile=tiny"])).source.root
+    before = build_motion(composed(["profile=tiny"])).clips.root
     monkeypatch.setitem(RECIPES, "synthetic", 7)
-    assert build_motion(composed(["profile=tiny"])).source.root == before.with_name(f"{before.name}-v7")
+    assert build_motion(composed(["profile=tiny"])).clips.root == before.with_name(f"{before.name}-v7")

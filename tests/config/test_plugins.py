@@ -287,7 +287,7 @@ def test_a_data_source_of_ones_own(folder: Path):
     write(folder, {"mine/__init__.py": WALKS, "mine/conf/data/walks.yaml": WALKS_YAML})
     cfg = composed(["plugins=[mine]", "data=walks", "data.synth.minutes=2", "data.synth.seed=3"])
     source = build_motion(cfg)
-    assert source.source.root == Path("made/mine.walks-minutes2.0-seed3")
+    assert source.clips.root == Path("made/mine.walks-minutes2.0-seed3")
     source.generate(folder)
     assert (folder / "2.0 3").exists()
     config = build_experiment(cfg).config
@@ -295,7 +295,7 @@ def test_a_data_source_of_ones_own(folder: Path):
     assert restored(config).data == cfg.data
     cfg.data.synth._target_ = "mine.runs"  # the same settings, but other motion
     other = build_motion(cfg)
-    assert other.source.root == Path("made/mine.runs-minutes2.0-seed3")
+    assert other.clips.root == Path("made/mine.runs-minutes2.0-seed3")
     assert other.cache != source.cache
 
 
@@ -303,7 +303,7 @@ def test_a_new_recipe_of_a_data_source_makes_its_clips_anew(folder: Path):
     newer = WALKS.replace("Plugin(", 'Plugin(recipes={"data.walks": 2}, ')
     write(folder, {"mine/__init__.py": newer, "mine/conf/data/walks.yaml": WALKS_YAML})
     source = build_motion(composed(["plugins=[mine]", "data=walks"]))
-    assert source.source.root == Path("made/mine.walks-minutes1.0-seed0-v2")
+    assert source.clips.root == Path("made/mine.walks-minutes1.0-seed0-v2")
 
 
 def test_an_executor_of_ones_own(folder: Path):

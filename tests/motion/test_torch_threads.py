@@ -33,13 +33,13 @@ def test_one_thread_and_then_as_many_as_before() -> None:
 
 def test_imports_keep_torch_to_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With more, short clips wait for one another, and busily at that."""
-    seen, pose = [], module.pose
+    seen, posed = [], module.clip_kinematics
 
     def counted(*arguments: object) -> object:
         seen.append(torch.get_num_threads())
-        return pose(*arguments)  # type: ignore[arg-type]
+        return posed(*arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(module, "pose", counted)
+    monkeypatch.setattr(module, "clip_kinematics", counted)
     torch.set_num_threads(2)
     path = write(
         tmp_path, performed(load_skeleton("cmu_daz"), synthesize_clip("walking", 1, seconds=1.0)).text()

@@ -181,7 +181,7 @@ def seed_of(run: Run) -> list[str]:
 def test_a_run_of_other_code_under_the_same_recipes_is_said(home, monkeypatch):
     run = motion_run(home)
     changed = {**run.manifest["sources"], "training/losses/terms.py": "0" * 12}
-    monkeypatch.setattr("memmlp.runs.run.sources", lambda packages: changed)
+    monkeypatch.setattr("memmlp.runs.run.code_digests", lambda packages: changed)
     assert run.changed_sources == ["training/losses/terms.py"]
     said = " ".join(command(home, "train", *TINY, INT8, *seed_of(run)).split())
     assert "before the code of training/losses/terms.py changed" in said

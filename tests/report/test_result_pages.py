@@ -13,7 +13,7 @@ import pytest
 from fake_runs import fake_sweep, runs_of
 from report.conftest import GROUPS
 
-from memmlp.cli.results import sources
+from memmlp.cli.results import kept_tables
 from memmlp.common.errors import InputError
 from memmlp.report.kept_results import Kept, dumps, overrides_of
 from memmlp.report.result_pages import KeptTable, Placeholders, _whole, origin_words, pages
@@ -99,15 +99,15 @@ def test_a_template_cannot_stand_for_a_tables_page(sweep: Sweep, kept: Kept):
 
 
 @functools.cache
-def kept_tables() -> dict[str, KeptTable]:
+def clones_tables() -> dict[str, KeptTable]:
     """The tables of the clone's kept results, computed once for the tests that read them."""
-    return sources(DOCS)
+    return kept_tables(DOCS)
 
 
 @pytest.mark.slow
 def test_pages_of_the_clone_are_made_again_byte_for_byte():
     templates = {path.name: path.read_text(encoding="utf-8") for path in (DOCS / "templates").glob("*.md")}
-    made = pages(kept_tables(), templates)
+    made = pages(clones_tables(), templates)
     assert "README.md" in made
     for name, text in made.items():
         assert (DOCS / name).read_bytes() == text.encode(), name
@@ -116,7 +116,7 @@ def test_pages_of_the_clone_are_made_again_byte_for_byte():
 @pytest.mark.slow
 def test_every_interval_of_the_clone_follows_from_what_is_kept():
     """As many intervals as the pages print are computed here from the per-clip results, and are equal."""
-    for name, one in kept_tables().items():
+    for name, one in clones_tables().items():
         text, printed = (DOCS / f"{name}.md").read_text(encoding="utf-8"), []
         content = json.loads((DOCS / "data" / f"{name}.json").read_text())
         sources_of = [None, *(one.kept.sources if one.by_source else ())]

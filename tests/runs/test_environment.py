@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from memmlp.runs import environment as module
-from memmlp.runs.environment import environment, own_sources
+from memmlp.runs.environment import environment, own_code_digests
 
 
 def test_environment_says_what_ran_without_the_machines_name():
@@ -27,9 +27,9 @@ def test_code_that_is_edited_while_it_runs_is_recorded_as_it_runs(
     """A worker does many runs with what it imported, whatever its files say later."""
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "lab_of_mine.py").write_text("A = 1\n")
-    before = own_sources(["lab_of_mine"])
+    before = own_code_digests(["lab_of_mine"])
     (tmp_path / "lab_of_mine.py").write_text("A = 2\n")
-    assert own_sources(["lab_of_mine"]) == before
+    assert own_code_digests(["lab_of_mine"]) == before
 
 
 def test_a_patch_is_of_the_code_that_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -57,4 +57,4 @@ def test_code_that_decides_what_reaches_the_constructors_is_recorded():
     folder = module.PACKAGE / "config"
     builders = [path for path in folder.glob("build*.py") if "built(" in path.read_text()]
     assert len(builders) > 1
-    assert {f"config/{path.name}" for path in builders} <= module.sources().keys()
+    assert {f"config/{path.name}" for path in builders} <= module.code_digests().keys()

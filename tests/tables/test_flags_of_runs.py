@@ -283,7 +283,7 @@ def test_runs_from_before_code_changed_are_said(
         asked.append(packages)
         return {"training/loop.py": "1", "ik.py": "1", "new.py": "1", "mine:mine.py": "2"}
 
-    monkeypatch.setattr("memmlp.tables.flags_of_code.sources", today)
+    monkeypatch.setattr("memmlp.tables.flags_of_code.code_digests", today)
     code = {"training/loop.py": "1", "ik.py": "1", "gone.py": "0"}
     old = {"full_model": code | {"ik.py": "0"}, "by position": code | {"mine:mine.py": "1"}}
     own = {"by position": {"mine": {"version": None, "digest": "d"}}}

@@ -68,7 +68,7 @@ def prepare(
     for key, value in given.items():
         if value is not None:
             OmegaConf.update(cfg, f"data.{key}", value)
-    show_manifest(run(build_motion(cfg).source, out))
+    show_manifest(run(build_motion(cfg).clips, out))
 
 
 def _protocol(split: str) -> tuple[str, str | None]:

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from memmlp.motion.clip import Clip
+from memmlp.motion.clip_kinematics import clip_kinematics
 from memmlp.motion.importing.axes import settle
-from memmlp.motion.importing.fidelity import Fidelity, compare, pose
+from memmlp.motion.importing.fidelity import Fidelity, compare
 from memmlp.motion.importing.floor import find_floor
 from memmlp.motion.importing.mapped_motion import MappedMotion, pick_joints
 from memmlp.motion.importing.recording import Recording
@@ -71,7 +72,7 @@ def convert(
     fitted = fit(recording, settled, mapped_motion, rest)
     clip = to_body(mapped_motion, fitted, rest, name, fps or recording.fps)
     if floor == AUTO:
-        height = find_floor(pose(clip, rest)[1], clip.fps)
+        height = find_floor(clip_kinematics(clip, rest)[1], clip.fps)
     else:
         height = None if floor == NONE else float(floor) * fitted.scale
     clip = lowered(clip, height or 0.0)

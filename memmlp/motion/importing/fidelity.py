@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 from memmlp.motion.body import HEAD, JOINTS, PARENTS
 from memmlp.motion.clip import Clip
-from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics
+from memmlp.motion.clip_kinematics import clip_kinematics
 from memmlp.motion.importing.anatomy import (
     FEET,
     HINGES,
@@ -89,7 +88,7 @@ class Fidelity:
 
 def compare(clip: Clip, mapped_motion: MappedMotion, rest: np.ndarray, skeleton: str) -> Fidelity:
     """Compare a clip on a body, rest joints (22, 3) in metres, with the mapped motion that it came from."""
-    rotations, positions = pose(clip, rest)
+    rotations, positions = clip_kinematics(clip, rest)
     expected = mapped_motion.positions @ Z_UP.T
     mm = _on_own_bones(rotations, expected, mapped_motion.mapped)
     degrees = _segments(positions, expected, mapped_motion.mapped)
@@ -103,14 +102,6 @@ def compare(clip: Clip, mapped_motion: MappedMotion, rest: np.ndarray, skeleton:
         *_implausible(clip),
     )
     return replace(found, faults=faults)
-
-
-def pose(clip: Clip, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return global rotations (N, 22, 3, 3) and positions (N, 22, 3) of a clip on a body."""
-    local = axis_angle_to_matrix(torch.from_numpy(clip.poses))
-    joints = torch.from_numpy(rest)
-    rotations, positions = forward_kinematics(local, joints[0] + torch.from_numpy(clip.trans), joints)
-    return rotations.numpy(), positions.numpy()
 
 
 def _on_own_bones(rotations: np.ndarray, expected: np.ndarray, mapped: np.ndarray) -> Worst:

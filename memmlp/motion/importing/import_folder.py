@@ -18,10 +18,11 @@ from memmlp.common.errors import InputError
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import load_rest_joints
 from memmlp.motion.clip import FRAME_RATE_RANGE, Skipped
+from memmlp.motion.clip_kinematics import clip_kinematics
 from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.importing.calibration_frame import JUMP, first_step
 from memmlp.motion.importing.convert import AUTO, convert, lowered
-from memmlp.motion.importing.fidelity import FEET_STAY, off_the_floor, pose
+from memmlp.motion.importing.fidelity import FEET_STAY, off_the_floor
 from memmlp.motion.importing.importable_files import find_recordings, read_recording, tells_rate
 from memmlp.motion.importing.reading_stance import STRAIGHTEST
 from memmlp.motion.importing.recording import Recording
@@ -186,7 +187,7 @@ def _one_floor_a_take(
             motion = lowered(read_clip(path, clip.clip), floor - (clip.floor or 0.0))
             write_clip(path, motion)
             others = (fault for fault in clip.faults if not fault.startswith(FEET_STAY))
-            faults = (*others, *off_the_floor(pose(motion, rest)[1]))
+            faults = (*others, *off_the_floor(clip_kinematics(motion, rest)[1]))
             clips[index] = replace(clip, floor=floor, faults=faults)
     return clips
 

@@ -17,7 +17,7 @@ from memmlp.sweep.executors.gpus import Share
 from memmlp.sweep.executors.submitit_jobs import UNLIMITED, Requeued, Submitted, explained
 
 
-class LocalExecutor(submitit.LocalExecutor):
+class SubmititLocal(submitit.LocalExecutor):
     """Submitit's executor of local processes, which would hide all GPUs from them.
 
     Attributes:
@@ -46,7 +46,7 @@ class Local:
 
     def __init__(self, folder: Path, shared: Sequence[Share] = ()):
         with explained("local"):
-            self.executor = LocalExecutor(folder=folder)
+            self.executor = SubmititLocal(folder=folder)
         self.shared = list(shared) or [()]
         self.gpus = bool(shared)
         self.started: list[tuple[Submitted, int]] = []

@@ -111,7 +111,7 @@ class DelayedSubmission(submitit.helpers.DelayedSubmission):  # submitit looks f
         super().set_timeout(timeout_min or UNLIMITED, max_num_timeout)
 
 
-class SlurmExecutor(submitit.SlurmExecutor):
+class SubmititSlurm(submitit.SlurmExecutor):
     """Submitit's executor, also for jobs without a time limit of their own, where the cluster's applies."""
 
     def _internal_process_submissions(self, delayed_submissions: list) -> list:
@@ -128,7 +128,7 @@ class SlurmExecutor(submitit.SlurmExecutor):
         self.update_parameters(job_name="memmlp", time=options.minutes, wckey=None, **words, **setup)
 
 
-class Unsent(SlurmExecutor):
+class Unsent(SubmititSlurm):
     """An executor that only writes the submission file; Slurm need not be installed."""
 
     @classmethod
@@ -150,7 +150,7 @@ class Slurm:
 
     def __init__(self, folder: Path, options: SlurmOptions):
         with explained("slurm"):
-            self.executor = SlurmExecutor(folder=folder, python=options.python)
+            self.executor = SubmititSlurm(folder=folder, python=options.python)
             self.executor.set(options)
         self.gpus = options.gpu
 

@@ -56,7 +56,7 @@ def prepared(memmlp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callabl
 def test_a_cache_has_the_clips_of_training(
     prepared: Callable[..., ClipFolder], words: list[str], train: list[str]
 ):
-    assert prepared(*words) == build_motion(composed([*train, "data.root=clips"])).source
+    assert prepared(*words) == build_motion(composed([*train, "data.root=clips"])).clips
 
 
 @pytest.mark.parametrize(

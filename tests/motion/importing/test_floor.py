@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from memmlp.motion.body import JOINTS, builtin_rest_joints
-from memmlp.motion.importing.fidelity import pose
+from memmlp.motion.clip_kinematics import clip_kinematics
 from memmlp.motion.importing.floor import find_floor
 from memmlp.motion.importing.skeleton_map import Z_UP
 from memmlp.motion.synthetic import synthesize_clip
@@ -27,7 +27,7 @@ def standing(frames: int) -> np.ndarray:
 @pytest.mark.parametrize("height", [0.0, 1.3, -0.4])
 def test_the_floor_of_people(activity: str, height: float) -> None:
     clip = synthesize_clip(activity, 2, seconds=4.0)
-    positions = pose(replace(clip, poses=clip.poses.astype(float)), REST)[1]
+    positions = clip_kinematics(replace(clip, poses=clip.poses.astype(float)), REST)[1]
     found = find_floor(positions + np.array([0, 0, height]), 60.0)
     assert found == pytest.approx(height, abs=0.02)
 

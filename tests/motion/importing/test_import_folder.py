@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import JOINTS, builtin_rest_joints
+from memmlp.motion.clip_kinematics import clip_kinematics
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.importing.convert import NONE, convert
-from memmlp.motion.importing.fidelity import pose
 from memmlp.motion.importing.import_folder import ImportSettings, import_folder
 from memmlp.motion.importing.skeleton_map import SKELETONS, find_skeleton, load_skeleton
 from memmlp.motion.importing.verify import verify
@@ -353,7 +353,7 @@ def test_who_lies_is_imported_lying_where_up_is_told(tmp_path: Path) -> None:
     with refuse(tmp_path / "clip.bvh", "stands along y in the zero pose, but along z in the motion"):
         import_folder(tmp_path / "clip.bvh", tmp_path / "out")
     import_folder(tmp_path / "clip.bvh", tmp_path / "out", ImportSettings(up="y"))
-    places = pose(read_clip(tmp_path / "out" / "clip.npz", "clip"), REST)[1]
+    places = clip_kinematics(read_clip(tmp_path / "out" / "clip.npz", "clip"), REST)[1]
     assert np.abs(places[:, 15, 2] - places[:, 0, 2]).max() < 0.2  # the head is as high as the pelvis
     assert verify(tmp_path / "clip.bvh", up="y").mm.value < 1
 
