@@ -160,7 +160,7 @@ class InputOptions(NamedTuple):
 
 
 FED = InputOptions._fields[1:]
-"""The options among these; the network is the command's argument."""
+"""Names of the fields that are options of the command; `network` is its argument."""
 
 
 class ShowOptions(NamedTuple):

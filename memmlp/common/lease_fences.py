@@ -1,9 +1,9 @@
 """Fences: a process that holds a folder by a lease can write below it only while it owns the lease.
 
-A lease has a number, and the next owner's is higher (memmlp.common.lease). A file is made under a temporary
-name that contains the number; the fence is checked, and the file renamed. The next owner removes temporary
-files of lower numbers before it begins. So a process that wakes up after it was superseded, even between
-check and rename, finds that its file is gone, and publishes nothing.
+A lease has a number (a fencing token), and the next owner's is higher (memmlp.common.lease). A file is made
+under a temporary name that contains the number; the fence is checked, and the file renamed. The next owner
+removes temporary files of lower numbers before it begins. So a process that wakes up after it was
+superseded, even between check and rename, finds that its file is gone, and publishes nothing.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Whether a process is alive: on this machine by its number, elsewhere by its signs of life.
+"""Whether a process is alive: on this machine by its number, elsewhere by its signs of life (heartbeat).
 
 A sign of life from another machine is never compared with this machine's clock, since clocks may differ by
 hours. What counts is how long this process has seen no change in it.

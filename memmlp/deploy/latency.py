@@ -155,7 +155,7 @@ def yardstick_session() -> onnxruntime.InferenceSession:
 
 
 def yardstick() -> onnx.ModelProto:
-    """Make the yardstick, a fixed stack of matrix products and ReLUs."""
+    """Make the yardstick, a fixed reference network of matrix products and ReLUs."""
     rows, width, layers = YARDSTICK_SHAPE
     weight = np.random.default_rng(0).standard_normal((width, width), np.float32) / np.sqrt(width)
     nodes, name = [], "input"

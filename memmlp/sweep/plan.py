@@ -1,6 +1,7 @@
 """A plan: the runs that a sweep's arms and seeds need, and their progress.
 
-A plan holds only the runs' identities; their progress is read from the run folders.
+A plan holds only the runs' identities; their progress is read from the run folders. Plans are made in
+`config/compose_plan.py`, since that composes configs.
 """
 
 from __future__ import annotations

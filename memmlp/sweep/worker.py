@@ -2,7 +2,7 @@
 
 Any number of workers, on any machines that share the outputs folder, may work on the same runs. A run is
 finished by one of them. When a worker is killed, or stands still for longer than its lease, another worker
-takes over its run from the last checkpoint.
+takes over its run from the last checkpoint. What a worker does with a task is in `config/worker_process.py`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How flags name what differs, and whose it is."""
+"""Wording helpers for flags: which property differs, and between which arms."""
 
 from __future__ import annotations
 

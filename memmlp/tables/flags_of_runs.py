@@ -136,7 +136,10 @@ def _older(sweep: Sweep, runs: Mapping[str, RunsBySeed], older: DescribeRun) -> 
 
 
 def early_looks(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
-    """Flag arms of which some seeds are there and others not yet: another look at them is still to come."""
+    """Flag arms whose planned seeds are only partly finished.
+
+    Testing them now and again later inflates the false-positive rate.
+    """
     early = [arm.label for arm in sweep.runnable() if len(runs[arm.label]) > 1 and _gaps(sweep, arm, runs)]
     if early:
         yield (

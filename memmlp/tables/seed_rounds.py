@@ -1,10 +1,10 @@
 """Rounds of seeds for arms with open verdicts: looks that are fixed in advance, and what they decided.
 
-Every arm goes through the same looks, each at a number of seeds that was fixed at the start. An arm whose
-comparisons are all decided gets no further looks. A look uses the first seeds of an arm and of its control,
-whatever other seeds exist, and what it decides is final. It spends its level over all comparisons of the
-sweep about which nothing has been claimed, including those of arms that are at another look. So the levels
-add up to 5 % for either family of claims, even if an arm is late because its runs failed
+Every arm goes through the same looks (interim analyses), each at a number of seeds that was fixed at the
+start. An arm whose comparisons are all decided gets no further looks. A look uses the first seeds of an arm
+and of its control, whatever other seeds exist, and what it decides is final. It spends its level over all
+comparisons of the sweep about which nothing has been claimed, including those of arms that are at another
+look. So the levels add up to 5 % for either family of claims, even if an arm is late because its runs failed
 (docs/statistics.md).
 """
 

@@ -10,8 +10,8 @@ from memmlp.motion.clip_kinematics import clip_kinematics
 
 
 def test_a_body_that_is_turned_about_its_pelvis():
-    """By a right angle about X in its second frame: what is up then points along Y's turned axis, +Z."""
-    rest = builtin_rest_joints() + [0.1, 0.2, 0.3]
+    """By a right angle about X in its second frame; the pelvis alone keeps its offset unturned."""
+    rest = builtin_rest_joints() + np.array([0.1, 0.2, 0.3])
     poses = np.zeros((2, 22, 3))
     poses[1, 0, 0] = np.pi / 2
     trans = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])

@@ -43,7 +43,10 @@ def prepare(minutes: float, clips: int) -> None:
 
 
 def _pieces(root: Path, count: int) -> None:
-    """Write clips of two seconds, each from another second of a walk, with its own noise in the positions."""
+    """Write two-second pieces of one walk, starting at 28 different seconds.
+
+    Each is moved by its own random horizontal offset, so that no two clips are equal.
+    """
     import numpy as np
 
     from memmlp.motion.clip import Clip

@@ -184,7 +184,10 @@ def show_runs(records: Sequence[Record], keys: Sequence[str], asked: bool) -> li
 
 
 def _columns(records: Sequence[Record], keys: Sequence[str], numbers: Mapping[str, str]) -> Iterator[Column]:
-    """Yield all columns: the values of some keys, and some numbers under heads of our own."""
+    """Yield all columns: values of some keys, and metric columns with short headings.
+
+    `numbers` maps these headings to keys.
+    """
     from memmlp.runs.query import data_labels
 
     yield Column("run", [one["id"] for one in records])

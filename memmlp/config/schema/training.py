@@ -177,8 +177,9 @@ class NoHandConfig(HandConfig):
 
 @dataclass
 class TermConfig:
-    """One more term of Mem-MLP's loss, of one's own (conf/term); null for none.
+    """A user-defined extra term of Mem-MLP's loss; null for none.
 
+    Its options come from the user's package, in a group `term`.
     `weight` acts with fixed weights alone (loss=manual).
     """
 

@@ -61,7 +61,7 @@ def run_loop(
     Packets that are not taken are reported at once, by a message with these counts alone.
 
     Args:
-        stream: the network.
+        stream: the stream of poses; its network is `stream.network`.
         source: gives the samples.
         publish: gets the messages.
         stopped: ends the loop.

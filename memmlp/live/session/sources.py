@@ -62,7 +62,7 @@ class TrackerSource(Protocol):
         space: the frame of reference of its poses.
         malformed: how many packets could not be read.
         foreign: how many packets came from machines whose packets are not taken.
-        worn: whether somebody wears the trackers now.
+        worn: whether the poses come from a wearer's devices, so that the stream can be fitted.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Skeleton maps: which joint of a BVH file stands for which of the 22 body joints, as YAML."""
+"""Skeleton maps: which node of a motion file stands for which of the 22 body joints, as YAML."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ FOUND = "auto"  # a unit or up axis that is found in each file
 
 @dataclass(frozen=True)
 class SkeletonMap:
-    """The map of a family of source skeletons.
+    """Which node of a file's skeleton stands for which of our 22 joints.
+
+    A map has the file's unit, axes and stance, too.
 
     Attributes:
         name: the map's name.

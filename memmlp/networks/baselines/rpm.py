@@ -145,7 +145,7 @@ class RPM(WindowlessModel):
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         """Take in the newest frames, one after the other; see MotionModel.
 
-        By default the n new frames are returned, which are the most that this network can make.
+        `newest`: how many of the last frames to return, at most n (the default).
         """
         shown = []
         for frame in self.encoded(sparse).split(1, 1):

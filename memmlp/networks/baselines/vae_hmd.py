@@ -131,7 +131,7 @@ class VAEHMD(WindowlessModel):
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         """Take in the newest frames, each on its own; see MotionModel.
 
-        By default the n new frames are returned, which are the most that this network can make.
+        `newest`: how many of the last frames to return, at most n (the default).
         """
         seen = sparse if newest is None else sparse[:, -newest:]
         return self.normalizer.posed(self.decoder(self.latent(seen).chunk(2, -1)[0]), seen), state
