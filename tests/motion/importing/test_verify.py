@@ -43,6 +43,27 @@ def test_verify_reads_the_npz(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert len(fidelity.faults) == 2
 
 
+@pytest.mark.parametrize("told", [None, 30])
+def test_the_rate_is_the_one_that_an_import_takes(
+    told: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The floor is found from feet that are slow, and how slow they are is said by the rate."""
+    kept = []
+
+    def reading(path: Path, name: str) -> Clip:
+        kept.append(read_clip(path, name))
+        return kept[-1]
+
+    monkeypatch.setattr("memmlp.motion.importing.verify.read_clip", reading)
+    (tmp_path / "inner").mkdir()
+    write(tmp_path / "inner", walk())
+    if told:
+        (tmp_path / "motion.yaml").write_text(f"fps: {told}")
+    [fidelity] = verify_folder(tmp_path)
+    assert isinstance(fidelity, Fidelity)
+    assert [clip.fps for clip in kept] == [pytest.approx(told or 120)]
+
+
 def test_verify_goes_on_past_bad_files(tmp_path: Path) -> None:
     for name in ("a", "c/1"):
         write(tmp_path, walk(), f"{name}.bvh")
