@@ -336,9 +336,9 @@ def known_of(shown: ShowOptions, space: SpaceName, stream: Stream) -> Calibratio
     from memmlp.live.wearer import stature
 
     body = stature(stream.network.skeleton)
-    known = Calibration(space, body)
+    known = Calibration(space)
     if shown.calibration is not None and shown.calibration.exists():
-        known = read_calibration(shown.calibration, space, body)
+        known = read_calibration(shown.calibration, space, stream.network.skeleton)
     height = known.height if shown.height is None else shown.height
     floor = known.floor if shown.floor is None else shown.floor
     offsets = known.offsets
@@ -346,7 +346,7 @@ def known_of(shown: ShowOptions, space: SpaceName, stream: Stream) -> Calibratio
         was = known.height or body
         note(f"{shown.calibration}: its calibration is of a height of {was:.2f} m; calibrate again")
         offsets = None
-    return Calibration(space, body, offsets, height, floor)
+    return Calibration(space, offsets, height, floor)
 
 
 def outputs_of(shown: ShowOptions, stream: Stream) -> Outputs:

@@ -7,10 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from memmlp.common.errors import InputError, why_unreadable
 from memmlp.common.files import write_json
+from memmlp.live.rotations import BodyTree
 from memmlp.live.spaces import SpaceName, space_of
 from memmlp.live.stream import Offsets, checked_offsets
+from memmlp.live.wearer import stature
 
 LARGEST = 100_000  # bytes of a file
 SAME = 5e-3  # metres by which two bodies of a height may differ
@@ -18,26 +22,28 @@ SAME = 5e-3  # metres by which two bodies of a height may differ
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a stream must know of a wearer; all fields except `body` are arguments of `Stream`.
+    """What a stream must know of a wearer; the fields are arguments of `Stream`.
 
     Attributes:
         space: the frame of reference, in whose axes the offsets are.
-        body: the body height of the network for which the offsets were found, metres
-            (`memmlp.live.wearer.stature`).
         offsets: the offsets of the joints from the devices; None for none.
         height: the body height, metres, of which the offsets are; None for the height of the network's body.
         floor: the height of the floor, metres.
     """
 
     space: SpaceName
-    body: float
     offsets: Offsets | None = None
     height: float | None = None
     floor: float = 0.0
 
 
-def save_calibration(path: Path, calibration: Calibration) -> None:
+def save_calibration(path: Path, calibration: Calibration, body: BodyTree) -> None:
     """Write a calibration, atomically.
+
+    Args:
+        path: the file.
+        calibration: what it shall hold.
+        body: the network's body, of which the offsets are.
 
     Raises:
         InputError: if the file cannot be written.
@@ -48,7 +54,8 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
     }
     words = {
         "space": calibration.space,
-        "body": calibration.body,
+        "body": stature(body),
+        "joints": tracked_joints(body).tolist(),
         "height": calibration.height,
         "floor": calibration.floor,
     }
@@ -58,8 +65,8 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
         raise InputError(f"{path}: cannot be written ({error.strerror}); allowed: a file to write") from error
 
 
-def read_calibration(path: Path, space: SpaceName, body: float) -> Calibration:
-    """Read a calibration, for a frame of reference and a network with a given body height (metres).
+def read_calibration(path: Path, space: SpaceName, body: BodyTree) -> Calibration:
+    """Read a calibration, for a frame of reference and a network's body.
 
     Raises:
         InputError: if the file is no calibration, is for another frame of reference, or is for a network with
@@ -77,13 +84,29 @@ def read_calibration(path: Path, space: SpaceName, body: float) -> Calibration:
         raise InputError(f"{path}: of --space {fields.get('space')}; allowed with it is that, not {space}")
     try:
         offsets = _offsets(fields["offsets"])
-        if abs(fields["body"] - body) > SAME:
-            raise InputError(
-                f"of a network's body of {fields['body']:.2f} m, and this one's has {body:.2f} m"
-            )
-        return Calibration(space, body, offsets, fields["height"], fields["floor"])
-    except (KeyError, TypeError, InputError) as error:
+        _check_body(fields, body)
+        return Calibration(space, offsets, fields["height"], fields["floor"])
+    except (KeyError, TypeError, ValueError, InputError) as error:
         raise InputError(f"{path}: cannot be used ({error}); allowed is {MADE}") from None
+
+
+def _check_body(fields: dict[str, Any], body: BodyTree) -> None:
+    """Refuse offsets of another body, of another height or with the same height and other arms."""
+    own = stature(body)
+    if abs(fields["body"] - own) > SAME:
+        raise InputError(f"of a network's body of {fields['body']:.2f} m, and this one's has {own:.2f} m")
+    joints = np.asarray(fields.get("joints", tracked_joints(body)), float)  # older files have none
+    away = np.linalg.norm(joints.reshape(3, 3) - tracked_joints(body), axis=-1).max()
+    if not away <= SAME:
+        raise InputError(
+            f"of a network whose body has its head or wrists {100 * away:.1f} cm elsewhere than this one's"
+        )
+
+
+def tracked_joints(body: BodyTree) -> np.ndarray:
+    """Return the rest positions of head and wrists from their mean (3, 3), metres: offsets are of these."""
+    joints = body.rest[body.tracked]
+    return joints - joints.mean(0)
 
 
 MADE = "a file that memmlp live --calibration wrote"

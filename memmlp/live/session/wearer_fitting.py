@@ -18,7 +18,6 @@ from memmlp.live.calibration_file import Calibration, save_calibration
 from memmlp.live.session.packets import QuaternionPoses
 from memmlp.live.spaces import SpaceName
 from memmlp.live.stream import Stream
-from memmlp.live.wearer import stature
 
 COUNTDOWN = 5.0  # seconds
 LONGEST = 60.0  # seconds of a countdown
@@ -170,9 +169,8 @@ class Fitting:
     def _save(self) -> None:
         if self.path is not None:
             stream = self.stream
-            body = stature(stream.network.skeleton)
-            made = Calibration(self.space, body, stream.offsets, self.own_height, stream.wearer.floor)
-            save_calibration(self.path, made)
+            made = Calibration(self.space, stream.offsets, self.own_height, stream.wearer.floor)
+            save_calibration(self.path, made, stream.network.skeleton)
 
     def _say(self, said: str, failed: bool = False) -> None:
         stream, waiting = self.stream, self.waiting

@@ -69,7 +69,7 @@ def test_a_calibration_waits_for_its_countdown(worn: Wearing):
         "me.json",
     )
     assert "0 cm from the joints" in state["said"]
-    saved = read_calibration(worn.path, "amass", 1.72).offsets
+    saved = read_calibration(worn.path, "amass", worn.stream.network.skeleton).offsets
     np.testing.assert_allclose(saved.positions, worn.stream.offsets.positions)
 
 
@@ -120,7 +120,7 @@ def test_height_and_floor(worn: Wearing):
     worn.order("height", None)
     worn.fitting.step(None)
     assert (worn.stream.wearer.scale, worn.stream.wearer.floor) == (1, 0)
-    saved = read_calibration(worn.path, "amass", 1.72)
+    saved = read_calibration(worn.path, "amass", worn.stream.network.skeleton)
     assert (saved.height, saved.floor) == (None, 0)
 
 
@@ -137,7 +137,7 @@ def test_another_height_forgets_the_calibration(worn: Wearing):
     state = worn.told[-1]
     assert (state["calibrated"], state["height"], state["failed"]) == (False, 190, False)
     assert state["said"].startswith("Calibrate again: the calibration was of another height")
-    saved = read_calibration(worn.path, "amass", 1.72)
+    saved = read_calibration(worn.path, "amass", worn.stream.network.skeleton)
     assert (saved.offsets, saved.height) == (None, 1.90)
 
 
@@ -166,7 +166,7 @@ def test_forgotten_and_cancelled(worn: Wearing):
     worn.now += 100
     worn.fitting.step(worn.pose())
     assert worn.stream.offsets is None
-    assert read_calibration(worn.path, "amass", 1.72).offsets is None
+    assert read_calibration(worn.path, "amass", worn.stream.network.skeleton).offsets is None
     assert (worn.told[-1]["waiting"], worn.told[-1]["calibrated"]) == (None, False)
 
 
