@@ -270,7 +270,9 @@ def send_clip(given: InputOptions) -> None:
     port, pack = (given.udp, to_json) if given.udp is not None else (given.osc, to_osc)
     assert port is not None
     click.echo(f"sending {source.name} to port {port}")
-    click.echo(f"{send(source, port, pack, space_of(given.space))} packets sent")
+    sent, samples = send(source, port, pack, space_of(given.space)), source.count
+    late = f" of {samples}: the others were due while this machine was busy" if sent < samples else ""
+    click.echo(f"{sent} packets sent{late}")
 
 
 def serve(given: InputOptions, shown: ShowOptions) -> None:

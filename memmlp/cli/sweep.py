@@ -190,7 +190,7 @@ def show_forecast(chosen: Sweep, plan: Plan, labels: Collection[str], workers: i
             f": about {found.seconds / workers / 60:.0f} min, judged by its {found.finished} finished runs"
         )
         if found.unlike:
-            line += f" ({found.unlike} runs are of arms without one; other arms' times stand for theirs)"
+            line += f" ({found.unlike} runs are of arms without a finished one, and judged by other arms)"
     click.echo(line)
 
 

@@ -66,10 +66,11 @@ def show_latency(console: Console, record: Mapping[str, Any]) -> None:
     """Print the time of a frame in the exported file that was asked for, and the file's size."""
     measured, precision = as_deployed(record), deployed_precision(record)
     file = "" if precision == "fp32" else f" in {precision}"
+    plain = "" if precision == "fp32" else f", fp32 {record['median_ms']:.2f} ms"
     console.print(
         f"a frame on one CPU core{file}: {measured['median_ms']:.2f} ms median, "
         f"{measured['p95_ms']:.2f} ms p95 "
-        f"({measured['ratio_to_yardstick']:.2f} x the yardstick)",
+        f"({measured['ratio_to_yardstick']:.2f} x the yardstick{plain})",
         soft_wrap=True,
     )
     if (share := measured.get("core_share", 1.0)) < CORE:

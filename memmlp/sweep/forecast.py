@@ -31,7 +31,11 @@ def forecast(plan: Plan) -> Forecast | None:
     Returns:
         None if nothing is left, or if no run of the kinds that are left has finished.
     """
-    left, times = plan.left(), {task.id: seconds(plan.run_of(task)) for task in plan.tasks}
+    left = plan.left()
+    begun = {
+        task.id for task in left
+    }  # a trained run may lack this plan's evaluation: its time says too little
+    times = {task.id: seconds(plan.run_of(task)) for task in plan.tasks if task.id not in begun}
     took = {name: time for name, time in times.items() if time is not None}
     kinds: dict[str, list[str]] = defaultdict(list)
     for task in plan.tasks:

@@ -98,8 +98,11 @@ def test_runs_of_two_data_sets_fit_a_terminal(
     assert "subject14" in memmlp("runs", "list", "--columns", "data.split.groups").out
 
 
-def test_a_long_value_that_nobody_asked_for_is_cut(memmlp: Memmlp, outputs: Path):
+def test_a_long_value_that_nobody_asked_for_is_cut(
+    memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch
+):
     Run.of(outputs, A).begin("memmlp", {"seed": "x," * 40}, data="d" * 64, upstream=None)
+    monkeypatch.setenv("COLUMNS", "90")
     assert "…" in memmlp("runs", "list").out
     assert "…" not in memmlp("runs", "list", "--columns", "seed").out
 
@@ -233,14 +236,33 @@ def test_list_shows_what_differs_as_far_as_there_is_room(
     for width in ("40", "70", "120"):
         monkeypatch.setenv("COLUMNS", width)
         seen[width] = memmlp("runs", "list").out
-    assert heads(seen["40"]) == {"run", "status", "seed", "MPJPE", "stream"}
-    assert "differ in memory.layers, too: --columns memory.layers" in seen["40"]
+    assert heads(seen["40"]) == {"run", "status", "name", "MPJPE", "stream"}
+    assert "differ in seed, memory.layers, too: --columns name,seed,memory.layers,stream.MPJPE" in seen["40"]
     assert heads(seen["70"]) == {"run", "status", "name", "seed", "memory.", "layers", "MPJPE", "stream"}
     assert "too:" not in seen["70"]
     assert heads(seen["120"]) == heads(seen["70"]) | {"window", "Jitter", "age", "ms"}
     for said in ("MPJPE [cm]", "Jitter [", "ms: a frame"):  # a legend of the columns that are shown
         assert said in seen["120"]
         assert (said in seen["70"]) == (said == "MPJPE [cm]")
+
+
+def test_of_many_keys_a_few_have_columns_and_results_have_theirs(
+    memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Where all had one, a narrow screen lost the names, and a wide one the results."""
+    for digit in ("d", "e"):
+        config = {f"key{letter}": digit for letter in "abcdefghij"}
+        Run.of(outputs, digit * 16).begin("memmlp", config, data="d" * 64, upstream=None, name=f"of {digit}")
+    wide = {"name", "stream", "window", "Jitter", "keya"}
+    for width, there in (("80", {"name", "stream"}), ("120", wide)):
+        monkeypatch.setenv("COLUMNS", width)
+        ran = memmlp("runs", "list")
+        assert heads(ran.out) >= there
+        assert lines_up(ran._replace(out=ran.out.partition("they differ")[0]), int(width))
+        told = ran.out.rpartition("too: --columns ")[2].split()[0]
+        assert told.startswith("name,")
+        assert memmlp("runs", "list", "--columns", told).code == 0
+        assert ("keys more, too:" in ran.out) == (width == "80")
 
 
 def test_names_have_the_room_that_there_is_and_seeds_are_said_once(

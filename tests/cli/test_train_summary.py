@@ -60,7 +60,9 @@ def test_times_and_size_are_those_of_the_file_that_was_asked_for():
     said = io.StringIO()
     show_latency(Console(file=said), record)
     first, last = said.getvalue().splitlines()
-    assert first.startswith("a frame on one CPU core in int8: 1.27 ms median, 1.40 ms p95 (0.45 x")
+    assert first.startswith(
+        "a frame on one CPU core in int8: 1.27 ms median, 1.40 ms p95 (0.45 x the yardstick, fp32 3.39 ms)"
+    )
     assert "ONNX file 0.6 MB" in last
     assert "busy" not in said.getvalue()
 

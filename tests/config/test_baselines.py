@@ -171,7 +171,7 @@ REFUSED = [
     (["loss=agrol", "predictor=rotation_only", "hand=fk"], "predictor=rotation_only with hand=off"),
     (
         ["loss=avatar_poser", "predictor=rotation_only", "hand=off"],
-        "allowed is loss=uncertainty or loss=manual",
+        "loss=avatar_poser: a baseline's, of other outputs than Mem-MLP's; allowed are loss=uncertainty",
     ),
     (["model=agrol_mlp", "loss.error=cube"], "loss.error=cube"),
     (["model=avatar_poser", "loss.anchor=foot"], "loss.anchor=foot"),

@@ -45,10 +45,12 @@ LEGEND = {
     "Jitter": f"Jitter [{UNITS['Jitter']}]: rotation branch",
     "ms": "ms: a frame on one core",
 }
-SPARED = ("ms", "age", "Jitter", "MPJPE\nwindow")  # what a narrow screen has no room for, first
+SPARED = ("ms", "age"), ("Jitter", "MPJPE\nwindow")  # what a narrow screen has no room for: first, and later
+DEAR = 3  # keys that have room before the second half of these
+TOLD = 4  # keys without room that are named below the table
 FOLD = 12  # characters of a value in a line, where it can be broken
 SHORT = 8  # characters of an id in a line below the table
-NAME = 36  # characters of a run's name in a line
+NAME = 31  # characters of a run's name in a line
 
 
 @click.command("list")
@@ -89,7 +91,9 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
     for line in older_results_lines(listed):
         click.echo(line)
     if hidden:
-        click.echo(f"they differ in {', '.join(hidden)}, too: --columns {','.join(hidden)}")
+        more = f" and {len(hidden) - TOLD} keys more" if len(hidden) > TOLD else ""
+        columns = ",".join(["name", *hidden[:TOLD], "stream.MPJPE"])
+        click.echo(f"they differ in {', '.join(hidden[:TOLD])}{more}, too: --columns {columns}")
     if upstream := Counter(kind_words(run.manifest["kind"]) for run in there if run not in found):
         told = ", ".join(f"{count} finished {word}" for word, count in upstream.items())
         click.echo(f"{told}: memmlp runs list --all")
@@ -172,8 +176,9 @@ def show_runs(records: Sequence[Record], keys: Sequence[str], asked: bool) -> li
         asked: whether the user asked for these keys, so that all of them are shown, without results.
     """
     columns = list(_columns(records, keys, {} if asked else SHOWN))
-    spare = [name for name in SPARED if name not in keys]
-    spare += [] if asked else [*reversed(keys[1:]), "name"]  # never the data: errors on others do not compare
+    spare = [name for name in SPARED[0] if name not in keys]
+    if not asked:  # never the name, which tells what differs, nor the data: errors on others do not compare
+        spare += [*reversed(keys[DEAR:]), *SPARED[1], *reversed(keys[:DEAR])]
     while spare and _width(columns) > console().width:
         columns = [column for column in columns if column.name != spare[0]]
         del spare[0]

@@ -262,7 +262,11 @@ def _check_foreign_loss(cfg: DictConfig, predictor: str) -> None:
     trained with them.
     """
     if not _is(cfg.loss, AGRoLLossConfig) and not _is(cfg.loss, TermsLossConfig):
-        raise InputError("loss: that of a baseline; allowed is loss=uncertainty or loss=manual")
+        raise InputError(
+            f"loss={cfg.loss.name}: a baseline's, of other outputs than Mem-MLP's; allowed are "
+            "loss=uncertainty and loss=manual, or with predictor=rotation_only hand=off loss=agrol and the "
+            "library's terms"
+        )
     if not predictor.startswith("RotationOnly") or not _is(cfg.hand, NoHandConfig):
         raise InputError(
             f"loss={cfg.loss.name} is of rotations alone: allowed is predictor=rotation_only with hand=off, "
