@@ -1,5 +1,6 @@
 """Parity of torch and ONNX Runtime over a clip: what is a difference, and what is rounding."""
 
+import copy
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +17,7 @@ from memmlp.deploy.parity import (
     TIE,
     TOLERANCE,
     begins_at_ties,
+    each_within_rounding,
     in_torch,
     parity,
     streamed,
@@ -71,11 +73,11 @@ def test_almost_parallel_columns_are_no_failure(tmp_path):
     assert parity(model, path, CLIP) > TOLERANCE
 
 
-def test_a_difference_within_what_torch_itself_rounds_off_is_tolerated():
+def test_a_difference_within_what_torch_itself_rounds_off_is_tolerated(step_files):
     """A rotation that hangs on next to nothing differs between any two float32 computations."""
-    model = tiny.baseline("agrol_mlp")
-    assert tolerated(model, Path(), CLIP, TOLERANCE)
-    assert not tolerated(model, Path(), CLIP, 2 * TOLERANCE)
+    model, path = exported.NETWORKS["agrol_mlp"](), step_files("agrol_mlp")
+    assert tolerated(model, path, CLIP, TOLERANCE)
+    assert not tolerated(model, path, CLIP, 2 * TOLERANCE)
 
     class Rounded(type(model)):
         apart = 3 * TOLERANCE
@@ -85,12 +87,54 @@ def test_a_difference_within_what_torch_itself_rounds_off_is_tolerated():
             return motion + self.apart * (motion.dtype is torch.float32), state
 
     model.__class__ = Rounded
-    assert tolerated(model, Path(), CLIP, 5 * TOLERANCE)
-    assert not tolerated(model, Path(), CLIP, 7 * TOLERANCE)
+    assert tolerated(model, path, CLIP, 5 * TOLERANCE)
+    assert not tolerated(model, path, CLIP, 7 * TOLERANCE)
     Rounded.apart = 1.0
-    assert tolerated(model, Path(), CLIP, ROUNDING)
-    assert not tolerated(model, Path(), CLIP, 1.1 * ROUNDING)
-    assert not tolerated(model, Path(), CLIP, math.nan)
+    assert tolerated(model, path, CLIP, ROUNDING)
+    assert not tolerated(model, path, CLIP, math.nan)
+
+
+class OneFrameHangsOnNothing(type(tiny.baseline("agrol_mlp"))):
+    """A network whose 31st frame has a rotation that is the direction of a difference next to zero."""
+
+    def initial_state(self, clips):
+        return super().initial_state(clips) | {"frame": torch.zeros(clips)}
+
+    def advance(self, sparse, state):
+        frame = state.pop("frame")
+        motion, state = super().advance(sparse, state)
+        if int(frame[0]) == 30:
+            given = sparse[..., :12]
+            nothing = (given + 1000) - 1000 - given  # but for rounding
+            motion = torch.cat([motion[..., :12] + 1000 * nothing, motion[..., 12:]], -1)
+        return motion, state | {"frame": frame + 1}
+
+
+def test_a_large_difference_is_tolerated_in_an_ill_conditioned_frame_alone():
+    """Seen in a sweep: MANIKIN's hip beside a straight leg, 6e-3 in one frame of 695, and the run failed."""
+    model = tiny.baseline("agrol_mlp")
+    model.__class__ = OneFrameHangsOnNothing
+    exact = in_torch(copy.deepcopy(model).double(), CLIP.double())
+    errors = (in_torch(model, CLIP) - exact).abs().amax(1)
+    assert errors[30] > 10 * ROUNDING
+    assert errors[[*range(30), *range(31, 50)]].max() < TOLERANCE / 4
+    apart = torch.zeros(50)
+    apart[30] = errors[30]
+    assert each_within_rounding(model, CLIP, apart)
+    assert not each_within_rounding(model, CLIP, apart * 9)
+    for other in (29, 31):
+        beside = apart.clone()
+        beside[other] = 2 * TOLERANCE  # a sound frame, in which a wrong graph shows
+        assert not each_within_rounding(model, CLIP, beside)
+    apart[30] = math.inf
+    assert not each_within_rounding(model, CLIP, apart)
+
+
+def test_where_many_frames_differ_rounding_does_not_explain_it():
+    model = tiny.baseline("agrol_mlp")
+    apart = torch.zeros(50)
+    apart[:6] = 2 * TOLERANCE
+    assert not each_within_rounding(model, CLIP, apart)
 
 
 def lookups(model: MemMLP, clip: torch.Tensor) -> tuple[Codebook, list[torch.Tensor]]:
