@@ -23,6 +23,7 @@ from memmlp.networks.vqvae import Codebook
 TOLERANCE = 1e-4  # on 6D components and metres
 ROUNDING = 10 * TOLERANCE  # the most that is put down to rounding; see `tolerated`
 DRAWS = 4  # float32 computations whose errors tell how a frame is conditioned; see `each_within_rounding`
+SPREAD = 4  # how far above the largest of these errors a difference may be
 TIE = 1e-4  # the margin below which rounding may choose another code-vector; see `Codebook.margins`
 
 
@@ -99,7 +100,7 @@ def each_within_rounding(model: MotionModel, clip: Tensor, apart: Tensor) -> boo
 
     How far float32 is from float64 in a frame is found by DRAWS computations whose inputs are moved by a
     rounding each, so that everything after them is rounded otherwise. A frame that differs by more than
-    TOLERANCE may differ by DRAWS times the largest of these errors, and by the size of a rotation's
+    TOLERANCE may differ by SPREAD times the largest of these errors, and by the size of a rotation's
     components at most; nine in ten frames must not differ.
     """
     differ = apart > TOLERANCE
@@ -111,7 +112,7 @@ def each_within_rounding(model: MotionModel, clip: Tensor, apart: Tensor) -> boo
     for _ in range(DRAWS):
         moved = clip * (1 + torch.finfo(clip.dtype).eps * torch.randint(-1, 2, clip.shape, generator=draw))
         errors = errors.maximum((in_torch(model, moved) - exact).abs().amax(1))
-    return bool((apart <= DRAWS * errors)[differ].all())
+    return bool((apart <= SPREAD * errors)[differ].all())
 
 
 @torch.no_grad()

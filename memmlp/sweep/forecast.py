@@ -32,10 +32,9 @@ def forecast(plan: Plan) -> Forecast | None:
         None if nothing is left, or if no run of the kinds that are left has finished.
     """
     left = plan.left()
-    begun = {
-        task.id for task in left
-    }  # a trained run may lack this plan's evaluation: its time says too little
-    times = {task.id: seconds(plan.run_of(task)) for task in plan.tasks if task.id not in begun}
+    # A trained run may lack an evaluation that this plan wants, so that its time says too little.
+    unfinished = {task.id for task in left}
+    times = {task.id: seconds(plan.run_of(task)) for task in plan.tasks if task.id not in unfinished}
     took = {name: time for name, time in times.items() if time is not None}
     kinds: dict[str, list[str]] = defaultdict(list)
     for task in plan.tasks:
