@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
+from memmlp.common.child_imports import child_imports
 from memmlp.experiment_tracking.tracker import Tracker
 from memmlp.runs.run import Run
 
@@ -70,12 +71,8 @@ class Feed:
         self.process = self._start(tracking) if tracking.trackers else None
 
     def _start(self, tracking: Tracking) -> subprocess.Popen[bytes] | None:
-        environment = os.environ | {
-            "OMP_NUM_THREADS": "1",
-            "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
-        }
+        environment = os.environ | child_imports() | {"OMP_NUM_THREADS": "1"}
         given = {
-            "path": sys.path,
             "trackers": pickle.dumps(tracking.trackers),
             "outputs": str(tracking.outputs.absolute()),
         }

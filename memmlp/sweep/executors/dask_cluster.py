@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from memmlp.common.child_imports import child_imports
 from memmlp.common.errors import InputError
 from memmlp.sweep.executors.executor import Work
 from memmlp.sweep.executors.gpus import VISIBLE
@@ -160,8 +161,7 @@ def _apart(work: Work, stop: str, gpus: bool) -> str | None:
     declared = get_worker().state.total_resources.get(GPU, 0)
     if gpus and declared > 1:  # nobody would say which of them is this task's
         return f"a Dask worker declares {declared:g} GPUs; allowed is one, each with its CUDA_VISIBLE_DEVICES"
-    path = os.pathsep.join(filter(None, sys.path))
-    environment = {**os.environ, "PYTHONPATH": path, **({} if gpus else {VISIBLE: ""})}
+    environment = {**os.environ, **child_imports(), **({} if gpus else {VISIBLE: ""})}
     with tempfile.TemporaryDirectory() as folder:
         said = Path(folder, "said")
         line = [sys.executable, "-m", __name__, str(said)]

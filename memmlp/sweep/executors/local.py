@@ -12,6 +12,7 @@ import submitit
 from submitit.core.utils import JobPaths
 from submitit.local import local
 
+from memmlp.common.child_imports import children_import_the_same
 from memmlp.sweep.executors.executor import Work
 from memmlp.sweep.executors.gpus import Share
 from memmlp.sweep.executors.submitit_jobs import UNLIMITED, Requeued, Submitted, explained
@@ -60,7 +61,7 @@ class Local:
         users = [number for _, number in self.started]
         least = min(range(len(self.shared)), key=users.count)
         self.executor.gpus = self.shared[least]
-        with _interruptible():
+        with _interruptible(), children_import_the_same():
             worker = Submitted(self.executor.submit(Requeued(work)))
         self.started.append((worker, least))
         return worker

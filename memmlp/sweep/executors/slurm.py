@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shlex
 from collections.abc import Mapping
@@ -12,6 +13,7 @@ from typing import Any
 import submitit
 import submitit.helpers
 
+from memmlp.common.child_imports import children_import_the_same
 from memmlp.common.errors import InputError
 from memmlp.sweep.executors.executor import Work
 from memmlp.sweep.executors.submitit_jobs import UNLIMITED, Requeued, Submitted, explained
@@ -152,12 +154,13 @@ class Slurm:
         with explained("slurm"):
             self.executor = SubmititSlurm(folder=folder, python=options.python)
             self.executor.set(options)
+        self.imports = children_import_the_same if options.python is None else contextlib.nullcontext
         self.gpus = options.gpu
 
     def submit(self, work: Work, count: int = 1) -> list[Submitted]:
         """Start workers as one job array. Raises InputError if sbatch refuses an option."""
         with explained("slurm"):
-            with self.executor.batch():
+            with self.imports(), self.executor.batch():
                 jobs: list[Any] = [self.executor.submit(Requeued(work)) for _ in range(count)]
             return [Submitted(job) for job in jobs]
 

@@ -31,6 +31,16 @@ def test_a_debug_worker_works_in_this_process(tmp_path: Path):
     assert handle.complaint() is None
 
 
+def test_a_worker_imports_the_package_that_starts_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Where the working folder has another copy of it, which would be found first."""
+    (tmp_path / "memmlp").mkdir()
+    (tmp_path / "memmlp" / "__init__.py").write_text("")
+    monkeypatch.chdir(tmp_path)
+    (handle,) = Local(tmp_path / "%j").submit(partial(touch, str(tmp_path / "done")))
+    until(lambda: not handle.alive(), "the worker ends")
+    assert (tmp_path / "done").exists()
+
+
 @pytest.mark.parametrize("around", [contextlib.nullcontext, ignoring_interrupts])
 def test_a_cancelled_local_worker_ends(tmp_path: Path, around):
     """Also where interrupts are ignored, by which submitit cancels."""

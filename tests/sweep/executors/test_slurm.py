@@ -103,7 +103,8 @@ def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Slurm's commands, of which sbatch keeps the files that it is given."""
     folder = tmp_path / "bin"
     folder.mkdir()
-    keep = f'cp "$1" {folder}/given.sh; echo "x" >> {folder}/calls; echo "Submitted batch job 42"'
+    keep = f'cp "$1" {folder}/given.sh; env > {folder}/given.env; echo "x" >> {folder}/calls'
+    keep += '; echo "Submitted batch job 42"'
     for name, line in {"sbatch": keep, "srun": "true", "sacct": "true"}.items():
         (folder / name).write_text(f"#!/bin/sh\n{line}\n")
         (folder / name).chmod(0o755)
@@ -121,6 +122,14 @@ def test_workers_are_submitted_at_once(tmp_path: Path, cluster: Path):
     assert "#SBATCH --array=0-2%3" in given
     assert "#SBATCH --time=1-0" in given
     assert "wckey" not in given
+
+
+@pytest.mark.parametrize("python", [None, "srun python3"])
+def test_jobs_import_the_package_that_submits_them(tmp_path: Path, cluster: Path, python: str | None):
+    """Unless another Python is asked for, which has packages of its own."""
+    Slurm(tmp_path / "logs" / "%j", SlurmOptions(python=python)).submit(partial(print, "work"))
+    given = (cluster / "given.env").read_text().splitlines()
+    assert ("PYTHONSAFEPATH=1" in given) == (python is None)
 
 
 def test_a_replaced_worker_is_a_job_without_a_time_limit_of_its_own(tmp_path: Path, cluster: Path):
