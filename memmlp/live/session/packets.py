@@ -7,8 +7,8 @@ A pose is seven numbers, `x y z qx qy qz qw`: metres and a unit quaternion. In J
 In OSC a bundle has the messages `/memmlp/head`, `/memmlp/left`, `/memmlp/right` (seven floats each),
 `/memmlp/time` (a double or float) and `/memmlp/seq` (an integer).
 
-A tracker that is null or missing is lost. A packet without a time gets its time of arrival. The sample's
-number, seq, only serves to count lost packets.
+A tracker that is null or missing is lost. A packet without a time gets its time of arrival. By the sample's
+number, seq, lost packets are counted, and those that others have overtaken are left out.
 """
 
 from __future__ import annotations

@@ -34,6 +34,9 @@ TOLD = 3  # strangers that are told of
 WAIT = 0.25  # seconds that `read` waits at most
 PAUSE = 1.0  # seconds between two rounds of a clip, so long that the stream begins anew
 LARGEST = 65_536  # the largest datagram, bytes
+OVERTAKEN = (
+    20  # packets that may overtake another on its way; a number further back is a sender that began anew
+)
 FORGOTTEN = 10_000  # so many missing numbers are not lost packets but another sender
 
 
@@ -253,7 +256,10 @@ class PacketSource:
         self.last: int | None = None
 
     def read(self) -> SourceSample | None:
-        """Return the next packet's sample; None if no packet came in time, or if the packet is not taken."""
+        """Return the next packet's sample; None if no packet came in time, or if the packet is not taken.
+
+        A packet that others have overtaken is not taken; it was counted as lost when they came.
+        """
         try:
             datagram, (sender, _) = self.socket.recvfrom(LARGEST)
         except TimeoutError:
@@ -267,6 +273,8 @@ class PacketSource:
         except ValueError:
             self.malformed += 1
             return None
+        if self._overtaken(packet):
+            return None
         now = time.monotonic() if packet.time is None else packet.time
         return SourceSample(now, packet.trackers, self._dropped(packet), arrived)
 
@@ -279,6 +287,12 @@ class PacketSource:
         if sender not in self.strangers and len(self.strangers) < TOLD:
             self.strangers.add(sender)
             self.tell(f"packets from {sender} are ignored; --sender {sender} takes them")
+
+    def _overtaken(self, packet: Packet) -> bool:
+        """Return whether a later packet came before, or the same one: its poses would be taken for new ones."""
+        if self.last is None or packet.seq is None:
+            return False
+        return 0 <= self.last - packet.seq <= OVERTAKEN
 
     def _dropped(self, packet: Packet) -> int:
         """Return how many sample numbers are missing between the last packet and this one."""

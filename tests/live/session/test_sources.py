@@ -134,6 +134,20 @@ def test_a_clip_arrives_as_packets(clip: TrackedClip, kind: str, space: str):
     assert arrives.truth(0.5) is None
 
 
+def test_a_packet_that_others_overtook_is_left_out():
+    """Without times its pose would count as the newest; a number far below the last is a new beginning."""
+    source = PacketSource("JSON", 0, from_json, "openxr")
+    packet = '{"head": [0, 1.6, 0, 0, 0, 0, 1], "seq": %d}'
+    numbers = [100, 103, 102, 101, 103, 104, 0, 1]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for number in numbers:
+            sender.sendto((packet % number).encode(), (HOST, source.port))
+    samples = [source.read() for _ in numbers]
+    source.close()
+    assert [s and s.dropped for s in samples] == [0, 2, None, None, None, 0, 0, 0]
+    assert source.malformed == 0
+
+
 def test_malformed_and_missing_packets_are_counted():
     arrives = PacketSource("UDP", 0, from_json, "amass")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
@@ -143,7 +157,7 @@ def test_malformed_and_missing_packets_are_counted():
             "nonsense",
             "",
             f'{{{head}, "seq": 8}}',
-            f'{{{head}, "seq": 2}}',
+            f'{{{head}, "seq": -40}}',
             f'{{{head}, "seq": {10**300}}}',
         ):
             sender.sendto(text.encode(), (HOST, arrives.port))
