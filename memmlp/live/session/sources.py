@@ -34,9 +34,7 @@ TOLD = 3  # strangers that are told of
 WAIT = 0.25  # seconds that `read` waits at most
 PAUSE = 1.0  # seconds between two rounds of a clip, so long that the stream begins anew
 LARGEST = 65_536  # the largest datagram, bytes
-OVERTAKEN = (
-    20  # packets that may overtake another on its way; a number further back is a sender that began anew
-)
+OVERTAKEN = 20  # packets that may overtake another; a number further back is a sender that began anew
 FORGOTTEN = 10_000  # so many missing numbers are not lost packets but another sender
 
 
@@ -289,10 +287,10 @@ class PacketSource:
             self.tell(f"packets from {sender} are ignored; --sender {sender} takes them")
 
     def _overtaken(self, packet: Packet) -> bool:
-        """Return whether a later packet came before, or the same one: its poses would be taken for new ones."""
+        """Return whether a later packet came before, after which these poses would be taken for new ones."""
         if self.last is None or packet.seq is None:
             return False
-        return 0 <= self.last - packet.seq <= OVERTAKEN
+        return 0 < self.last - packet.seq <= OVERTAKEN
 
     def _dropped(self, packet: Packet) -> int:
         """Return how many sample numbers are missing between the last packet and this one."""
