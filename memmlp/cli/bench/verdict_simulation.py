@@ -80,7 +80,7 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
 
 
 def markdown(rows: Sequence[dict[str, Any]], seed: int) -> str:
-    """Return the rows and remarks as Markdown, for docs/statistics.md."""
+    """Return the rows and remarks as Markdown, for docs/results/verdicts.md."""
     lines = [HEADER, ["---" if name == "of" else "---:" for name in HEADER], *map(columns, rows)]
     text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     return "\n".join([text, "", *(f"- {line}" for line in remarks(rows, seed))]) + "\n"
