@@ -249,7 +249,7 @@ def write_results(setup: Setup, study: Study) -> None:
     model = option_in_slot(_experiments(setup, {})[0].config, "model")
     if model == USUAL["model"]:  # Table 5 is of no other network
         table = f"table{results.TABLE:02d}.yaml"
-        results.write_table(study, packaged("sweeps") / table, setup.folder / table)
+        results.write_table(study, packaged("sweeps") / table, setup.folder / table, setup.words)
     results.write_plots(study, setup.folder)
 
 

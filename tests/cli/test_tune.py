@@ -67,7 +67,7 @@ def test_the_same_command_does_nothing_and_status_shows_the_same(home: Path):
 
 def test_the_best_is_an_arm_of_table_5(home: Path):
     table = folder_of(home) / "table05.yaml"
-    words = [str(table), *TINY, "seed=0"]
+    words = [str(table), "seed=0"]  # data and profile are those of the search
     assert "manual, searched" in command(home, "sweep", *words, "--dry-run")
     shown = command(home, "table", *words)
     assert re.search(r"manual, searched .*1", shown)
@@ -168,7 +168,7 @@ def test_table_5_is_of_mem_mlp_alone(tmp_path: Path, monkeypatch: pytest.MonkeyP
     written: list[Path] = []
     for name in ("write_trials", "write_experiments", "write_plots"):
         monkeypatch.setattr(results, name, lambda *_: None)
-    monkeypatch.setattr(results, "write_table", lambda _study, _shipped, path: written.append(path))
+    monkeypatch.setattr(results, "write_table", lambda _study, _shipped, path, _words: written.append(path))
     space = ["search.base=[]", "search.space.loss=null", "+search.space.optim.lr={low: 1e-4, high: 1e-2}"]
     for words in ([], [*space, "model=avatar_poser"]):
         write_results(prepare_search([*TINY, *words], None, tmp_path), None)

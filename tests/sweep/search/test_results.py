@@ -99,16 +99,19 @@ def test_what_a_search_leaves(tmp_path: Path):
     assert path.read_text().startswith("# @package _global_\n")
     shipped = tmp_path / "shipped.yaml"
     shipped.write_text("control: b\narms: {a: {overrides: [loss=manual]}, b: []}\n")
-    assert results.write_table(study, shipped, tmp_path / "table05.yaml")
-    arms = yaml.safe_load((tmp_path / "table05.yaml").read_text())["arms"]
+    words = ["data=mine", "seed=3", "profile=small"]
+    assert results.write_table(study, shipped, tmp_path / "table05.yaml", words)
+    written = yaml.safe_load((tmp_path / "table05.yaml").read_text())
+    assert written["base"] == ["data=mine", "profile=small"]
+    arms = written["arms"]
     assert list(arms) == ["manual, searched", "a", "b"]
     assert f"loss.hand={best.params['loss.hand']}" in arms["manual, searched"]["overrides"]
-    written = results.write_plots(study, tmp_path)
-    assert {path.name for path in written} == {
+    plots = results.write_plots(study, tmp_path)
+    assert {path.name for path in plots} == {
         "optimization_history.png", "parallel_coordinate.png", "slice.png", "param_importances.png",
         "study.html",
     }  # fmt: skip
-    assert all(path.stat().st_size > 5000 for path in written)
+    assert all(path.stat().st_size > 5000 for path in plots)
     page = (tmp_path / "study.html").read_text()
     assert "<script src=" not in page
 
@@ -120,7 +123,7 @@ def test_table_5_takes_only_loss_weights(tmp_path: Path):
     log(run, STEPS, 1.0)
     run.finish([])
     one.look(1)
-    assert not results.write_table(study, tmp_path / "none", tmp_path / "table05.yaml")
+    assert not results.write_table(study, tmp_path / "none", tmp_path / "table05.yaml", [])
 
 
 def after_one_trial(folder: Path, space: dict, base: list[str]) -> Study:
