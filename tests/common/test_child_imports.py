@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import sysconfig
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,13 @@ def found(**environment: str) -> str:
 
 def test_a_child_imports_the_same_package(foreign: Path):
     assert found(**child_imports()) == memmlp.__file__
+
+
+def test_another_interpreter_keeps_its_own_library(foreign: Path):
+    """One of another version that a job starts on its way would not work with this one's."""
+    paths = child_imports()["PYTHONPATH"].split(os.pathsep)
+    assert str(Path(memmlp.__file__).parents[1]) in paths
+    assert not [path for path in paths if path.startswith(sysconfig.get_path("stdlib"))]
 
 
 def test_so_it_does_within_the_context_alone(foreign: Path):
