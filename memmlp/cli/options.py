@@ -87,6 +87,17 @@ outputs_option = click.option(
     show_default=True,
     help="Folder in which runs and caches of data are kept.",
 )
+source_option = click.option(
+    "--source",
+    help="Source whose test clips are shown, where the data has several.  [default: all together]",
+)
+
+together_option = click.option(
+    "--together",
+    multiple=True,
+    metavar="PATTERN",
+    help="Count test clips whose names match PATTERN alike as one group in intervals and verdicts.",
+)
 
 
 def page_options(port: int) -> Callable[[Command], Command]:

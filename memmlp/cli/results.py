@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import config_dir_option, outputs_option, plugins_option
+from memmlp.cli.options import (
+    config_dir_option,
+    outputs_option,
+    plugins_option,
+    source_option,
+    together_option,
+)
 from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
@@ -119,14 +126,36 @@ def save_command(
     click.echo(f"{path}: {merged.count} runs, {kept.count - its_own} of them {here}")
 
 
-@results.command("docs")
-@click.option(
+folder_option = click.option(
     "--folder",
     type=click.Path(path_type=Path, file_okay=False),
     default=FOLDER,
     show_default=True,
     help="Folder of the pages, with data/ and templates/ below it.",
 )
+
+
+@results.command("show")
+@click.argument("name", metavar="NAME")
+@source_option
+@together_option
+@folder_option
+def show(name: str, source: str | None, together: tuple[str, ...], folder: Path) -> None:
+    """Show the table of kept results, without any run; NAME is that of their page."""
+    from memmlp.cli.table import on_screen
+    from memmlp.report.kept_results import load_kept
+    from memmlp.tables.build_table import titled
+
+    path = folder / "data" / f"{name}.json"
+    if not path.is_file():
+        known = ", ".join(sorted(one.stem for one in path.parent.glob("*.json")))
+        raise InputError(f"{path}: no such results; allowed is one of: {known or 'none is kept'}")
+    found = _table(load_kept(path), source, together)
+    on_screen([titled(found, source) if source else found])
+
+
+@results.command("docs")
+@folder_option
 @click.option("--check", is_flag=True, help="Write nothing; exit with 1 where a page differs.")
 def docs(folder: Path, check: bool) -> None:
     """Make all pages of results from what is kept.
@@ -175,7 +204,9 @@ def kept_tables(folder: Path) -> dict[str, KeptTable]:
         # Verdicts of rounds are those of all clips together, and of no source alone.
         names = () if kept.rounds else kept.sources
         by_source = tuple(titled(_table(kept, name), name) for name in names)
-        found[path.stem] = KeptTable(kept, _table(kept), by_source, _trends(kept, path.stem))
+        found[path.stem] = KeptTable(
+            kept, _table(kept), by_source, _trends(kept, path.stem), partial(_table, kept, None)
+        )
     return found
 
 
@@ -205,14 +236,17 @@ def _with_seeds(sweep: Sweep, kept: Kept) -> Sweep:
     return sweep.with_overrides([f"seed={','.join(map(str, seeds))}"])
 
 
-def _table(kept: Kept, source: str | None = None) -> Table:
+def _table(kept: Kept, source: str | None = None, patterns: Sequence[str] = ()) -> Table:
     """Compute the table of kept results, over the sweep's seeds and all further ones of their runs.
 
-    With a source's name, it is the table of that source's test clips alone.
+    Args:
+        kept: the results.
+        source: the only source whose test clips are shown; None for all.
+        patterns: test clips that match one alike count as one group, beside the groups of the data.
     """
     from memmlp.cli.sweep_with_rounds import flag_of_other_rounds
     from memmlp.config.compose_plan import find_sweep
-    from memmlp.tables.build_table import make_table, on_source
+    from memmlp.tables.build_table import make_table, on_source, together
     from memmlp.tables.seed_rounds import of_json
 
     words = tuple(word for word in kept.overrides if not word.startswith("seed="))
@@ -221,6 +255,8 @@ def _table(kept: Kept, source: str | None = None) -> Table:
     rounds = of_json(kept.rounds) if kept.rounds else None
     other = flag_of_other_rounds(rounds, sweep) if rounds else None
     if rounds and not other:
+        if source or patterns:
+            raise InputError("--source, --together: allowed for a fixed number of seeds, not for rounds")
         spent = rounds.spent(sweep)
         table = make_table(spent, kept.of(spent), command=f"{kept.command} --until-decided", rounds=rounds)
     else:
@@ -228,6 +264,8 @@ def _table(kept: Kept, source: str | None = None) -> Table:
         runs = kept.of(sweep)
         if source is not None:
             sweep, runs, left_out = on_source(sweep, runs, source)
+        runs, tied = together(runs, patterns)
+        left_out = (*left_out, *tied)
         table = make_table(sweep, runs, command=kept.command)
     said = [*left_out, *([other] if other else []), *kept.flags, *_outdated(kept)]
     return replace(table, flags=(*table.flags, *said))

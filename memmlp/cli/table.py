@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
-from memmlp.cli.options import config_dir_option, outputs_option, plugins_option
+from memmlp.cli.options import (
+    config_dir_option,
+    outputs_option,
+    plugins_option,
+    source_option,
+    together_option,
+)
 from memmlp.common.errors import InputError
 from memmlp.sweep.definition import BRANCHES
 
@@ -53,10 +59,8 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
     type=click.Choice(BRANCHES),
     help="Branch whose errors are shown.  [default: that of the paper's table]",
 )
-@click.option(
-    "--source",
-    help="Source whose test clips are shown, where the data has several.  [default: all together]",
-)
+@source_option
+@together_option
 @click.option(
     "--add",
     multiple=True,
@@ -85,6 +89,7 @@ def table(
     mode: str,
     branch: str | None,
     source: str | None,
+    together: tuple[str, ...],
     add: tuple[Path, ...],
     untrained: bool,
     seeds_needed: bool,
@@ -100,10 +105,9 @@ def table(
     if seeds_needed and (form or out or add):
         raise InputError("--seeds-needed: goes to the screen alone, without --format, --out and --add")
     measured = [rows_measured_in_browsers.read(path) for path in add]
+    part = Part(branch, source, together, untrained)
     with _uncollected():
-        found = gathered(
-            [name], overrides, outputs, SHOWN_MODES[mode], functools.cache(load), branch, source, untrained
-        )
+        found = gathered([name], overrides, outputs, SHOWN_MODES[mode], functools.cache(load), part)
     if seeds_needed:
         seeds_on_screen(found, SHOWN_MODES[mode])
         return
@@ -131,6 +135,25 @@ def _uncollected() -> Iterator[None]:
         gc.enable()
 
 
+class Part(NamedTuple):
+    """What of a sweep's results its table shows.
+
+    Attributes:
+        branch: the branch to show in place of the arms' own; None for the arms' own.
+        source: the only source whose test clips are shown; None for all.
+        together: patterns of test clips that count as one group, beside the groups of the data.
+        untrained: whether to measure the costs of networks without a run, with random weights.
+    """
+
+    branch: str | None = None
+    source: str | None = None
+    together: Sequence[str] = ()
+    untrained: bool = False
+
+
+WHOLE = Part()
+
+
 class SweepTable(NamedTuple):
     """A sweep, the finished runs of its arms by seed, and its table."""
 
@@ -145,9 +168,7 @@ def gathered(
     outputs: Path,
     modes: Sequence[str],
     read: Read,
-    branch: str | None = None,
-    source: str | None = None,
-    untrained: bool = False,
+    part: Part = WHOLE,
 ) -> list[SweepTable]:
     """Gather the tables with the given names.
 
@@ -160,12 +181,10 @@ def gathered(
         outputs: the folder of runs and caches.
         modes: modes of evaluation to show.
         read: reads a run (`memmlp.tables.measured_run.load`).
-        branch: the branch to show in place of the arms' own; None for the arms' own.
-        source: the only source whose test clips are shown; None for all.
-        untrained: whether to measure the costs of networks without a run.
+        part: what of the results is shown.
 
     Raises:
-        InputError: if none of them can be composed with the command line's overrides.
+        InputError: if none of them can be composed with the command line's overrides, or has that part.
     """
     from memmlp.cli.sweep_with_rounds import sweep_with_rounds
     from memmlp.common.progress import progress_bar
@@ -174,19 +193,20 @@ def gathered(
     found, failures = [], []
     sweeps = find_sweeps(names, overrides)
     for sweep, command in progress_bar(sweeps, "tables") if len(sweeps) > 1 else sweeps:
-        sweep = sweep.with_branch(branch) if branch else sweep
-        if untrained:
+        sweep = sweep.with_branch(part.branch) if part.branch else sweep
+        if part.untrained:
             from memmlp.config.untrained_costs import check_costs
 
             check_costs(sweep)
         try:
             known = sweep_with_rounds(sweep, overrides, outputs.absolute())
-            found.append(table_of_plan(known, modes, command, read, source, untrained))
+            found.append(table_of_plan(known, modes, command, read, part))
         except InputError as error:
             failures.append(error)
             table = without_runs(sweep, modes, f"nothing measured: {error}")
             found.append(SweepTable(sweep, {arm.label: {} for arm in sweep.runnable()}, table))
-    if failures and (overrides or found[0].sweep.table is None) and len(failures) == len(found):
+    asked = overrides or part.source or part.together or found[0].sweep.table is None
+    if failures and asked and len(failures) == len(found):
         raise failures[0]
     return found
 
@@ -196,31 +216,32 @@ def table_of_plan(
     modes: Sequence[str],
     command: str,
     read: Read,
-    source: str | None = None,
-    untrained: bool = False,
+    part: Part = WHOLE,
 ) -> SweepTable:
-    """Return a planned sweep's finished runs and its table, for one source's test clips if one is given.
-
-    With `untrained`, networks without a run are measured with random weights.
-    """
-    from memmlp.tables.build_table import finished_runs, make_table, on_source, titled
+    """Return a planned sweep's finished runs, and the table of a part of their results."""
+    from memmlp.tables.build_table import finished_runs, make_table, on_source, titled, together
     from memmlp.tables.runs_of_plan import older_run_finder, run_finder, state_finder
 
     sweep, plan, rounds, flags = shown
-    if source and rounds:
-        raise InputError(f"--source {source}: allowed for a fixed number of seeds, not for --until-decided")
+    for option, given in (("source", part.source), ("together", " ".join(part.together))):
+        if given and rounds:
+            raise InputError(
+                f"--{option} {given}: allowed for a fixed number of seeds, not for --until-decided"
+            )
     runs = finished_runs(sweep, run_finder(plan, read))
-    if untrained:
+    if part.untrained:
         from memmlp.config.untrained_costs import with_costs
 
         runs, measured = with_costs(sweep, runs)
         flags = (*flags, *measured)
-    if source:
-        sweep, runs, left_out = on_source(sweep, runs, source)
+    if part.source:
+        sweep, runs, left_out = on_source(sweep, runs, part.source)
         flags = (*left_out, *flags)
+    runs, tied = together(runs, part.together)
+    flags = (*tied, *flags)
     command = f"{command} --until-decided" if rounds else command
     table = make_table(sweep, runs, modes, command, state_finder(plan), older_run_finder(plan), rounds)
-    table = titled(table, source) if source else table
+    table = titled(table, part.source) if part.source else table
     return SweepTable(sweep, runs, replace(table, flags=(*table.flags, *flags)))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from jinja2 import Environment, StrictUndefined, TemplateError
@@ -44,13 +44,15 @@ class KeptTable(NamedTuple):
     """The content of a page: kept results, and the table computed from them now.
 
     `by_source` are the tables of each source's test clips alone, if the data has several sources; `trends`
-    are the effects against the sweep's scale, if it has one.
+    are the effects against the sweep's scale, if it has one. `together` makes the same table with test clips
+    in one group, too, that match one of some patterns alike.
     """
 
     kept: Kept
     table: Table
     by_source: tuple[Table, ...] = ()
     trends: Trends | None = None
+    together: Callable[[Sequence[str]], Table] | None = None
 
 
 def pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -> dict[str, str]:
@@ -152,6 +154,7 @@ class Placeholders:
             "summary",
             "held",
             "way",
+            "decided",
         )
         return {"names": sorted(self.sources), **{name: getattr(self, name) for name in names}}
 
@@ -282,6 +285,20 @@ class Placeholders:
         whole = [_whole(first.cells[mode][metric]) for metric in table.measured_metrics]
         title = f"the whole way, from {escaped(first.label)}"
         return "\n".join([*lines, f"| **{title}** | {' | '.join(map(escaped, whole))} |"])
+
+    def decided(self, name: str, *patterns: str) -> str:
+        """Return how many of a table's differences are significant: `53 of 148`.
+
+        Args:
+            name: the name of the table's results.
+            patterns: clips that match one alike count as one group, beside the groups of the data.
+        """
+        table, together = self._table(name), self.sources[name].together
+        if patterns and together:
+            table = together(patterns)
+        cells = (cell for row in table.rows for metrics in row.cells.values() for cell in metrics.values())
+        found = Counter(cell.effect.verdict for cell in cells if cell.effect and cell.effect.verdict)
+        return f"{found.total() - found[Verdict.OPEN] - found[Verdict.EQUIVALENT]} of {found.total()}"
 
     def _costs(self, name: str) -> str:
         table = self._table(name)

@@ -129,6 +129,57 @@ def titled(table: Table, source: str) -> Table:
     return replace(table, title=f"{table.title} (test clips of {source} alone)")
 
 
+class Together(NamedTuple):
+    """Finished runs whose test clips are in coarser groups than their data's.
+
+    Attributes:
+        runs: the runs of the arms, by seed.
+        flags: a line that says which clips are together, and how many groups there are.
+    """
+
+    runs: dict[str, RunsBySeed]
+    flags: tuple[str, ...]
+
+
+def together(runs: Mapping[str, RunsBySeed], patterns: Sequence[str]) -> Together:
+    """Put test clips into one group, too, whose names match a pattern alike.
+
+    Statistics count groups, so this shows what of a table hangs on their choice.
+
+    Args:
+        runs: the finished runs of a sweep's arms, by seed.
+        patterns: regular expressions, as those of `data.split.groups`.
+
+    Raises:
+        InputError: for a pattern that is no regular expression, or puts nothing together.
+    """
+    for pattern in patterns:
+        try:
+            tied = _regrouped(runs, [pattern])
+        except InputError as error:
+            raise InputError(f"--together {str(error).partition(': ')[2]}") from None
+        if _group_count(tied) == _group_count(runs):
+            raise InputError(f"--together {pattern}: puts no test clips together; allowed is one that does")
+    if not patterns:
+        return Together(dict(runs), ())
+    own = _regrouped(runs, patterns)
+    words = f"{_group_count(own)} groups of test clips in place of {_group_count(runs)}"
+    quoted = ", ".join(f"'{pattern}'" for pattern in patterns)
+    return Together(own, (f"{words}: those whose names match {quoted} alike are together (--together)",))
+
+
+def _regrouped(runs: Mapping[str, RunsBySeed], patterns: Sequence[str]) -> dict[str, RunsBySeed]:
+    return {
+        label: {seed: run.together(patterns) for seed, run in seeds.items()} for label, seeds in runs.items()
+    }
+
+
+def _group_count(runs: Mapping[str, RunsBySeed]) -> int:
+    """Return how many groups the test clips of all runs are in."""
+    every = (run for seeds in runs.values() for run in seeds.values())
+    return len({run.group(clip) for run in every for clip in run.clips})
+
+
 def without_runs(sweep: Sweep, modes: Sequence[str], reason: str) -> Table:
     """Make the table of a sweep whose runs can't be identified: the paper's values, and the reason."""
     return replace(make_table(sweep, {arm.label: {} for arm in sweep.runnable()}, modes), flags=(reason,))

@@ -13,6 +13,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
+from memmlp.motion.preparing.groups import Grouping
 from memmlp.runs.deployment_folder import as_deployed, deployed_precision, timed_on
 from memmlp.runs.environment import computed_imports
 from memmlp.runs.evaluation_file import intact, of_one_solver
@@ -125,6 +126,16 @@ class Measured:
     def group(self, clip: str) -> str:
         """Return the group of a clip."""
         return self.groups.get(clip, clip)
+
+    def together(self, patterns: Sequence[str]) -> Measured:
+        """Return the same results with clips in one group, too, whose names match a pattern alike.
+
+        Args:
+            patterns: regular expressions, as those of `data.split.groups`.
+        """
+        grouping = Grouping(tuple(patterns), {clip: self.group(clip) for clip in self.clips})
+        groups = grouping.tied({clip: clip for clip in self.clips})
+        return replace(self, groups={clip: group[0] for group in groups for clip in group})
 
     def by_source(self) -> dict[str, Measured]:
         """Return the results on each source's clips alone, by source; empty if there is only one source."""

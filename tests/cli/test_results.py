@@ -47,6 +47,16 @@ def test_kept_results_become_pages(memmlp: Memmlp, planned: None):
     assert ", open" in Path("docs/results/README.md").read_text()
 
 
+def test_kept_results_are_shown_without_a_run(memmlp: Memmlp, planned: None):
+    memmlp("results", "save", "14")
+    ran = memmlp("results", "show", "table14", "--together", "(salsa)")
+    assert ran.code == 0
+    assert "3 groups of test clips in place of 12" in " ".join(ran.out.split())
+    kept = memmlp("results", "show", "table14").out
+    assert "in place of" not in kept
+    assert kept.splitlines()[2:20] == memmlp("table", "14").out.splitlines()[2:20]
+
+
 def test_a_run_of_two_arms_is_one():
     run = SimpleNamespace(id="a")
     assert _count({"plain": {0: run}, "inverse kinematics": {0: run}}) == 1  # type: ignore[dict-item]
@@ -197,6 +207,7 @@ def test_a_file_of_ones_own_is_not_the_shipped_one(memmlp: Memmlp, planned: None
         (["save", "10"], ("no finished run", "memmlp sweep table10")),
         (["save", "14", "optim.lr=1"], ("table14.json", "memmlp sweep table14 optim.lr=1", "--name")),
         (["save", "14", "--out", "/proc/no"], ("/proc/no",)),
+        (["show", "15"], ("data/15.json", "no such results", "table14")),
         (["docs", "--folder", "elsewhere"], ("elsewhere", "no folder data", "--out elsewhere/data")),
     ],
 )

@@ -46,6 +46,14 @@ def test_command_shows_another_branch(memmlp: Memmlp, planned: None):
     assert out.count("± ") < " ".join(memmlp("table", "14").out.split()).count("± ")  # no rotations, no MPJRE
 
 
+def test_command_puts_clips_together(memmlp: Memmlp, planned: None):
+    out = " ".join(memmlp("table", "14", "--together", "(salsa)").out.split())
+    assert "3 groups of test clips in place of 12" in out
+    assert one_line(
+        memmlp("table", "14", "--together", "walk"), "--together walk: puts no test clips together"
+    )
+
+
 def test_command_plans_seeds(memmlp: Memmlp, planned: None):
     out = memmlp("table", "14", "--seeds-needed", "--mode", "stream").out
     rows = [line.split() for line in out.splitlines() if " stream " in line]

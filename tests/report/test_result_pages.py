@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from memmlp.common.errors import InputError
 from memmlp.report.kept_results import Kept, dumps, overrides_of
 from memmlp.report.result_pages import KeptTable, Placeholders, _whole, origin_words, pages
 from memmlp.sweep.definition import Sweep
-from memmlp.tables.build_table import make_table
+from memmlp.tables.build_table import make_table, together
 from memmlp.tables.statistics import Verdict, holm, paired_effects
 from memmlp.tables.table import Cell, Effect
 from memmlp.tables.table_text import MINUS
@@ -65,6 +66,24 @@ def test_what_holds_of_the_paper_is_counted_and_listed(sweep: Sweep, kept: Kept)
     row = next(row for row in made.table.rows if row.label == "2")
     words = [str(row.cells["stream"][metric].effect.verdict) for metric in made.table.measured_metrics]
     assert line == f"| [14](t.md) | 2 | 2, 4, 6, 8 | {' | '.join(words)} |"
+
+
+def test_significant_differences_are_counted_with_coarser_groups_too(sweep: Sweep, kept: Kept):
+    """Counted anew from Holm's p-values; the coarser table is the one that the source makes."""
+    made = source(sweep, kept)
+
+    def coarser(patterns: Sequence[str]):
+        assert patterns == ("a", "b")
+        return make_table(sweep, together(kept.of(sweep), ["."]).runs)
+
+    made = made._replace(together=coarser)
+    words = '{{ decided("t") }}, {{ decided("t", "a", "b") }}'
+    text = pages({"t": made}, {"README.md": f"{words}\n"})["README.md"].splitlines()[-1]
+    cells = [cell for row in made.table.rows for own in row.cells.values() for cell in own.values()]
+    effects = [cell.effect for cell in cells if cell.effect and cell.effect.verdict]
+    significant = sum(effect.holm < 0.05 for effect in effects)
+    assert 0 < significant < len(effects)
+    assert text == f"{significant} of {len(effects)}, 0 of {len(effects)}"
 
 
 def test_each_commit_is_named_once(kept: Kept):

@@ -8,14 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from fake_runs import fake_sweep, runs_of
+from fake_runs import CLIPS, fake_sweep, runs_of
 from fake_table import SHIPPED, printed
 from processes import finished
 
 from memmlp.common.errors import InputError
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import load_sweep, parse_sweep
-from memmlp.tables.build_table import make_table, on_source, without_runs
+from memmlp.tables.build_table import make_table, on_source, together, without_runs
 from memmlp.tables.measured_run import load
 
 
@@ -84,6 +84,29 @@ def test_arms_without_a_sources_clips_are_left_out_and_named(tmp_path: Path):
     assert all(len(run.clips) == len(clips) // 2 for run in old.runs["both"].values())
     with pytest.raises(InputError, match=r"--source third: no finished run .* allowed is new, old"):
         on_source(sweep, runs, "third")
+
+
+def test_clips_that_are_put_together_count_as_those_that_the_data_has_together(tmp_path: Path):
+    """Patterns add to the groups that there are: pairs of salsas stay together where kicks come together."""
+    sweep = parse_sweep("two", {"arms": {"one": [], "other": ["optim.lr=1"]}, "seeds": [0, 1, 2]})
+    pairs = {clip: f"pair {int(clip[-2:]) // 2}" if "salsa" in clip else clip for clip in CLIPS}
+    wanted = {**pairs, "kicks/01": "kicks", "kicks/02": "kicks"}
+    effects = {"other": 1.1}
+    own = runs_of(sweep, fake_sweep(tmp_path / "own", sweep, effects, groups=pairs))
+    coarser = runs_of(sweep, fake_sweep(tmp_path / "coarser", sweep, effects, groups=wanted))
+    found = together(own, ["^(kicks)/"])
+    assert found.flags == (
+        "7 groups of test clips in place of 8: those whose names match '^(kicks)/' alike are together "
+        "(--together)",
+    )
+    cells = [row.cells for row in make_table(sweep, coarser).rows]
+    assert [row.cells for row in make_table(sweep, found.runs).rows] == cells
+    assert [row.cells for row in make_table(sweep, own).rows] != cells
+    assert together(own, []).runs == own
+    with pytest.raises(InputError, match=r"^--together nothing: puts no test clips together"):
+        together(own, ["^(kicks)/", "nothing"])
+    with pytest.raises(InputError, match=r"^--together '\(' is no regular expression"):
+        together(own, ["("])
 
 
 def test_a_mode_in_which_nothing_was_measured_is_left_out(tmp_path: Path):

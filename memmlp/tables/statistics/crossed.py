@@ -10,7 +10,8 @@ m[s, g] give three variances, with these degrees of freedom:
     E = variance of what neither explains x sum of w^2 / S                    (S - 1) (G - 1)
 
 A + B - E estimates the variance of the mean, because the noise is contained in both A and B. (Where groups
-differ in size, and clips differ more than groups, B is larger than it should be; it is never smaller.)
+differ in size, B is larger than it should be if clips differ more than groups, and smaller if the larger
+groups have the larger effects.)
 """
 
 from __future__ import annotations
