@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -15,7 +16,7 @@ from memmlp.runs.deployment_folder import as_deployed, deployed_precision
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import BRANCHES
 from memmlp.tables.flags_of_runs import CORE
-from memmlp.tables.measured_run import Errors, load
+from memmlp.tables.measured_run import SAME, SHARED, Errors, load
 
 STAGES = ("training", "evaluation", "deployment")
 COLUMNS = [(mode, branch) for mode in ("stream", "window") for branch in BRANCHES]
@@ -42,24 +43,37 @@ def show(outcome: Outcome) -> None:
 def show_side_by_side(outcomes: Mapping[str, Outcome]) -> None:
     """Print the errors of several networks, by name, on the same test clips, and their costs.
 
-    The errors are those of the rotation branch, in stream mode if that was measured.
+    The errors are those in stream mode if that was measured. A network whose branches differ has a column
+    for each.
     """
     found = {name: outcome.results for name, outcome in outcomes.items()}
     mode = "stream" if all("stream" in results for results in found.values()) else "window"
+    columns = [(name, branch) for name, results in found.items() for branch in _differing(results[mode])]
     table = Table(title=f"side by side, {mode}", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     table.add_column("metric")
     table.add_column("unit")
-    for name in found:
-        table.add_column(name, justify="right")
+    for name, branch in columns:
+        several = len(_differing(found[name][mode])) > 1
+        table.add_column(f"{name}\n{branch}" if several else name, justify="right")
     for metric, unit in UNITS.items():
-        values = [results[mode]["rotation"].get(metric) for results in found.values()]
-        if None not in values:
-            table.add_row(metric, unit, *(f"{value:.2f}" for value in values))
-    costs = [as_deployed(results["latency"]) for results in found.values() if "latency" in results]
-    if len(costs) == len(found):
+        values = [found[name][mode][branch].get(metric) for name, branch in columns]
+        if any(value is not None for value in values):
+            table.add_row(metric, unit, *("-" if value is None else f"{value:.2f}" for value in values))
+    if all("latency" in results for results in found.values()):
+        costs = [as_deployed(found[name]["latency"]) for name, _ in columns]
         table.add_row("a frame", "ms", *(f"{cost['median_ms']:.2f}" for cost in costs))
         table.add_row("parameters", "M", *(f"{cost['parameters'] / 1e6:.2f}" for cost in costs))
     Console(highlight=False).print(table)
+
+
+def _differing(branches: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return the branches whose positions differ: those of a network that predicts rotations alone don't."""
+    found: list[str] = []
+    for branch in (branch for branch in BRANCHES if branch in branches):
+        own = branches[branch][SHARED]
+        if not any(math.isclose(own, branches[other][SHARED], rel_tol=SAME) for other in found):
+            found.append(branch)
+    return found
 
 
 def show_latency(console: Console, record: Mapping[str, Any]) -> None:

@@ -76,6 +76,21 @@ def test_times_of_a_busy_machine_say_so():
 
 def test_side_by_side_has_the_times_of_the_files_that_were_asked_for(capsys: pytest.CaptureFixture[str]):
     deployed = {"median_ms": 3.39, "settings": {"precision": "int8"}, "int8": {"median_ms": 1.27}}
-    outcome = SimpleNamespace(results={"stream": {"rotation": {}}, "latency": MEASURED | deployed})
+    outcome = SimpleNamespace(
+        results={"stream": {"rotation": {"MPJPE": 1.0}}, "latency": MEASURED | deployed}
+    )
     show_side_by_side({"one": cast(Outcome, outcome)})
     assert "1.27" in capsys.readouterr().out
+
+
+def test_side_by_side_shows_each_branch_that_differs(capsys: pytest.CaptureFixture[str]):
+    """A network that predicts positions, too, is not compared by its rotations alone."""
+    two = {"rotation": {"MPJRE": 2.0, "MPJPE": 6.49}, "position": {"MPJPE": 5.46}}
+    one = {"rotation": {"MPJRE": 3.0, "MPJPE": 4.8}, "position": {"MPJPE": 4.8 * (1 + 1e-6)}}
+    outcomes = {"two": {"stream": two}, "one": {"stream": one}}
+    show_side_by_side({name: cast(Outcome, SimpleNamespace(results=own)) for name, own in outcomes.items()})
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["two", "two"] in lines
+    assert ["metric", "unit", "rotation", "position", "one"] in lines
+    assert ["MPJPE", "cm", "6.49", "5.46", "4.80"] in lines
+    assert ["MPJRE", "deg", "2.00", "-", "3.00"] in lines
