@@ -48,10 +48,20 @@ def _refuse_several(found: Iterable[Sequence[str]]) -> None:
 
 
 def read_lists(folder: Path) -> dict[str, str]:
-    """Map clip names to "train" or "test", by all lists below a folder."""
-    files = {phase: sorted(folder.rglob(f"{phase}_split.txt")) for phase in PHASES}
+    """Map clip names to "train" or "test", by all lists below a folder.
+
+    Raises:
+        InputError: if there are no lists, one cannot be read or lacks its counterpart, or a clip is in both.
+    """
+    files = {phase: sorted(folder.rglob(_file(phase))) for phase in PHASES}
     if not files["train"]:
         raise InputError(f"data.split: no SUBSET/train_split.txt below {folder}")
+    for own in sorted({file.parent for phase in PHASES for file in files[phase]}):
+        if lacking := [_file(phase) for phase in PHASES if own / _file(phase) not in files[phase]]:
+            raise InputError(
+                f"data.split: no {lacking[0]} in {own}, beside the other list of this subset; "
+                "allowed: both, of which one may be empty"
+            )
     entries: dict[str, str] = {}
     for phase in PHASES:
         for file in files[phase]:
@@ -59,6 +69,11 @@ def read_lists(folder: Path) -> dict[str, str]:
                 if entries.setdefault(name, phase) != phase:
                     raise InputError(f"{file}: {name} is both in a train and in a test list")
     return entries
+
+
+def _file(phase: str) -> str:
+    """Return the name of a subset's list."""
+    return f"{phase}_split.txt"
 
 
 def _read_list(file: Path) -> Iterator[str]:

@@ -107,7 +107,9 @@ def test_a_list_with_the_same_frames_in_two_parts_keeps_those_of_its_test(root, 
     folder = tmp_path / "lists" / "a"
     folder.mkdir(parents=True)
     (folder / "train_split.txt").write_text("".join(f"a/{n}.npz\n" for n in range(4)))
+    (folder / "test_split.txt").touch()
     (folder.parent / "b").mkdir()
+    (folder.parent / "b" / "train_split.txt").touch()
     (folder.parent / "b" / "test_split.txt").write_text("b/copy.npz\n")
     manifest = prepare(ClipFolder(root, ListSplit(tmp_path / "lists"), min_frames=20), tmp_path / "cache")
     assert manifest.duplicates == {"a/1": "b/copy"}

@@ -72,8 +72,10 @@ def test_copies_are_drawn_together(root, tmp_path, seed):
 def test_a_lists_training_gives_way_to_its_test(root, tmp_path):
     write_clip(root / "b" / "again.npz", resample(recorded("running"), 60.0)[0])
     for part, names in (("train", [f"a/{name}" for name in ACTIVITIES]), ("test", ["b/again"])):
-        file = tmp_path / "lists" / names[0].split("/")[0] / f"{part}_split.txt"
-        file.parent.mkdir(parents=True)
-        file.write_text("".join(f"{name}.npz\n" for name in names))
+        lists = tmp_path / "lists" / names[0].split("/")[0]
+        lists.mkdir(parents=True)
+        for phase in ("train", "test"):
+            (lists / f"{phase}_split.txt").touch()
+        (lists / f"{part}_split.txt").write_text("".join(f"{name}.npz\n" for name in names))
     manifest = prepare(ClipFolder(root, ListSplit(tmp_path / "lists")), tmp_path / "cache")
     assert manifest.duplicates == {"a/running": "b/again"}

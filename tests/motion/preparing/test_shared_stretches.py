@@ -115,9 +115,11 @@ def test_a_lists_training_gives_way_to_its_test(tmp_path: Path):
     for name, part in {"a/whole": clip, "a/other": other, "b/cut": cut(clip, 90)}.items():
         write_clip(tmp_path / "clips" / f"{name}.npz", part)
     for part, names in (("train", ["a/whole", "a/other"]), ("test", ["b/cut"])):
-        file = tmp_path / "lists" / names[0].split("/")[0] / f"{part}_split.txt"
-        file.parent.mkdir(parents=True)
-        file.write_text("".join(f"{name}.npz\n" for name in names))
+        lists = tmp_path / "lists" / names[0].split("/")[0]
+        lists.mkdir(parents=True)
+        for phase in ("train", "test"):
+            (lists / f"{phase}_split.txt").touch()
+        (lists / f"{part}_split.txt").write_text("".join(f"{name}.npz\n" for name in names))
     split = ListSplit(tmp_path / "lists", val=0)
     manifest = prepare(ClipFolder(tmp_path / "clips", split), tmp_path / "cache")
     assert manifest.duplicates == {"a/whole": "b/cut"}

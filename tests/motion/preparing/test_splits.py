@@ -109,6 +109,21 @@ def test_lists_in_agrols_format(tmp_path):
         ListSplit(tmp_path)
 
 
+@pytest.mark.parametrize("gone", ["train", "test"])
+def test_a_list_without_its_counterpart_is_refused(tmp_path, gone):
+    """Half of a subset's lists would pass for the protocol; an empty list says that it is meant."""
+    for subset in ("CMU", "MPI_HDM05"):
+        (tmp_path / subset).mkdir()
+        (tmp_path / subset / "train_split.txt").write_text(f"{subset}/01/1_poses.npz\n")
+        (tmp_path / subset / "test_split.txt").write_text(f"{subset}/02/1_poses.npz\n")
+    list_ = tmp_path / "MPI_HDM05" / f"{gone}_split.txt"
+    list_.unlink()
+    with pytest.raises(InputError, match=rf"no {gone}_split.txt in .*MPI_HDM05, .*one may be empty"):
+        ListSplit(tmp_path)
+    list_.write_text("")
+    assert ListSplit(tmp_path).listed == {"CMU": 2, "MPI_HDM05": 1}
+
+
 def test_subsets_by_folder():
     names = [f"{subset}/{n}" for subset in (*S2_TRAIN, *S2_TEST, "DanceDB") for n in range(4)]
     parts = SubsetSplit(S2_TRAIN, S2_TEST, val=0.1).assign(names).parts
@@ -167,6 +182,8 @@ def write_lists(folder, names=OLD):
     for number, name in enumerate(names):
         lists = folder / name.split("/")[0]
         lists.mkdir(parents=True, exist_ok=True)
+        for phase in ("train", "test"):
+            (lists / f"{phase}_split.txt").touch()
         with open(lists / f"{'test' if number % 4 == 3 else 'train'}_split.txt", "a") as file:
             file.write(f"{name}.npz\n")
     return folder
