@@ -13,11 +13,13 @@ metres:
 | parts as the smplx package names them | `global_orient` (N, 3), `body_pose` (N, 63 or 69) |
 
 The translation is `trans` or `transl` (N, 3); the frame rate `mocap_framerate`, `mocap_frame_rate` or `fps`.
+A file that has something under several of these names, as SMPL-X' have the rotations, must have it alike.
 """
 
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +42,7 @@ LAYOUTS: tuple[dict[str, tuple[int, ...]], ...] = (
 TRANSLATIONS = ("trans", "transl")
 FRAME_RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 FARTHEST = 1e4  # metres from the origin
+SAME = 0.01  # radians or metres by which two arrays of one motion differ at most, whatever their precisions
 
 
 class NoMotion(InputError):
@@ -64,12 +67,13 @@ def read_clip(path: Path, name: str) -> Clip:
         trans = file.columns(trans_key, 3, (3,))
         fps = _frame_rate(path, file.scalar(rate_key))
         _check_rates(file, fps)
-    lengths = {len(part) for part in (*parts, trans)}
-    if len(lengths) > 1:
-        keys = ", ".join((*layout, trans_key))
-        raise InputError(f"{path}: {keys} have different lengths, {sorted(lengths)}")
-    body = np.concatenate(parts, 1) if len(parts) > 1 else parts[0]
-    _check_numbers(path, body, trans)
+        keys = (*layout, trans_key)
+        lengths = {len(part) for part in (*parts, trans)}
+        if len(lengths) > 1:
+            raise InputError(f"{path}: {', '.join(keys)} have different lengths, {sorted(lengths)}")
+        body = np.concatenate(parts, 1) if len(parts) > 1 else parts[0]
+        _check_numbers(path, body, trans)
+        _check_copies(file, keys, body, trans)
     return Clip(name, body.reshape(-1, N_JOINTS, 3), trans, fps)
 
 
@@ -92,6 +96,27 @@ def _check_rates(file: Npz, fps: float) -> None:
     for key in FRAME_RATES:
         if key in file.names and (other := _frame_rate(file.path, file.scalar(key))) != fps:
             raise InputError(f"{file.path}: has two frame rates, {fps:g} and {key}={other:g}; allowed is one")
+
+
+def _check_copies(file: Npz, read: Sequence[str], body: np.ndarray, trans: np.ndarray) -> None:
+    """Raise InputError if the file has rotations or a translation under other names, too, and other ones.
+
+    One of them may have been turned, moved or filtered, and the other forgotten.
+
+    Args:
+        file: the file.
+        read: the names under which its motion was read.
+        body: the rotations (N, 66) that were read.
+        trans: the translation (N, 3) that was read.
+    """
+    widths = {key: widths for layout in LAYOUTS for key, widths in layout.items()}
+    roots, bodies = ("root_orient", "global_orient"), ("pose_body", "body_pose")
+    same = {**dict.fromkeys(roots, body[:, :3]), **dict.fromkeys(bodies, body[:, 3:])}
+    same |= dict.fromkeys(TRANSLATIONS, trans)
+    for key in sorted((same.keys() & file.names) - set(read)):
+        copy = file.columns(key, same[key].shape[1], widths.get(key, (3,)))
+        if copy.shape != same[key].shape or not (np.abs(copy - same[key]) <= SAME).all():
+            raise InputError(f"{file.path}: {key} is another motion than {', '.join(read)}; allowed is one")
 
 
 def _check_numbers(path: Path, body: np.ndarray, trans: np.ndarray) -> None:

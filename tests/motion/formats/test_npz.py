@@ -275,6 +275,23 @@ def test_two_frame_rates_must_be_one(tmp_path):
     assert read_clip(tmp_path / "a.npz", "a").fps == 120
 
 
+@pytest.mark.parametrize("key", ["root_orient", "pose_body", "transl"])
+def test_a_motion_under_several_names_must_be_one(key, tmp_path):
+    """SMPL-X' files have rotations whole and in parts; one that is turned alone is no longer the same."""
+    good, path = arrays(width=165), tmp_path / "a.npz"
+    copies = {
+        "root_orient": good["poses"][:, :3],
+        "pose_body": good["poses"][:, 3:66],
+        "transl": good["trans"],
+    }
+    path.write_bytes(npz(**good, **{name: copy.astype("f2") for name, copy in copies.items()}))
+    assert len(read_clip(path, "a")) == 20
+    for wrong in (copies[key] + 0.1, copies[key][1:], copies[key] * np.nan):
+        path.write_bytes(npz(**good, **{**copies, key: wrong}))
+        with pytest.raises(InputError, match=rf"a\.npz: {key} is another motion than poses, trans; allowed"):
+            read_clip(path, "a")
+
+
 def test_a_file_that_unpacks_to_more_than_it_says_is_refused(tmp_path):
     path, honest = tmp_path / "a.npz", io.BytesIO()
     np.savez_compressed(honest, **(arrays() | {"poses": np.zeros((5000, 156))}))
