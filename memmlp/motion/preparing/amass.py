@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 RENAMED = {
     "bmlrub": "biomotionlabntroje",
@@ -68,10 +68,22 @@ def clip_key(name: str) -> str:
     return f"{subset(unpacked(name))}/{SUFFIX.sub('', rest.replace(' ', '_'))}"
 
 
+PEOPLE = (
+    r"(?i)^ACCAD/((?:fe)?male\d)",
+    r"(?i)^(?:DFaust|DFaust_67|MoSh|MPI_mosh|PosePrior|MPI_Limits|SSM|SSM_synced)/(?:\d{8}_)?(\d{5})/",
+)
+"""Patterns of people with several folders, for `data.split.groups`.
+
+ACCAD has one for each kind of motion, such as `Female1Running_c3d`, and the sets recorded at the MPI have the
+same number for a person.
+"""
+
+
 def divided_subjects(parts: Iterable[tuple[str, str]]) -> list[str]:
     """Return the AMASS subjects, SUBSET/SUBJECT, that have clips in both training and test.
 
-    A subject is the same one under all names that the subset ever had, and is given by the first that occurs.
+    A subject is the same one under all names that the subset ever had, and in all folders of one person
+    (`PEOPLE`), and is given by the first that occurs.
 
     Args:
         parts: clips' names and parts.
@@ -81,6 +93,13 @@ def divided_subjects(parts: Iterable[tuple[str, str]]) -> list[str]:
     for name, part in parts:
         folders = unpacked(name).split("/")[:-1]
         if len(folders) >= 2 and subset(folders[0]) in AMASS:
-            subject = subset(folders[0]), folders[1].replace(" ", "_")
-            found[names.setdefault(subject, "/".join(folders[:2]))].add(part)
+            found[names.setdefault(_subject(folders), "/".join(folders[:2]))].add(part)
     return sorted(subject for subject, of in found.items() if {"train", "test"} <= of)
+
+
+def _subject(folders: Sequence[str]) -> tuple[str, str]:
+    """Return a key of the person whose clips are in a folder, SUBSET, SUBJECT and those below it."""
+    for pattern in PEOPLE:
+        if match := re.search(pattern, "/".join(folders) + "/"):
+            return pattern, match[1].lower()
+    return subset(folders[0]), folders[1].replace(" ", "_")
