@@ -27,7 +27,7 @@ from memmlp.live.pose_latency import measure_pose
 from memmlp.motion.body import FPS
 from memmlp.motion.clip import LINES, Skipped
 from memmlp.motion.motion_source import Prepared
-from memmlp.motion.preparing.amass import divided_subjects
+from memmlp.motion.preparing.amass import absent_subsets, divided_subjects
 from memmlp.motion.preparing.groups import unfitting
 from memmlp.motion.preparing.manifest import ClipRecord, Manifest
 from memmlp.pipeline.devices import described, overlooked_gpu
@@ -417,10 +417,12 @@ def data_warnings(experiment: Experiment, data: Prepared) -> dict[str, Any]:
 
 
 def partial_words(experiment: Experiment, data: Prepared) -> str | None:
-    """Return in words which part of its list or of its training clips the data is; None if it is complete."""
-    config, coverage = experiment.config["data"], data.manifest.coverage
+    """Return in words which part of its protocol or of its training clips the data is; None for all of it."""
+    config, manifest = experiment.config["data"], data.manifest
+    coverage, found = manifest.coverage, manifest.listed or (*manifest.left_out, *manifest.groups)
     fraction = config["split"].get("train_fraction", 1)
     parts = [] if coverage.whole else [str(coverage)]
+    parts += [absent] if (absent := absent_subsets(config["name"], found)) else []
     parts += [f"{100 * fraction:g} % of its training groups"] if fraction < 1 else []
     return ", ".join([config["name"], *parts]) if parts else None
 

@@ -30,6 +30,7 @@ from memmlp.experiment_tracking.follower_pipe import Tracking
 from memmlp.live.stream import Stream
 from memmlp.motion.clip import Skipped
 from memmlp.motion.dataset import MotionDataset
+from memmlp.motion.preparing.amass import S2_TEST, S2_TRAIN
 from memmlp.pipeline import run_stages
 from memmlp.pipeline.run_stages import recording_outcome, upstream_run
 from memmlp.runs import environment
@@ -347,7 +348,7 @@ def test_a_split_that_tests_on_the_people_that_it_trains_on_says_so(names, confi
     clips = [SimpleNamespace(name=name, split=part, fps=60.0) for name, part in parts]
     found = run_stages.divided_subjects_remark({"split": {}, **config}, clips)
     assert found.startswith(said) if said else found == ""
-    manifest = SimpleNamespace(coverage=SimpleNamespace(whole=True), clips=clips)
+    manifest = SimpleNamespace(coverage=SimpleNamespace(whole=True), clips=clips, listed={"CMU": 1})
     data = SimpleNamespace(manifest=manifest)
     experiment = SimpleNamespace(config={"data": {"name": "mine", "split": {}, **config}})
     assert run_stages.data_warnings(experiment, data) == {
@@ -367,7 +368,8 @@ def test_clips_that_were_recorded_at_a_lower_rate_are_said():
     assert said.startswith("3 of 7 clips were recorded at 25 to 30 Hz and go on by straight lines")
     assert run_stages.low_rates_remark(lines, clips[2:6], "clips") is None
     assert run_stages.low_rates_remark(splines, clips, "clips") is None
-    manifest = SimpleNamespace(coverage=SimpleNamespace(whole=True), clips=clips, interpolation="lines")
+    whole = SimpleNamespace(whole=True)
+    manifest = SimpleNamespace(coverage=whole, clips=clips, interpolation="lines", listed={"CMU": 1})
     experiment = SimpleNamespace(config={"data": {"name": "mine", "split": {}}})
     said = run_stages.data_warnings(experiment, SimpleNamespace(manifest=manifest))["resampled"]
     assert said.startswith("2 of 6 test clips were recorded at 30 Hz and go on by straight lines")
@@ -389,9 +391,29 @@ def test_a_part_of_the_data_is_told(whole, fraction, words):
     class Coverage(SimpleNamespace):
         __str__ = lambda self: "7 of 8"  # noqa: E731
 
-    data = SimpleNamespace(manifest=SimpleNamespace(coverage=Coverage(whole=whole)))
+    data = SimpleNamespace(manifest=SimpleNamespace(coverage=Coverage(whole=whole), listed={"CMU": 8}))
     experiment = SimpleNamespace(config={"data": {"name": "s1", "split": fraction}})
     assert run_stages.partial_words(experiment, data) == words
+
+
+@pytest.mark.parametrize(
+    ("name", "listed", "clips", "words"),
+    [
+        ("amass_s1", ["CMU", "BMLrub", "HDM05"], ["CMU/1/a"], None),
+        ("amass_s1", ["CMU"], ["CMU/1/a"], "1 of 3 subsets (without BioMotionLab_NTroje, MPI_HDM05)"),
+        ("amass_s3", [], [f"{name}/1/a" for name in (*S2_TRAIN, *S2_TEST, "DanceDB")], None),
+        ("amass_s3", [], ["x/KIT/1/a", "CMU/1/a"], "2 of 14 subsets (without MPI_Limits, "),
+        ("amass_s2", ["CMU"], ["CMU/1/a"], None),
+        ("mocap", [], ["CMU/1/a"], None),
+    ],
+)
+def test_a_protocol_without_some_of_its_subsets_is_told(name, listed, clips, words):
+    """Lists of one subset, or its folder alone, are whole in themselves, and no protocol."""
+    every = {"coverage": SimpleNamespace(whole=True), "listed": dict.fromkeys(listed, 1)}
+    every |= {"left_out": {}, "groups": {clip: clip for clip in clips}}
+    data = SimpleNamespace(manifest=SimpleNamespace(**every))
+    found = run_stages.partial_words(SimpleNamespace(config={"data": {"name": name, "split": {}}}), data)
+    assert found.startswith(f"{name}, {words}") if words else found is None
 
 
 def test_metrics_of_other_code_are_measured_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

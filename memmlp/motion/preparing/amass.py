@@ -34,6 +34,9 @@ def subset(name: str) -> str:
     return RENAMED.get(top, top)
 
 
+S1 = ("CMU", "BioMotionLab_NTroje", "MPI_HDM05")
+"""Protocol S1: the subsets that have lists."""
+
 S2_TRAIN = (
     "CMU", "MPI_Limits", "TotalCapture", "Eyes_Japan_Dataset", "KIT", "BioMotionLab_NTroje", "BMLmovi",
     "EKUT", "ACCAD", "MPI_mosh", "SFU", "MPI_HDM05",
@@ -66,6 +69,27 @@ def clip_key(name: str) -> str:
     """Return a key that is the same for all names of a clip in all releases, except for letter case."""
     _, _, rest = unpacked(name).partition("/")
     return f"{subset(unpacked(name))}/{SUFFIX.sub('', rest.replace(' ', '_'))}"
+
+
+PROTOCOLS = {"amass_s1": S1, "amass_s3": (*S2_TRAIN, *S2_TEST)}
+"""Option of `data` -> subsets that it is not whole without; S3 has all that a release has, and so these."""
+
+
+def absent_subsets(data: str, names: Iterable[str]) -> str:
+    """Say which subsets of a protocol are absent, as in "1 of 3 subsets (without CMU, MPI_HDM05)", or "".
+
+    Args:
+        data: the option of `data`; only of those in `PROTOCOLS` there is something to say.
+        names: names of clips or of folders of subsets.
+    """
+    wanted = PROTOCOLS.get(data, ())
+    present = {subset(one) for name in names for one in (name, unpacked(name))}
+    absent = [name for name in wanted if subset(name) not in present]
+    if not absent:
+        return ""
+    more = f" and {len(absent) - 3} more" if len(absent) > 3 else ""
+    there = f"{len(wanted) - len(absent)} of {len(wanted)} subsets"
+    return f"{there} (without {', '.join(absent[:3])}{more})"
 
 
 PEOPLE = (
