@@ -164,9 +164,9 @@ class ClipPredictor:
             InputError: if no clip could be read, or a file cannot be written.
         """
         written: list[Path] = []
-        skipped = list(plan.skipped)
+        skipped, odd = list(plan.skipped), dict[str, str]()
         seconds = 0.0
-        clips = read_targets(plan, self._frames, skipped, strict)
+        clips = read_targets(plan, lambda target: self._frames(target, odd), skipped, strict)
         while batch := list(islice(clips, self.evaluation.batch)):
             targets, frames = zip(*batch, strict=True)
             made = self.predict([target.name for target in targets], frames)
@@ -174,15 +174,19 @@ class ClipPredictor:
                 write_motion(target.path, clip, self.rest, plan.format)
                 written.append(target.path)
                 seconds += len(clip) / FPS
-        return ExportReport(tuple(written), seconds, tuple(skipped))
+        return ExportReport(tuple(written), seconds, tuple(skipped), odd)
 
-    def _frames(self, target: Target) -> Tensor:
+    def _frames(self, target: Target, odd: dict[str, str]) -> Tensor:
         """Read a clip's frames (N, 252), computed on the network's body as in a cache.
+
+        Args:
+            target: what is to be read.
+            odd: gets what is unusual of the clip, by its name.
 
         Raises:
             InputError: if the file can't be read, or has fewer than two frames at 60 Hz.
         """
-        clip, _ = resample(read_motion(target), interpolation=self.interpolation)
+        clip, _ = resample(read_motion(target, odd), interpolation=self.interpolation)
         if len(clip) < 2:
             few = f"{target.source}: one frame at {FPS} Hz"
             raise InputError(f"{few}; allowed: two or more, as a velocity needs them")

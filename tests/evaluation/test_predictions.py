@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -133,6 +134,15 @@ def test_a_folder_is_predicted_as_its_clips_are(tmp_path: Path):
         np.testing.assert_allclose(joints(after), expected, atol=1e-5)
         head = frames(at_60)[:, SPARSE_DIM:].unflatten(-1, (-1, 3))[:, -22 + 15]
         np.testing.assert_allclose(joints(after)[:, 15], head, atol=1e-5)
+
+
+def test_what_is_unusual_of_a_clip_is_said(tmp_path: Path):
+    clip = source(30)
+    poses = np.zeros_like(clip.poses)
+    poses[:, 0] = 1e-3 * np.arange(len(poses))[:, None]  # the rest pose, along Y
+    write_clip(tmp_path / "a.npz", replace(clip, poses=poses, trans=np.zeros_like(clip.trans)))
+    report = predictor().export(plan_export(tmp_path / "a.npz", tmp_path / "out.npz"))
+    assert report.unusual["a"].startswith("the head is never above the pelvis")
 
 
 def test_strict_stops_at_a_bad_clip(tmp_path: Path):

@@ -99,8 +99,9 @@ def show_some(lines: list[str], what: str) -> None:
 
 
 def show_exported(report: ExportReport, out: Path) -> None:
-    """Print what an export skipped and how much it wrote."""
+    """Print what an export skipped, what is odd of the others, and how much it wrote."""
     show_skipped([f"{file.file}: {file.reason}" for file in report.skipped])
+    show_pairs("unusual", report.unusual, ": ")
     click.echo(f"{amount(len(report.written), report.seconds)}, in {out}")
 
 

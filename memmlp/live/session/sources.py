@@ -14,6 +14,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from memmlp.common.errors import InputError
+from memmlp.common.progress import remark
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
 from memmlp.live.session.packets import Packet, Parse, QuaternionPoses
 from memmlp.live.spaces import Space, SpaceName
@@ -132,12 +133,14 @@ def npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
     from memmlp.motion.clip import resample
     from memmlp.motion.features import motion_frames
     from memmlp.motion.formats.npz import read_clip
-    from memmlp.motion.plausibility import check_plausible
+    from memmlp.motion.plausibility import check_plausible, unusual
     from memmlp.motion.preparing.imported_body import check_networks_joints
 
     recorded = read_clip(path, path.stem)
     check_networks_joints([path], rest)
     check_plausible(path, recorded)
+    if reason := unusual(recorded):
+        remark(f"{path}: unusual, {reason}")
     clip, _ = resample(recorded)
     if len(clip) < 3:
         raise InputError(f"{path}: {len(clip)} frames at 60 Hz; allowed are 3 or more")

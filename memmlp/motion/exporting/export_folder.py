@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
@@ -14,7 +14,7 @@ from memmlp.motion.body import load_rest_joints
 from memmlp.motion.clip import Clip, Skipped, resample
 from memmlp.motion.exporting.write import FORMATS, SUFFIXES, Format, format_of, write_motion
 from memmlp.motion.formats.npz import NoMotion, read_clip
-from memmlp.motion.plausibility import check_plausible
+from memmlp.motion.plausibility import check_plausible, unusual
 from memmlp.motion.preparing.find_clips import clip_name, find_clips
 from memmlp.motion.preparing.imported_body import check_imported_body
 
@@ -64,11 +64,13 @@ class ExportReport:
         written: the files that were written.
         seconds: the total duration of the written clips.
         skipped: the clips that were skipped.
+        unusual: clip -> what is odd about it, though it may be sound.
     """
 
     written: tuple[Path, ...]
     seconds: float
     skipped: tuple[Skipped, ...]
+    unusual: Mapping[str, str] = field(default_factory=dict)
 
 
 def plan_export(source: Path, out: Path, name: str | None = None) -> ExportPlan:
@@ -172,10 +174,20 @@ def read_targets(
         raise InputError(f"no usable clip in {len(plan.targets)} files{first}; allowed: AMASS npz files")
 
 
-def read_motion(target: Target) -> Clip:
-    """Read a target's clip. Raises InputError if it is damaged or can't be a person's motion."""
+def read_motion(target: Target, odd: dict[str, str]) -> Clip:
+    """Read a target's clip.
+
+    Args:
+        target: the target.
+        odd: gets what is unusual of the clip, by its name.
+
+    Raises:
+        InputError: if it is damaged or can't be a person's motion.
+    """
     clip = read_clip(target.source, target.name)
     check_plausible(target.source, clip)
+    if reason := unusual(clip):
+        odd[target.name] = reason
     return clip
 
 
@@ -198,16 +210,16 @@ def export(
     if plan.format.has_bones:
         check_imported_body([target.source for target in plan.targets], str(body), rest, "--body")
     written: list[Path] = []
-    skipped = list(plan.skipped)
+    skipped, odd = list(plan.skipped), dict[str, str]()
     seconds = 0.0
-    for target, clip in read_targets(plan, lambda target: _motion(target, fps), skipped, strict):
+    for target, clip in read_targets(plan, lambda target: _motion(target, fps, odd), skipped, strict):
         write_motion(target.path, clip, rest, plan.format)
         written.append(target.path)
         seconds += len(clip) / clip.fps
-    return ExportReport(tuple(written), seconds, tuple(skipped))
+    return ExportReport(tuple(written), seconds, tuple(skipped), odd)
 
 
-def _motion(target: Target, fps: float | None) -> Clip:
+def _motion(target: Target, fps: float | None, odd: dict[str, str]) -> Clip:
     """Read the clip that is to be written to a target, resampled to `fps` if that is given."""
-    clip = read_motion(target)
+    clip = read_motion(target, odd)
     return clip if fps is None else resample(clip, fps)[0]

@@ -103,6 +103,16 @@ def test_what_is_no_person_is_skipped(folder: Path, tmp_path: Path):
     assert "degrees" in report.skipped[1].reason
 
 
+def test_what_is_unusual_is_exported_and_said(folder: Path, memmlp: Memmlp):
+    """Somebody who lies throughout, or a file with another axis up."""
+    still = Clip("lying", np.zeros((5, 22, 3)) + 1e-3 * np.arange(5)[:, None, None], np.zeros((5, 3)), 60.0)
+    write_clip(folder / "lying.npz", still)
+    report = export(plan_export(folder / "lying.npz", folder.parent / "lying.bvh"))
+    assert report.unusual["lying"].startswith("the head is never above the pelvis")
+    ran = memmlp("data", "export", str(folder / "lying.npz"), "--out", "again.bvh")
+    assert ran.out.startswith("unusual: lying: the head is never above the pelvis")
+
+
 def test_two_files_of_one_name_are_refused(folder: Path, tmp_path: Path):
     write_clip(folder / "walk.NPZ", moving(5))
     if len(list(folder.glob("walk.*"))) == 1:
