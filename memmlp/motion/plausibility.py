@@ -21,6 +21,7 @@ MOST_TURN = 4 * math.pi  # a rotation vector has no reason to be longer than pi;
 MOST_SPEED = 30.0  # m/s; the fastest runner reached 12.4
 MOST_HEIGHT = 10.0  # metres of the pelvis over z = 0 beyond which the feet have to prove that they stand
 LOWEST = 0.3  # metres of the lowest joint over or below z = 0, beyond which feet that slide are told
+RATES = (20.0, 500.0)  # Hz between which motion is recorded and kept; others may be slips, as 12 for 120
 SAMPLES = 50  # frames looked at for posture
 
 
@@ -43,7 +44,7 @@ def unusual(clip: Clip) -> str | None:
         return "the head is never above the pelvis, so it lies throughout, or Z is not up"
     if abs(height := _height(clip)) > MOST_HEIGHT:
         return f"the pelvis is at z = {height:.0f} m"
-    return _off_the_floor(clip, joints)
+    return _odd_rate(clip) or _off_the_floor(clip, joints)
 
 
 def _degrees(clip: Clip) -> str | None:
@@ -90,6 +91,13 @@ def _y_up(clip: Clip) -> str | None:
     if abs(middle) > 0.2 and (high - low > 0.35 or np.ptp(joints[:, 0, 2]) < 1.0):
         return None
     return "the person stands along Y and never along Z, so Y is up; allowed: Z up"
+
+
+def _odd_rate(clip: Clip) -> str | None:
+    low, high = RATES
+    if low <= clip.fps <= high:
+        return None
+    return f"a frame rate of {clip.fps:g} Hz, which may be wrong; usual are {low:g} to {high:g} Hz"
 
 
 def _off_the_floor(clip: Clip, joints: np.ndarray) -> str | None:

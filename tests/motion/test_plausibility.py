@@ -59,6 +59,14 @@ def test_lying_and_crawling_pass_and_are_told(heading):
     assert implausible(replace(crawling, trans=crawling.trans + along)) is None
 
 
+@pytest.mark.parametrize("fps", [1.0, 12.0, 1000.0])
+def test_a_rate_at_which_hardly_anybody_records_is_told(fps):
+    clip = replace(motion("idling"), fps=fps)
+    assert implausible(clip) is None
+    assert unusual(clip).startswith(f"a frame rate of {fps:g} Hz, which may be wrong")
+    assert all(unusual(replace(clip, fps=usual)) is None for usual in (20.0, 59.94, 60.0, 250.0, 480.0))
+
+
 def test_a_floor_at_any_height_passes_where_feet_stand_on_it():
     for z in (-40.0, 100.0):
         clip = moved(motion("walking"), z=z)
