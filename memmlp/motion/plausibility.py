@@ -22,6 +22,7 @@ MOST_SPEED = 30.0  # m/s; the fastest runner reached 12.4
 MOST_HEIGHT = 10.0  # metres of the pelvis over z = 0 beyond which the feet have to prove that they stand
 LOWEST = 0.3  # metres of the lowest joint over or below z = 0, beyond which feet that slide are told
 RATES = (20.0, 500.0)  # Hz between which motion is recorded and kept; others may be slips, as 12 for 120
+COARSE = 1e-3  # metres between the places of half precision from which on speeds show them: 0.06 m/s at 60 Hz
 SAMPLES = 50  # frames looked at for posture
 
 
@@ -44,7 +45,7 @@ def unusual(clip: Clip) -> str | None:
         return "the head is never above the pelvis, so it lies throughout, or Z is not up"
     if abs(height := _height(clip)) > MOST_HEIGHT:
         return f"the pelvis is at z = {height:.0f} m"
-    return _odd_rate(clip) or _off_the_floor(clip, joints)
+    return _odd_rate(clip) or _coarse(clip) or _off_the_floor(clip, joints)
 
 
 def _degrees(clip: Clip) -> str | None:
@@ -98,6 +99,15 @@ def _odd_rate(clip: Clip) -> str | None:
     if low <= clip.fps <= high:
         return None
     return f"a frame rate of {clip.fps:g} Hz, which may be wrong; usual are {low:g} to {high:g} Hz"
+
+
+def _coarse(clip: Clip) -> str | None:
+    """Return what is odd about a translation that was saved in half precision, or None."""
+    half = clip.trans.astype(np.float16)
+    step = float(np.spacing(np.abs(half).max()))
+    if step < COARSE or (half != clip.trans).any() or not np.ptp(half, axis=0).any():
+        return None
+    return f"trans is in half precision, in steps of {1000 * step:.0f} mm, which its speeds and Jitter show"
 
 
 def _off_the_floor(clip: Clip, joints: np.ndarray) -> str | None:

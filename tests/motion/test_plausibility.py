@@ -67,6 +67,14 @@ def test_a_rate_at_which_hardly_anybody_records_is_told(fps):
     assert all(unusual(replace(clip, fps=usual)) is None for usual in (20.0, 59.94, 60.0, 250.0, 480.0))
 
 
+def test_a_translation_in_half_precision_is_told():
+    clip = moved(motion("walking"), x=6.0)
+    half = clip.trans.astype(np.float16).astype(float)
+    assert "half precision, in steps of 8 mm" in unusual(replace(clip, trans=half))
+    for fine in (clip.trans, clip.trans.astype(np.float32), half[:1] + 0 * half):
+        assert "half" not in (unusual(replace(clip, trans=fine)) or "")
+
+
 def test_a_floor_at_any_height_passes_where_feet_stand_on_it():
     for z in (-40.0, 100.0):
         clip = moved(motion("walking"), z=z)
