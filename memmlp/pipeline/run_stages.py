@@ -142,6 +142,8 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
         remark(f"data: {said}")
     run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
     if not run.done:
+        if experiment.evaluations:
+            data.open("test")  # an error without test clips, which is better told now than after the training
         experiment.training.optim.check_installed()
         if overlooked := overlooked_gpu(experiment.config["device"]):
             remark(overlooked)

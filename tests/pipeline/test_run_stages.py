@@ -105,6 +105,14 @@ def test_a_training_says_on_a_terminal_what_is_odd_about_its_data(capsys, monkey
     assert capsys.readouterr().err == said
 
 
+def test_data_without_test_clips_is_refused_before_the_training(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    experiment = build_experiment(composed([*TINY, "memory=none", "data.split.test=0"]))
+    with pytest.raises(InputError, match="no test clips"):
+        run_stages.run_experiment(experiment)
+    assert not list_runs(tmp_path / "outputs")
+
+
 def test_the_same_command_finds_the_run_and_others_share_the_vqvae(home, monkeypatch):
     before = {run.id: run.marker.stat().st_mtime_ns for run in list_runs(home / "outputs")}
     assert "finished already" in command(home, "train", *TINY, INT8)
