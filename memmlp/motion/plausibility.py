@@ -23,6 +23,7 @@ MOST_HEIGHT = 10.0  # metres of the pelvis over z = 0 beyond which the feet have
 LOWEST = 0.3  # metres of the lowest joint over or below z = 0, beyond which feet that slide are told
 RATES = (20.0, 500.0)  # Hz between which motion is recorded and kept; others may be slips, as 12 for 120
 COARSE = 1e-3  # metres between the places of half precision from which on speeds show them: 0.06 m/s at 60 Hz
+STIFF = 0.01  # radians by which a joint turns in a clip at most, if it does not turn
 SAMPLES = 50  # frames looked at for posture
 
 
@@ -45,7 +46,7 @@ def unusual(clip: Clip) -> str | None:
         return "the head is never above the pelvis, so it lies throughout, or Z is not up"
     if abs(height := _height(clip)) > MOST_HEIGHT:
         return f"the pelvis is at z = {height:.0f} m"
-    return _odd_rate(clip) or _coarse(clip) or _off_the_floor(clip, joints)
+    return _odd_rate(clip) or _coarse(clip) or _stiff(clip) or _off_the_floor(clip, joints)
 
 
 def _degrees(clip: Clip) -> str | None:
@@ -108,6 +109,12 @@ def _coarse(clip: Clip) -> str | None:
     if step < COARSE or (half != clip.trans).any() or not np.ptp(half, axis=0).any():
         return None
     return f"trans is in half precision, in steps of {1000 * step:.0f} mm, which its speeds and Jitter show"
+
+
+def _stiff(clip: Clip) -> str | None:
+    if len(clip) < 2 or np.ptp(clip.poses[:, 1:], axis=0).max() > STIFF:
+        return None
+    return "no joint but the root turns, so it is a pose for calibration, or its poses are lost"
 
 
 def _off_the_floor(clip: Clip, joints: np.ndarray) -> str | None:

@@ -75,6 +75,15 @@ def test_a_translation_in_half_precision_is_told():
         assert "half" not in (unusual(replace(clip, trans=fine)) or "")
 
 
+def test_a_pose_that_is_held_throughout_is_told():
+    """T-poses for calibration, and files that have lost all rotations but the root's."""
+    clip = motion("walking")
+    for first in (1, 0):
+        poses = np.concatenate([clip.poses[:, :first], np.repeat(clip.poses[:1, first:], len(clip), 0)], 1)
+        assert implausible(replace(clip, poses=poses)) is None
+        assert unusual(replace(clip, poses=poses)).startswith("no joint but the root turns")
+
+
 def test_a_floor_at_any_height_passes_where_feet_stand_on_it():
     for z in (-40.0, 100.0):
         clip = moved(motion("walking"), z=z)
