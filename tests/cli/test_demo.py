@@ -18,8 +18,10 @@ def test_each_stage_has_a_line_without_a_terminal(memmlp):
     stages = [line.partition(":")[0] for line in ran.err.splitlines()]
     again = ["data", "network", "evaluation", "deployment"]
     assert stages == ["data", "VQ-VAE", "network", "evaluation", "deployment", *again]
-    head = next(line for line in ran.out.splitlines() if "Mem-MLP" in line)
-    assert head.split() == ["metric", "unit", "Mem-MLP", "RecurrentPoser"]
+    heads = [line.split() for line in ran.out.splitlines()]
+    first = next(number for number, words in enumerate(heads) if "Mem-MLP" in words)
+    assert heads[first] == ["Mem-MLP", "Mem-MLP"]
+    assert heads[first + 1] == ["metric", "unit", "rotation", "position", "RecurrentPoser"]
     assert "the demo took" in ran.out
     assert "--label Mem-MLP --label RecurrentPoser" in ran.out.partition("next: ")[2]
 
