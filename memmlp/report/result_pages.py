@@ -294,7 +294,9 @@ class Placeholders:
             patterns: clips that match one alike count as one group, beside the groups of the data.
         """
         table, together = self._table(name), self.sources[name].together
-        if patterns and together:
+        if patterns:
+            if together is None:
+                raise InputError(f"{name}: has no coarser groups; allowed is decided without patterns")
             table = together(patterns)
         cells = (cell for row in table.rows for metrics in row.cells.values() for cell in metrics.values())
         found = Counter(cell.effect.verdict for cell in cells if cell.effect and cell.effect.verdict)

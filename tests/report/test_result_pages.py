@@ -100,6 +100,7 @@ def test_each_commit_is_named_once(kept: Kept):
         ('{{ effect("t", "3", "stream", "MPJPE") }}', "'3' is no arm of t; allowed are 2, 2, 4"),
         ('{{ effect("t", "2", "live", "MPJPE") }}', "'live' is no mode; allowed are stream, window"),
         ('{{ effect("t", "2", "stream", "MPJ") }}', "'MPJ' is no metric of t"),
+        ('{{ decided("t", "a") }}', "t: has no coarser groups"),
         ("{{ nothing }}", "'nothing' is undefined"),
         ("{{ effect(", "README.md"),
         ('Memory lowers it: {{ effect("t", "2", "stream", "MPJPE") }}', "placeholders"),
