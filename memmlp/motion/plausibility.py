@@ -17,6 +17,8 @@ from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
 from memmlp.motion.clip import Clip
 
 HEAD, ANKLES = JOINTS.index("head"), [JOINTS.index("left_ankle"), JOINTS.index("right_ankle")]
+KNEES = [JOINTS.index("left_knee"), JOINTS.index("right_knee")]
+ELBOWS = [JOINTS.index("left_elbow"), JOINTS.index("right_elbow")]
 MOST_TURN = 4 * math.pi  # a rotation vector has no reason to be longer than pi; fits wind up to 2 pi and more
 MOST_SPEED = 30.0  # m/s; the fastest runner reached 12.4
 MOST_HEIGHT = 10.0  # metres of the pelvis over z = 0 beyond which the feet have to prove that they stand
@@ -24,6 +26,9 @@ LOWEST = 0.3  # metres of the lowest joint over or below z = 0, beyond which fee
 RATES = (20.0, 500.0)  # Hz between which motion is recorded and kept; others may be slips, as 12 for 120
 COARSE = 1e-3  # metres between the places of half precision from which on speeds show them: 0.06 m/s at 60 Hz
 STIFF = 0.01  # radians by which a joint turns in a clip at most, if it does not turn
+ALONG = math.radians(20)  # between trunk and legs, up to which a body is straight
+LEANS = (30.0, 65.0)  # degrees from Z of a straight body; who runs came to 22, who lies is near 90
+BACKWARDS = 0.3  # radians of knees and elbows that bend the wrong way; stretched ones came to 0.08
 SAMPLES = 50  # frames looked at for posture
 
 
@@ -46,7 +51,8 @@ def unusual(clip: Clip) -> str | None:
         return "the head is never above the pelvis, so it lies throughout, or Z is not up"
     if abs(height := _height(clip)) > MOST_HEIGHT:
         return f"the pelvis is at z = {height:.0f} m"
-    return _odd_rate(clip) or _coarse(clip) or _stiff(clip) or _off_the_floor(clip, joints)
+    of_poses = _stiff(clip) or _backwards(clip) or _leaning(joints)
+    return _odd_rate(clip) or _coarse(clip) or of_poses or _off_the_floor(clip, joints)
 
 
 def _degrees(clip: Clip) -> str | None:
@@ -115,6 +121,38 @@ def _stiff(clip: Clip) -> str | None:
     if len(clip) < 2 or np.ptp(clip.poses[:, 1:], axis=0).max() > STIFF:
         return None
     return "no joint but the root turns, so it is a pose for calibration, or its poses are lost"
+
+
+def _backwards(clip: Clip) -> str | None:
+    """Return which joints bend the wrong way for most of the clip, or None.
+
+    On SMPL's body knees bend about +X, the left elbow about -Y, and the right one about +Y.
+    """
+    poses = clip.poses[_spread(clip)]
+    knees, (left, right) = poses[:, KNEES, 0], poses[:, ELBOWS, 1].T
+    for name, bent in (("knees", knees), ("elbows", (right - left) / 2)):
+        if np.median(bent) < -BACKWARDS:
+            return f"the {name} bend backwards, so left and right are swapped, or an axis is mirrored"
+    return None
+
+
+def _leaning(joints: np.ndarray) -> str | None:
+    """Return what is odd about how far the body leans where it is straight, or None."""
+    ankles, pelvis, head = joints[:, ANKLES].mean(1), joints[:, 0], joints[:, HEAD]
+    straight = _angles(head - pelvis, pelvis - ankles) < ALONG
+    if straight.mean() < 0.5:
+        return None
+    lean = math.degrees(np.median(_angles(head - ankles, np.array([0.0, 0.0, 1.0]))[straight]))
+    if not LEANS[0] < lean < LEANS[1]:
+        return None
+    return f"the straight body leans by {lean:.0f} degrees, so Z may not be up"
+
+
+def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the angles (n,), radians, between vectors (n, 3)."""
+    lengths = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
+    cosines = (a * b).sum(-1) / np.maximum(lengths, 1e-9)
+    return np.arccos(np.clip(cosines, -1, 1))
 
 
 def _off_the_floor(clip: Clip, joints: np.ndarray) -> str | None:

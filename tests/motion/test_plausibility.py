@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from memmlp.motion.body import JOINTS
 from memmlp.motion.clip import Clip
 from memmlp.motion.plausibility import implausible, unusual
 from memmlp.motion.synthetic import synthesize_clip
 
+SIDES = {"left": "right", "right": "left"}
+OTHER_SIDE = [JOINTS.index("_".join(SIDES.get(word, word) for word in name.split("_"))) for name in JOINTS]
 ACTIVITIES = ("walking", "jumping", "sitting", "idling")
 Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
 
@@ -82,6 +85,31 @@ def test_a_pose_that_is_held_throughout_is_told():
         poses = np.concatenate([clip.poses[:, :first], np.repeat(clip.poses[:1, first:], len(clip), 0)], 1)
         assert implausible(replace(clip, poses=poses)) is None
         assert unusual(replace(clip, poses=poses)).startswith("no joint but the root turns")
+
+
+def test_left_and_right_swapped_is_told():
+    """Elbows and knees then bend backwards; a true mirror image is a person's motion."""
+    clip = motion("walking")
+    poses = clip.poses[:, OTHER_SIDE]
+    assert unusual(replace(clip, poses=poses)).startswith("the elbows bend backwards")
+    assert unusual(replace(clip, poses=poses * [1, -1, -1], trans=clip.trans * [-1, 1, 1])) is None
+
+
+@pytest.mark.parametrize(
+    ("signs", "joints"), [((1, -1, -1), "elbows"), ((-1, 1, -1), "knees"), ((-1, -1, 1), "knees")]
+)
+def test_a_mirrored_axis_is_told(signs, joints):
+    clip = motion("walking")
+    poses = np.concatenate([clip.poses[:, :1], clip.poses[:, 1:] * np.array(signs)], 1)
+    assert unusual(replace(clip, poses=poses)).startswith(f"the {joints} bend backwards")
+
+
+@pytest.mark.parametrize("degrees", [40, 55])
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_a_floor_that_is_tilted_is_told(axis, degrees):
+    tilted = turned(motion("walking"), Rotation.from_euler(axis, degrees, degrees=True).as_matrix())
+    assert implausible(tilted) is None
+    assert "straight body leans by" in unusual(tilted)
 
 
 def test_a_floor_at_any_height_passes_where_feet_stand_on_it():
