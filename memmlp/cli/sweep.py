@@ -16,7 +16,7 @@ from memmlp.common.errors import InputError
 from memmlp.runs.identity import NETWORK
 
 if TYPE_CHECKING:
-    from memmlp.cli.sweep_with_rounds import SweepWithRounds
+    from memmlp.cli.shown_sweep import ShownSweep
     from memmlp.sweep.definition import Sweep
     from memmlp.sweep.plan import Plan
 
@@ -77,7 +77,7 @@ def sweep(
     controls, get more, up to --max-seeds.
     """
     from memmlp.cli import seed_rounds
-    from memmlp.cli.sweep_with_rounds import SweepWithRounds, spent_before
+    from memmlp.cli.shown_sweep import ShownSweep, spent_before
     from memmlp.config.compose_plan import find_sweep, make_plan, sweep_folder
 
     seed_rounds.check(overrides, until_decided, max_seeds)
@@ -108,13 +108,13 @@ def sweep(
     work = partial(run_workers, workers=workers)
     if rounds:
         rounds, plan = seed_rounds.run_until_decided(chosen, outputs, rounds, work, fail_fast)
-        show_outcome(SweepWithRounds(rounds.spent(chosen), plan, rounds), [name, *overrides], chosen, labels)
+        show_outcome(ShownSweep(rounds.spent(chosen), plan, rounds), [name, *overrides], chosen, labels)
         return
     wanted = replace(wanted, fail_fast=fail_fast)
     if wanted.left():
         work(chosen, wanted)
     show_outcome(
-        SweepWithRounds(chosen, replace(plan, fail_fast=fail_fast), None, spent_before(chosen, outputs)),
+        ShownSweep(chosen, replace(plan, fail_fast=fail_fast), None, spent_before(chosen, outputs)),
         [name, *overrides],
         chosen,
         labels,
@@ -194,9 +194,7 @@ def show_forecast(chosen: Sweep, plan: Plan, labels: Collection[str], workers: i
     click.echo(line)
 
 
-def show_outcome(
-    shown: SweepWithRounds, words: Sequence[str], chosen: Sweep, labels: Collection[str]
-) -> None:
+def show_outcome(shown: ShownSweep, words: Sequence[str], chosen: Sweep, labels: Collection[str]) -> None:
     """Print the table, finished and failed runs, and the next command.
 
     Exits with 1 if something failed that the arms with these labels need.

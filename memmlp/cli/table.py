@@ -23,7 +23,7 @@ from memmlp.common.errors import InputError
 from memmlp.sweep.definition import BRANCHES
 
 if TYPE_CHECKING:
-    from memmlp.cli.sweep_with_rounds import SweepWithRounds
+    from memmlp.cli.shown_sweep import ShownSweep
     from memmlp.sweep.definition import Sweep
     from memmlp.tables.effects import RunsBySeed
     from memmlp.tables.runs_of_plan import Read
@@ -186,7 +186,7 @@ def gathered(
     Raises:
         InputError: if none of them can be composed with the command line's overrides, or has that part.
     """
-    from memmlp.cli.sweep_with_rounds import sweep_with_rounds
+    from memmlp.cli.shown_sweep import shown_sweep
     from memmlp.common.progress import progress_bar
     from memmlp.tables.build_table import without_runs
 
@@ -199,7 +199,7 @@ def gathered(
 
             check_costs(sweep)
         try:
-            known = sweep_with_rounds(sweep, overrides, outputs.absolute())
+            known = shown_sweep(sweep, overrides, outputs.absolute())
             found.append(table_of_plan(known, modes, command, read, part))
         except InputError as error:
             failures.append(error)
@@ -212,7 +212,7 @@ def gathered(
 
 
 def table_of_plan(
-    shown: SweepWithRounds,
+    shown: ShownSweep,
     modes: Sequence[str],
     command: str,
     read: Read,

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from memmlp.tables.seed_rounds import Rounds
 
 
-class SweepWithRounds(NamedTuple):
+class ShownSweep(NamedTuple):
     """The part of a sweep that a table shows, if seeds may have been spent in rounds.
 
     Attributes:
@@ -30,7 +30,7 @@ class SweepWithRounds(NamedTuple):
     flags: tuple[str, ...] = ()
 
 
-def sweep_with_rounds(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> SweepWithRounds:
+def shown_sweep(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> ShownSweep:
     """Return the sweep with its rounds, if rounds were taken and fit the sweep's present form.
 
     Otherwise the sweep is shown with its own seeds; if rounds were taken, a flag says so.
@@ -41,19 +41,17 @@ def sweep_with_rounds(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> 
     path = rounds_path(sweep, outputs)
     kept = read(path)
     if kept is None or not kept.taken:
-        return SweepWithRounds(sweep, make_plan(sweep, outputs), None)
+        return ShownSweep(sweep, make_plan(sweep, outputs), None)
     seeds_given = any(word.startswith("seed=") for word in overrides)
     if flag := flag_of_other_rounds(kept, sweep, seeds_given):
-        return SweepWithRounds(sweep, make_plan(sweep, outputs), None, (flag,))
+        return ShownSweep(sweep, make_plan(sweep, outputs), None, (flag,))
     spent = kept.spent(sweep)
     plan = make_plan(spent, outputs)
     try:
         same_runs(kept, sweep, plan, path)
     except InputError as error:
-        return SweepWithRounds(
-            spent, plan, None, (f"seeds were spent in rounds, but not of these runs: {error}",)
-        )
-    return SweepWithRounds(spent, plan, kept)
+        return ShownSweep(spent, plan, None, (f"seeds were spent in rounds, but not of these runs: {error}",))
+    return ShownSweep(spent, plan, kept)
 
 
 def flag_of_other_rounds(kept: Rounds, sweep: Sweep, seeds_given: bool = False) -> str | None:

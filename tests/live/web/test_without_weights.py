@@ -9,7 +9,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from memmlp.deploy.latency import YARDSTICK_SHAPE, yardstick
-from memmlp.live.web.separate_weights import LEAST, LOCATION, without_weights
+from memmlp.live.web.without_weights import LEAST, LOCATION, without_weights
 
 
 def drawn_bytes(drawn: list) -> bytearray:
