@@ -39,8 +39,6 @@ def demo(overrides: tuple[str, ...]) -> None:
     if both:
         outcomes += train_demo([*overrides, RECURRENT_POSER])
     if len(outcomes) == len(NETWORKS):
-        if "profile=tiny" in overrides:
-            click.echo("profile=tiny trains for a few steps: these errors say nothing of the networks")
         show_side_by_side(dict(zip(NETWORKS, outcomes, strict=True)))
     click.echo(f"the demo took {(time.monotonic() - started) / 60:.1f} minutes")
     click.echo(next_steps(overrides, unentered(), [one.run.id for one in outcomes]))

@@ -81,6 +81,7 @@ def save_command(
     from memmlp.config.compose_plan import find_sweep, is_path
     from memmlp.report.kept_results import Kept, load_kept, overrides_of, save, without_paths
     from memmlp.tables.build_table import finished_runs
+    from memmlp.tables.flag_words import listed
     from memmlp.tables.measured_run import load
     from memmlp.tables.runs_of_plan import run_finder
     from memmlp.tables.seed_rounds import as_json
@@ -124,6 +125,8 @@ def save_command(
     save(path, merged)
     here = f"from here{''.join(f' and {origin}' for origin in files)}"
     click.echo(f"{path}: {merged.count} runs, {kept.count - its_own} of them {here}")
+    if lacking := _lacking(known.sweep, merged):
+        click.echo(f"missing of the sweep: {listed(lacking)}; make them with: {kept.command}")
 
 
 folder_option = click.option(
@@ -282,6 +285,15 @@ def _outdated(kept: Kept) -> list[str]:
 def _count(runs: Mapping[str, RunsBySeed]) -> int:
     """Return the number of runs; arms that differ in their evaluation alone have the same ones."""
     return len({run.id for by_seed in runs.values() for run in by_seed.values()})
+
+
+def _lacking(sweep: Sweep, kept: Kept) -> list[str]:
+    """Return what kept results lack of a sweep: the arms without all seeds, with those that are missing."""
+    gaps = {
+        arm.label: [seed for seed in sweep.seeds_of(arm) if seed not in kept.runs.get(arm.label, {})]
+        for arm in sweep.runnable()
+    }
+    return [f"'{label}' seed {', '.join(map(str, seeds))}" for label, seeds in gaps.items() if seeds]
 
 
 def _merged(path: Path, before: Kept, kept: Kept, ids: Mapping[tuple[str, int], str]) -> Kept:

@@ -16,7 +16,7 @@ from memmlp.runs.deployment_folder import as_deployed, deployed_precision
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import BRANCHES
 from memmlp.tables.flags_of_runs import CORE
-from memmlp.tables.measured_run import SAME, SHARED, Errors, load
+from memmlp.tables.measured_run import SAME, SHARED, Errors, frames_seen, hardly_trained, load
 
 STAGES = ("training", "evaluation", "deployment")
 COLUMNS = [(mode, branch) for mode in ("stream", "window") for branch in BRANCHES]
@@ -31,6 +31,8 @@ def show(outcome: Outcome) -> None:
         console.print(f"on a part of the data: {partial}", style="yellow", soft_wrap=True)
     if changed := run.changed_sources:
         console.print(older_code(run, changed), style="yellow", soft_wrap=True)
+    if hardly := hardly_trained({"frames": frames_seen(run)}):
+        console.print(hardly, style="yellow", soft_wrap=True)
     console.print(metrics_table(results))
     for table in source_tables(run, outcome.stages):
         console.print(table)

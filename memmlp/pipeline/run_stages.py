@@ -335,7 +335,8 @@ def train_run(
     """Train the network of a run, and mark the run as done."""
     steps = experiment.training.optim.steps
     onward = ", on from its checkpoint" if run.checkpoint.exists() else ""
-    tell(f"network: train it for {steps} steps{onward} (run {run.id})")
+    say = remark if onward else tell  # a progress bar does not tell why it begins in the middle
+    say(f"network: train it for {steps} steps{onward} (run {run.id})")
     begin(experiment, run, experiment.identity(data.digest), experiment.config)
     if files := computed_imports(run.manifest.get("plugins") or {}):
         remark(f"plugins: edits are not seen of what is imported by computed names ({files})")

@@ -34,7 +34,8 @@ def find_run(outputs: Path | str, name: str) -> Run:
         return Run(Path(name).resolve())
     if not matches:
         raise InputError(
-            f"run '{name}': no such folder, and the id of none of the {len(known)} runs in {where} begins so"
+            f"run '{name}': no such folder, and the id of none of the {len(known)} runs in {where} begins so "
+            "(memmlp runs list)"
         )
     ids = _enumerate(sorted(run.id for run in matches))
     raise InputError(f"run '{name}': {len(matches)} ids begin so: {ids}")

@@ -13,7 +13,7 @@ from memmlp.sweep.definition import COSTS, Arm, Sweep
 from memmlp.tables import flags_of_code
 from memmlp.tables.effects import RunsBySeed, control_arm, one_and_the_same
 from memmlp.tables.flag_words import flags_of_difference, listed, quoted, unique
-from memmlp.tables.measured_run import SHARED, UNKNOWN, Measured
+from memmlp.tables.measured_run import SHARED, UNKNOWN, Measured, hardly_trained
 
 DescribeRun = Callable[[Arm, int], str | None]
 BUILT_IN = "builtin"
@@ -75,6 +75,8 @@ def flags(
     if TIMES & set(sweep.metrics):
         yield from flags_of_difference("machine of the times", _timed(every))
         yield from _busy(sweep, runs)
+    if set(sweep.metrics) - set(COSTS):
+        yield from _hardly_trained(every)
     yield from _seen(sweep, runs)
     yield from _partial(every)
     yield from _divided_subjects(every)
@@ -268,6 +270,15 @@ def _calmer_than_truth(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable
     for (mode, truth), arms in calmer.items():
         less = f"Jitter below the truth's {truth} ({mode}): {listed(arms)}"
         yield f"{less}; calmer than the motion itself is no better"
+
+
+def _hardly_trained(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
+    """Flag arms whose networks saw so little motion that their errors are those of the first weights."""
+    for said in unique(hardly_trained(run.training) for _, run in every):
+        labels = unique(label for label, run in every if hardly_trained(run.training) == said)
+        if said:
+            which = "every arm" if len(labels) == len({label for label, _ in every}) else quoted(labels)
+            yield f"{said}: {which}"
 
 
 def _seen(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:

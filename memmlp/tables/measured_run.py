@@ -22,6 +22,7 @@ from memmlp.runs.run import Run
 Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # values by mode, branch and metric
 UNKNOWN = "?"
 SHARED = "MPJPE"  # a metric that both branches have
+LITTLE = 30 * 60 * 60  # frames: half an hour at 60 a second; `profile=small` draws 23 times as many
 SAME = 1e-4  # relative difference up to which two errors count as those of the same joints (float32)
 
 
@@ -263,6 +264,19 @@ def frames_seen(run: Run) -> float:
         return seen
     before = frames_seen(Run(run.folder.parent / str(run.manifest.get("upstream"))))
     return seen + before if seen and before else 0.0
+
+
+def hardly_trained(training: Mapping[str, float]) -> str:
+    """Return a warning if a network saw less than half an hour of motion in training; empty otherwise.
+
+    Args:
+        training: what its training took, as in `Measured.training`.
+    """
+    seen = training.get("frames") or math.inf
+    if seen >= LITTLE:
+        return ""
+    minutes = f"{seen / 3600:.2g} minutes of motion"
+    return f"hardly trained, on {minutes} with repetitions, so that errors say nothing of the network"
 
 
 def _join(known: dict[str, Any], more: Mapping[str, Any]) -> None:

@@ -62,6 +62,7 @@ def test_import_warns_with_the_same_sentences(source: Path) -> None:
     assert f"warning: b.bvh: {'; '.join(sentences)}" in said.splitlines()
     assert "skipped c.bvh: no MOTION" in said
     assert len(list((source.parent / "out").glob("*.npz"))) == 2
+    assert "next: memmlp train data=mocap data.root=out" in said.splitlines()
     assert "1 clip, 0.5 seconds, skeleton cmu_daz" in run(
         source.parent, "data", "import", "source/a.bvh", "--out", "one"
     )
@@ -101,3 +102,10 @@ def test_wrong_options_write_nothing(source: Path, options: tuple[str, ...], sai
     told = run(source.parent, "data", "import", "source", "--out", "out", *options, code=2)
     assert said in told
     assert not (source.parent / "out").exists()
+
+
+def test_an_import_names_the_grouping_of_its_clips(source: Path) -> None:
+    (source / "a.bvh").rename(source / "dataset-1_walk_active_001.bvh")
+    said = run(source.parent, "data", "import", "source", "--out", "a folder")
+    chosen = "data/grouping@data.split=bandai_namco"
+    assert f"next: memmlp train data=mocap 'data.root=a folder' {chosen}" in said.splitlines()

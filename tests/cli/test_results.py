@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,7 +17,7 @@ from memmlp.config import compose_plan
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.plan import Entry, Plan
 from memmlp.sweep.sweep_file import parse_sweep
-from memmlp.tables.build_table import finished_runs
+from memmlp.tables.build_table import Find, finished_runs
 from memmlp.tables.effects import RunsBySeed
 
 
@@ -167,6 +168,20 @@ def test_pages_without_data_go(memmlp: Memmlp, planned: None):
     assert "small.md" in memmlp("results", "docs", "--check").err
     memmlp("results", "docs")
     assert [path.name for path in Path("docs/results").glob("*.md")] == ["notes.md"]
+
+
+def test_what_a_sweep_lacks_is_told(memmlp: Memmlp, planned: None, monkeypatch: pytest.MonkeyPatch):
+    assert "missing" not in memmlp("results", "save", "14").out
+    monkeypatch.setattr("memmlp.tables.build_table.finished_runs", without_the_last_seed)
+    said = memmlp("results", "save", "14", "--name", "fewer").out.splitlines()[-1]
+    assert re.fullmatch(
+        r"missing of the sweep: ('[^']+' seed 2(, )?){4}; make them with: memmlp sweep .*", said
+    )
+
+
+def without_the_last_seed(sweep: Sweep, find: Find) -> dict[str, RunsBySeed]:
+    found = finished_runs(sweep, find)
+    return {label: {seed: run for seed, run in runs.items() if seed < 2} for label, runs in found.items()}
 
 
 def test_prose_with_a_claim_is_refused(memmlp: Memmlp, planned: None):

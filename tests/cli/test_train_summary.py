@@ -53,6 +53,13 @@ def test_brackets_in_a_folders_name_are_shown(tmp_path: Path, capsys: pytest.Cap
     assert f"run      {run.folder}\n" in capsys.readouterr().out
 
 
+def test_a_network_that_hardly_saw_motion_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    for steps, told in ((2000, False), (20, True)):
+        config = {"optim": {"steps": steps, "batch": 8}, "model": {"frames": 11}}
+        show(Outcome(fake_run(tmp_path, f"of {steps}", config=config), (), {}, ()))
+        assert ("hardly trained" in capsys.readouterr().out) == told
+
+
 def test_times_and_size_are_those_of_the_file_that_was_asked_for():
     times = {"median_ms": 3.39, "p95_ms": 3.5, "ratio_to_yardstick": 1.2, "settings": {"precision": "int8"}}
     record = MEASURED | times

@@ -31,7 +31,8 @@ def test_the_newest_run_is_first(tmp_path: Path):
 def test_no_such_run_is_one_line(tmp_path: Path, name: str):
     begun(tmp_path)
     with pytest.raises(
-        InputError, match=r"no such folder, and the id of none of the \d+ runs in .*runs begins so"
+        InputError,
+        match=r"no such folder, and the id of none of the \d+ runs in .*runs begins so \(memmlp runs list\)",
     ):
         find_run(tmp_path, name)
 

@@ -137,6 +137,28 @@ def test_a_clip_on_which_every_run_diverged_is_flagged(sweep: Sweep, tmp_path: P
     assert all(f"'{arm.label}' seed 0 (1 clips)" in line for arm in sweep.runnable())
 
 
+def test_networks_that_hardly_saw_motion_are_told(sweep: Sweep, tmp_path: Path):
+    """As with `profile=tiny`, whose tables otherwise look like any other."""
+    small, tiny = (
+        {"optim": {"steps": steps, "batch": batch}, "model": {"frames": frames}}
+        for steps, batch, frames in ((2000, 32, 41), (20, 8, 11))
+    )
+
+    def flags(*hardly: str) -> list[str]:
+        runs = {
+            arm.label: fake_run(tmp_path, arm.label, config=tiny if arm.label in hardly else small)
+            for arm in sweep.runnable()
+        }
+        table = table_of(replace(sweep, seeds=(0,)), lambda arm, seed: runs[arm.label])
+        return [flag for flag in table.flags if "hardly" in flag]
+
+    said = "hardly trained, on 0.49 minutes of motion with repetitions, so that "
+    said += "errors say nothing of the network"
+    assert flags() == []
+    assert flags("no | memory") == [f"{said}: 'no | memory'"]
+    assert flags(*(arm.label for arm in sweep.runnable())) == [f"{said}: every arm"]
+
+
 def test_motion_calmer_than_the_true_one_is_said(sweep: Sweep, tmp_path: Path):
     """Where a network hardly follows, the best Jitter of a table is its own."""
     find = fake_sweep(tmp_path, sweep)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -54,6 +55,7 @@ def import_(
     SOURCE is a folder or one file. The clips are brought to the 22-joint tree, and each is compared with its
     file; what looks wrong is said.
     """
+    from memmlp.config.shipped_groupings import grouping_to_choose
     from memmlp.motion.importing.import_folder import ImportSettings, import_folder
 
     rates = _rates(fps)
@@ -67,7 +69,9 @@ def import_(
     seconds = sum(clip.frames / clip.fps for clip in report.clips)
     maps = ", ".join(sorted({clip.skeleton for clip in report.clips}))
     click.echo(f"{amount(len(report.clips), seconds)}, skeleton {maps}, in {out}")
-    click.echo(f"next: memmlp train data=mocap data.root={out}")
+    grouping = grouping_to_choose([Path(clip.clip).with_suffix("").as_posix() for clip in report.clips])
+    chosen = [f"data/grouping@data.split={grouping}"] if grouping else []
+    click.echo("next: " + shlex.join(["memmlp", "train", "data=mocap", f"data.root={out}", *chosen]))
 
 
 def _rates(texts: Sequence[str]) -> dict[str, float]:

@@ -77,7 +77,8 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
     query = parse(where) if where else None
     there = lookup.list_runs(outputs)
     if not there:
-        click.echo(f"no runs in {outputs / 'runs'}; memmlp demo makes the first")
+        told = "memmlp demo makes the first; --outputs FOLDER or MEMMLP_OUTPUTS names another folder"
+        click.echo(f"no runs in {outputs.absolute() / 'runs'}: {told}")
         return
     found = there if every or query else [run for run in there if not is_finished_upstream(run)]
     limit = len(found) if every or query or sort else NEWEST

@@ -141,7 +141,7 @@ class FolderPaths:
         return bool(paths) and known and len(set(map(Path, paths))) == len(paths)
 
     def __str__(self) -> str:
-        return "an existing folder, or a list of several"
+        return "an existing folder of npz clips, such as memmlp data import makes, or a list of several"
 
 
 @dataclass(frozen=True)

@@ -243,7 +243,7 @@ class LiveServer(ThreadingHTTPServer):
         except (OSError, OverflowError) as error:
             taken = getattr(error, "errno", None) == errno.EADDRINUSE
             reason = "taken" if taken else getattr(error, "strerror", None) or error
-            allowed = "allowed are this machine's addresses and free ports (0: any that is free)"
+            allowed = "allowed are this machine's addresses and free ports (--port 0: any that is free)"
             raise InputError(f"--host {host} --port {port}: {reason}; {allowed}") from None
 
     def server_bind(self) -> None:

@@ -123,7 +123,8 @@ def unfitting(split: Mapping[str, Any], names: Collection[str]) -> str:
         said += [
             "each clip counts as independent of all others, and clips of one person may lie in training and "
             f"in test: no clip's name fits the {len(patterns)} patterns of data.split.groups that tie clips "
-            f"together (the first is {patterns[0]}); data.split.groups_file can list who is in which clip"
+            f"together (the first is {patterns[0]}); data/grouping@data.split=NAME has those of other "
+            "collections, and data.split.groups_file can list who is in which clip"
         ]
     return "; ".join(said)
 

@@ -200,7 +200,7 @@ class RunsServer(ThreadingHTTPServer):
             super().__init__((host, port), RunsHandler)
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
-            allowed = "allowed are this machine's addresses and free ports (0: any that is free)"
+            allowed = "allowed are this machine's addresses and free ports (--port 0: any that is free)"
             raise InputError(f"--host {host} --port {port}: {reason}; {allowed}") from None
 
     def server_bind(self) -> None:

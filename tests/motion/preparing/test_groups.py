@@ -57,7 +57,8 @@ def test_patterns_that_fit_no_clip_are_told():
     assert unfitting(split, ["ann/1", "ben/2"]) == (
         "each clip counts as independent of all others, and clips of one person may lie in training and in "
         "test: no clip's name fits the 2 patterns of data.split.groups that tie clips together (the first is "
-        "^(S[0-9])_); data.split.groups_file can list who is in which clip"
+        "^(S[0-9])_); data/grouping@data.split=NAME has those of other collections, and "
+        "data.split.groups_file can list who is in which clip"
     )
     assert unfitting(split, ["ann/1", "S1_2"]) == unfitting({"groups": []}, ["ann/1"]) == ""
     assert unfitting(split, ["CMU/CMU/01/take1"]) == ""

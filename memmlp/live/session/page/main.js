@@ -93,7 +93,8 @@ addEventListener('keydown', event => {
 function status() {
   if (events.readyState !== EventSource.OPEN) return ['gone', 'not connected'];
   if (performance.now() - arrived > QUIET) {
-    return ['', malformed ? `waiting for trackers, ${malformed} packets malformed` : 'waiting for trackers'];
+    const waiting = `waiting for ${greeting?.worn ? 'trackers' : 'the clip'}`;
+    return ['', malformed ? `${waiting}, ${malformed} packets malformed` : waiting];
   }
   return history.paused ? ['', 'paused'] : ['live', 'live'];
 }
