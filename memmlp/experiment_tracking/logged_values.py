@@ -209,7 +209,7 @@ class SweepFacts:
     Attributes:
         name: the name of its folder, which differs between command lines of one sweep file.
         folder: the sweep's folder.
-        status: "running", "done" or "failed".
+        status: "running", "stopped" (unfinished, and nobody is at it), "done" or "failed".
         arms: run id -> the label of its arm.
         aggregates: means over seeds, by LABEL/MODE/METRIC.
         verdicts: verdicts on differences from the controls, by LABEL/MODE/METRIC.

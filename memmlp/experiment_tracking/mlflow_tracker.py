@@ -32,7 +32,9 @@ QUIET = {
 }
 CHATTY = ("mlflow", "alembic", "urllib3")
 EXPERIMENT = "memmlp"
-STATUS = {"running": "RUNNING", "done": "FINISHED", "failed": "FAILED", "killed": "KILLED"}
+STATUS = {
+    "running": "RUNNING", "done": "FINISHED", "failed": "FAILED", "killed": "KILLED", "stopped": "KILLED",
+}  # fmt: skip
 PARAM_LENGTH, TAG_LENGTH = 6000, 5000  # MLflow's limits
 PARAMS, METRICS = 100, 1000
 

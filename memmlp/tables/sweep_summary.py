@@ -27,14 +27,21 @@ def summary(plan: Plan, table: Table) -> dict[str, Any]:
         for mode, metrics in row.cells.items()
         for metric, cell in metrics.items()
     }
-    states = plan.counts()
     return {
         "name": plan.name,
-        "status": "failed" if states["failed"] else "running" if plan.left() else "done",
+        "status": _status(plan),
         "labels": _labels(plan),
         "aggregates": {key: cell.mean for key, cell in cells.items() if cell.mean is not None},
         "verdicts": {key: verdict for key, cell in cells.items() if (verdict := _verdict(cell))},
     }
+
+
+def _status(plan: Plan) -> str:
+    """Return "failed" if a run failed, "running" while one is worked on, "stopped" or "done"."""
+    states = plan.counts()
+    return next(
+        (word for word in ("failed", "running") if states[word]), "stopped" if plan.left() else "done"
+    )
 
 
 def _labels(plan: Plan) -> dict[str, str]:

@@ -60,13 +60,16 @@ def test_a_run_of_two_arms_has_both_labels_and_means_that_are_no_numbers_are_lef
     assert "none/stream/MPJPE" in facts.aggregates
 
 
-def test_a_sweep_with_a_failed_run_failed_and_one_with_a_missing_run_goes_on(tmp_path: Path):
+def test_a_sweep_with_a_failed_run_failed_and_one_with_a_missing_run_stopped(tmp_path: Path):
     sweep = load_sweep(written(tmp_path))
     table, run = table_of(sweep, fake_sweep(tmp_path, sweep)), fake_run(tmp_path, "other")
     entry, task = Entry("full", 0, run.id), RunTask(run.id, "memmlp", {})
     plan = Plan("mine", tmp_path, (entry,), (task,))
     run.marker.unlink()
     write_summary(plan, table, tmp_path)
+    assert read_json(tmp_path / "summary.json")["status"] == "stopped"
+    with run.lock():
+        write_summary(plan, table, tmp_path)
     assert read_json(tmp_path / "summary.json")["status"] == "running"
     run.fail("why")
     write_summary(plan, table, tmp_path)
