@@ -16,9 +16,9 @@ from memmlp.report.ui.searches import Searches
 from memmlp.report.ui.sweeps import Sweeps
 from memmlp.report.ui.users_of_run import uses_by_run
 from memmlp.runs.identity import ID
+from memmlp.sweep.definition import MODES
 
 MOST_CURVES = 60  # runs whose curves are told at once
-MODES = ("stream", "window")
 
 
 class Answers:
