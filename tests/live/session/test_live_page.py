@@ -79,10 +79,13 @@ def test_it_plays_pauses_and_goes_back(browser: Browser, url: str):
     assert browser.errors == []
 
 
-def test_it_says_what_it_waits_for_and_when_the_command_has_ended(browser: Browser, clip: TrackedClip):
-    with LiveServer(Hub(greeting(ClipSource(clip, 60), "tiny")), 0) as server:
+@pytest.mark.parametrize(("worn", "what"), [(True, "trackers"), (False, "the clip")])
+def test_it_says_what_it_waits_for_and_when_the_command_has_ended(
+    browser: Browser, clip: TrackedClip, worn: bool, what: str
+):
+    with LiveServer(Hub(greeting(ClipSource(clip, 60), "tiny") | {"worn": worn}), 0) as server:
         browser.open(server.url)
-        browser.wait("document.querySelector('#status').textContent == 'waiting for trackers'")
+        browser.wait(f"document.querySelector('#status').textContent == 'waiting for {what}'")
         assert browser.value("document.querySelector('#error').hidden")  # of no frame there is no error
         browser.wait("document.querySelector('#trackers').classList.contains('waiting')")
         server.hub.publish({"dropped": 0, "malformed": 3})
