@@ -289,11 +289,11 @@ def _count(runs: Mapping[str, RunsBySeed]) -> int:
 
 def _lacking(sweep: Sweep, kept: Kept) -> list[str]:
     """Return what kept results lack of a sweep: the arms without all seeds, with those that are missing."""
-    gaps = {
-        arm.label: [seed for seed in sweep.seeds_of(arm) if seed not in kept.runs.get(arm.label, {})]
-        for arm in sweep.runnable()
-    }
-    return [f"'{label}' seed {', '.join(map(str, seeds))}" for label, seeds in gaps.items() if seeds]
+    from memmlp.tables.flags_of_runs import gaps
+
+    runs = {arm.label: kept.runs.get(arm.label, {}) for arm in sweep.runnable()}
+    lacking = {arm.label: gaps(sweep, arm, runs) for arm in sweep.runnable()}
+    return [f"'{label}' seed {', '.join(map(str, seeds))}" for label, seeds in lacking.items() if seeds]
 
 
 def _merged(path: Path, before: Kept, kept: Kept, ids: Mapping[tuple[str, int], str]) -> Kept:

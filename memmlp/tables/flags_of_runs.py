@@ -111,17 +111,17 @@ def _other_data(sweep: Sweep) -> Iterable[str]:
 
 def _missing(sweep: Sweep, runs: Mapping[str, RunsBySeed], command: str, state: DescribeRun) -> Iterable[str]:
     """Flag the missing runs, with their states, and the command that makes them."""
-    gaps = {}
+    lacking: dict[str, str] = {}
     for arm in sweep.runnable():
-        seeds = _gaps(sweep, arm, runs)
+        seeds = gaps(sweep, arm, runs)
         if seeds:
             states = unique(word for seed in seeds if (word := state(arm, seed)))
             words = f" ({', '.join(states)})" if states else ""
-            gaps[arm.label] = f"seed {', '.join(map(str, seeds))}{words}"
-    alike = 1 < len(sweep.runnable()) == len(gaps) and len(set(gaps.values())) == 1
-    told = [f"'{label}' {gap}" for label, gap in gaps.items()]
-    if gaps:
-        every = f"every arm's {next(iter(gaps.values()))}"
+            lacking[arm.label] = f"seed {', '.join(map(str, seeds))}{words}"
+    alike = 1 < len(sweep.runnable()) == len(lacking) and len(set(lacking.values())) == 1
+    told = [f"'{label}' {gap}" for label, gap in lacking.items()]
+    if lacking:
+        every = f"every arm's {next(iter(lacking.values()))}"
         yield f"missing: {every if alike else listed(told)}; fill with: {command}"
 
 
@@ -130,7 +130,7 @@ def _older(sweep: Sweep, runs: Mapping[str, RunsBySeed], older: DescribeRun) -> 
     found = [
         f"'{arm.label}' seed {seed} ({run})"
         for arm in sweep.runnable()
-        for seed in _gaps(sweep, arm, runs)
+        for seed in gaps(sweep, arm, runs)
         if (run := older(arm, seed))
     ]
     if found:
@@ -142,7 +142,7 @@ def early_looks(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
 
     Testing them now and again later inflates the false-positive rate.
     """
-    early = [arm.label for arm in sweep.runnable() if len(runs[arm.label]) > 1 and _gaps(sweep, arm, runs)]
+    early = [arm.label for arm in sweep.runnable() if len(runs[arm.label]) > 1 and gaps(sweep, arm, runs)]
     if early:
         yield (
             "not all seeds are there: a table that is looked at again as they come has a star by chance more "
@@ -150,7 +150,8 @@ def early_looks(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
         )
 
 
-def _gaps(sweep: Sweep, arm: Arm, runs: Mapping[str, RunsBySeed]) -> list[int]:
+def gaps(sweep: Sweep, arm: Arm, runs: Mapping[str, RunsBySeed]) -> list[int]:
+    """Return the seeds of an arm for which there is no run."""
     return [seed for seed in sweep.seeds_of(arm) if seed not in runs[arm.label]]
 
 
