@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 from collections.abc import Mapping
 from ipaddress import IPv4Network
 from pathlib import Path
@@ -204,7 +205,7 @@ def check_options(given: InputOptions, shown: ShowOptions, send: bool) -> None:
         raise InputError("--hz: is of a clip; packets come at whatever rate; allowed is a clip, or --send")
     if send and (shown.vmc or shown.vrchat or shown.record or shown.avatar):
         raise InputError(
-            "--send: sends a clip's trackers alone; allowed with it is no --vmc, --vrchat or --record"
+            "--send: sends trackers alone; allowed with it is no --vmc, --vrchat, --record or --avatar"
         )
     if given.osc is not None:
         needs_osc()
@@ -253,6 +254,8 @@ def load_clip(given: InputOptions) -> TrackedClip:
         raise InputError(
             f"{given.network}: has no test clips; allowed with it are --clip FILE.npz, --udp and --osc"
         )
+    if sys.stderr.isatty():  # somebody waits, for seconds
+        note(f"opening run {given.network} and its test clips")
     from memmlp.config.open_run import clip_index, open_run
 
     test = open_run(given.outputs, given.network).test

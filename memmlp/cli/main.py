@@ -47,7 +47,7 @@ COMMANDS = {
     "predict": Command("predict", "predict", "What a network makes of clips, as BVH, glTF or npz."),
     "render": Command("render", "render", "Figures and films of runs beside the truth, coloured by error."),
     "live": Command("live", "live", "A network live on a local page: a clip, or trackers by UDP or OSC."),
-    "web": Command("web", "web", "A site that times, plays and wears networks in any browser."),
+    "web": Command("web", "web", "A site that times and plays networks in any browser, and on a headset."),
     "export": Command("export", "export", "ONNX file of a finished run."),
     "bench": Command("bench", "bench", "Measure this machine; sweeps and searches under kills."),
 }

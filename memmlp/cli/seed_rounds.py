@@ -74,12 +74,12 @@ def run_until_decided(
     """
     from dataclasses import replace
 
-    from memmlp.config.compose_plan import make_plan
+    from memmlp.config.compose_plan import kept_or_new_plan
     from memmlp.tables.seed_rounds_file import same_runs
 
     while True:
         spent = rounds.spent(sweep)
-        plan = replace(make_plan(spent, outputs, prepare=True), fail_fast=fail_fast)
+        plan = replace(kept_or_new_plan(spent, outputs, prepare=True), fail_fast=fail_fast)
         same_runs(rounds, sweep, plan, rounds_path(sweep, outputs))
         if plan.left():
             work(spent, plan)

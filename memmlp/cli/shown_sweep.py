@@ -35,18 +35,18 @@ def shown_sweep(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> ShownS
 
     Otherwise the sweep is shown with its own seeds; if rounds were taken, a flag says so.
     """
-    from memmlp.config.compose_plan import make_plan
+    from memmlp.config.compose_plan import kept_or_new_plan
     from memmlp.tables.seed_rounds_file import read, same_runs
 
     path = rounds_path(sweep, outputs)
     kept = read(path)
     if kept is None or not kept.taken:
-        return ShownSweep(sweep, make_plan(sweep, outputs), None)
+        return ShownSweep(sweep, kept_or_new_plan(sweep, outputs), None)
     seeds_given = any(word.startswith("seed=") for word in overrides)
     if flag := flag_of_other_rounds(kept, sweep, seeds_given):
-        return ShownSweep(sweep, make_plan(sweep, outputs), None, (flag,))
+        return ShownSweep(sweep, kept_or_new_plan(sweep, outputs), None, (flag,))
     spent = kept.spent(sweep)
-    plan = make_plan(spent, outputs)
+    plan = kept_or_new_plan(spent, outputs)
     try:
         same_runs(kept, sweep, plan, path)
     except InputError as error:

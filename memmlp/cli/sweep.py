@@ -78,7 +78,7 @@ def sweep(
     """
     from memmlp.cli import seed_rounds
     from memmlp.cli.shown_sweep import ShownSweep, spent_before
-    from memmlp.config.compose_plan import find_sweep, make_plan, sweep_folder
+    from memmlp.config.compose_plan import find_sweep, kept_or_new_plan, sweep_folder
 
     seed_rounds.check(overrides, until_decided, max_seeds)
     if again and (until_decided or status or dry_run):
@@ -90,7 +90,7 @@ def sweep(
     outputs = outputs.absolute()
     rounds = seed_rounds.current_rounds(chosen, outputs, max_seeds) if until_decided else None
     spent = rounds.spent(chosen) if rounds else chosen
-    plan = make_plan(spent, outputs, prepare=not (status or dry_run))
+    plan = kept_or_new_plan(spent, outputs, prepare=not (status or dry_run))
     wanted = plan.of_arms(labels)
     if status or dry_run:
         show(spent, plan, labels)

@@ -34,7 +34,7 @@ def show(outcome: Outcome) -> None:
     if hardly := hardly_trained({"frames": frames_seen(run)}):
         console.print(hardly, style="yellow", soft_wrap=True)
     console.print(metrics_table(results))
-    for table in source_tables(run, outcome.stages):
+    for table in source_tables(run, outcome.stage_ids):
         console.print(table)
     if "latency" in results:
         show_latency(console, results["latency"])

@@ -236,7 +236,7 @@ def hire(folder: Path, plan: Plan, workers: Workers, devices: Iterable[str]) -> 
     Raises:
         InputError: if workers can't have the GPUs that are asked for.
     """
-    from memmlp.config.worker_process import start_lone_worker, start_worker
+    from memmlp.config.worker_process import work_alone, work_under_controller
     from memmlp.sweep.controller import Fleet
     from memmlp.sweep.worker import Presence
 
@@ -251,7 +251,7 @@ def hire(folder: Path, plan: Plan, workers: Workers, devices: Iterable[str]) -> 
     gpu = made.gpus and not named <= WITHOUT
     if workers.executor == "local":
         threads = max((os.cpu_count() or 1) // count, 1)
-        task = partial(start_worker, str(path), threads, str(presence.path), gpu)
+        task = partial(work_under_controller, str(path), threads, str(presence.path), gpu)
     else:
-        task = partial(start_lone_worker, str(path), gpu)
+        task = partial(work_alone, str(path), gpu)
     return path, Fleet(made, task, count, folder / "workers", presence)

@@ -156,14 +156,14 @@ def build_tracking(cfg: DictConfig) -> Tracking:
 
 def build_architecture(cfg: DictConfig) -> Architecture:
     """Build the architecture of a checked config, which makes and loads the network."""
-    network = build_network(cfg)
+    network = build_unrefined_architecture(cfg)
     if cfg.refiner is None:
         return network
     frame = {name: getattr(network, name) for name in ("coordinates", "normalize", "vqvae")}
     return RefinedArchitecture(**frame, network=network, refiner=built(cfg.refiner))
 
 
-def build_network(cfg: DictConfig) -> Architecture:
+def build_unrefined_architecture(cfg: DictConfig) -> Architecture:
     """Build the architecture of a checked config's network, without a refiner."""
     frame = {"coordinates": build_coordinates(cfg.frame.coordinates), "normalize": cfg.frame.normalize}
     vqvae = partial(VQVAE, **{name: cfg.vqvae[name] for name in VQVAE_SETTINGS})

@@ -42,7 +42,7 @@ EXPERIMENT = "experiment"
 
 
 def parse(argv: Sequence[str]) -> tuple[argparse.Namespace, argparse.ArgumentParser]:
-    """Parse Hydra's command line; flags may be anywhere among the overrides.
+    """Parse Hydra's command line, and import the packages that it names; flags may be among the overrides.
 
     Raises:
         InputError: for flags that Hydra does not know or that are not allowed here.
@@ -146,7 +146,7 @@ def _above(config: str, parents: Mapping[str, str | None]) -> Iterator[str]:
 def check_words(args: argparse.Namespace) -> None:
     """Raise InputError for what Hydra would leave out without a word: a hidden file, a second experiment."""
     _check_hidden(args)
-    _jobs(args)
+    _jobs(args)  # refuses a second experiment
 
 
 def preflight(args: argparse.Namespace) -> list[DictConfig]:

@@ -123,8 +123,8 @@ def sweep_folder(sweep: Sweep, outputs: Path) -> Path:
     return as_written if as_written.is_dir() else same_for_all
 
 
-def make_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
-    """Return the plan of a sweep: the kept plan if it is still valid.
+def kept_or_new_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
+    """Return the kept plan of a sweep if it is still valid, or else a new one, which is kept.
 
     Looking at a sweep that was never started writes nothing into the outputs. Looking at fewer of its seeds,
     or while its data is absent, leaves the kept plan unchanged.
@@ -166,7 +166,7 @@ def plan_anew(sweep: Sweep, outputs: Path) -> Plan:
     """Return the plan of a sweep as far as its data is prepared, and write nothing into the outputs.
 
     Raises:
-        InputError: as `make_plan` does.
+        InputError: as `kept_or_new_plan` does.
     """
     return _plan(sweep, outputs, prepare=False)[0]
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from memmlp.pipeline.experiment import Experiment
 
 
-def start_worker(path: str, threads: int, controller: str, gpu: bool) -> str | None:
+def work_under_controller(path: str, threads: int, controller: str, gpu: bool) -> str | None:
     """Work on the tasks of the plan in a file for as long as its controller's process is alive.
 
     Args:
@@ -35,7 +35,7 @@ def start_worker(path: str, threads: int, controller: str, gpu: bool) -> str | N
     return None
 
 
-def start_lone_worker(path: str, gpu: bool) -> str | None:
+def work_alone(path: str, gpu: bool) -> str | None:
     """Work on the tasks of the plan in a file until none is left, on another machine than the controller.
 
     A worker on a cluster outlives the process that started it: it works on a closed plan (a sweep's) to its
@@ -77,7 +77,7 @@ def perform(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
     from memmlp.config.build import build_experiment
     from memmlp.config.plugins import activate
     from memmlp.pipeline.devices import use_threads
-    from memmlp.pipeline.run_stages import run_experiment, upstream_run
+    from memmlp.pipeline.run_stages import make_upstream_runs, run_experiment
     from memmlp.runs.identity import NETWORK
 
     activate(task.config.get("plugins") or ())
@@ -85,13 +85,13 @@ def perform(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
     check_identity(experiment, task)
     use_threads(experiment.config["threads"] or threads)
     if task.kind != NETWORK:
-        upstream_run(experiment, experiment.data.prepare(), task.id)
+        make_upstream_runs(experiment, experiment.data.prepare(), task.id)
     else:
         run_experiment(experiment, partial(check_wanted, path, task.id))
 
 
 def check_identity(experiment: Experiment, task: RunTask) -> None:
-    """Raise InputError if this code and data give the task another identity than the plan has."""
+    """Prepare the data, and raise InputError if the task's identity is no longer the plan's."""
     from memmlp.config.compose_plan import tasks_of
 
     digest = experiment.data.prepare().digest

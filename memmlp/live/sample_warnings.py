@@ -73,7 +73,7 @@ class OddSamples:
 
     @property
     def jumping(self) -> bool:
-        """Whether more times in a row jumped than a pause would explain."""
+        """Whether the times of so many successive samples jumped that no pause explains it."""
         return self.row["jump"] >= ODD["jump"].row
 
     def take(self, time: float | None, positions: np.ndarray, lost: Lost) -> None:

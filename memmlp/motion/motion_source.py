@@ -86,6 +86,8 @@ class MotionSource:
     def prepare(self) -> Prepared:
         """Return the cache with its manifest; it is made if it is missing or out of date.
 
+        Synthetic clips are generated first, where the source has any.
+
         Raises:
             InputError: if the cache can't be made, or if, without `partial`, an entry of the split's list has
                 no clip. A missing file is reported before any file is read.

@@ -55,13 +55,13 @@ class Outcome:
         run: the network's run.
         made: the stages that this call made, out of "training", "evaluation" and "deployment".
         results: mode -> branch -> metric, and "latency".
-        stages: the identities of the evaluations and the deployment that the results come from.
+        stage_ids: the identities of the evaluations and the deployment that the results come from.
     """
 
     run: Run
     made: tuple[str, ...]
     results: dict[str, Any]
-    stages: tuple[str, ...]
+    stage_ids: tuple[str, ...]
 
 
 def tested_clips_remark(clips: Sequence[ClipRecord]) -> str:
@@ -147,14 +147,15 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
         experiment.training.optim.check_installed()
         if overlooked := overlooked_gpu(experiment.config["device"]):
             remark(overlooked)
-    upstream = upstream_run(experiment, data)
+    upstream = None if run.done and not experiment.force else make_upstream_runs(experiment, data)
     with run.lock():
         if experiment.force:
             run.reset()
         made = []
         with recording_outcome(experiment, run):
             if not run.done:
-                train_run(experiment, run, data, upstream, watch)
+                # Another process may have begun the run anew since it was seen to be done.
+                train_run(experiment, run, data, upstream or make_upstream_runs(experiment, data), watch)
                 made.append("training")
             made += make_missing_stages(experiment, run, data)
         if experiment.predictions is not None:
@@ -247,10 +248,8 @@ def clip_rows(experiment: Experiment, run: Run) -> list[dict[str, Any]]:
     return list(rows.values())
 
 
-def upstream_run(experiment: Experiment, data: Prepared, last: str | None = None) -> Run | None:
-    """Return the finished run that the experiment's run builds upon, made if necessary; None for none.
-
-    The runs upstream of that run are made first, in order.
+def make_upstream_runs(experiment: Experiment, data: Prepared, last: str | None = None) -> Run | None:
+    """Train what is missing of the runs upstream, in order, and return the last of them; None for none.
 
     Args:
         experiment: the experiment.
@@ -352,7 +351,7 @@ def train_run(
 def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequence[str]) -> None:
     """Evaluate a trained run in the given modes.
 
-    Each evaluation is one file, which is written completely or not at all.
+    Each evaluation is one file, which is written completely or not at all. A picture is drawn, too, once.
     """
     run.attempt("evaluation")
     tell(f"evaluation: measure the errors on the test clips, in {' and '.join(modes)} mode")
@@ -420,7 +419,7 @@ def data_warnings(experiment: Experiment, data: Prepared) -> dict[str, Any]:
 
 
 def partial_words(experiment: Experiment, data: Prepared) -> str | None:
-    """Return in words which part of its protocol or of its training clips the data is; None for all of it."""
+    """Describe in words what the data lacks of its protocol or of its training clips; None if nothing."""
     config, manifest = experiment.config["data"], data.manifest
     coverage, found = manifest.coverage, manifest.listed or (*manifest.left_out, *manifest.groups)
     fraction = config["split"].get("train_fraction", 1)

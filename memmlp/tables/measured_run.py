@@ -122,7 +122,7 @@ class Measured:
     def by_clip(self, names: Sequence[str], mode: str, branch: str, metric: str) -> np.ndarray:
         """Return a metric for each of these clips (C,); NaN for clips for which the run has none."""
         found = [self.clips[name].get(mode, {}).get(branch, {}).get(metric) for name in names]
-        return np.array(found, float)  # of None, NaN
+        return np.array(found, float)  # None becomes NaN
 
     def group(self, clip: str) -> str:
         """Return the group of a clip."""

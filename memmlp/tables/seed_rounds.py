@@ -142,7 +142,7 @@ class Rounds:
         return found
 
     def spent(self, sweep: Sweep) -> Sweep:
-        """Return the sweep with seeds for each arm: those spent on it, and those that its next look needs."""
+        """Return the sweep with seeds for each arm: those spent so far and those of its next look."""
         counts = self.counts(sweep)
         arms = tuple(
             replace(arm, seeds=self.seeds[: counts[arm.label]]) if arm.label in counts else arm

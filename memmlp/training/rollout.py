@@ -133,7 +133,10 @@ class PersistentStreams(Rollout):
     def draw(
         self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int
     ) -> TrainingCall:
-        """Draw the training call of a step: the next streams, each moved on by one stride."""
+        """Draw the training call of a step: the next streams, each moved on by one stride.
+
+        Whose states `keep` gets is remembered until then, so that the two are called in turn.
+        """
         clips, end = sampler.draw(step)
         who = (step * len(clips) + torch.arange(len(clips), device=clips.device)) % self.streams
         again = sampler.draw_beginnings(step, model.stride)

@@ -86,7 +86,10 @@ class NetworkTraining:
     def task(
         self, architecture: Architecture, data: Prepared, upstream: Path | None, device: torch.device
     ) -> MotionTask:
-        """Make the task of training a network that is not yet trained; for the arguments see `train`."""
+        """Make the task of training a network that is not yet trained; for the arguments see `train`.
+
+        It seeds torch, for the first weights, and begins the rollout anew.
+        """
         dataset = data.open("train").to(device)
         torch.manual_seed(self.seed)
         normalizer = architecture.normalizer(data.manifest, dataset.frames)

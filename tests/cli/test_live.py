@@ -38,7 +38,7 @@ from memmlp.motion.synthetic import synthesize_clip
         (["--hz", "90", "--udp", "9000"], "--hz: is of a clip"),
         (["--sender", "192.168.1.9"], "--sender: goes with --udp PORT"),
         (["--udp", "9001", "--sender", "nowhere"], "nowhere"),
-        (["--udp", "9001", "--send", "--vmc", "127.0.0.1"], "--send: sends a clip's trackers alone"),
+        (["--udp", "9001", "--send", "--vmc", "127.0.0.1"], "--send: sends trackers alone"),
         (["--udp", "9001", "--token", "a token of many letters"], "--token: goes with --host"),
         (["--udp", "9001", "--host", "0.0.0.0", "--token", "short"], "--token: 5 characters"),
         (["--vmc", "127.0.0.1:none"], "--vmc"),

@@ -31,7 +31,7 @@ def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
         found = [Entry(arm.label, seed, find(arm, seed).id) for arm, seed in entries]  # type: ignore[union-attr]
         return Plan(sweep.name, tmp_path / sweep.name, () if sweep.name == "table10" else tuple(found), ())
 
-    monkeypatch.setattr("memmlp.config.compose_plan.make_plan", plan)
+    monkeypatch.setattr("memmlp.config.compose_plan.kept_or_new_plan", plan)
 
 
 def test_kept_results_become_pages(memmlp: Memmlp, planned: None):
@@ -103,7 +103,7 @@ def test_what_a_file_has_stands_before_the_same_runs_of_other_files(
 ):
     """Their costs were measured at another time."""
     monkeypatch.setattr("memmlp.config.runs_from_kept_results.outdated", lambda recipes: [])
-    monkeypatch.setattr("memmlp.config.runs_from_kept_results.plan_anew", compose_plan.make_plan)
+    monkeypatch.setattr("memmlp.config.runs_from_kept_results.plan_anew", compose_plan.kept_or_new_plan)
     memmlp("results", "save", "14")
     path = Path("docs/results/data/table14.json")
     own = path.read_text()

@@ -20,7 +20,7 @@ from processes import PATIENCE, ignoring_interrupts, started, until
 
 from memmlp.cli.workers import split_executor
 from memmlp.common.errors import InputError
-from memmlp.config.compose_plan import find_sweep, make_plan, orphans, plan_anew
+from memmlp.config.compose_plan import find_sweep, kept_or_new_plan, orphans, plan_anew
 from memmlp.config.worker_process import perform
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.recipe_versions import RECIPES
@@ -128,7 +128,7 @@ def test_an_edited_file_adds_arms_and_lists_orphans(home: Path):
 
 def test_seeds_come_one_after_another_each_with_all_arms(home: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(home)
-    plan = make_plan(
+    plan = kept_or_new_plan(
         find_sweep("trial.yaml").with_overrides([*TINY, "seed=1,0"]), (home / "outputs").absolute()
     )
     cells = [(entry.seed, entry.label) for entry in plan.entries]
@@ -200,12 +200,14 @@ def test_a_plan_is_kept_until_the_data_changes(home: Path, monkeypatch: pytest.M
     outputs = (home / "outputs").absolute()
     kept = json.loads(next(outputs.glob("sweeps/trial-*/plan_stamp.json")).read_text())
     assert kept["stamp"]
-    first = make_plan(chosen, outputs)
+    first = kept_or_new_plan(chosen, outputs)
     clip = next((home / "outputs" / "data").rglob("*.npz"))
     os.utime(clip)
-    assert make_plan(chosen, outputs).entries == ()
-    assert [task.id for task in make_plan(chosen, outputs, prepare=True).tasks] == [t.id for t in first.tasks]
-    assert orphans(chosen, make_plan(chosen, outputs)) == []
+    assert kept_or_new_plan(chosen, outputs).entries == ()
+    assert [task.id for task in kept_or_new_plan(chosen, outputs, prepare=True).tasks] == [
+        t.id for t in first.tasks
+    ]
+    assert orphans(chosen, kept_or_new_plan(chosen, outputs)) == []
 
 
 def test_a_plan_is_kept_until_the_groups_of_clips_change(home: Path, monkeypatch: pytest.MonkeyPatch):
@@ -218,7 +220,7 @@ def test_a_plan_is_kept_until_the_groups_of_clips_change(home: Path, monkeypatch
     def planned(word: str) -> Plan:
         rows = [f"{clip},{word} {clip}\n" for clip in clips]
         (home / "groups.csv").write_text("clip,group\n" + "".join(rows))
-        return make_plan(chosen, outputs, prepare=True)
+        return kept_or_new_plan(chosen, outputs, prepare=True)
 
     before, after = planned("take"), planned("person")
     assert [entry.id for entry in after.entries] == [entry.id for entry in before.entries]
@@ -328,7 +330,7 @@ def test_shipped_sweeps_are_found_by_name_and_number(name: str):
 
 def test_a_worker_of_other_code_or_data_leaves_the_run_alone(home: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(home)
-    plan = make_plan(find_sweep("trial.yaml").with_overrides(TINY), (home / "outputs").absolute())
+    plan = kept_or_new_plan(find_sweep("trial.yaml").with_overrides(TINY), (home / "outputs").absolute())
     other = replace(next(task for task in plan.tasks if task.kind == "memmlp"), id="0" * 16)
     with pytest.raises(InputError, match="the data or the code changed since the sweep began"):
         perform(home / "plan.json", 1, plan, other)

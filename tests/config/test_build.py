@@ -22,7 +22,7 @@ from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.pipeline.experiment import Experiment
-from memmlp.pipeline.run_stages import upstream_run
+from memmlp.pipeline.run_stages import make_upstream_runs
 from memmlp.runs.run import Run
 
 TINY = [
@@ -121,7 +121,7 @@ def trained(overrides: list[str]) -> Arm:
 def train_and_stream(cfg: DictConfig) -> Arm:
     experiment = build_experiment(cfg)
     data = experiment.data.prepare()
-    above = upstream_run(experiment, data)
+    above = make_upstream_runs(experiment, data)
     run = Run(Path(mkdtemp(dir=".", prefix="arm-")))
     weights = above.model if above else None
     model = experiment.training.train(experiment.architecture, data, weights, run, experiment.device)

@@ -22,7 +22,7 @@ from memmlp.evaluation import modes as evaluation
 from memmlp.experiment_tracking.follower_pipe import Tracking
 from memmlp.motion.dataset import MotionDataset
 from memmlp.pipeline.experiment import Experiment
-from memmlp.pipeline.run_stages import upstream_run
+from memmlp.pipeline.run_stages import make_upstream_runs
 from memmlp.runs.identity import NEUTRAL, Identity, deployment_id, evaluation_id, flatten
 from memmlp.runs.run import Run
 
@@ -132,7 +132,7 @@ def outcome(folder: Path, overrides: list[str]) -> Outcome:
     experiment = replace(build_experiment(composed([*BASE, *overrides])), outputs=folder)
     data = experiment.data.prepare()
     identity = experiment.identity(data.digest)
-    codes = upstream_run(replace(experiment, tracking=Tracking((), folder)), data).model
+    codes = make_upstream_runs(replace(experiment, tracking=Tracking((), folder)), data).model
     run = Run(folder / "run")
     run.folder.mkdir(parents=True)
     model = experiment.training.train(experiment.architecture, data, codes, run, experiment.device)

@@ -32,7 +32,7 @@ from memmlp.motion.clip import Skipped
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.preparing.amass import S2_TEST, S2_TRAIN
 from memmlp.pipeline import run_stages
-from memmlp.pipeline.run_stages import recording_outcome, upstream_run
+from memmlp.pipeline.run_stages import make_upstream_runs, recording_outcome
 from memmlp.runs import environment
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.lookup import list_runs
@@ -122,7 +122,18 @@ def test_the_same_command_finds_the_run_and_others_share_the_vqvae(home, monkeyp
     assert len(codes) == 1
     monkeypatch.chdir(home)
     experiment = build_experiment(composed([*TINY, "seed=1"]))  # by default a VQ-VAE follows its run's seed
-    assert upstream_run(experiment, experiment.data.prepare()).id not in codes
+    assert make_upstream_runs(experiment, experiment.data.prepare()).id not in codes
+
+
+def test_what_a_finished_run_was_built_upon_is_not_trained_again(home):
+    codes = next(run for run in list_runs(home / "outputs") if run.manifest["kind"] == "vqvae")
+    aside = codes.folder.rename(home / "aside")
+    try:
+        assert "finished already" in command(home, "train", *TINY, INT8)
+        assert not codes.folder.exists()
+    finally:
+        shutil.rmtree(codes.folder, ignore_errors=True)
+        aside.rename(codes.folder)
 
 
 def test_eval_repeats_the_runs_numbers_and_saves_predictions(home):
@@ -275,7 +286,7 @@ def test_every_experiment_trains_and_streams(home, name, monkeypatch: pytest.Mon
     cfg = composed([f"experiment={name}", *TINY, "optim.steps=2"])
     experiment = build_experiment(cfg)
     data = experiment.data.prepare()
-    above = upstream_run(experiment, data)
+    above = make_upstream_runs(experiment, data)
     run = Run(home / "variants" / name)
     run.folder.mkdir(parents=True, exist_ok=True)
     weights = above.model if above else None

@@ -15,7 +15,7 @@ from memmlp.config.compose_plan import tasks_of
 from memmlp.config.worker_process import check_identity
 from memmlp.networks import checkpoint
 from memmlp.networks.baselines.sage_net import SAGENet
-from memmlp.pipeline.run_stages import upstream_run
+from memmlp.pipeline.run_stages import make_upstream_runs
 from memmlp.runs.lookup import check_trained, list_runs
 from memmlp.training.train_sage import PARTS
 
@@ -64,7 +64,7 @@ def test_one_command_trains_each_part_and_then_the_whole(memmlp):
     weights = chain[2].model.read_bytes()
     chain[2].reset()
     experiment = build_experiment(composed(SHORT))
-    made = upstream_run(experiment, experiment.data.prepare(), chain[2].id)
+    made = make_upstream_runs(experiment, experiment.data.prepare(), chain[2].id)
     assert (made.id, made.model.read_bytes()) == (chain[2].id, weights)
     assert "finished already" in memmlp("train", *SHORT).out
 

@@ -325,7 +325,7 @@ def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         found = [Entry(arm.label, seed, find(arm, seed).id) for arm, seed in entries]  # type: ignore[union-attr]
         return Plan(sweep.name, tmp_path / sweep.name, tuple(found), ())
 
-    monkeypatch.setattr("memmlp.config.compose_plan.make_plan", plan)
+    monkeypatch.setattr("memmlp.config.compose_plan.kept_or_new_plan", plan)
 
 
 @pytest.mark.slow

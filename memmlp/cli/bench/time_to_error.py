@@ -189,14 +189,14 @@ def measure_seed(
 
 def learner(experiment: Experiment, data: Any, error: str = "MPJPE") -> Learner:
     """Return an experiment's training, which can run piece by piece; its VQ-VAE is found or trained first."""
-    from memmlp.pipeline.run_stages import upstream_run
+    from memmlp.pipeline.run_stages import make_upstream_runs
     from memmlp.training.time_to_error import Learner
     from memmlp.training.train_network import NetworkTraining
 
     training = experiment.training
     assert isinstance(training, NetworkTraining)
     training.optim.check_installed()
-    above = upstream_run(experiment, data)
+    above = make_upstream_runs(experiment, data)
     task = training.task(experiment.architecture, data, above.weights() if above else None, experiment.device)
     return Learner(task, training.optim, training.seed, f"rotation {error}")
 

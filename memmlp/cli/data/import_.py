@@ -19,7 +19,7 @@ from memmlp.common.errors import InputError
 @click.argument("source", type=PATH)
 @click.option("--out", required=True, type=PATH, help="Folder for the npz files.")
 @click.option(
-    "--skeleton", help="A shipped joint map or the path of one; by default the joints' names decide."
+    "--skeleton", help="A shipped skeleton map or the path of one; by default the joints' names decide."
 )
 @click.option("--fps", multiple=True, metavar="[FOLDER=]HZ", help="True frame rate, for all or one folder.")
 @click.option(
@@ -37,7 +37,11 @@ from memmlp.common.errors import InputError
 )
 @click.option("--body", default="builtin", show_default=True, help="builtin, or an SMPL-H model.npz.")
 @click.option("--strict", is_flag=True, help="Stop at the first bad file instead of skipping it.")
-@click.option("--sound", is_flag=True, help="Skip clips with faults instead of writing them with a warning.")
+@click.option(
+    "--sound",
+    is_flag=True,
+    help="Skip faulty clips instead of writing them with a warning.",
+)
 def import_(
     source: Path,
     out: Path,

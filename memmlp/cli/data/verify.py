@@ -1,4 +1,4 @@
-"""`memmlp data verify`: compares imports with their files."""
+"""`memmlp data verify`: imports files on trial, and compares each result with its file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from memmlp.cli.options import PATH
 
 @click.command("verify")
 @click.argument("source", type=PATH)
-@click.option("--skeleton", help="A shipped joint map or the path of one.")
+@click.option("--skeleton", help="A shipped skeleton map or the path of one.")
 @click.option("--body", default="builtin", show_default=True, help="builtin, or an SMPL-H model.npz.")
 @click.option("--up", type=click.Choice(["y", "z"]), help="The files' up axis; by default the map's.")
 @click.option("--all", "every", is_flag=True, help="Show every file and not only those with faults.")

@@ -222,7 +222,7 @@ def _with_wide_names(columns: Sequence[Column]) -> list[Column]:
 
 
 def _with_names(columns: Sequence[Column], width: int) -> list[Column]:
-    """Return the columns with names in lines of a width, without the seed where that has a column."""
+    """Return the columns with names wrapped to a width; a seed that has its own column is cut from them."""
     names = [name.replace("\n", "") for name in _cells(columns, "name")]
     if names and (seeds := _cells(columns, "seed")):
         names = [name.removesuffix(f" · seed {seed}") for name, seed in zip(names, seeds, strict=True)]

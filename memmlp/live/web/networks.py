@@ -1,4 +1,4 @@
-"""A site's networks: the graphs that are timed, and the one that plays clips and is worn."""
+"""A site's networks: the graphs that are timed, and the one that plays clips and runs on a headset."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ class Writer:
     ) -> Entry:
         """Write two files in float32: the network's step, and the full graph from trackers to joints.
 
-        The full graph is not written if `played` is given, which then stands for it.
+        If `played` is given, that entry is used in place of the full graph, which is not written.
         """
         step, whole = made / f"{name}.onnx", _whole(made, name)
         export(graph, step, network.run)
@@ -142,7 +142,7 @@ class Writer:
         return {"graph": name, "precision": "fp32", "step": alone, "whole": played}
 
     def weightless(self, name: str, model: onnx.ModelProto) -> Entry:
-        """Write a graph without its weights; return its address and the weights that the page has to draw."""
+        """Write a graph without its weights; return its address and the weights to make at random."""
         drawn = without_weights(model)
         file = self._kept(name, model.SerializeToString())
         return {"file": file, "weights": [part._asdict() for part in drawn]}

@@ -41,7 +41,7 @@ class Site:
     """The contents of a site.
 
     Attributes:
-        networks: the networks; those that are trained can be played and worn.
+        networks: the networks; those that are trained play clips and run on headsets.
         base: the network that the others' times are compared with; None for a site without a bench.
         clips: the clips that can be played.
         calibration: clips (N, 252) from which the ranges of int8 are found, for the bench.

@@ -1,4 +1,4 @@
-"""ONNX files without weights; the page draws random ones, since values do not matter for a step's time."""
+"""ONNX files without weights; the page makes random ones, since values do not matter for a step's time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ KINDS = {TensorProto.FLOAT: "float32", TensorProto.FLOAT16: "float16", TensorPro
 
 
 class Drawn(NamedTuple):
-    """A tensor that the page draws at random.
+    """A tensor whose numbers the page makes at random.
 
     Attributes:
         offset: where the tensor begins among all drawn tensors of the graph, bytes.

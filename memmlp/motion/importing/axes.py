@@ -24,7 +24,7 @@ TELL = "--up y or z, or up in the skeleton's map"
 MOST_UPRIGHT = 0.5  # how much of the way from pelvis to head lies along the up axis on average, to be found
 
 
-def settle(recording: Recording, skeleton: SkeletonMap) -> SkeletonMap:
+def with_unit_and_up(recording: Recording, skeleton: SkeletonMap) -> SkeletonMap:
     """Return the map with unit and up axis filled in from the recording, where the map leaves them open.
 
     Raises:

@@ -8,7 +8,7 @@ import numpy as np
 
 from memmlp.motion.clip import Clip
 from memmlp.motion.clip_kinematics import clip_kinematics
-from memmlp.motion.importing.axes import settle
+from memmlp.motion.importing.axes import with_unit_and_up
 from memmlp.motion.importing.fidelity import Fidelity, compare
 from memmlp.motion.importing.floor import find_floor
 from memmlp.motion.importing.mapped_motion import MappedMotion, pick_joints
@@ -67,7 +67,7 @@ def convert(
     Raises:
         InputError: as `mapped_motion.pick_joints` and `retarget.fit` do.
     """
-    settled = settle(recording, skeleton)
+    settled = with_unit_and_up(recording, skeleton)
     mapped_motion = pick_joints(recording, settled)
     fitted = fit(recording, settled, mapped_motion, rest)
     clip = to_body(mapped_motion, fitted, rest, name, fps or recording.fps)

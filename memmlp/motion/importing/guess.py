@@ -17,7 +17,7 @@ import yaml
 from memmlp.common.errors import InputError
 from memmlp.motion.body import JOINTS, load_rest_joints
 from memmlp.motion.importing.anatomy import CHAINS, unit
-from memmlp.motion.importing.axes import settle
+from memmlp.motion.importing.axes import with_unit_and_up
 from memmlp.motion.importing.calibration_frame import JUMP, MAYBE, first_step
 from memmlp.motion.importing.convert import convert
 from memmlp.motion.importing.limbs_by_shape import Limbs, Pair, Tree, find_limbs, middle, read_tree
@@ -296,7 +296,7 @@ def as_yaml(proposed: Guess, recording: Recording) -> str:
 def _axes_lines(recording: Recording, skeleton: SkeletonMap) -> Iterator[str]:
     """Yield the lines of unit and up axis: found in each file, with this file's values as comments."""
     try:
-        settled = settle(recording, skeleton)
+        settled = with_unit_and_up(recording, skeleton)
         yield f"unit: auto  # in this file {settled.unit:.4g} m"
         yield f"up: auto  # in this file {settled.up}"
     except InputError as error:

@@ -11,6 +11,7 @@ from memmlp.motion.importing.recording import Recording
 
 BVH, EXPMAP = ".bvh", ".txt"
 COLUMNS = 90  # numbers in a first line that only exponential maps have; other text files are passed over
+ALLOWED = "a .bvh file, a .txt file of exponential maps, or a folder with some in it"
 FIRST_LINE = 10_000  # bytes of a file that are looked at for that
 
 
@@ -21,13 +22,12 @@ def find_recordings(source: Path) -> dict[Path, Path]:
         InputError: if there is none.
     """
     if not source.exists():
-        raise InputError(f"{source}: no such file or folder; allowed: BVH files")
+        raise InputError(f"{source}: no such file or folder; allowed: {ALLOWED}")
     top = source if source.is_dir() else source.parent
     paths = sorted(source.rglob("*")) if source.is_dir() else [source]
     files = {path.relative_to(top): path for path in paths if path.is_file() and _is_recording(path)}
     if not files:
-        allowed = "a .bvh file, a .txt file of exponential maps, or a folder with some in it"
-        raise InputError(f"{source}: no BVH file found; allowed: {allowed}")
+        raise InputError(f"{source}: no recording found; allowed: {ALLOWED}")
     return files
 
 

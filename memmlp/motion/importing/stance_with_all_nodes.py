@@ -8,7 +8,7 @@ import numpy as np
 
 from memmlp.motion.body import JOINTS, PARENTS
 from memmlp.motion.importing import anatomy
-from memmlp.motion.importing.axes import settle
+from memmlp.motion.importing.axes import with_unit_and_up
 from memmlp.motion.importing.mapped_motion import MappedMotion, pick_joints
 from memmlp.motion.importing.reading_stance import Stance, find_stance
 from memmlp.motion.importing.recording import Recording
@@ -49,7 +49,7 @@ def find_stance_with_all_nodes(
     Raises:
         InputError: as importing does: if no person stands in the file, or the map does not fit it.
     """
-    settled = settle(recording, skeleton)
+    settled = with_unit_and_up(recording, skeleton)
     mapped_motion = pick_joints(recording, settled)
     stance = find_stance(recording, settled, mapped_motion)
     turned = stance.rotations @ fit(recording, settled, mapped_motion, rest).corrections

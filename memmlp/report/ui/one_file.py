@@ -114,7 +114,7 @@ def _replays(answers: Answers, sweeps: Iterable[list[str]], found: Mapping[str, 
             continue
         clip, begin = page["clips"][0]["name"], None
         for run_id in [best, *([page["control"]["id"]] if page["control"] else [])]:
-            piece = answers.replays.now(run_id, clip, MODES[0], begin, SECONDS)
+            piece = answers.replays.get_waiting(run_id, clip, MODES[0], begin, SECONDS)
             if piece["state"] == "ready":
                 made[f"replay/{run_id}?{query(clip=clip, mode=MODES[0])}"] = piece
                 begin = piece["from"] / piece["fps"]

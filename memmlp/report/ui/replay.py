@@ -44,7 +44,7 @@ class Replays:
         self.made: dict[tuple[str, str, str], Future[dict[str, np.ndarray]]] = {}
         self.lock = threading.Lock()
 
-    def now(
+    def get_waiting(
         self, run_id: str, clip: str, mode: str, begin: float | None = None, seconds: float = SECONDS
     ) -> dict[str, Any]:
         """Compute a piece of `seconds` of a replay and return it as `get` does, but only once it is there."""

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.bvh import Bvh, read_bvh
-from memmlp.motion.importing.axes import UNITS, settle
+from memmlp.motion.importing.axes import UNITS, with_unit_and_up
 from memmlp.motion.importing.skeleton_map import SkeletonMap, load_skeleton
 from memmlp.motion.synthetic import synthesize_clip
 
@@ -33,25 +33,25 @@ def file(folder: Path, chosen: SkeletonMap, clip: Clip, turned: bool = True) -> 
 @pytest.mark.parametrize("up", ["y", "z"])
 @pytest.mark.parametrize("unit", UNITS)
 def test_unit_and_up_are_found(tmp_path: Path, walk: Clip, unit: float, up: str) -> None:
-    settled = settle(file(tmp_path, replace(TOLD, unit=unit, up=up), walk), FOUND)
+    settled = with_unit_and_up(file(tmp_path, replace(TOLD, unit=unit, up=up), walk), FOUND)
     assert (settled.unit, settled.up) == (unit, up)
 
 
 def test_what_is_told_counts(tmp_path: Path, walk: Clip) -> None:
-    assert settle(file(tmp_path, TOLD, walk), replace(TOLD, up="z", unit=0.012)).up == "z"
-    assert settle(file(tmp_path, TOLD, walk), replace(TOLD, up="z", unit=0.012)).unit == 0.012
+    assert with_unit_and_up(file(tmp_path, TOLD, walk), replace(TOLD, up="z", unit=0.012)).up == "z"
+    assert with_unit_and_up(file(tmp_path, TOLD, walk), replace(TOLD, up="z", unit=0.012)).unit == 0.012
 
 
 @pytest.mark.parametrize("unit", [0.3048, 10.0, 1e-4])
 def test_an_unknown_unit_is_refused(tmp_path: Path, walk: Clip, unit: float) -> None:
     with refuse(tmp_path / "clip.bvh", "legs of", "fits none of"):
-        settle(file(tmp_path, replace(TOLD, unit=unit), walk), FOUND)
+        with_unit_and_up(file(tmp_path, replace(TOLD, unit=unit), walk), FOUND)
 
 
 @pytest.mark.parametrize("unit", [1.0, 0.1, 0.0254, 0.001])
 def test_a_wrong_unit_is_refused(tmp_path: Path, walk: Clip, unit: float) -> None:
     with refuse(tmp_path / "clip.bvh", f"with the unit {unit:g} of cmu_daz"):
-        settle(file(tmp_path, TOLD, walk), replace(TOLD, unit=unit))
+        with_unit_and_up(file(tmp_path, TOLD, walk), replace(TOLD, unit=unit))
 
 
 @pytest.mark.parametrize("axis", ["x", "-y"])
@@ -60,12 +60,12 @@ def test_another_up_axis_is_refused(tmp_path: Path, walk: Clip, axis: str) -> No
     poses = walk.poses.astype(float)
     poses[:, 0] = (Rotation.from_rotvec(turn) * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
     with refuse(tmp_path / "clip.bvh", "no up axis is found"):
-        settle(file(tmp_path, TOLD, replace(walk, poses=poses)), FOUND)
+        with_unit_and_up(file(tmp_path, TOLD, replace(walk, poses=poses)), FOUND)
 
 
 def test_the_calibration_frame_does_not_count(tmp_path: Path) -> None:
     bvh = read(tmp_path, "cmu_daz", frames=1)
-    assert settle(bvh, replace(FOUND, calibration_frame=True)).up is None
+    assert with_unit_and_up(bvh, replace(FOUND, calibration_frame=True)).up is None
 
 
 def lying(clip: Clip, head: str) -> Clip:
@@ -81,15 +81,15 @@ def test_who_lies_in_a_file_whose_zero_pose_stands_lies(
     tmp_path: Path, walk: Clip, up: str, head: str
 ) -> None:
     chosen = replace(TOLD, up=up)
-    assert settle(file(tmp_path, chosen, lying(walk, head), turned=False), FOUND).up == up
+    assert with_unit_and_up(file(tmp_path, chosen, lying(walk, head), turned=False), FOUND).up == up
 
 
 def test_a_zero_pose_and_a_motion_of_two_minds_are_refused(tmp_path: Path, walk: Clip) -> None:
     """It may be a person who lies, or one who walks while only the root's rotation has Z up."""
     bvh = file(tmp_path, TOLD, lying(walk, "z"), turned=False)
     with refuse(tmp_path / "clip.bvh", "stands along y in the zero pose", "along z in the motion", "--up y"):
-        settle(bvh, FOUND)
-    assert [settle(bvh, replace(FOUND, up=up)).up for up in "yz"] == ["y", "z"]
+        with_unit_and_up(bvh, FOUND)
+    assert [with_unit_and_up(bvh, replace(FOUND, up=up)).up for up in "yz"] == ["y", "z"]
     upside_down = lying(lying(walk, "z"), "z")
     with refuse(tmp_path / "clip.bvh", "no up axis is found"):
-        settle(file(tmp_path, TOLD, upside_down, turned=False), FOUND)
+        with_unit_and_up(file(tmp_path, TOLD, upside_down, turned=False), FOUND)

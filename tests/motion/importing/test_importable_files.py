@@ -28,7 +28,7 @@ def test_other_text_is_passed_over(tmp_path: Path) -> None:
     write(tmp_path / "all", "Notes on the recordings, by hand.", "README.txt")
     write(tmp_path / "all", person("cmu_daz", 3, 0).text(), "deep/A.BVH")
     assert [path.as_posix() for path in find_recordings(tmp_path / "all")] == ["deep/A.BVH", "walking_1.txt"]
-    with refuse(tmp_path / "all" / "README.txt", "no BVH file found"):
+    with refuse(tmp_path / "all" / "README.txt", "no recording found"):
         find_recordings(tmp_path / "all" / "README.txt")
     assert not tells_rate(tmp_path / "all" / "walking_1.txt")
     assert len(read_recording(tmp_path / "all" / "deep" / "A.BVH")) == 3
