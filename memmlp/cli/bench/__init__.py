@@ -11,7 +11,7 @@ from memmlp.cli.bench.prepare_data import prepare
 from memmlp.cli.bench.soak import soak
 from memmlp.cli.bench.stream_evaluation import stream
 from memmlp.cli.bench.time_to_error import train
-from memmlp.cli.bench.tracker_overhead import tracking
+from memmlp.cli.bench.tracking_overhead import tracking
 from memmlp.cli.bench.ui_page import ui
 from memmlp.cli.bench.verdict_simulation import verdicts
 

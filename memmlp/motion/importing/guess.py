@@ -21,7 +21,7 @@ from memmlp.motion.importing.axes import with_unit_and_up
 from memmlp.motion.importing.calibration_frame import JUMP, MAYBE, first_step
 from memmlp.motion.importing.convert import convert
 from memmlp.motion.importing.limbs_by_shape import Limbs, Pair, Tree, find_limbs, middle, read_tree
-from memmlp.motion.importing.names import NodeWords, without_namespace, words
+from memmlp.motion.importing.node_names import NodeWords, without_namespace, words
 from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.skeleton_map import SkeletonMap
 

@@ -13,7 +13,7 @@ import yaml
 
 from memmlp.common.errors import InputError, why_unreadable
 from memmlp.motion.body import JOINTS
-from memmlp.motion.importing.names import find_nodes
+from memmlp.motion.importing.node_names import find_nodes
 from memmlp.motion.importing.recording import Recording
 
 SKELETONS = Path(__file__).parent / "skeletons"

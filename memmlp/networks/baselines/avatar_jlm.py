@@ -23,7 +23,7 @@ from memmlp.motion.body import (
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.agrol import WholeWindow
-from memmlp.networks.baselines.encoder import EncoderLayer, draw_weights
+from memmlp.networks.baselines.transformer_encoder import EncoderLayer, draw_weights
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import Learned
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from memmlp.motion.body import N_JOINTS, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.baselines.encoder import EncoderLayer, draw_weights
+from memmlp.networks.baselines.transformer_encoder import EncoderLayer, draw_weights
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import MotionModel
 

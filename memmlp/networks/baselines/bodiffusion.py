@@ -16,7 +16,7 @@ from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM, TRACKED
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.agrol import TimeEmbedding, WholeWindow
 from memmlp.networks.baselines.ancestral_diffusion import AncestralDiffusion, Denoised
-from memmlp.networks.baselines.encoder import Attention
+from memmlp.networks.baselines.transformer_encoder import Attention
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import Learned
 

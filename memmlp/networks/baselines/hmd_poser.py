@@ -25,7 +25,7 @@ from memmlp.motion.body import (
 )
 from memmlp.motion.geometry import matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.baselines.encoder import EncoderLayer
+from memmlp.networks.baselines.transformer_encoder import EncoderLayer
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import Learned
 from memmlp.networks.windowless_model import WindowlessModel

@@ -34,7 +34,6 @@ from memmlp.motion.network_coordinates import Heading
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.avatar_jlm import AvatarJLM
 from memmlp.networks.baselines.avatar_poser import AvatarPoser, head
-from memmlp.networks.baselines.encoder import draw_weights
 from memmlp.networks.baselines.limb_solver import (
     ANKLES,
     BASES,
@@ -47,6 +46,7 @@ from memmlp.networks.baselines.limb_solver import (
     solved,
     swivels,
 )
+from memmlp.networks.baselines.transformer_encoder import draw_weights
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import Learned, MotionModel
 

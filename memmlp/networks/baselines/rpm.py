@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from memmlp.common import distributed
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.baselines.encoder import Attention, EncoderLayer
+from memmlp.networks.baselines.transformer_encoder import Attention, EncoderLayer
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import Learned
 from memmlp.networks.windowless_model import WindowlessModel

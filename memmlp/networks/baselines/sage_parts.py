@@ -19,7 +19,7 @@ from memmlp.motion.body import N_JOINTS, ROTATION, TRACKED
 from memmlp.networks.baselines.agrol import TimeEmbedding
 from memmlp.networks.baselines.avatar_jlm import JOINT_DIM, tracker_features
 from memmlp.networks.baselines.bodiffusion import SINES, DiTBlock
-from memmlp.networks.baselines.encoder import Attention
+from memmlp.networks.baselines.transformer_encoder import Attention
 from memmlp.networks.layers import Dropout
 
 UPPER = (0, 3, 6, 9, *range(12, 22))

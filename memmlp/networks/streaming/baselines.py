@@ -17,11 +17,11 @@ from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP, TimedBlock
 from memmlp.networks.baselines.avatar_jlm import TOKENS, AvatarJLM
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
 from memmlp.networks.baselines.ego_poser import PLACES, EgoPoser, beside_head, places
-from memmlp.networks.baselines.encoder import EncoderLayer
 from memmlp.networks.baselines.hmd_poser import HMDPoser
 from memmlp.networks.baselines.manikin import ManikinL, ManikinS
 from memmlp.networks.baselines.rpm import RPM
 from memmlp.networks.baselines.still_pose import StillPose
+from memmlp.networks.baselines.transformer_encoder import EncoderLayer
 from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.layers import MLPBlock
 from memmlp.networks.memory import State

@@ -6,7 +6,7 @@ import torch
 
 from memmlp.evaluation import modes as evaluation
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.networks.baselines.encoder import Attention, EncoderLayer
+from memmlp.networks.baselines.transformer_encoder import Attention, EncoderLayer
 
 CLIP = tiny.clip(40)
 SPARSE = CLIP[None, :, :SPARSE_DIM]

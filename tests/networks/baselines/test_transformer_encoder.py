@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from memmlp.config.build import untrained
-from memmlp.networks.baselines.encoder import Attention, draw_weights
+from memmlp.networks.baselines.transformer_encoder import Attention, draw_weights
 
 EMBEDDING = (".query", ".key", ".value")
 

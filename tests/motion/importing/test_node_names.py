@@ -6,7 +6,7 @@ import pytest
 from bvh_samples import own_tree
 from skeleton_families import FAMILIES, family, renamed
 
-from memmlp.motion.importing.names import find_nodes, keys, without_namespace, words
+from memmlp.motion.importing.node_names import find_nodes, keys, without_namespace, words
 from memmlp.motion.importing.skeleton_map import find_skeleton, load_skeleton, shipped_skeletons
 
 
