@@ -10,16 +10,15 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import numpy as np
 
 from memmlp.common.core_share import LEAST_CORE_SHARE
-from memmlp.sweep.definition import COSTS, Arm, Sweep
+from memmlp.sweep.definition import COSTS, TIMES, Arm, Sweep
 from memmlp.tables import flags_of_code
 from memmlp.tables.effects import RunsBySeed, control_arm, one_and_the_same
 from memmlp.tables.flag_words import flags_of_difference, had_core, listed, quoted, unique
 from memmlp.tables.measured_run import CORE_SHARES, SHARED, UNKNOWN, Measured, hardly_trained
+from memmlp.tables.table import STEADY
 
 DescribeRun = Callable[[Arm, int], str | None]
 BUILT_IN = "builtin"
-TIMES = {"ms", "network ms", "pose ms", "ratio", "FPS"}
-STEADY = 1.25  # how many times the ratio of one seed that of another may be: it does not depend on the seed
 ALIKE = 1.1  # how many times the frames of its control an arm may see in training before a flag says so
 SMPLH = (1, 2, 3)  # the paper's tables on AMASS, on the rest joints of SMPL-H bodies
 ORIGIN = {
@@ -72,7 +71,7 @@ def flags(
         yield from flags_of_difference(what, [(told.get(value, value), label) for value, label in values])
     yield from flags_of_code.other_files(every)
     yield from flags_of_code.older_code((label, run.code, run.origin.plugins) for label, run in every)
-    if TIMES & set(sweep.metrics):
+    if set(TIMES) & set(sweep.metrics):
         yield from flags_of_difference("machine of the times", _timed(every))
         yield from _busy(sweep, runs)
     if set(sweep.metrics) - set(COSTS):
