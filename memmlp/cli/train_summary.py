@@ -10,13 +10,13 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from memmlp.common.core_share import LEAST_CORE_SHARE
 from memmlp.evaluation.units import UNITS
 from memmlp.pipeline.run_stages import Outcome
 from memmlp.runs.deployment_folder import as_deployed, deployed_precision
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import BRANCHES
-from memmlp.tables.flags_of_runs import CORE
-from memmlp.tables.measured_run import SAME, SHARED, Errors, frames_seen, hardly_trained, load
+from memmlp.tables.measured_run import CORE_SHARES, SAME, SHARED, Errors, frames_seen, hardly_trained, load
 
 STAGES = ("training", "evaluation", "deployment")
 COLUMNS = [(mode, branch) for mode in ("stream", "window") for branch in BRANCHES]
@@ -89,7 +89,7 @@ def show_latency(console: Console, record: Mapping[str, Any]) -> None:
         f"({measured['ratio_to_yardstick']:.2f} x the yardstick{plain})",
         soft_wrap=True,
     )
-    if (share := measured.get("core_share", 1.0)) < CORE:
+    if (share := min(measured.get(key, 1.0) for key in CORE_SHARES.values())) < LEAST_CORE_SHARE:
         busy = f"the machine was busy: it had a core for {share:.0%} of the time, and its times are too long"
         console.print(busy, style="yellow", soft_wrap=True)
     if "pose_median_ms" in measured:  # runs of earlier versions lack it

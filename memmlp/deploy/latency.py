@@ -6,9 +6,9 @@ import json
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import onnx
@@ -17,6 +17,7 @@ import torch
 from onnx import TensorProto, helper
 from torch.utils.flop_counter import FlopCounterMode
 
+from memmlp.common.core_share import CoreClock
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.networks.motion_model import MotionModel
@@ -27,6 +28,18 @@ WARM_UP = 30  # steps before the timed ones
 SETTLING = 3  # untimed steps of a file at the start of each round
 Key = TypeVar("Key", bound=Hashable)
 YARDSTICK_SHAPE = (41, 512, 8)  # rows, width, layers: 86 M multiply-adds of plain matrix products
+
+
+class InTurn(NamedTuple):
+    """Times of one file that was timed in turn with others.
+
+    Attributes:
+        seconds: the time of each step (rounds, steps), in seconds.
+        core_shares: the share of each round (rounds,) in which the thread had a core.
+    """
+
+    seconds: np.ndarray
+    core_shares: np.ndarray
 
 
 def measure_step(path: Path, steps: int = 200) -> dict[str, Any]:
@@ -42,7 +55,7 @@ def measure_step(path: Path, steps: int = 200) -> dict[str, Any]:
     ours, theirs = [], []
     for step in range(WARM_UP + max(steps, 200)):
         if step == WARM_UP:
-            begun, busy = time.perf_counter(), time.thread_time()
+            clock = CoreClock()
         start = time.perf_counter()
         stream.step(sparse)
         middle = time.perf_counter()
@@ -54,35 +67,53 @@ def measure_step(path: Path, steps: int = 200) -> dict[str, Any]:
         **_milliseconds("", ours),
         **_milliseconds("yardstick_", theirs),
         "ratio_to_yardstick": float(np.median(ours) / np.median(theirs)),
-        "core_share": (time.thread_time() - busy) / (time.perf_counter() - begun),
+        "core_share": clock.share,
         "steps": len(ours),
         "threads": 1,
     }
 
 
-def time_in_turn(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, np.ndarray]:
+def time_in_turn(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, InTurn]:
     """Time the steps of exported files on one thread, with all files in turn in each round.
 
     A file's first steps in each round, in which the caches fill, are not counted.
-
-    Returns:
-        For each file the seconds of its steps (rounds, steps).
     """
     streams = {key: OnnxStream(path) for key, path in paths.items()}
-    seconds = {key: np.zeros((rounds, steps)) for key in paths}
     random = np.random.default_rng(0)
     given = {
         key: [np.asarray(random.normal(size=array.shape), np.float32) for array in stream.inputs.values()]
         for key, stream in streams.items()
     }
-    for index in range(rounds):
-        for key, stream in streams.items():
-            for step in range(-SETTLING, steps):
-                start = time.perf_counter()
-                stream.step(*given[key])
-                if step >= 0:
-                    seconds[key][index, step] = time.perf_counter() - start
-    return seconds
+
+    def time_round(key: Key) -> np.ndarray:
+        seconds = np.zeros(SETTLING + steps)
+        for step in range(len(seconds)):
+            start = time.perf_counter()
+            streams[key].step(*given[key])
+            seconds[step] = time.perf_counter() - start
+        return seconds[SETTLING:]
+
+    return in_turn(paths, rounds, time_round)
+
+
+def in_turn(keys: Iterable[Key], rounds: int, time_round: Callable[[Key], np.ndarray]) -> dict[Key, InTurn]:
+    """Time files in rounds, all in turn in each, in an order that is reversed after each round.
+
+    Args:
+        keys: the files' keys.
+        rounds: how many rounds.
+        time_round: times a file's steps of one round, and returns their seconds (steps,).
+    """
+    order = list(keys)
+    seconds: dict[Key, list[np.ndarray]] = {key: [] for key in order}
+    shares: dict[Key, list[float]] = {key: [] for key in order}
+    for _ in range(rounds):
+        for key in order:
+            clock = CoreClock()
+            seconds[key].append(time_round(key))
+            shares[key].append(clock.share)
+        order.reverse()
+    return {key: InTurn(np.array(seconds[key]), np.array(shares[key])) for key in seconds}
 
 
 def profile(path: Path, steps: int = 100) -> list[tuple[str, str, float, float]]:

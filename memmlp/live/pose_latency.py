@@ -9,7 +9,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from memmlp.deploy.latency import SETTLING
+from memmlp.common.core_share import CoreClock
+from memmlp.deploy.latency import SETTLING, InTurn, in_turn
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.live.rotations import quaternion_to_matrix
 from memmlp.live.stream import Stream
@@ -25,27 +26,29 @@ def measure_pose(path: Path, steps: int) -> dict[str, float]:
 
     A pose is a call of `Stream.step`: features, conversions, forward kinematics and the network's step.
     Unlike in `measure_step`, no yardstick runs in between. So a small network stays in the caches, and its
-    whole pose may take less time than its step does there.
+    whole pose may take less time than its step does there. `pose_core_share` is the share of that time in
+    which the thread had a core.
     """
-    seconds = alternate(Stream(path), None, WARM_UP + max(steps, LEAST))[WARM_UP:, 1]
+    stream, clock = Stream(path), CoreClock()
+    seconds = alternate(stream, None, WARM_UP + max(steps, LEAST))[WARM_UP:, 1]
     return {
         "pose_median_ms": 1000 * float(np.median(seconds)),
         "pose_p95_ms": 1000 * float(np.percentile(seconds, 95)),
+        "pose_core_share": clock.share,
     }
 
 
-def time_poses_in_turn(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, np.ndarray]:
+def time_poses_in_turn(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, InTurn]:
     """Time whole poses of exported networks on one thread, with all files in turn in each round.
 
-    Returns:
-        For each file the seconds of its poses (rounds, steps); the first poses of a round are left out.
+    The first poses of a round are left out.
     """
     streams = {key: Stream(path) for key, path in paths.items()}
-    seconds = {key: np.zeros((rounds, steps)) for key in paths}
-    for index in range(rounds):
-        for key, stream in streams.items():
-            seconds[key][index] = alternate(stream, None, SETTLING + steps)[SETTLING:, 1]
-    return seconds
+
+    def time_round(key: Key) -> np.ndarray:
+        return alternate(streams[key], None, SETTLING + steps)[SETTLING:, 1]
+
+    return in_turn(paths, rounds, time_round)
 
 
 def alternate(stream: Stream, network: OnnxStream | None, frames: int) -> np.ndarray:

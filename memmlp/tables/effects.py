@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from memmlp.sweep.definition import COSTS, Arm, Sweep
+from memmlp.sweep.definition import COSTS, TIMES, Arm, Sweep
 from memmlp.tables.measured_run import Measured
 from memmlp.tables.statistics import detectable, equivalence_p, holm, paired_effects, verdict
-from memmlp.tables.table import Effect, Key
+from memmlp.tables.table import STEADY, Effect, Key
 
 RunsBySeed = Mapping[int, Measured]  # an arm's finished runs by seed
 
@@ -204,13 +204,17 @@ def _judged(
 
 
 def _costs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -> dict[Key, Effect]:
-    """Return the differences of mean costs, without intervals: costs are exact, or hold for this machine."""
+    """Return the differences of mean costs, without intervals: costs are exact, or hold for this machine.
+
+    Of times it is said whether they differ beyond what they do by themselves.
+    """
     found = {}
     for arm, other in _compared(sweep):
         for mode, metric in itertools.product(modes, set(sweep.metrics) & set(COSTS)):
             sides = [_mean_cost(runs[one.label], metric) for one in (arm, other)]
             if not any(math.isnan(side) for side in sides):
-                found[Key(arm.label, mode, metric)] = Effect(sides[0] - sides[1])
+                noise = metric in TIMES and max(sides) < STEADY * min(sides)
+                found[Key(arm.label, mode, metric)] = Effect(sides[0] - sides[1], within_noise=noise)
     return found
 
 

@@ -29,6 +29,11 @@ def quoted(labels: Iterable[str]) -> str:
     return listed([f"'{label}'" for label in unique(labels)])
 
 
+def had_core(label: str, share: float) -> str:
+    """Name what was timed while its thread had a core for only a share of the time."""
+    return f"'{label}' (had a core for {100 * share:.0f} % of the time)"
+
+
 def listed(words: Sequence[str], most: int = 12) -> str:
     """Join words with commas; of many words, only the first ones and the number of the others."""
     return ", ".join(words[:most]) + (f", and {len(words) - most} more" if len(words) > most else "")

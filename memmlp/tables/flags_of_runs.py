@@ -9,17 +9,16 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from memmlp.sweep.definition import COSTS, Arm, Sweep
+from memmlp.common.core_share import LEAST_CORE_SHARE
+from memmlp.sweep.definition import COSTS, TIMES, Arm, Sweep
 from memmlp.tables import flags_of_code
 from memmlp.tables.effects import RunsBySeed, control_arm, one_and_the_same
-from memmlp.tables.flag_words import flags_of_difference, listed, quoted, unique
-from memmlp.tables.measured_run import SHARED, UNKNOWN, Measured, hardly_trained
+from memmlp.tables.flag_words import flags_of_difference, had_core, listed, quoted, unique
+from memmlp.tables.measured_run import CORE_SHARES, SHARED, UNKNOWN, Measured, hardly_trained
+from memmlp.tables.table import STEADY
 
 DescribeRun = Callable[[Arm, int], str | None]
 BUILT_IN = "builtin"
-TIMES = {"ms", "network ms", "pose ms", "ratio", "FPS"}
-CORE = 0.9  # how much of a measurement the thread has to have a core for its times to be the network's
-STEADY = 1.25  # how many times the ratio of one seed that of another may be: it does not depend on the seed
 ALIKE = 1.1  # how many times the frames of its control an arm may see in training before a flag says so
 SMPLH = (1, 2, 3)  # the paper's tables on AMASS, on the rest joints of SMPL-H bodies
 ORIGIN = {
@@ -72,7 +71,7 @@ def flags(
         yield from flags_of_difference(what, [(told.get(value, value), label) for value, label in values])
     yield from flags_of_code.other_files(every)
     yield from flags_of_code.older_code((label, run.code, run.origin.plugins) for label, run in every)
-    if TIMES & set(sweep.metrics):
+    if set(TIMES) & set(sweep.metrics):
         yield from flags_of_difference("machine of the times", _timed(every))
         yield from _busy(sweep, runs)
     if set(sweep.metrics) - set(COSTS):
@@ -316,10 +315,10 @@ def _busy(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
     found = []
     for arm in sweep.runnable():
         costs = [run.costs for run in runs[arm.label].values()]
-        shares = [cost["core share"] for cost in costs if "core share" in cost]
+        shares = [cost[name] for cost in costs for name in CORE_SHARES if name in cost]
         ratios = [cost["ratio"] for cost in costs if "ratio" in cost]
-        if shares and min(shares) < CORE:
-            found.append(f"'{arm.label}' (had a core for {100 * min(shares):.0f} % of the time)")
+        if shares and min(shares) < LEAST_CORE_SHARE:
+            found.append(had_core(arm.label, min(shares)))
         elif ratios and max(ratios) > STEADY * min(ratios):
             found.append(f"'{arm.label}' (ratio {min(ratios):.3g} to {max(ratios):.3g} over seeds)")
     if found:

@@ -23,6 +23,13 @@ Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # values by mode, branch
 UNKNOWN = "?"
 SHARED = "MPJPE"  # a metric that both branches have
 LITTLE = 30 * 60 * 60  # frames: half an hour at 60 a second; `profile=small` draws 23 times as many
+CORE_SHARES = {
+    "core share": "core_share",
+    "network core share": "alone_core_share",
+    "pose core share": "pose_core_share",
+}
+"""The shares of the measured times, of a step, of the network alone and of a pose, in which the thread had a
+core: their names among a run's costs, and in a deployment's record. Earlier runs lack some."""
 SAME = 1e-4  # relative difference up to which two errors count as those of the same joints (float32)
 
 
@@ -89,8 +96,8 @@ class Measured:
         groups: the group (take, subject) of each clip; a clip that is not listed is a group of its own.
         costs: GFLOP and GMAC of the network as it was trained, for one frame; ms of a step of the exported
             graph, the ratio of its time to the yardstick's in the same minute, millions of parameters, MB of
-            the ONNX file, frames per second, and the share of the measured time in which the thread had a
-            core.
+            the ONNX file, frames per second, and the shares of the measured times in which the thread had a
+            core (CORE_SHARES).
         origin: what the run was made from.
         latency: all measurements of its streaming step.
         sources: the source of each clip, if the data has several sources.
@@ -324,7 +331,7 @@ def _costs(latency: Mapping[str, Any]) -> dict[str, float]:
         "pose ms": of("pose_median_ms"),
         "ratio": of("ratio_to_yardstick"),
         "FPS": 1000 / of("median_ms"),
-        "core share": of("core_share"),
+        **{name: of(key) for name, key in CORE_SHARES.items()},
     }
     return {name: float(cost) for name, cost in costs.items() if not np.isnan(cost)}
 

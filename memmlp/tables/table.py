@@ -12,6 +12,7 @@ from memmlp.sweep.definition import COSTS
 from memmlp.tables.statistics import Verdict
 
 LEVEL = 0.05
+STEADY = 1.25  # how many times a measured time may be another of the same work
 
 
 class Key(NamedTuple):
@@ -26,7 +27,7 @@ class Key(NamedTuple):
 class Effect:
     """An arm's difference from its control, over the seeds and clips that both have.
 
-    Fields that a comparison does not have are None; costs have only the mean.
+    Fields that a comparison does not have are None; costs have only the mean, and whether it is noise.
 
     Attributes:
         mean: the mean difference.
@@ -39,6 +40,7 @@ class Effect:
         seeds, clips, groups: how many of each were paired.
         level: the level with which the corrected p-values are compared.
         decided: the number of seeds of the look that decided the verdict; None without such a look.
+        within_noise: whether it is between times that differ by no more than STEADY times.
     """
 
     mean: float
@@ -54,6 +56,7 @@ class Effect:
     groups: int = 0
     level: float = LEVEL
     decided: int | None = None
+    within_noise: bool = False
 
     @property
     def significant(self) -> bool:
@@ -87,9 +90,9 @@ class Cell:
     def agrees(self) -> bool | None:
         """True if the paper's effect holds, False if its opposite does; None if neither is known.
 
-        The verdict decides; for a cost, which has no verdict, the sign does.
+        The verdict decides; for a cost, which has no verdict, the sign does, beyond the noise of times.
         """
-        if self.effect is None or not self.paper_effect or not self.effect.mean:
+        if self.effect is None or not self.paper_effect or not self.effect.mean or self.effect.within_noise:
             return None
         if not self.effect.seeds:
             return (self.effect.mean > 0) == (self.paper_effect > 0)

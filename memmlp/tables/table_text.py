@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from memmlp.evaluation.units import HIGHER, UNITS
 from memmlp.sweep.definition import COSTS
 from memmlp.tables.statistics import Verdict
-from memmlp.tables.table import Cell, Row, Table
+from memmlp.tables.table import STEADY, Cell, Row, Table
 
 COST_UNITS = {
     "FLOPs": "G",
@@ -205,7 +205,14 @@ def _agreement(table: Table) -> str:
     counts = ", ".join(f"{found[verdict]} {verdict}" for verdict in Verdict if found[verdict])
     said = f"; of {sum(found.values())} effects in {mode} mode: {counts}" if found else ""
     signs = "; of a cost by its sign" if costs else ""
+    signs += f", of a time from x {STEADY:g} on" if _has_noise(table) else ""
     return f"paper: value (difference; ✓ it holds here, ✗ the opposite does{signs}){said}"
+
+
+def _has_noise(table: Table) -> bool:
+    """Return whether the paper has an effect on a time for which ours is no more than noise."""
+    cells = [cell for row in table.rows for cells in row.cells.values() for cell in cells.values()]
+    return any(cell.paper_effect and cell.effect and cell.effect.within_noise for cell in cells)
 
 
 def _lines(table: Table, row: Row, mode: str) -> Iterable[ArmLine]:

@@ -15,7 +15,7 @@ class Validation(NamedTuple):
 
     Attributes:
         steps: how many steps had been taken.
-        seconds: processor time of these steps, in seconds, without validations.
+        seconds: processor time of these steps, of all threads, in seconds, without validations.
         error: the validation's error.
     """
 

@@ -74,8 +74,9 @@ def test_times_and_size_are_those_of_the_file_that_was_asked_for():
     assert "busy" not in said.getvalue()
 
 
-def test_times_of_a_busy_machine_say_so():
-    times = {"median_ms": 3.39, "p95_ms": 3.5, "ratio_to_yardstick": 1.2, "core_share": 0.31}
+@pytest.mark.parametrize("key", ["core_share", "alone_core_share", "pose_core_share"])
+def test_times_of_a_busy_machine_say_so(key: str):
+    times = {"median_ms": 3.39, "p95_ms": 3.5, "ratio_to_yardstick": 1.2, key: 0.31}
     said = io.StringIO()
     show_latency(Console(file=said), MEASURED | times)
     assert "it had a core for 31% of the time" in said.getvalue()

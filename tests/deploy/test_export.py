@@ -9,6 +9,7 @@ import pytest
 import tiny
 import torch
 
+from memmlp.common import core_share
 from memmlp.deploy import latency
 from memmlp.deploy.export import export, save
 from memmlp.deploy.onnx_stream import OnnxStream
@@ -104,6 +105,31 @@ def test_a_thread_without_a_core_is_seen(exported, monkeypatch):
     clock = iter([5.0, 5.0 + 1e-9])
     monkeypatch.setattr(latency.time, "thread_time", lambda: next(clock))
     assert latency.measure_step(exported[1], steps=1)["core_share"] < 1e-6
+
+
+def test_the_order_of_files_is_reversed_and_each_rounds_share_of_a_core_is_kept(monkeypatch):
+    """By clocks of the test's own: a step is 2 s, and the second round's `b` waits 6 s more for a core."""
+    clock, order = {"passed": 0.0, "busy": 0.0}, []
+    monkeypatch.setattr(core_share.time, "perf_counter", lambda: clock["passed"])
+    monkeypatch.setattr(core_share.time, "thread_time", lambda: clock["busy"])
+
+    def time_round(key):
+        order.append(key)
+        clock["busy"] += 2
+        clock["passed"] += 8 if order == ["a", "b", "b"] else 2
+        return np.array([2.0])
+
+    found = latency.in_turn("ab", 3, time_round)
+    assert order == ["a", "b", "b", "a", "a", "b"]
+    assert found["a"].core_shares.tolist() == [1, 1, 1]
+    assert found["b"].core_shares.tolist() == [1, 0.25, 1]
+    assert found["b"].seconds.tolist() == [[2], [2], [2]]
+
+
+def test_files_are_timed_in_turn(exported):
+    found = latency.time_in_turn({"a": exported[1], "b": exported[1]}, 2, 3)
+    assert all(times.seconds.shape == (2, 3) and (times.seconds > 0).all() for times in found.values())
+    assert all(times.core_shares.shape == (2,) for times in found.values())
 
 
 def test_macs_are_counted_by_hand():

@@ -2,7 +2,8 @@
 
 import pytest
 
-from memmlp.live.pose_latency import alternate, measure_pose
+from memmlp.common import core_share
+from memmlp.live.pose_latency import alternate, measure_pose, time_poses_in_turn
 from memmlp.live.stream import Stream
 
 pytestmark = pytest.mark.slow
@@ -12,7 +13,19 @@ def test_a_whole_pose_is_timed(step_files):
     file = step_files("no_memory")
     found = measure_pose(file, 1)
     assert 0 < found["pose_median_ms"] <= found["pose_p95_ms"]
+    assert 0 < found["pose_core_share"] < 1.01
     stream = Stream(file)
     both = alternate(stream, stream.network, 5)
     assert both.shape == (5, 2)
     assert (both > 0).all()
+
+
+def test_a_pose_whose_thread_had_no_core_is_seen(step_files, monkeypatch):
+    clock = iter([5.0, 5.0 + 1e-9])
+    monkeypatch.setattr(core_share.time, "thread_time", lambda: next(clock))
+    assert measure_pose(step_files("no_memory"), 1)["pose_core_share"] < 1e-6
+
+
+def test_poses_are_timed_in_turn(step_files):
+    (times,) = time_poses_in_turn({"one": step_files("no_memory")}, 2, 3).values()
+    assert (times.seconds.shape, times.core_shares.shape) == ((2, 3), (2,))

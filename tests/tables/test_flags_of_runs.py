@@ -214,6 +214,8 @@ def test_times_of_another_machine_than_the_controls_are_said(sweep: Sweep, tmp_p
     [
         ({"ratio_to_yardstick": 0.8}, "(ratio 0.6 to 0.8 over seeds)"),
         ({"core_share": 0.52}, "(had a core for 52 % of the time)"),
+        ({"core_share": 0.97, "alone_core_share": 0.52}, "(had a core for 52 % of the time)"),
+        ({"pose_core_share": 0.52}, "(had a core for 52 % of the time)"),
         ({"ratio_to_yardstick": 0.7, "core_share": 0.97}, None),
     ],
 )

@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fake_runs import fake_sweep, table_of
 from fake_table import cell, printed
 
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import Sweep
+from memmlp.sweep.sweep_file import parse_sweep
 from memmlp.tables.statistics import Verdict
-from memmlp.tables.table import Effect, Table
+from memmlp.tables.table import Cell, Effect, Table
 
 
 def test_mean_and_sd_over_seeds(sweep: Sweep, table: Table, tmp_path: Path):
@@ -54,4 +56,37 @@ def test_what_the_table_could_have_seen(table: Table, sweep: Sweep, tmp_path: Pa
 def test_costs_come_from_the_latency(table: Table):
     assert cell(table, "full_model", "FLOPs").mean == pytest.approx(0.026)
     assert cell(table, "no | memory", "ms").mean == pytest.approx(0.96)
-    assert cell(table, "no | memory", "ms").effect == Effect(pytest.approx(0.16))
+    assert cell(table, "no | memory", "ms").effect == Effect(pytest.approx(0.16), within_noise=True)
+
+
+@pytest.mark.parametrize(
+    ("factor", "printed_ms", "ms", "fps"),
+    [
+        (1.2, "6.8 (+0.8)", None, None),
+        (1.3, "6.8 (+0.8 ✓)", True, True),
+        (0.85, "6.8 (+0.8)", None, None),
+        (0.7, "6.8 (+0.8 ✗)", False, False),
+    ],
+)
+def test_times_agree_with_the_paper_beyond_their_noise_alone(
+    factor: float, printed_ms: str, ms: bool | None, fps: bool | None, tmp_path: Path
+):
+    arms = {"one": {"overrides": ["a=b"], "paper": {"ms": 6.8, "FPS": 65.0}},
+            "control": {"overrides": [], "paper": {"ms": 6.0, "FPS": 72.0}}}  # fmt: skip
+    file = {"title": "Times", "seeds": [0], "control": "control", "metrics": ["ms", "FPS"], "arms": arms}
+    sweep = parse_sweep("times", file)
+    made = table_of(sweep, fake_sweep(tmp_path, sweep, {"one": factor}))
+    assert (cell(made, "one", "ms").agrees, cell(made, "one", "FPS").agrees) == (ms, fps)
+    assert printed_ms in " ".join(printed(made, 200).split())
+
+
+def test_a_missing_mark_of_a_time_is_explained_beside_others(tmp_path: Path):
+    """Costs that are exact go by their sign, however small; the legend says what of times is noise."""
+    arms = {"slow": {"overrides": ["a=b"], "paper": {"ms": 6.8}},
+            "slower": {"overrides": ["a=c"], "paper": {"ms": 9.0}},
+            "control": {"overrides": [], "paper": {"ms": 6.0}}}  # fmt: skip
+    file = {"title": "Times", "seeds": [0], "control": "control", "metrics": ["ms"], "arms": arms}
+    sweep = parse_sweep("times", file)
+    find = fake_sweep(tmp_path, sweep, {"slow": 1.1, "slower": 2.0})
+    assert "of a cost by its sign, of a time from x 1.25 on)" in printed(table_of(sweep, find), 200)
+    assert Cell({0: 1.001}, 2.0, Effect(0.001), 1.0).agrees is True

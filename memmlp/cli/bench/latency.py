@@ -11,7 +11,7 @@ import click
 from memmlp.cli.options import config_dir_option, plugins_option
 
 if TYPE_CHECKING:
-    import numpy as np
+    from memmlp.deploy.latency import InTurn
 
 Timed = tuple[str, str]
 """A network in MODELS, and a variant in VARIANTS."""
@@ -112,11 +112,14 @@ def latency(
         paths = dict(export_all(chosen, overrides, Path(folder)))
         rows = timed(paths, rounds, steps)
         show(rows, rounds)
+        if warning := busy(rows):
+            click.echo(warning, err=True)
         if file:
             from memmlp.common.files import write_json
             from memmlp.runs.environment import environment
 
-            write_json(file, {"overrides": list(overrides), "made_by": environment(), "rows": rows})
+            how = {"overrides": list(overrides), "rounds": rounds, "steps": steps, "threads": 1}
+            write_json(file, {**how, "made_by": environment(), "rows": rows})
         if breakdown:
             name, variant = breakdown.split(":")
             show_breakdown(paths[name, variant])
@@ -172,39 +175,63 @@ def timed(paths: dict[Timed, Path], rounds: int, steps: int) -> list[dict[str, A
     from memmlp.deploy.latency import time_in_turn
     from memmlp.live.pose_latency import time_poses_in_turn
 
-    seconds = time_in_turn(paths, rounds, steps)
+    whole = time_in_turn(paths, rounds, steps)
     deployed = {key: path for key, path in paths.items() if key[1] in DEPLOYED}
     poses = time_poses_in_turn(deployed, rounds, steps)
     return [
         {"model": key[0], "variant": key[1]}
-        | summary("", times, seconds[BASE])
+        | summary("", times, whole[BASE])
         | (summary("pose_", poses[key], poses[POSE_BASE]) if key in poses else {})
-        for key, times in seconds.items()
+        for key, times in whole.items()
     ]
 
 
-def summary(prefix: str, seconds: np.ndarray, base: np.ndarray) -> dict[str, float]:
+def summary(prefix: str, times: InTurn, base: InTurn) -> dict[str, float]:
     """Summarise a file's times.
 
     Args:
         prefix: the beginning of the keys.
-        seconds: the time of each step (rounds, steps).
-        base: the time of each step of the file with which it is compared (rounds, steps).
+        times: its times.
+        base: the times of the file with which it is compared.
 
     Returns:
-        Median and 95th percentile in milliseconds; and the median, minimum and maximum, over the rounds, of
-        the ratio of both medians.
+        Median and 95th percentile in milliseconds; the median, minimum and maximum, over the rounds, of the
+        ratio of both medians; and the least share of a round in which the thread had a core.
     """
     import numpy as np
 
-    ratios = np.median(seconds, 1) / np.median(base, 1)
+    seconds = times.seconds
+    ratios = np.median(seconds, 1) / np.median(base.seconds, 1)
     return {
         f"{prefix}median_ms": 1000 * float(np.median(seconds)),
         f"{prefix}p95_ms": 1000 * float(np.percentile(seconds, 95)),
         f"{prefix}ratio_to_avatar_poser": float(np.median(ratios)),
         f"{prefix}ratio_least": float(ratios.min()),
         f"{prefix}ratio_most": float(ratios.max()),
+        f"{prefix}core_share": float(times.core_shares.min()),
     }
+
+
+def least_core_share(row: dict[str, Any]) -> float:
+    """Return the least share of a round, of steps or of poses, in which a row's thread had a core."""
+    return min(row[key] for key in ("core_share", "pose_core_share") if key in row)
+
+
+def busy(rows: list[dict[str, Any]]) -> str:
+    """Return a line that names the rows that were timed while other work ran; empty if there are none.
+
+    A long step is interrupted more often than a short one, so that other work is in their ratio, too.
+    """
+    from memmlp.common.core_share import LEAST_CORE_SHARE
+    from memmlp.tables.flag_words import had_core, listed
+
+    found = [
+        had_core(f"{row['model']} {row['variant']}", share)
+        for row in rows
+        if (share := least_core_share(row)) < LEAST_CORE_SHARE
+    ]
+    said = "timed on a busy machine, so that other work is in the times and ratios"
+    return f"{said}: {listed(found)}" if found else ""
 
 
 def show(rows: list[dict[str, Any]], rounds: int) -> None:
@@ -214,10 +241,11 @@ def show(rows: list[dict[str, Any]], rounds: int) -> None:
 
     print(f"milliseconds on one thread, {rounds} rounds in turn; x: of AvatarPoser's network, or of its pose")
     print("torch: AvatarPoser's network of torch's own layers, which checks the time of ours")
+    print("core: the least % of a round in which the thread had a core")
     table = Table(box=None, pad_edge=False)
     for name in ("network", "graph"):
         table.add_column(name, no_wrap=True)
-    for name in ("step", "p95", "x", "rounds", "pose", "x"):
+    for name in ("step", "p95", "x", "rounds", "pose", "x", "core"):
         table.add_column(name, justify="right", no_wrap=True)
     for r in rows:
         table.add_row(
@@ -226,6 +254,7 @@ def show(rows: list[dict[str, Any]], rounds: int) -> None:
             *(short(r[key]) for key in ("median_ms", "p95_ms", "ratio_to_avatar_poser")),
             f"{short(r['ratio_least'])}-{short(r['ratio_most'])}",
             *(short(r[key]) if key in r else "" for key in ("pose_median_ms", "pose_ratio_to_avatar_poser")),
+            f"{100 * least_core_share(r):.0f}",
         )
     Console().print(table)
 

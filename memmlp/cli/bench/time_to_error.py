@@ -71,7 +71,8 @@ def train(
     Today's recipe is `memmlp train` with OVERRIDES (by default profile=small); the recipe has the overrides
     of --recipe, too. For each seed both are trained on the CPU, in turn, piece by piece. Printed are when
     each first had the validation error (stream mode) that today's ends with, in steps and in seconds of the
-    processor without validations, and the ratio of the seconds with an interval over seeds.
+    processor (of all threads, so no time of a clock) without validations, and the ratio of the seconds with
+    an interval over seeds.
     """
     import os
     import shlex
@@ -90,26 +91,72 @@ def train(
                 show_breakdown(arm, (*BASE, *overrides, *words), breakdown)
         return
     subject = {"overrides": list(overrides), "recipe": list(own), "error": error, "every": every}
-    rows = known_rows(file, subject)
-    for seed in range(seeds):
-        words = (*BASE, *overrides)
-        arms = (
-            compose_experiment((*words, f"seed={seed}")),
-            compose_experiment((*words, *own, f"seed={seed}")),
-        )
-        experiments = dict(zip(ARMS, arms, strict=True))
+    arms = {
+        seed: {
+            arm: compose_experiment((*BASE, *overrides, *words, f"seed={seed}"))
+            for arm, words in zip(ARMS, ((), own), strict=True)
+        }
+        for seed in range(seeds)
+    }
+    made_by = maker(arms[0])
+    rows = known_rows(file, subject, made_by)
+    for seed, experiments in arms.items():
         rows[seed] = measure_seed(experiments, seed, error, every, rows.get(seed))
+        if seed == 0:
+            click.echo(f"s: seconds {of_processor(made_by['threads'])}")
         click.echo(seed_line(rows[seed], error))
         if file:
-            write(file, subject, rows, times)
-    click.echo(conclusion(summary([rows[seed] for seed in range(seeds)], times)))
+            write(file, subject, made_by, rows, times)
+    click.echo(conclusion(summary([rows[seed] for seed in range(seeds)], times), made_by["threads"]))
 
 
-def known_rows(file: Path | None, subject: dict[str, Any]) -> dict[int, dict[str, Any]]:
+def of_processor(threads: int) -> str:
+    """Return in words whose time is measured: that of several threads together is no time of a clock."""
+    return "of the processor" + (f", of all {threads} threads together" if threads > 1 else "")
+
+
+def maker(experiments: dict[str, Experiment]) -> dict[str, Any]:
+    """Return what the seconds of a row depend on beside its runs: threads, torch, processor, and code."""
+    import torch
+
+    from memmlp.runs.environment import code_digests, environment
+
+    packages = {name for one in experiments.values() for name in one.config.get("plugins") or ()}
+    return {
+        "threads": torch.get_num_threads(),
+        "torch": str(torch.__version__),
+        "cpu": environment()["cpu"],
+        "code": code_digests(sorted(packages)),
+    }
+
+
+def other_maker(before: dict[str, Any], now: dict[str, Any]) -> str:
+    """Return in words how what measured some rows differs from what would go on; empty if it does not.
+
+    Args:
+        before: as `maker` returned it then; empty if it was not written down.
+        now: as `maker` returns it.
+    """
+    from memmlp.runs.environment import changed
+    from memmlp.tables.flag_words import listed
+
+    if not before:
+        return "code that it does not name"
+    words = [
+        f"{key} {before[key]} (here {now[key]})" for key in now if key != "code" and before[key] != now[key]
+    ]
+    files = changed(before["code"], now["code"])
+    return ", ".join([*words, *([f"other code of {listed(files, 3)}"] if files else [])])
+
+
+def known_rows(
+    file: Path | None, subject: dict[str, Any], made_by: dict[str, Any]
+) -> dict[int, dict[str, Any]]:
     """Return the rows that a file has already, by seed; empty if there is no file.
 
     Raises:
-        InputError: if the file is from another comparison, or can't be written.
+        InputError: if the file is from another comparison, its rows were made by other code, threads, torch
+            or on another processor, or it can't be written.
     """
     from memmlp.common.errors import InputError
     from memmlp.common.files import read_json
@@ -125,6 +172,8 @@ def known_rows(file: Path | None, subject: dict[str, Any]) -> dict[int, dict[str
         raise InputError(
             f"--json {file}: is of another comparison; allowed is a new file, or the same options"
         )
+    if other := other_maker(content.get("made_by") or {}, made_by):
+        raise InputError(f"--json {file}: its rows are of {other}; allowed is a new file, or what made them")
     return {row["seed"]: row for row in content["seeds"]}
 
 
@@ -174,7 +223,7 @@ def measure_seed(
     if known is not None:
         if known["runs"] != ids:
             raise InputError(
-                "--json: what is measured there is of other code, configs or data; use a new file"
+                "--json: what is measured there is of other configs, recipe versions or data; use a new file"
             )
         return known
     if len({(run.data, run.upstream.id if run.upstream else None) for run in runs.values()}) > 1:
@@ -240,15 +289,19 @@ def summary(rows: Sequence[dict[str, Any]], times: float) -> dict[str, Any]:
     return {**numbers, "verdict": str(verdict(p, np.nan, mean, 1.0)), "times": times, "never": never}
 
 
-def write(file: Path, subject: dict[str, Any], rows: dict[int, dict[str, Any]], times: float) -> None:
-    """Write the measurements, with the number of threads and the summary so far."""
-    import torch
-
+def write(
+    file: Path,
+    subject: dict[str, Any],
+    made_by: dict[str, Any],
+    rows: dict[int, dict[str, Any]],
+    times: float,
+) -> None:
+    """Write the measurements, with their unit, what made all of them (`maker`) and the summary so far."""
     from memmlp.common.files import write_json
 
     every = list(rows.values())
-    setting = {"threads": torch.get_num_threads(), "torch": torch.__version__}
-    write_json(file, {"subject": subject, **setting, "seeds": every, "summary": summary(every, times)})
+    about = {"subject": subject, "made_by": made_by, "unit": f"seconds {of_processor(made_by['threads'])}"}
+    write_json(file, {**about, "seeds": every, "summary": summary(every, times)})
 
 
 def seed_line(row: dict[str, Any], error: str) -> str:
@@ -260,18 +313,21 @@ def seed_line(row: dict[str, Any], error: str) -> str:
     return "; ".join(parts)
 
 
-def conclusion(found: dict[str, Any]) -> str:
-    """Return the last line: ratio, interval, verdict."""
+def conclusion(found: dict[str, Any], threads: int) -> str:
+    """Return the last line: ratio, whose time it is of, interval, verdict."""
     claim = f"at least {found['times']:g} times: {found['verdict']}"
     if found["never"]:
         return f"the recipe never had the error with seed {', '.join(map(str, found['never']))}; {claim}"
     several = found["low"] is not None
+    mine = f"in seconds {of_processor(threads)}"
     interval = f"{found['low']:.2f} to {found['high']:.2f}" if several else "none, of one seed"
-    return f"{found['ratio']:.2f} times sooner (95 % interval over seeds: {interval}); {claim}"
+    return f"{found['ratio']:.2f} times sooner {mine} (95 % interval over seeds: {interval}); {claim}"
 
 
 def show_breakdown(arm: str, words: Sequence[str], steps: int) -> None:
     """Print how long a step takes, and each of its parts."""
+    import torch
+
     from memmlp.training.step_profile import PARTS, step_parts
 
     experiment = compose_experiment((*words, f"optim.steps={WARM_UP + 2 * steps}"))
@@ -282,7 +338,8 @@ def show_breakdown(arm: str, words: Sequence[str], steps: int) -> None:
     alone = 1000 * (one.seconds - before) / steps
     parts = step_parts(one.take, steps)
     whole = sum(parts.values())
-    click.echo(f"{arm}: a step takes {alone:.1f} ms of the processor; with the profiler {whole:.1f} ms pass,")
+    mine = of_processor(torch.get_num_threads())
+    click.echo(f"{arm}: a step takes {alone:.1f} ms {mine}; with the profiler {whole:.1f} ms pass,")
     click.echo(f"  {whole / parts[PARTS[0]]:.2f} times its matrix products:")
     for name, value in parts.items():
         click.echo(f"  {name:<16}{value:8.2f} ms  {100 * value / whole:5.1f} %")

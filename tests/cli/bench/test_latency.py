@@ -10,18 +10,37 @@ import tiny
 import torch
 from conftest import Memmlp, one_line
 
-from memmlp.cli.bench.latency import CHECK, VARIANTS, summary
+from memmlp.cli.bench.latency import CHECK, VARIANTS, busy, show, summary
 from memmlp.cli.bench.torch_avatar_poser import TorchAvatarPoser, export_plainly
+from memmlp.deploy.latency import InTurn
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
 
 
 def test_a_summary_by_hand():
     seconds = np.array([[1, 2, 3], [4, 4, 4], [6, 6, 6]]) * 1e-3
-    found = summary("pose_", seconds, np.full((3, 2), 2e-3))
+    base = InTurn(np.full((3, 2), 2e-3), np.ones(3))
+    found = summary("pose_", InTurn(seconds, np.array([0.98, 0.7, 1.0])), base)
     assert found["pose_median_ms"] == pytest.approx(4)
     assert [found[f"pose_ratio_{key}"] for key in ("least", "most")] == [1, 3]
     assert found["pose_ratio_to_avatar_poser"] == pytest.approx(2)
+    assert found["pose_core_share"] == 0.7
+
+
+def test_rows_that_had_no_core_of_their_own_are_named(capsys: pytest.CaptureFixture[str]):
+    """Whether it was their steps or their poses that waited; the least share has a column."""
+    times = {"median_ms": 4.0, "p95_ms": 4.1, "ratio_to_avatar_poser": 1, "ratio_least": 1, "ratio_most": 1}
+    poses = {"pose_median_ms": 4.2, "pose_ratio_to_avatar_poser": 1.1, "pose_core_share": 0.52}
+    quiet = {"model": "rpm", "variant": "network", **times, "core_share": 0.97}
+    waited = {"model": "rpm", "variant": "int8", **times, **poses, "core_share": 0.93}
+    assert busy([quiet]) == ""
+    assert busy([quiet, waited]) == (
+        "timed on a busy machine, so that other work is in the times and ratios: "
+        "'rpm int8' (had a core for 52 % of the time)"
+    )
+    show([quiet, waited], 5)
+    shown = [line.split()[-1] for line in capsys.readouterr().out.splitlines()[-3:]]
+    assert shown == ["core", "97", "52"]
 
 
 def weights_of_torch(ours: AvatarPoser) -> dict[str, torch.Tensor]:
@@ -76,6 +95,8 @@ def test_every_graph_is_timed_and_compared(memmlp: Memmlp, tmp_path):
     written = json.loads(file.read_text())
     rows = {(row["model"], row["variant"]): row for row in written["rows"]}
     assert written["overrides"] == ["profile=tiny"]
+    assert [written[key] for key in ("rounds", "steps", "threads")] == [5, 2, 1]
+    assert all(0 < row["core_share"] < 1.01 for row in written["rows"])
     assert written["made_by"]["cores"] > 0
     assert said.code == 0
     assert list(rows) == [*(("avatar_poser", variant) for variant in VARIANTS), CHECK]

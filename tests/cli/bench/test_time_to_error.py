@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from conftest import Memmlp, one_line
 
-from memmlp.cli.bench.time_to_error import conclusion, summary
+from memmlp.cli.bench.time_to_error import conclusion, other_maker, summary
 
 TINY = ("profile=tiny", "data.synth.minutes=0.2", "threads=1", "memory=none", "optim.steps=4")
 
@@ -35,13 +35,35 @@ def test_ratio_interval_and_verdict_by_hand():
 def test_a_seed_that_never_had_the_error_leaves_nothing_to_claim():
     found = summary([row(0, 20, 1), row(1, 20, 1.1), row(2, 20, None)], 1.0)
     assert (found["verdict"], found["ratio"], found["never"]) == ("open", None, [2])
-    assert "never had the error with seed 2" in conclusion(found)
+    assert "never had the error with seed 2" in conclusion(found, 1)
 
 
 def test_one_seed_has_no_interval():
     found = summary([row(0, 20, 10)], 1.0)
     assert (found["verdict"], found["low"]) == ("open", None)
-    assert conclusion(found).startswith("2.00 times sooner (95 % interval over seeds: none")
+    assert conclusion(found, 1).startswith(
+        "2.00 times sooner in seconds of the processor (95 % interval over seeds: none"
+    )
+
+
+def test_seconds_of_several_threads_are_said_to_be_no_time_of_a_clock():
+    said = conclusion(summary([row(0, 20, 10)], 1.0), 4)
+    assert said.startswith("2.00 times sooner in seconds of the processor, of all 4 threads together (")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({}, ""),
+        ({"threads": 4}, "threads 4 (here 1)"),
+        ({"torch": "2.0", "cpu": "another"}, "torch 2.0 (here 2.1), cpu another (here one)"),
+        ({"code": {"training/loop.py": "b"}}, "other code of training/loop.py"),
+    ],
+)
+def test_rows_of_other_code_threads_torch_or_processors_are_told(change: dict, said: str):
+    now = {"threads": 1, "torch": "2.1", "cpu": "one", "code": {"training/loop.py": "a"}}
+    assert other_maker(now | change, now) == said
+    assert other_maker({}, now) == "code that it does not name"
 
 
 @pytest.mark.slow
@@ -54,11 +76,20 @@ def test_a_file_goes_on_with_the_seeds_that_it_lacks_and_refuses_another_compari
     first = json.loads(file.read_text())["seeds"]
     ran = memmlp("bench", "train", *recipe, "--seeds", "2", *TINY)
     assert ran.code == 0, ran.err
+    assert ran.out.startswith("s: seconds of the processor\nseed 0: ")
     content = json.loads(file.read_text())
     assert content["seeds"][:1] == first
     assert [one["seed"] for one in content["seeds"]] == [0, 1]
     assert first[0]["today"]["steps"] in (2, 4)
     assert first[0]["runs"]["today"] != first[0]["runs"]["recipe"]
+    assert content["unit"] == "seconds of the processor"
+    assert content["made_by"].keys() == {"threads", "torch", "cpu", "code"}
+    file.write_text(json.dumps(content | {"made_by": content["made_by"] | {"torch": "1.0"}}))
+    assert one_line(memmlp("bench", "train", *recipe, "--seeds", "2", *TINY), f"--json {file}", "torch 1.0 (")
+    code = content["made_by"]["code"] | {"training/loop.py": "another"}
+    file.write_text(json.dumps(content | {"made_by": content["made_by"] | {"code": code}}))
+    again = memmlp("bench", "train", *recipe, "--seeds", "2", *TINY)
+    assert one_line(again, f"--json {file}", "other code of training/loop.py")
     other = ("bench", "train", "--recipe", "optim.warmup=2", "--json", str(file), *TINY)
     assert one_line(memmlp(*other), f"--json {file}", "another comparison")
     changed = ("bench", "train", "--recipe", "data.synth.minutes=0.3", "--seeds", "1", *TINY)
@@ -70,6 +101,7 @@ def test_a_profile_has_every_part_of_both(memmlp: Memmlp):
     ran = memmlp("bench", "train", "--breakdown", "2", "--recipe", "optim=muon", *TINY)
     assert ran.code == 0, ran.err
     assert ran.out.count("matrix products") == 4
+    assert " ms of the processor; with" in ran.out
     assert "recipe: " in ran.out
 
 
