@@ -12,6 +12,7 @@ from memmlp.tables.effects import RunsBySeed, control_arm, effects, paper_effect
 from memmlp.tables.flags_of_runs import DescribeRun, early_looks, flags, silent
 from memmlp.tables.measured_run import Measured
 from memmlp.tables.table import Cell, Effect, Key, Row, Table
+from memmlp.tables.timed_alone import measured_for
 
 if TYPE_CHECKING:
     from memmlp.tables.seed_rounds import Rounds
@@ -191,7 +192,8 @@ def _row(
     """Return an arm's row; `runs` is None for a row with only the paper's values."""
 
     def cell(mode: str, metric: str) -> Cell:
-        numbers = {seed: run.value(mode, arm.branch, metric) for seed, run in (runs or {}).items()}
+        counted = measured_for(metric, runs or {})
+        numbers = {seed: run.value(mode, arm.branch, metric) for seed, run in counted.items()}
         values = {seed: value for seed, value in numbers.items() if value is not None}
         effect = found.get(Key(arm.label, mode, metric))
         return Cell(values, (arm.paper or {}).get(metric), effect, paper_effect(sweep, arm, metric))

@@ -16,6 +16,7 @@ from memmlp.sweep.definition import COSTS, TIMES, Arm, Sweep
 from memmlp.tables.measured_run import Measured
 from memmlp.tables.statistics import detectable, equivalence_p, holm, paired_effects, verdict
 from memmlp.tables.table import STEADY, Effect, Key
+from memmlp.tables.timed_alone import measured_for
 
 RunsBySeed = Mapping[int, Measured]  # an arm's finished runs by seed
 
@@ -219,7 +220,7 @@ def _costs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -
 
 
 def _mean_cost(runs: RunsBySeed, metric: str) -> float:
-    costs = [run.costs[metric] for run in runs.values() if metric in run.costs]
+    costs = [run.costs[metric] for run in measured_for(metric, runs).values() if metric in run.costs]
     return statistics.mean(costs) if costs else math.nan  # equal costs have themselves as their mean
 
 

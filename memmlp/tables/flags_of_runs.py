@@ -14,8 +14,9 @@ from memmlp.sweep.definition import COSTS, TIMES, Arm, Sweep
 from memmlp.tables import flags_of_code
 from memmlp.tables.effects import RunsBySeed, control_arm, one_and_the_same
 from memmlp.tables.flag_words import flags_of_difference, had_core, listed, quoted, unique
-from memmlp.tables.measured_run import CORE_SHARES, SHARED, UNKNOWN, Measured, hardly_trained
+from memmlp.tables.measured_run import SHARED, UNKNOWN, Measured, hardly_trained
 from memmlp.tables.table import STEADY
+from memmlp.tables.timed_alone import core_share, timed_alone
 
 DescribeRun = Callable[[Arm, int], str | None]
 BUILT_IN = "builtin"
@@ -312,17 +313,21 @@ def _timed(every: Sequence[tuple[str, Measured]]) -> list[tuple[str, str]]:
 
 def _busy(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
     """Flag arms whose times were measured while other work ran on the machine."""
-    found = []
+    found, fewer = [], []
     for arm in sweep.runnable():
-        costs = [run.costs for run in runs[arm.label].values()]
-        shares = [cost[name] for cost in costs for name in CORE_SHARES if name in cost]
-        ratios = [cost["ratio"] for cost in costs if "ratio" in cost]
+        counted = timed_alone(runs[arm.label])
+        shares = [share for run in counted.values() if (share := core_share(run)) is not None]
+        ratios = [run.costs["ratio"] for run in counted.values() if "ratio" in run.costs]
         if shares and min(shares) < LEAST_CORE_SHARE:
             found.append(had_core(arm.label, min(shares)))
         elif ratios and max(ratios) > STEADY * min(ratios):
             found.append(f"'{arm.label}' (ratio {min(ratios):.3g} to {max(ratios):.3g} over seeds)")
+        if len(counted) < len(runs[arm.label]):
+            fewer.append(f"'{arm.label}' ({len(counted)} of {len(runs[arm.label])})")
     if found:
         yield f"timed on a busy machine, so that other work is in the times: {listed(found)}"
+    if fewer:
+        yield f"times are of the seeds that were timed with a core to themselves: {listed(fewer)}"
 
 
 def _partial(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
