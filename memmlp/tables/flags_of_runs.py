@@ -242,7 +242,8 @@ def _no_numbers(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
             lost[cell] |= clips - short
     found = [f"'{label}' seed {seed} ({len(clips)} clips)" for (label, seed), clips in lost.items() if clips]
     if found:
-        yield f"errors that are no numbers, of clips that are left out of differences: {listed(found)}"
+        left = "of clips that are left out of differences, whose verdicts so stay open"
+        yield f"errors that are no numbers, {left}: {listed(found)}"
 
 
 def _lacking(run: Measured, mode: str, branch: str, metric: str) -> set[str]:
