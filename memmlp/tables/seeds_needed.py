@@ -42,7 +42,7 @@ def needs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str] = M
         modes: the modes of evaluation whose comparisons are returned.
     """
     seen = with_existing_branches(sweep, runs)
-    pairs, arms = paired(seen, runs, modes), {arm.label: arm for arm in seen.arms}
+    pairs, arms = paired(seen, runs, MODES), {arm.label: arm for arm in seen.arms}
     found, comparisons = [], testable(pairs)
     for key, pair in pairs.items():
         effect = paper_effect(seen, arms[key.label], key.metric)
