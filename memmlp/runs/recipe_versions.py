@@ -102,3 +102,16 @@ def outdated(known: Mapping[str, int]) -> list[str]:
 def recipes(components: list[str]) -> dict[str, int]:
     """Return the recipe versions of components by name; 0 for a component that is not in this package."""
     return {name: RECIPES.get(name, 0) for name in sorted(components)}
+
+
+def first_of_vqvae(known: Mapping[str, int], codebook: str | None = None) -> dict[str, int]:
+    """Return the recipe versions upstream of a network from before these were kept with it, by component.
+
+    Args:
+        known: the network's own recipe versions.
+        codebook: the kind of its VQ-VAE's codebook; None for the default.
+
+    Returns:
+        The first versions of its VQ-VAE and codebook; empty if its memory has no VQ-VAE upstream.
+    """
+    return {"vqvae": 1, f"codebook.{codebook or 'ema'}": 1} if "memory.vq" in known else {}
