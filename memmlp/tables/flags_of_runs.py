@@ -67,9 +67,11 @@ def flags(
     if set(sweep.metrics) - set(COSTS):
         yield from _resampled(every)
     for attribute, what in ORIGIN.items():
-        told = {UNKNOWN: "none"} if attribute == "gpu" else {}
+        unknown = "none" if attribute == "gpu" else UNKNOWN
         values = [(getattr(run.origin, attribute), label) for label, run in every]
-        yield from flags_of_difference(what, [(told.get(value, value), label) for value, label in values])
+        yield from flags_of_difference(
+            what, [(each.replace(UNKNOWN, unknown), label) for each, label in values]
+        )
     yield from flags_of_code.other_files(every)
     yield from flags_of_code.older_code((label, run.code, run.origin.plugins) for label, run in every)
     if TIMES & set(sweep.metrics):
@@ -81,6 +83,7 @@ def flags(
     yield from _partial(every)
     yield from _divided_subjects(every)
     yield from flags_of_code.recipes(every)
+    yield from flags_of_code.upstream_weights(every)
     yield from flags_of_code.own_code(every)
     yield from flags_of_code.computed_imports(every)
     uncommitted = [label for label, run in every if run.origin.changed]
