@@ -289,8 +289,8 @@ def _recipes(kept: Kept, label: str, run: Measured) -> dict[str, int]:
     from memmlp.runs.recipe_versions import first_of_vqvae
 
     words = dict(word.split("=", 1) for word in (*kept.arms.get(label, ()), *kept.overrides) if "=" in word)
-    first = first_of_vqvae(run.origin.recipes, words.get("vqvae.codebook"))
-    return {**first, **run.origin.every_recipe}
+    known = run.origin.every_recipe
+    return {**known, **first_of_vqvae(known, words.get("vqvae.codebook"))}
 
 
 def _count(runs: Mapping[str, RunsBySeed]) -> int:

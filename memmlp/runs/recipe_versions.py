@@ -105,13 +105,14 @@ def recipes(components: list[str]) -> dict[str, int]:
 
 
 def first_of_vqvae(known: Mapping[str, int], codebook: str | None = None) -> dict[str, int]:
-    """Return the recipe versions upstream of a network from before these were kept with it, by component.
+    """Return the recipe versions of a VQ-VAE from before these were kept with the networks upon it.
 
     Args:
-        known: the network's own recipe versions.
-        codebook: the kind of its VQ-VAE's codebook; None for the default.
+        known: the recipe versions that are known of a network and its upstream runs, by component.
+        codebook: the kind of the VQ-VAE's codebook; None for the default.
 
     Returns:
-        The first versions of its VQ-VAE and codebook; empty if its memory has no VQ-VAE upstream.
+        The first versions of VQ-VAE and codebook; empty if they are known, or if there is no VQ-VAE upstream.
     """
-    return {"vqvae": 1, f"codebook.{codebook or 'ema'}": 1} if "memory.vq" in known else {}
+    lacking = "memory.vq" in known and "vqvae" not in known
+    return {"vqvae": 1, f"codebook.{codebook or 'ema'}": 1} if lacking else {}

@@ -41,10 +41,10 @@ def recorded_upstream(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
 def upstream_recipes(run: Run) -> dict[str, int]:
     """Return the recipe versions of the components with which a run's upstream runs were trained.
 
-    A run from before these were recorded has the first ones of its VQ-VAE, if its memory has one upstream.
+    Where they were not recorded, a VQ-VAE upstream has the first ones.
     """
     manifest = run.manifest
-    if upstream := recorded_upstream(manifest):
-        return {name: number for one in upstream for name, number in (one.get("recipes") or {}).items()}
+    every = [one.get("recipes") or {} for one in recorded_upstream(manifest)]
+    found = {name: number for recipes in every for name, number in recipes.items()}
     codebook = (run.config.get("vqvae") or {}).get("codebook")
-    return first_of_vqvae(manifest.get("recipes") or {}, codebook)
+    return found | first_of_vqvae({**found, **(manifest.get("recipes") or {})}, codebook)

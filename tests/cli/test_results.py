@@ -89,7 +89,7 @@ def test_kept_results_upon_an_older_vqvae_are_said(
     monkeypatch.setitem(RECIPES, raised, 2)
     assert shown() == said
     for run in content["runs"].values():
-        run["origin"]["upstream_recipes"] = {raised: 2}
+        run["origin"]["upstream_recipes"] = {"vqvae": RECIPES["vqvae"], raised: 2}
     assert not shown()
 
 

@@ -128,6 +128,6 @@ def test_a_network_upon_an_older_vqvae_may_go(tmp_path: Path, monkeypatch: pytes
     assert found(tmp_path, "old") == {}
     monkeypatch.setitem(RECIPES, "codebook.ema", RECIPES["codebook.ema"] + 1)
     assert found(tmp_path, "old") == {OLD: "old"}
-    now = [{"id": CODES, "recipes": {"codebook.ema": RECIPES["codebook.ema"]}}]
+    now = [{"id": CODES, "recipes": {name: RECIPES[name] for name in ("vqvae", "codebook.ema")}}]
     Run.of(tmp_path, OLD).write_manifest({"upstream_runs": now})
     assert found(tmp_path, "old") == {}

@@ -71,3 +71,9 @@ def test_a_run_from_before_this_was_recorded_has_the_first_recipes(
     run = Run.of(tmp_path, NETWORK)
     run.begin("memmlp", config, data="d", upstream=CODES, recipes={memory: 1})
     assert upstream_recipes(run) == expected
+
+
+def test_a_refiner_upon_a_network_from_before_has_the_first_recipes_of_its_vqvae(tmp_path: Path):
+    network = trained(tmp_path, NETWORK, recipes={"memory.vq": 1})
+    refined = trained(tmp_path, PART, network, recipes={"memory.vq": 1, "refiner.sage": 1})
+    assert upstream_recipes(refined) == {"memory.vq": 1, "vqvae": 1, "codebook.ema": 1}
