@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from memmlp.sweep.definition import Sweep
     from memmlp.tables.effects import RunsBySeed
     from memmlp.tables.effects_along_axes import Trends
+    from memmlp.tables.measured_run import Measured
     from memmlp.tables.table import Table
 
 FOLDER = Path("docs/results")
@@ -278,8 +279,18 @@ def _outdated(kept: Kept) -> list[str]:
     """Return a flag that names the components whose recipe versions have changed since, if any."""
     from memmlp.runs.recipe_versions import outdated
 
-    found = sorted({words for run in kept.every for words in outdated(run.origin.recipes)})
+    every = [_recipes(kept, label, run) for label, runs in kept.runs.items() for run in runs.values()]
+    found = sorted({words for recipes in every for words in outdated(recipes)})
     return [f"made by an earlier recipe: {', '.join(found)}"] if found else []
+
+
+def _recipes(kept: Kept, label: str, run: Measured) -> dict[str, int]:
+    """Return the recipe versions of an arm's kept run and its upstream runs; older files lack the latter."""
+    from memmlp.runs.recipe_versions import first_of_vqvae
+
+    words = dict(word.split("=", 1) for word in (*kept.arms.get(label, ()), *kept.overrides) if "=" in word)
+    known = run.origin.every_recipe
+    return {**known, **first_of_vqvae(known, words.get("vqvae.codebook"))}
 
 
 def _count(runs: Mapping[str, RunsBySeed]) -> int:

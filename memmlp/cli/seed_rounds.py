@@ -158,7 +158,7 @@ def closing(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> lis
         for label, number in unseen.items()
     ]
     if any(finding.p is None for finding in still):
-        lines.append("the test clips are one group: no number of seeds decides")
+        lines.append("test clips are one group, or a network diverged on one: no number of seeds decides")
     return [*lines, *_outlooks(rounds, sweep, runs), _spent(rounds, sweep)]
 
 

@@ -41,7 +41,9 @@ from memmlp.runs.identity import (
     evaluation_recipes,
     evaluation_settings,
 )
+from memmlp.runs.resumed_origin import UPSTREAM
 from memmlp.runs.run import Run
+from memmlp.runs.upstream_origin import upstream_origins
 from memmlp.training.loop import Watch, unwatched
 
 SLOW = 0.99  # of the network's rate, below which a recording lacks frames: 59.94 Hz is as good as 60
@@ -293,7 +295,7 @@ def train_upstream(
     upstream: Run | None,
 ) -> None:
     """Train a run that other runs build upon, and mark it as done."""
-    begin(experiment, run, identity, training.config)
+    begin(experiment, run, identity, training.config, upstream)
     run.write_manifest({"partial": partial_words(experiment, data)})
     tell(f"{training.told} (run {run.id})")
     weights = upstream.weights() if upstream else None
@@ -336,7 +338,7 @@ def train_run(
     onward = ", on from its checkpoint" if run.checkpoint.exists() else ""
     say = remark if onward else tell  # a progress bar does not tell why it begins in the middle
     say(f"network: train it for {steps} steps{onward} (run {run.id})")
-    begin(experiment, run, experiment.identity(data.digest), experiment.config)
+    begin(experiment, run, experiment.identity(data.digest), experiment.config, upstream)
     if files := computed_imports(run.manifest.get("plugins") or {}):
         remark(f"plugins: edits are not seen of what is imported by computed names ({files})")
     run.write_manifest({"body": data.manifest.body, **data_warnings(experiment, data)})
@@ -387,14 +389,20 @@ def deploy_run(experiment: Experiment, run: Run, data: Prepared, name: str) -> N
         )
 
 
-def begin(experiment: Experiment, run: Run, identity: Identity, config: dict[str, Any]) -> None:
-    """Begin a training: write its config, and record in the manifest its identity and the machine."""
-    upstream = identity.upstream.id if identity.upstream else None
-    facts = {"recipes": identity.recipes, "what": identity.what, **machine(experiment)}
+def begin(
+    experiment: Experiment, run: Run, identity: Identity, config: dict[str, Any], upstream: Run | None
+) -> None:
+    """Begin a training: write its config, and record in the manifest its identity and the machine.
+
+    The manifest also has the weights that the training builds upon, and what these were made by.
+    """
+    above = identity.upstream.id if identity.upstream else None
+    facts: dict[str, Any] = {UPSTREAM: upstream_origins(upstream)} if upstream else {}
+    facts |= {"recipes": identity.recipes, "what": identity.what, **machine(experiment)}
     facts |= {"processes": distributed.size(), **own_code(experiment)}
     counting = {**(identity.upstream.config if identity.upstream else {}), **identity.config}
     facts |= {"name": experiment.called(identity.kind, counting), "user": user()}
-    run.begin(identity.kind, config, data=identity.data, upstream=upstream, **facts)
+    run.begin(identity.kind, config, data=identity.data, upstream=above, **facts)
 
 
 def user() -> str | None:

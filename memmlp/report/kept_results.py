@@ -33,7 +33,10 @@ LATER_FACTS = (
     "divided",
     "resampled",
     "computed_imports",
+    "upstream_recipes",
+    "upstream_weights",
 )  # the origins of older files have none of these
+NO_LATER_FACTS = asdict(Origin(code="", changed=False, data="", hardware=""))
 OLDER_NAMES = {"vqvae": "upstream"}  # what the origins of older files call otherwise
 
 
@@ -298,7 +301,7 @@ def _record(run: Measured) -> dict[str, Any]:
     costs = _shortened_costs(run)
     origin = plain(asdict(run.origin))
     for name in LATER_FACTS:
-        if origin[name] == getattr(Origin, name):
+        if origin[name] == NO_LATER_FACTS[name]:
             del origin[name]
     training = {"training": {name: _short(number) for name, number in run.training.items()}}
     record = {"origin": origin, "clips": _clips_key(run), "costs": costs}

@@ -109,8 +109,8 @@ def origin_words(kept: Kept) -> str:
     parts = [" and ".join(f"{count} {what}{'s' * (count != 1)}" for what, count in counts.items() if count)]
     for attribute, what in ORIGIN.items():
         values = {str(getattr(run.origin, attribute)) for run in kept.every}
-        # A run that other code went on with has several commits; each of all is named once.
-        values = {one for words in values for one in words.split(", ")} if attribute == "code" else values
+        # A run has several where others went on with it, or made what it builds upon; each is named once.
+        values = {one for words in values for one in words.split(", ")}
         parts += [f"{what} {escaped(_listed(sorted(values - {UNKNOWN})))}"] if values - {UNKNOWN} else []
     parts += sorted({escaped(run.origin.partial) for run in kept.every if run.origin.partial})
     recipes = _recipes(kept.every)
@@ -129,7 +129,7 @@ def _listed(words: Sequence[str]) -> str:
 
 def _recipes(runs: Iterable[Measured]) -> str:
     """Return the recipe versions of the components."""
-    found = sorted({(name, number) for run in runs for name, number in run.origin.recipes.items()})
+    found = sorted({(name, number) for run in runs for name, number in run.origin.every_recipe.items()})
     return ", ".join(f"{escaped(name)} {number}" for name, number in found)
 
 

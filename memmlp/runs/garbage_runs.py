@@ -15,6 +15,7 @@ from memmlp.runs.notes import read_notes
 from memmlp.runs.recipe_versions import outdated
 from memmlp.runs.run import Run
 from memmlp.runs.shown_name import kind_words
+from memmlp.runs.upstream_origin import upstream_recipes
 
 REASONS = ("failed", "old", "orphaned")
 
@@ -70,7 +71,7 @@ def delete(one: Garbage) -> bool:
 def _reason(run: Run, orphans: Mapping[str, str]) -> tuple[str, str]:
     if run.failure and not run.done:  # a trained run may have failed in an export alone
         return "failed", run.failure
-    if changed := outdated(run.manifest.get("recipes") or {}):
+    if changed := outdated({**upstream_recipes(run), **(run.manifest.get("recipes") or {})}):
         return "old", f"older recipe: {', '.join(changed)}"
     return ("orphaned", orphans[run.id]) if run.id in orphans else ("", "")
 

@@ -10,11 +10,15 @@ from memmlp.runs.environment import changed
 MACHINE = ("device", "gpu", "gpu_index", "threads", "processes", "precision", "cpu")
 """What can change a result's last digits, and which of a machine's GPUs it was."""
 
+UPSTREAM = "upstream_runs"
+"""The key of the manifest with the origins of a run's upstream runs."""
+
 
 def joined(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
     """Join the origins of a training before and after it was resumed; if they differ, both are kept.
 
-    A file whose code changed in between gets "mixed" in place of a digest.
+    A file whose code changed in between gets "mixed" in place of a digest. Upstream runs that have become
+    others since (trained again, under the same ids) follow those of today.
 
     Args:
         before: the manifest so far, empty for a training from the start.
@@ -30,6 +34,9 @@ def joined(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any
         found["git"] = {**new, "dirty": old["dirty"] or new["dirty"]} | ({"before": other} if other else {})
     known = before.get("sources", after["sources"])
     found["sources"] = after["sources"] | dict.fromkeys(changed(known, after["sources"]), "mixed")
+    upstream = after.get(UPSTREAM, [])
+    if earlier := [one for one in before.get(UPSTREAM, []) if one not in upstream]:
+        found[UPSTREAM] = [*upstream, *earlier]
     for name, package in (before.get("plugins") or {}).items():
         now = (after.get("plugins") or {}).get(name, package)
         if now["digest"] != package["digest"]:

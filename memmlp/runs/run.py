@@ -276,8 +276,8 @@ class Run:
             config: the resolved config.
             data: digest of the prepared data.
             upstream: id of the run whose weights this one uses.
-            facts: further entries of the manifest, such as recipes, device and threads, and the user's
-                packages that it uses (`plugins`).
+            facts: further entries of the manifest, such as recipes, device and threads, the origins of its
+                upstream runs (`upstream_runs`), and the user's packages that it uses (`plugins`).
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         atomic_write(self.config_path, yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
@@ -387,13 +387,18 @@ class Run:
         marker = read_json(self.marker)
         return "artifacts" in marker and belongs(marker.get("id"), self.folder)
 
+    @property
+    def weights_digest(self) -> str | None:
+        """The SHA-256 of the weights as the training left them; None before it is finished."""
+        return read_json(self.marker).get("artifacts", {}).get(self.model.name)
+
     def weights(self) -> Path:
         """Return the file of the trained weights.
 
         Raises:
             InputError: if the file was changed since the training.
         """
-        digest = read_json(self.marker).get("artifacts", {}).get(self.model.name)
+        digest = self.weights_digest
         if digest and not self._same(self.model.name, digest):
             raise InputError(
                 f"{self.model}: not the weights that were trained; do the run again with force=true"

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from memmlp.sweep.definition import COSTS, TIMES, Arm, Sweep
-from memmlp.tables.measured_run import Measured
+from memmlp.tables.measured_run import SHARED, Measured
 from memmlp.tables.statistics import detectable, equivalence_p, holm, paired_effects, verdict
 from memmlp.tables.table import STEADY, Effect, Key
 from memmlp.tables.timed_alone import measured_for
@@ -45,12 +45,22 @@ class Paired(NamedTuple):
         groups: the number of each clip's group (C,).
         clips: the names of these clips (C).
         takes: the names of their groups (C).
+        diverged: whether further clips were lost because a network diverged on them.
     """
 
     matrix: np.ndarray
     groups: np.ndarray
     clips: tuple[str, ...] = ()
     takes: tuple[str, ...] = ()
+    diverged: bool = False
+
+    @property
+    def testable(self) -> bool:
+        """Whether there is a p-value: with several seeds and groups of clips, and no clip lost to divergence.
+
+        What is left after a divergence is too easy a test of the network that diverged.
+        """
+        return len(self.matrix) > 1 and len(set(self.groups)) > 1 and not self.diverged
 
 
 def control_arm(sweep: Sweep, arm: Arm) -> Arm | None:
@@ -131,14 +141,36 @@ def _paired(
 ) -> Paired:
     """Return ours minus theirs, over the shared seeds and the clips for which all runs have a number."""
     seeds, clips, names, groups = shared
-    sides = [
-        np.array([runs[seed].by_clip(clips, mode, branch, metric) for seed in seeds])
-        for runs, branch in zip((ours, theirs), branches, strict=True)
-    ]
-    matrix = (sides[0] - sides[1]).reshape(len(seeds), len(clips))
-    known = np.isfinite(matrix).all(0)
-    left = [(clip, name) for clip, name, is_known in zip(clips, names, known, strict=False) if is_known]
-    return Paired(matrix[:, known], groups[known], *map(tuple, zip(*left, strict=True)))
+
+    def errors(metric: str) -> np.ndarray:
+        """Return a metric of both sides (2, S, C)."""
+        found = [
+            [runs[seed].by_clip(clips, mode, branch, metric) for seed in seeds]
+            for runs, branch in zip((ours, theirs), branches, strict=True)
+        ]
+        return np.array(found).reshape(2, len(seeds), len(clips))
+
+    values = errors(metric)
+    known = np.isfinite(values).all((0, 1))
+    diverged = not known.all() and _diverged(values, errors(SHARED))
+    own, others = values[:, :, known]
+    left, takes = (tuple(itertools.compress(words, known)) for words in (clips, names))
+    return Paired(own - others, groups[known], left, takes, diverged)
+
+
+def _diverged(values: np.ndarray, positions: np.ndarray) -> bool:
+    """Return whether a network diverged on a clip for which a metric has no number, rather than a short clip.
+
+    A clip is too short if no run has a number for it, although all have a position error.
+
+    Args:
+        values: the metric (2, S, C) of both sides.
+        positions: their position errors (2, S, C); runs without any tell nothing.
+    """
+    known, placed = np.isfinite(values), np.isfinite(positions)
+    measured = placed.any(2, keepdims=True)
+    lost = known.any((0, 1)) | (measured & ~placed).any((0, 1))
+    return bool((lost & ~known.all((0, 1))).any())
 
 
 def _shared(ours: RunsBySeed, theirs: RunsBySeed) -> SharedClips:
@@ -166,7 +198,7 @@ def alike(pairs: Mapping[Key, Paired]) -> Iterator[tuple[list[Key], np.ndarray, 
 def tested(pairs: Mapping[Key, Paired], smallest: Mapping[str, float]) -> dict[Key, Effect]:
     """Return the effects with their own p-values, not corrected yet, in the order of the pairs."""
     found: dict[Key, Effect] = {}
-    comparisons = testable(pairs)
+    comparisons = max(1, testable(pairs))  # with none, nothing computed by it is shown
     for keys, differences, groups in alike(pairs):
         size = {"seeds": differences.shape[1], "clips": differences.shape[2], "groups": len(set(groups))}
         margins = np.array([smallest.get(key.metric, np.nan) for key in keys])
@@ -175,7 +207,8 @@ def tested(pairs: Mapping[Key, Paired], smallest: Mapping[str, float]) -> dict[K
         numbers = paired_effects(differences, groups)
         columns = zip(keys, numbers.mean, numbers.low, numbers.high, numbers.p, same, seen, strict=True)
         for key, mean, low, high, p, equal, least in columns:
-            words = {"low": low, "high": high, "p": p, "equal": equal, "detectable": least}
+            words = {"low": low, "high": high}
+            words |= {"p": p, "equal": equal, "detectable": least} if pairs[key].testable else {}
             known: dict[str, Any] = {name: or_none(number) for name, number in words.items()}
             found[key] = Effect(float(mean), **known, **size)
     return {key: found[key] for key in pairs}
@@ -183,7 +216,7 @@ def tested(pairs: Mapping[Key, Paired], smallest: Mapping[str, float]) -> dict[K
 
 def testable(pairs: Mapping[Key, Paired]) -> int:
     """Return how many comparisons have a p-value, so that Holm's correction is over them."""
-    return sum(len(pair.matrix) > 1 and len(set(pair.groups)) > 1 for pair in pairs.values())
+    return sum(pair.testable for pair in pairs.values())
 
 
 def _judged(

@@ -16,11 +16,10 @@ FILES = 5  # names of files that a flag has at most
 
 def recipes(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
     """Flag components that several arms use, but with different recipe versions."""
-    for name in sorted({name for _, run in every for name in run.origin.recipes}):
-        having = [(run, label) for label, run in every if name in run.origin.recipes]
-        yield from flags_of_difference(
-            f"recipe of {name}", [(str(r.origin.recipes[name]), label) for r, label in having]
-        )
+    versions = [(run.origin.every_recipe, label) for label, run in every]
+    for name in sorted({name for known, _ in versions for name in known}):
+        having = [(str(known[name]), label) for known, label in versions if name in known]
+        yield from flags_of_difference(f"recipe of {name}", having)
 
 
 def other_files(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
@@ -57,6 +56,16 @@ def older_code(runs: Iterable[tuple[str, Mapping[str, str], Iterable[str]]]) -> 
         labels = quoted(label for label, files in found if files)
         since = "has changed since these runs, under the same recipes"
         yield f"code of {listed(names, FILES)} {since}: {labels}"
+
+
+def upstream_weights(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
+    """Flag upstream runs with other weights under the same id: trained again, or on another machine."""
+    found: dict[str, list[tuple[str, str]]] = defaultdict(list)
+    for label, run in every:
+        for upstream, digests in run.origin.upstream_weights.items():
+            found[upstream] += [(digest, label) for digest in digests.split(", ")]
+    for upstream, having in found.items():
+        yield from flags_of_difference(f"digest of the weights of upstream run {upstream}", having)
 
 
 def own_code(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:

@@ -67,9 +67,11 @@ def flags(
     if set(sweep.metrics) - set(COSTS):
         yield from _resampled(every)
     for attribute, what in ORIGIN.items():
-        told = {UNKNOWN: "none"} if attribute == "gpu" else {}
+        unknown = "none" if attribute == "gpu" else UNKNOWN
         values = [(getattr(run.origin, attribute), label) for label, run in every]
-        yield from flags_of_difference(what, [(told.get(value, value), label) for value, label in values])
+        yield from flags_of_difference(
+            what, [(each.replace(UNKNOWN, unknown), label) for each, label in values]
+        )
     yield from flags_of_code.other_files(every)
     yield from flags_of_code.older_code((label, run.code, run.origin.plugins) for label, run in every)
     if set(TIMES) & set(sweep.metrics):
@@ -81,6 +83,7 @@ def flags(
     yield from _partial(every)
     yield from _divided_subjects(every)
     yield from flags_of_code.recipes(every)
+    yield from flags_of_code.upstream_weights(every)
     yield from flags_of_code.own_code(every)
     yield from flags_of_code.computed_imports(every)
     uncommitted = [label for label, run in every if run.origin.changed]
@@ -242,7 +245,8 @@ def _no_numbers(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
             lost[cell] |= clips - short
     found = [f"'{label}' seed {seed} ({len(clips)} clips)" for (label, seed), clips in lost.items() if clips]
     if found:
-        yield f"errors that are no numbers, of clips that are left out of differences: {listed(found)}"
+        left = "of clips that are left out of differences, whose verdicts so stay open"
+        yield f"errors that are no numbers, {left}: {listed(found)}"
 
 
 def _lacking(run: Measured, mode: str, branch: str, metric: str) -> set[str]:

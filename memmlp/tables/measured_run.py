@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from memmlp.runs.deployment_folder import as_deployed, deployed_precision, timed
 from memmlp.runs.environment import computed_imports
 from memmlp.runs.evaluation_file import intact, of_one_solver
 from memmlp.runs.run import Run
+from memmlp.runs.upstream_origin import recorded_upstream, upstream_recipes
 
 Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # values by mode, branch and metric
 UNKNOWN = "?"
@@ -37,6 +39,8 @@ SAME = 1e-4  # relative difference up to which two errors count as those of the 
 class Origin:
     """What a run was made from, and on which machine. All runs of a table should have the same origin.
 
+    Code, uncommitted changes, packages and machines include those of its upstream runs and its evaluations.
+
     Attributes:
         code: the commit; the package's version outside a checkout.
         changed: whether the checkout had uncommitted changes.
@@ -52,6 +56,9 @@ class Origin:
         recipes: the recipe version of each component.
         upstream: the id of the upstream run: a VQ-VAE's, a part's, or that of the network before a refiner;
             None if there is none.
+        upstream_recipes: the recipe version of each component of the upstream runs, as far as known.
+        upstream_weights: a digest of the weights of each upstream run, by its id, as far as known; two where
+            the run was resumed upon others.
         partial: which part of its protocol's list the data is, in words; None if it is complete.
         plugins: version and code digest of each user's package that it uses.
         computed_imports: the files of these that import by names that they compute, in words; None for none.
@@ -83,6 +90,13 @@ class Origin:
     timed_on: str = UNKNOWN
     divided: str | None = None
     resampled: str | None = None
+    upstream_recipes: Mapping[str, int] = field(default_factory=dict)
+    upstream_weights: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def every_recipe(self) -> Mapping[str, int]:
+        """The recipe version of each component, of the upstream runs too."""
+        return {**self.upstream_recipes, **self.recipes}
 
 
 @dataclass(frozen=True)
@@ -104,8 +118,8 @@ class Measured:
         run: the run's folder; None for results that were kept without it.
         training: what its training took, as far as known: `seconds`; `frames`, the frames seen, each counted
             as often as it was drawn in a window; and `flops` for kept results.
-        code: a digest of the code of each file with which it was trained (`code_digests`); empty for
-            kept results.
+        code: a digest of the code of each file with which it was trained (`code_digests`), or several where
+            its upstream runs were trained with other code; empty for kept results.
     """
 
     id: str
@@ -229,9 +243,10 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     deployments = [run.deployment(name) for name in stages or () if run.deployment(name).done]
     deployed = (deployments or [run.preferred_deployment])[-1]
     latency = deployed.record
-    origin = replace(_evaluated(_origin(manifest), reports), deployed=deployed_precision(latency))
+    origin = _evaluated(_with_upstream(_origin(manifest), run), reports)
+    origin = replace(origin, deployed=deployed_precision(latency))
     origin = replace(origin, recipes={**origin.recipes, **deployed.recipes}, timed_on=timed_on(latency))
-    training, code = _training(run, manifest), manifest.get("sources") or {}
+    training, code = _training(run, manifest), _code(manifest)
     costs = _costs(latency)
     return Measured(run.id, means, clips, groups, costs, origin, latency, run, sources, training, code)
 
@@ -370,20 +385,48 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
     )
 
 
+def _code(manifest: Mapping[str, Any]) -> dict[str, str]:
+    """Return the digests of a training's code by file, with other ones of its upstream runs."""
+    own, *others = [one.get("sources") or {} for one in (manifest, *recorded_upstream(manifest))]
+    return {name: _words([own[name], *(one[name] for one in others if name in one)]) for name in own}
+
+
+def _with_upstream(origin: Origin, run: Run) -> Origin:
+    """Return the origin of a run, joined with the origins of its upstream runs where these differ."""
+    upstream = recorded_upstream(run.manifest)
+    digests: dict[str, list[str]] = defaultdict(list)
+    for one in upstream:
+        digests[one["id"]] += [one["weights"][:8]] if one.get("weights") else []
+    weights = {name: _words(found) for name, found in digests.items() if found}
+    joined = _joined(origin, list(map(_origin, upstream)))
+    return replace(joined, upstream_recipes=upstream_recipes(run), upstream_weights=weights)
+
+
 def _evaluated(origin: Origin, reports: Sequence[Mapping[str, Any]]) -> Origin:
     """Return the origin of a run, joined with the origins of its evaluations where these differ."""
     others = [_origin({**report.get("made_by", {}), **report}) for report in reports]
+    recipes = {name: number for one in (origin, *others) for name, number in one.recipes.items()}
+    offline = any(report.get("offline") for report in reports)
+    return replace(_joined(origin, others), recipes=recipes, offline=offline)
+
+
+def _joined(origin: Origin, others: Sequence[Origin]) -> Origin:
+    """Return an origin with the code and the machines of others, where these differ."""
     found: dict[str, Any] = {"changed": origin.changed or any(other.changed for other in others)}
-    found["offline"] = any(report.get("offline") for report in reports)
     for name in ("code", "hardware", "device", "gpu", "threads", "torch"):
         known = [word for other in others if (word := getattr(other, name)) not in (UNKNOWN, "version ?")]
-        found[name] = ", ".join(dict.fromkeys([getattr(origin, name), *known]))
+        found[name] = _words([getattr(origin, name), *known])
     computed = [one.computed_imports for one in (origin, *others) if one.computed_imports]
     found["computed_imports"] = "; ".join(dict.fromkeys(computed)) or None
+    plugins = dict(origin.plugins)
     for other in others:
-        found["recipes"] = {**found.get("recipes", origin.recipes), **other.recipes}
-        found["plugins"] = _both(found.get("plugins", origin.plugins), other.plugins)
-    return replace(origin, **found)
+        plugins = _both(plugins, other.plugins)
+    return replace(origin, **found, plugins=plugins)
+
+
+def _words(parts: Iterable[str]) -> str:
+    """Join words with commas, each once; a part may be several joined words."""
+    return ", ".join(dict.fromkeys(word for part in parts for word in part.split(", ")))
 
 
 def _both(known: Mapping[str, str], more: Mapping[str, str]) -> dict[str, str]:

@@ -43,7 +43,8 @@ class Finding:
         label, mode, metric: which comparison it is.
         verdict: the verdict, final unless it is open.
         mean: the mean difference.
-        p: its p-value; None with one group of clips, where nothing can be decided.
+        p: its p-value; None with one group of clips, or where a network diverged on a clip: no number of
+            seeds can decide the comparison.
         holm: the corrected p-value of the difference, to be compared with the look's level.
         equal: the corrected p-value of equivalence, to be compared with the look's level.
     """

@@ -33,15 +33,20 @@ class Need(NamedTuple):
 def needs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str] = MODES) -> list[Need]:
     """Return the needs of all arms and metrics whose effects the paper prints, in the table's order.
 
-    The correction is over the comparisons that the runs allow today. With fewer than two seeds or two groups
-    of clips the spread can't be estimated, and the comparison is left out.
+    The correction is over the comparisons that the runs allow today, in both modes, as a table's is. A
+    comparison without a p-value, such as that of an arm with one seed, is left out.
+
+    Args:
+        sweep: the sweep.
+        runs: the finished runs of every runnable arm, by seed.
+        modes: the modes of evaluation whose comparisons are returned.
     """
     seen = with_existing_branches(sweep, runs)
-    pairs, arms = paired(seen, runs, modes), {arm.label: arm for arm in seen.arms}
+    pairs, arms = paired(seen, runs, MODES), {arm.label: arm for arm in seen.arms}
     found, comparisons = [], testable(pairs)
     for key, pair in pairs.items():
         effect = paper_effect(seen, arms[key.label], key.metric)
-        if effect and len(pair.matrix) > 1 and len(set(pair.groups)) > 1:
+        if effect and key.mode in modes and pair.testable:
             number = seeds_needed(pair.matrix, effect, comparisons, pair.groups)
             found.append(Need(*key, effect, float(pair.matrix.mean()), len(pair.matrix), number))
     return found

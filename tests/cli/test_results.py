@@ -14,6 +14,7 @@ from fake_runs import fake_sweep
 
 from memmlp.cli.results import _count
 from memmlp.config import compose_plan
+from memmlp.runs.recipe_versions import RECIPES
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.plan import Entry, Plan
 from memmlp.sweep.sweep_file import parse_sweep
@@ -56,6 +57,40 @@ def test_kept_results_are_shown_without_a_run(memmlp: Memmlp, planned: None):
     kept = memmlp("results", "show", "table14").out
     assert "in place of" not in kept
     assert kept.splitlines()[2:20] == memmlp("table", "14").out.splitlines()[2:20]
+
+
+@pytest.mark.parametrize(
+    ("raised", "words", "said"),
+    [
+        ("vqvae", [], True),
+        ("codebook.ema", [], True),
+        ("codebook.gradient", [], False),
+        ("codebook.gradient", ["vqvae.codebook=gradient"], True),
+    ],
+)
+def test_kept_results_upon_an_older_vqvae_are_said(
+    memmlp: Memmlp, planned: None, monkeypatch: pytest.MonkeyPatch, raised: str, words: list[str], said: bool
+):
+    """Older files have the recipes of the network alone, whose VQ-VAE had the first ones."""
+    memmlp("results", "save", "14")
+    path = Path("docs/results/data/table14.json")
+    content = json.loads(path.read_text())
+    content["overrides"] += words
+    for run in content["runs"].values():
+        run["origin"]["recipes"] = {"memory.vq": RECIPES["memory.vq"]}
+
+    def shown() -> bool:
+        content.pop("digest", None)
+        path.write_text(json.dumps(content))
+        found = " ".join(memmlp("results", "show", "table14").out.split())
+        return f"made by an earlier recipe: {raised} 1 -> 2" in found
+
+    assert not shown()
+    monkeypatch.setitem(RECIPES, raised, 2)
+    assert shown() == said
+    for run in content["runs"].values():
+        run["origin"]["upstream_recipes"] = {"vqvae": RECIPES["vqvae"], raised: 2}
+    assert not shown()
 
 
 def test_a_run_of_two_arms_is_one():

@@ -31,6 +31,7 @@ def test_one_command_trains_the_network_and_then_its_refiner(memmlp):
     assert ran.code == 0, ran.err
     (refined,) = (run for run in list_runs(Path("outputs")) if run.id != bare.id)
     assert refined.manifest["upstream"] == bare.id
+    assert [one["id"] for one in refined.manifest["upstream_runs"]] == [bare.id]
     assert bare.model.read_bytes() == weights
     assert refined.manifest["recipes"].keys() - bare.manifest["recipes"].keys() == {"refiner.sage"}
     assert set(refined.results) == {"window", "stream"}

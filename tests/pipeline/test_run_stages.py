@@ -22,6 +22,7 @@ from own_package import registers_kept
 from PIL import Image
 
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
+from memmlp.common.files import file_digest
 from memmlp.common.progress import telling
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
@@ -65,6 +66,10 @@ def test_a_run_leaves_everything(home):
     upstream = Run.of(home / "outputs", run.manifest["upstream"])
     assert upstream.done
     assert upstream.manifest["kind"] == "vqvae"
+    (known,) = run.manifest["upstream_runs"]
+    assert (known["id"], known["weights"]) == (upstream.id, file_digest(upstream.model))
+    assert known["recipes"] == upstream.manifest["recipes"]
+    assert load(run.folder).origin.upstream_recipes["vqvae"] == RECIPES["vqvae"]
     with Image.open(run.folder / "poses.png") as picture:
         assert picture.size[0] > 600
         assert len(picture.convert("RGB").getcolors(10**6)) > 50

@@ -43,6 +43,8 @@ def test_one_command_trains_each_part_and_then_the_whole(memmlp):
     chain = [runs[kind] for kind in (*PARTS, "memmlp")]
     assert [run.manifest["upstream"] for run in chain] == [None, *(run.id for run in chain[:-1])]
     assert all(run.done for run in chain)
+    above = [one.id for one in reversed(chain[:-1])]
+    assert [one["id"] for one in chain[-1].manifest["upstream_runs"]] == above
     assert [run.manifest["name"].partition(" ·")[0] for run in chain[:2]] == ["upper codes", "lower codes"]
     whole = chain[-1]
     assert isinstance(build_experiment(config_of(whole)).architecture.load(whole.model), SAGENet)

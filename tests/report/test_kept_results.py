@@ -234,3 +234,9 @@ def test_an_arm_that_was_never_run_may_become_another(sweep: Sweep, kept: Kept):
     other = {**kept.arms, "2": ("memory=gru",)}
     waiting.check(other)
     assert waiting.merged(replace(kept, arms=other)).arms["2"] == ("memory=gru",)
+
+
+def test_facts_that_a_run_has_not_leave_the_file_as_it_was(kept: Kept):
+    """Files from before they were recorded stay as they are, byte for byte."""
+    later = {"upstream_recipes", "upstream_weights", "partial", "timed_on"}
+    assert all(not later & run["origin"].keys() for run in json.loads(dumps(kept))["runs"].values())

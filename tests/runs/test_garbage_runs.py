@@ -10,6 +10,7 @@ from memmlp.common.files import write_json
 from memmlp.common.liveness import myself
 from memmlp.runs.garbage_runs import delete, garbage
 from memmlp.runs.notes import add_tags
+from memmlp.runs.recipe_versions import RECIPES
 from memmlp.runs.run import Run
 
 FAILED, OLD, GONE, CODES, USED, GOOD, EMPTY = (f"{letter}" * 16 for letter in "0123456")
@@ -117,3 +118,16 @@ def test_a_finished_vqvae_of_a_search_under_way_stays(outputs: Path):
     assert CODES in found(outputs)
     write_json(folder / "one.process", myself())
     assert CODES not in found(outputs)
+
+
+def test_a_network_upon_an_older_vqvae_may_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Its own recipes say nothing of a VQ-VAE that was trained upstream of it."""
+    for name, memory in ((OLD, "memory.vq"), (GOOD, "memory.none")):
+        run = Run.of(tmp_path, name)
+        run.begin("memmlp", {}, data="d", upstream=None, recipes={memory: 1})
+    assert found(tmp_path, "old") == {}
+    monkeypatch.setitem(RECIPES, "codebook.ema", RECIPES["codebook.ema"] + 1)
+    assert found(tmp_path, "old") == {OLD: "old"}
+    now = [{"id": CODES, "recipes": {name: RECIPES[name] for name in ("vqvae", "codebook.ema")}}]
+    Run.of(tmp_path, OLD).write_manifest({"upstream_runs": now})
+    assert found(tmp_path, "old") == {}

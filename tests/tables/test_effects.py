@@ -17,6 +17,7 @@ from memmlp.sweep.definition import Sweep
 from memmlp.tables.build_table import make_table
 from memmlp.tables.effects import _mean_cost
 from memmlp.tables.measured_run import load
+from memmlp.tables.seeds_needed import needs
 from memmlp.tables.statistics import Verdict, holm, paired_effects
 from memmlp.tables.table import Table
 
@@ -218,6 +219,35 @@ def test_the_correction_is_the_same_whichever_mode_is_shown(sweep: Sweep, tmp_pa
     assert one.comparisons == both.comparisons
     for label, metric in (("no | memory", "MPJPE"), ("by position", "Jitter")):
         assert cell(one, label, metric).effect == cell(both, label, metric).effect
+
+
+@pytest.mark.parametrize("word", ["nan", "inf"])
+@pytest.mark.parametrize("label", ["no | memory", "full_model"])
+def test_nothing_is_claimed_of_the_clips_that_a_divergence_leaves(
+    sweep: Sweep, tmp_path: Path, label: str, word: str
+):
+    """An arm that diverged on a hard clip would be better for it; too short a clip takes no verdict."""
+    find = fake_sweep(tmp_path, sweep, EFFECTS)
+    before = table_of(sweep, find)
+    arm = next(arm for arm in sweep.arms if arm.label == label)
+    for one, seed in [(one, seed) for one in sweep.runnable() for seed in sweep.seeds]:
+        path = find(one, seed).evaluation("stream-0")
+        report = json.loads(path.read_text())
+        for branch in ("rotation", "position"):
+            report["clips"][0][branch]["Jitter"] = "nan"  # of every run: it is too short
+        if (one, seed) == (arm, 1):
+            report["clips"][1]["rotation"] |= dict.fromkeys(("MPJPE", "MPJRE"), word)
+        path.write_text(json.dumps(report))
+    table, lost = table_of(sweep, find), ("MPJPE", "MPJRE")
+    assert all(cell(before, "no | memory", metric).effect.significant for metric in (*lost, "Jitter"))
+    for metric in lost:
+        effect = cell(table, "no | memory", metric).effect
+        assert (effect.clips, effect.verdict, effect.significant) == (11, Verdict.OPEN, False)
+        assert (effect.p, effect.equal, effect.detectable) == (None, None, None)
+        assert cell(table, "no | memory", metric, "window").effect.significant
+    assert cell(table, "no | memory", "Jitter").effect.clips == 11
+    assert cell(table, "no | memory", "Jitter").effect.significant
+    assert {need.metric for need in needs(sweep, runs_of(sweep, find), ("stream",))} == set()
 
 
 @pytest.mark.parametrize("seeds", range(1, 11))

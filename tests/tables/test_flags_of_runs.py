@@ -105,9 +105,8 @@ def test_a_network_that_diverged_on_a_clip_is_said(sweep: Sweep, tmp_path: Path,
             path.write_text(json.dumps(report))
     table = table_of(sweep, find)
     assert [cell(table, "no | memory", metric).effect.clips for metric in ("Jitter", "MPJPE")] == [11, 10]
-    line = (
-        "errors that are no numbers, of clips that are left out of differences: 'full_model' seed 1 (2 clips)"
-    )
+    left = "of clips that are left out of differences, whose verdicts so stay open"
+    line = f"errors that are no numbers, {left}: 'full_model' seed 1 (2 clips)"
     assert [flag for flag in table.flags if "no numbers" in flag] == [line]
 
 
@@ -271,6 +270,68 @@ def test_runs_of_different_origin_are_flagged(
     assert len(flags) == 1
     assert all(word in flags[0] for word in words)
     assert any("one seed" in flag for flag in table.flags)
+
+
+UPSTREAM = {**ORIGIN, "id": "a" * 16, "weights": "1" * 64}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"git": ORIGIN["git"] | {"commit": "fedcba98"}}, "code differs: 0123456 of 'no | memory', "),
+        ({"git": ORIGIN["git"] | {"commit": "fedcba98"}}, "; 0123456, fedcba9 of 'by position'"),
+        ({"git": ORIGIN["git"] | {"dirty": True}}, "made by code with uncommitted changes: 'by position'"),
+        ({"cpu": "Another one"}, "; A processor, Another one of 'by position'"),
+        ({"gpu": "A card"}, "; none, A card of 'by position'"),
+        ({"recipes": {"vqvae": 2}}, "recipe of vqvae differs: 1 of 'no | memory', 'full_model'; 2 of 'by po"),
+        ({"sources": {"ik.py": "3"}}, "code of ik.py differs: "),
+        ({"sources": {"ik.py": "3"}}, "code of ik.py has changed since these runs, under the same recipes: "),
+        ({"weights": "2" * 64}, "weights of upstream run aaaaaaaaaaaaaaaa differs: 11111111 of "),
+    ],
+)  # fmt: skip
+def test_runs_upon_upstream_runs_of_different_origin_are_flagged(
+    sweep: Sweep, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict, words: str
+):
+    """A VQ-VAE by other code, on another machine, or trained again under its id, is in every error."""
+    monkeypatch.setattr("memmlp.tables.flags_of_code.code_digests", lambda packages: {"ik.py": "1"})
+    usual = UPSTREAM | {"recipes": {"vqvae": 1}, "sources": {"ik.py": "1"}}
+
+    def table(change: dict) -> Table:
+        def run(arm: Arm, seed: int) -> Run:
+            above = usual | (change if arm.label == "by position" else {})
+            made = {"upstream": above["id"], "upstream_runs": [above], "sources": {"ik.py": "1"}}
+            return fake_run(tmp_path, arm.label, seed, origin=made)
+
+        return table_of(sweep, run)
+
+    before = set(table({}).flags)
+    assert any(words in flag for flag in set(table(change).flags) - before)
+    assert not any(words in flag for flag in before)
+
+
+def test_seeds_upon_other_weights_of_one_upstream_run_are_flagged(sweep: Sweep, tmp_path: Path):
+    """Also after they were kept, and where a training was resumed upon others; of old runs none is known."""
+    weights = {0: ["1"], 1: ["1", "2"], 2: []}
+
+    def run(arm: Arm, seed: int) -> Run:
+        above = [UPSTREAM | {"weights": 64 * one} for one in weights[seed]]
+        made = {"upstream": UPSTREAM["id"], **({"upstream_runs": above} if above else {})}
+        return fake_run(tmp_path, arm.label, seed, origin=made)
+
+    def said(runs) -> list[str]:
+        return [flag for flag in make_table(sweep, runs).flags if "weights of upstream" in flag]
+
+    runs = runs_of(sweep, run)
+    every = "'no | memory', 'by position', 'full_model'"
+    line = (
+        f"digest of the weights of upstream run {'a' * 16} differs: 11111111 of {every}; 22222222 of {every}"
+    )
+    assert said(runs) == [line]
+    path = tmp_path / "kept.json"
+    path.write_text(dumps(Kept("table11", (), runs, {})))
+    assert said(load_kept(path).runs) == [line]
+    weights[1] = ["1"]
+    assert said(runs_of(sweep, run)) == []
 
 
 def test_files_that_differ_between_arms_of_one_commit_are_named(sweep: Sweep, tmp_path: Path):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from fake_runs import CLIPS, fake_sweep, runs_of
 
-from memmlp.sweep.definition import Sweep
+from memmlp.sweep.definition import MODES, Sweep
 from memmlp.tables.seeds_needed import needs
 
 
@@ -26,5 +26,7 @@ def test_seeds_that_the_papers_effects_need(sweep: Sweep, tmp_path: Path):
     alone = needs(sweep, {**runs, "by position": {}})
     assert needs(sweep, {**runs, "by position": {0: runs["by position"][0]}}) == alone  # it has no p-values
     assert needs(replace(sweep, seeds=(0,)), runs_of(replace(sweep, seeds=(0,)), find)) == []
+    for mode in MODES:  # the table's own correction is over both, whichever is shown
+        assert needs(sweep, runs, (mode,)) == [need for need in found.values() if need.mode == mode]
     one = fake_sweep(tmp_path / "one", sweep, groups=dict.fromkeys(CLIPS, "one"))
     assert needs(sweep, runs_of(sweep, one)) == []

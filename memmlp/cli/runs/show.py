@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 SUMMARY = ("kind", "started", "finished")
 LEFT_OUT = (
-    "id", "name", "what", "data", "upstream", "sources", "attempts", "forgiven", "stages", *SUMMARY
+    "id", "name", "what", "data", "upstream", "upstream_runs", "sources", "attempts", "forgiven", "stages",
+    *SUMMARY,
 )  # fmt: skip
 
 

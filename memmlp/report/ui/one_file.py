@@ -80,7 +80,9 @@ def _run(page: Mapping[str, Any]) -> dict[str, Any]:
     """Return a run's page without the parts that only its server could show."""
     clips = sorted(page["clips"], key=_error, reverse=True)[:MOST_CLIPS]
     manifest = {
-        key: value for key, value in page["manifest"].items() if not key.startswith(("sources", "attempts"))
+        key: value
+        for key, value in page["manifest"].items()
+        if not key.startswith(("sources", "attempts", "upstream_runs"))
     }
     return {**page, "clips": clips, "manifest": manifest}
 

@@ -185,7 +185,7 @@ function files(run) {
 }
 
 function provenance(run) {
-  const skip = /^(attempts|sources|seconds)/;
+  const skip = /^(attempts|sources|seconds|upstream_runs)/;
   const rows = Object.entries(run.manifest).filter(([key]) => !skip.test(key)).map(([key, value]) => [key, word(value)]);
   return rows.length ? h('section', {}, h('h2', {}, 'Where it comes from'), h('details', {}, h('summary', {}, 'Manifest'), pairs(rows))) : null;
 }
