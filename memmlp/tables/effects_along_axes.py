@@ -239,7 +239,7 @@ def _trend(
     differences, groups, lost = _shared([cell.pair for cell in cells])
     values = [cell.values for cell in cells]
     varied = tuple(name for name in sweep.scale.against if len({one.get(name) for one in values}) > 1)
-    reason, line = _reason(sweep.scale.against, values, varied, differences), None
+    reason, line = _reason(sweep.scale.against, values, varied, differences) or _diverged(cells), None
     if not reason:
         x = np.array([[1.0, *(math.log10(one[name]) for name in varied)] for one in values])
         line = fit(differences, x, groups)
@@ -316,6 +316,12 @@ def _reason(
     if not differences.size:
         return "its cells share no test clip"
     return "" if against[0] in varied else f"all cells have the same {against[0]}"
+
+
+def _diverged(cells: Sequence[_Cell]) -> str:
+    """Name the cells in which a network diverged on a test clip: a line through what is left says too little."""
+    names = [" ".join(cell.arm.cell) for cell in cells if cell.pair.diverged]
+    return f"a network diverged on a test clip of {', '.join(names)}" if names else ""
 
 
 def _point(cell: _Cell) -> EffectOfCell:

@@ -130,12 +130,14 @@ def test_a_cell_without_a_number_is_no_cell(tmp_path: Path):
     assert (len(trend.points), trend.clips, trend.lost) == (6, 12, 0)
 
 
-def test_clips_that_some_cells_lack_are_counted(tmp_path: Path):
+def test_clips_that_some_cells_lack_are_counted_and_leave_no_line(tmp_path: Path):
     sweep, runs = cells(tmp_path, course(1.0, 1.3))
     for run in runs[sweep.arms[-1].label].values():
         next(iter(run.clips.values()))["stream"]["rotation"]["MPJPE"] = math.nan
     trend = trends(sweep, runs).trends[0]
     assert (len(trend.points), trend.clips, trend.lost) == (7, 11, 1)
+    cell = " ".join(sweep.arms[-1].cell)
+    assert (trend.line, trend.reason) == (None, f"a network diverged on a test clip of {cell}")
 
 
 def test_cells_that_share_no_clip_have_no_line(tmp_path: Path):
