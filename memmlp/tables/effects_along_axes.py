@@ -319,7 +319,7 @@ def _reason(
 
 
 def _diverged(cells: Sequence[_Cell]) -> str:
-    """Name the cells in which a network diverged on a test clip: a line through what is left says too little."""
+    """Name the cells in which a network diverged on a test clip, as no line goes through what is left."""
     names = [" ".join(cell.arm.cell) for cell in cells if cell.pair.diverged]
     return f"a network diverged on a test clip of {', '.join(names)}" if names else ""
 
