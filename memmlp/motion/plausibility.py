@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from memmlp.common.errors import InputError
 from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
 from memmlp.motion.clip import Clip
+from memmlp.motion.frame_rates import is_known_rate, nearest_rate
 
 HEAD, ANKLES = JOINTS.index("head"), [JOINTS.index("left_ankle"), JOINTS.index("right_ankle")]
 KNEES = [JOINTS.index("left_knee"), JOINTS.index("right_knee")]
@@ -103,9 +104,12 @@ def _y_up(clip: Clip) -> str | None:
 
 def _odd_rate(clip: Clip) -> str | None:
     low, high = RATES
-    if low <= clip.fps <= high:
+    if not low <= clip.fps <= high:
+        return f"a frame rate of {clip.fps:g} Hz, which may be wrong; usual are {low:g} to {high:g} Hz"
+    if is_known_rate(clip.fps):
         return None
-    return f"a frame rate of {clip.fps:g} Hz, which may be wrong; usual are {low:g} to {high:g} Hz"
+    usual = f"the nearest usual one is {nearest_rate(clip.fps):g} Hz"
+    return f"a frame rate of {clip.fps:g} Hz, which may be wrong; {usual}"
 
 
 def _coarse(clip: Clip) -> str | None:

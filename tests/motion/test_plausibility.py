@@ -70,6 +70,12 @@ def test_a_rate_at_which_hardly_anybody_records_is_told(fps):
     assert all(unusual(replace(clip, fps=usual)) is None for usual in (20.0, 59.94, 60.0, 250.0, 480.0))
 
 
+@pytest.mark.parametrize(("fps", "usual"), [(62.5, "60"), (125.0, "120"), (33.3333, "30")])
+def test_a_rate_that_is_none_of_cameras_is_told(fps, usual):
+    said = f"a frame rate of {fps:g} Hz, which may be wrong; the nearest usual one is {usual} Hz"
+    assert unusual(replace(motion("idling"), fps=fps)) == said
+
+
 def test_a_translation_in_half_precision_is_told():
     clip = moved(motion("walking"), x=6.0)
     half = clip.trans.astype(np.float16).astype(float)

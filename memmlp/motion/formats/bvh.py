@@ -19,6 +19,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.motion.clip import FRAME_RATE_RANGE
+from memmlp.motion.frame_rates import USUAL_RATES
 
 AXES = "XYZ"
 CHANNELS = tuple(axis + kind for kind in ("position", "rotation") for axis in AXES)
@@ -30,7 +31,6 @@ MAX_HEAD = 2**22  # bytes before MOTION
 MAX_LINE = 200_000  # bytes
 MAX_VALUES = 2**24  # in all frames: 25 minutes of 93 channels at 120 Hz
 RATE_DIGITS = 1e-4  # relative: 1 / 0.00833333 s is 120 Hz, as the header has no more digits
-USUAL_RATES = (15, 24, 25, 30, 48, 50, 60, 72, 75, 90, 100, 120, 144, 150, 180, 200, 240, 300)  # Hz
 COARSEST = 0.05  # relative rounding of a frame time that still means one of them: two digits
 
 

@@ -20,6 +20,7 @@ from memmlp.motion.body import load_rest_joints
 from memmlp.motion.clip import FRAME_RATE_RANGE, Skipped
 from memmlp.motion.clip_kinematics import clip_kinematics
 from memmlp.motion.formats.npz import read_clip, write_clip
+from memmlp.motion.frame_rates import is_known_rate, nearest_rate
 from memmlp.motion.importing.calibration_frame import JUMP, first_step
 from memmlp.motion.importing.convert import AUTO, convert, lowered
 from memmlp.motion.importing.fidelity import FEET_STAY, off_the_floor
@@ -299,6 +300,7 @@ def _take_notes(names: Mapping[str, str], takes: Sequence[str]) -> Iterator[str]
 def _notes(clips: Sequence[Imported], maps: Mapping[str, SkeletonMap], how: ImportSettings) -> Iterator[str]:
     """Yield what the user should know of an import, one line each."""
     yield from _rate_notes([clip for clip in clips if clip.fps != clip.header_fps])
+    yield from _odd_rate_notes([clip for clip in clips if clip.fps_reason == HEADER])
     yield from (f"{skeleton.name}: {skeleton.note}" for skeleton in maps.values() if skeleton.note)
     for name in maps:
         yield from _family_notes(name, [clip for clip in clips if clip.skeleton == name])
@@ -334,8 +336,23 @@ def _rate_notes(clips: Sequence[Imported]) -> Iterator[str]:
         told = f"{clip.fps:g} Hz, {clip.fps_reason}; the header says {clip.header_fps:g} Hz"
         alike.setdefault(f"{Path(clip.source).parent.as_posix()}: {told}", []).append(Path(clip.source).name)
     for told, names in alike.items():
-        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-        yield f"{told} ({', '.join(names[:3])}{more})"
+        yield f"{told} ({_first(names)})"
+
+
+def _odd_rate_notes(clips: Sequence[Imported]) -> Iterator[str]:
+    """Describe rates of headers that motion is not usually recorded at, one line for all clips of a rate."""
+    alike: dict[float, list[str]] = {}
+    for clip in clips:
+        if not is_known_rate(clip.fps):
+            alike.setdefault(clip.fps, []).append(clip.source)
+    for fps, names in alike.items():
+        usual = f"--fps {nearest_rate(fps):g} if that is meant"
+        yield f"the header's {fps:.6g} Hz may be a frame time cut off too early; {usual} ({_first(names)})"
+
+
+def _first(names: Sequence[str]) -> str:
+    """Return the first three names, and how many more there are."""
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def _publish(staging: Path, out: Path, report: ImportReport, body: Mapping[str, str]) -> None:
