@@ -59,8 +59,9 @@ def evaluate(
     click.echo(f"run {found.run.id}: {said}")
     if partial := found.run.manifest.get("partial"):
         click.echo(f"on a part of the data: {partial}")
-    if resampled := found.run.manifest.get("resampled"):
-        click.echo(resampled)
+    for fact in ("resampled", "unusual"):
+        if warning := found.run.manifest.get(fact):
+            click.echo(warning)
     if changed := found.run.changed_sources:
         click.echo(older_code(found.run, changed))
     for table in (metrics_table(results), *source_tables(found.run, experiment.stages)):

@@ -261,7 +261,7 @@ def summary(setup: Setup, study: Study) -> None:
     from rich.console import Console
     from rich.text import Text
 
-    from memmlp.pipeline.run_stages import partial_words
+    from memmlp.pipeline.data_remarks import partial_words
     from memmlp.sweep.search.progress_table import counts, figures, row, trials_table
     from memmlp.sweep.search.results import at_an_end, importances
 

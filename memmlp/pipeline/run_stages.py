@@ -24,12 +24,13 @@ from memmlp.evaluation.evaluation import picture
 from memmlp.evaluation.predictions import save_predictions
 from memmlp.experiment_tracking.follower_pipe import Tracking
 from memmlp.live.pose_latency import measure_pose
-from memmlp.motion.body import FPS
-from memmlp.motion.clip import LINES, Skipped
 from memmlp.motion.motion_source import Prepared
-from memmlp.motion.preparing.amass import absent_subsets, divided_subjects
-from memmlp.motion.preparing.groups import unfitting
-from memmlp.motion.preparing.manifest import ClipRecord, Manifest
+from memmlp.pipeline.data_remarks import (
+    data_remarks,
+    data_warnings,
+    partial_words,
+    tested_clips_remark,
+)
 from memmlp.pipeline.devices import described, overlooked_gpu
 from memmlp.pipeline.experiment import Experiment, UpstreamTraining
 from memmlp.runs.environment import computed_imports, packages_of_ones_own
@@ -45,8 +46,6 @@ from memmlp.runs.resumed_origin import UPSTREAM
 from memmlp.runs.run import Run
 from memmlp.runs.upstream_origin import upstream_origins
 from memmlp.training.loop import Watch, unwatched
-
-SLOW = 0.99  # of the network's rate, below which a recording lacks frames: 59.94 Hz is as good as 60
 
 
 @dataclass(frozen=True)
@@ -66,67 +65,6 @@ class Outcome:
     stage_ids: tuple[str, ...]
 
 
-def tested_clips_remark(clips: Sequence[ClipRecord]) -> str:
-    """Say how many test clips and groups there are, and whether they are too few for conclusions."""
-    tested = [clip.group for clip in clips if clip.split == "test"]
-    counts = f"test clips: {len(tested)}, in groups: {len(set(tested))}"
-    if len(set(tested)) > 1:
-        return counts
-    return f"{counts}, too few to tell networks apart; more motion or a larger data.split.test tests on more"
-
-
-def divided_subjects_remark(config: Mapping[str, Any], clips: Sequence[ClipRecord]) -> str:
-    """Say that a seeded split of AMASS has subjects in both training and test; empty if it has none.
-
-    It is also empty for published lists, which are used as they were published, and for mixes.
-    """
-    divided = divided_subjects((clip.name, clip.split) for clip in clips)
-    if not divided or config.get("sources") or "folder" in config["split"]:
-        return ""
-    more = f" and {len(divided) - 1} more" if len(divided) > 1 else ""
-    apart = "data=amass_s3 with one release of AMASS keeps subjects apart"
-    return f"clips of {divided[0]}{more} are in training and in test; {apart}"
-
-
-def low_rates_remark(manifest: Manifest, clips: Sequence[ClipRecord], what: str) -> str | None:
-    """Return a remark on clips of a lower rate than the network's that were interpolated by straight lines.
-
-    The lines give these clips kinks, which no person makes. It is None if there are no such clips.
-
-    Args:
-        manifest: the data's manifest.
-        clips: some or all of its clips.
-        what: what they are called, in the plural.
-    """
-    rates = sorted(clip.fps for clip in clips if clip.fps < SLOW * FPS)
-    if not rates or manifest.interpolation != LINES:
-        return None
-    hertz = f"{rates[0]:g}" + (f" to {rates[-1]:g}" if rates[-1] > rates[0] else "")
-    slow = f"{len(rates)} of {len(clips)} {what} were recorded at {hertz} Hz"
-    return (
-        f"{slow} and go on by straight lines (data.interpolation): their Jitter and velocities have its kinks"
-    )
-
-
-def skipped_remark(skipped: Sequence[Skipped]) -> str | None:
-    """Return what to say of files that are no usable clips; None if there are none."""
-    if not skipped:
-        return None
-    files = "1 file was" if len(skipped) == 1 else f"{len(skipped)} files were"
-    first = skipped[0]
-    return f"{files} skipped, first {first.file} ({first.reason}); data.strict=true stops there"
-
-
-def unusual_remark(unusual: Mapping[str, str]) -> str | None:
-    """Return what to say of clips that are odd but may be sound (name -> why); None if there are none."""
-    if not unusual:
-        return None
-    clips = "1 clip is" if len(unusual) == 1 else f"{len(unusual)} clips are"
-    first, *others = list(unusual)[:3]
-    names = ", ".join([f"{first} ({unusual[first]})", *others])
-    return f"{clips} unusual, first {names}; memmlp data inspect tells more"
-
-
 def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     """Bring the experiment's run to its end, doing only what is missing.
 
@@ -137,10 +75,7 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     data = experiment.data.prepare()
     clips = data.manifest.clips
     tell(f"data: {len(clips)} clips ({tested_clips_remark(clips)}), prepared in {data.cache}")
-    untied = unfitting(data.manifest.split, [clip.name for clip in clips])
-    files = skipped_remark(data.manifest.skipped), unusual_remark(data.manifest.unusual)
-    subjects = divided_subjects_remark(experiment.config["data"], clips)
-    for said in filter(None, (*files, low_rates_remark(data.manifest, clips, "clips"), subjects, untied)):
+    for said in data_remarks(experiment, data):
         remark(f"data: {said}")
     run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
     if not run.done:
@@ -416,25 +351,6 @@ def own_code(experiment: Experiment) -> dict[str, Any]:
     """Return version and digest of the user's own packages in the experiment; empty if it uses none."""
     packages = experiment.config.get("plugins")
     return {"plugins": packages_of_ones_own(packages)} if packages else {}
-
-
-def data_warnings(experiment: Experiment, data: Prepared) -> dict[str, Any]:
-    """Return warnings about a run's data for tables to flag, in words; None for each that does not apply."""
-    divided = divided_subjects_remark(experiment.config["data"], data.manifest.clips) or None
-    tested = [clip for clip in data.manifest.clips if clip.split == "test"]
-    resampled = low_rates_remark(data.manifest, tested, "test clips")
-    return {"partial": partial_words(experiment, data), "divided": divided, "resampled": resampled}
-
-
-def partial_words(experiment: Experiment, data: Prepared) -> str | None:
-    """Describe in words what the data lacks of its protocol or of its training clips; None if nothing."""
-    config, manifest = experiment.config["data"], data.manifest
-    coverage, found = manifest.coverage, manifest.listed or (*manifest.left_out, *manifest.groups)
-    fraction = config["split"].get("train_fraction", 1)
-    parts = [] if coverage.whole else [str(coverage)]
-    parts += [absent] if (absent := absent_subsets(config["name"], found)) else []
-    parts += [f"{100 * fraction:g} % of its training groups"] if fraction < 1 else []
-    return ", ".join([config["name"], *parts]) if parts else None
 
 
 def machine(experiment: Experiment) -> dict[str, Any]:

@@ -32,6 +32,7 @@ LATER_FACTS = (
     "timed_on",
     "divided",
     "resampled",
+    "unusual",
     "computed_imports",
     "upstream_recipes",
     "upstream_weights",

@@ -65,7 +65,8 @@ def flags(
     if "Jitter" in sweep.metrics:
         yield from _calmer_than_truth(sweep, runs)
     if set(sweep.metrics) - set(COSTS):
-        yield from _resampled(every)
+        yield from _data_warnings(every, "resampled")
+        yield from _data_warnings(every, "unusual")
     for attribute, what in ORIGIN.items():
         unknown = "none" if attribute == "gpu" else UNKNOWN
         values = [(getattr(run.origin, attribute), label) for label, run in every]
@@ -81,7 +82,7 @@ def flags(
         yield from _hardly_trained(every)
     yield from _seen(sweep, runs)
     yield from _partial(every)
-    yield from _divided_subjects(every)
+    yield from _data_warnings(every, "divided")
     yield from flags_of_code.recipes(every)
     yield from flags_of_code.upstream_weights(every)
     yield from flags_of_code.own_code(every)
@@ -340,16 +341,10 @@ def _partial(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
         yield f"{part}, and no more: {quoted(label for label, run in every if run.origin.partial == part)}"
 
 
-def _divided_subjects(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Flag runs that were tested on subjects on whom they were trained."""
-    for said in unique(run.origin.divided for _, run in every if run.origin.divided):
-        yield f"{said}: {quoted(label for label, run in every if run.origin.divided == said)}"
-
-
-def _resampled(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Flag runs that were tested on clips recorded at a lower rate than the network's."""
-    for said in unique(run.origin.resampled for _, run in every if run.origin.resampled):
-        yield f"{said}: {quoted(label for label, run in every if run.origin.resampled == said)}"
+def _data_warnings(every: Sequence[tuple[str, Measured]], fact: str) -> Iterable[str]:
+    """Flag runs by a warning about their data, of a field of their origins."""
+    for said in unique(warning for _, run in every if (warning := getattr(run.origin, fact))):
+        yield f"{said}: {quoted(label for label, run in every if getattr(run.origin, fact) == said)}"
 
 
 def _replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:

@@ -67,6 +67,7 @@ class Origin:
         timed_on: the processor on which size and times were measured, and ONNX Runtime's version there.
         divided: a warning, in words, if subjects have clips in both training and test; None otherwise.
         resampled: a warning, in words, if test clips were recorded at a lower rate; None otherwise.
+        unusual: a warning, in words, if test clips are odd; None otherwise.
     """
 
     code: str
@@ -90,6 +91,7 @@ class Origin:
     timed_on: str = UNKNOWN
     divided: str | None = None
     resampled: str | None = None
+    unusual: str | None = None
     upstream_recipes: Mapping[str, int] = field(default_factory=dict)
     upstream_weights: Mapping[str, str] = field(default_factory=dict)
 
@@ -377,6 +379,7 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
         partial=manifest.get("partial"),
         divided=manifest.get("divided"),
         resampled=manifest.get("resampled"),
+        unusual=manifest.get("unusual"),
         plugins={
             name: f"{one['version'] or 'no version'} ({one['digest']})"
             for name, one in (manifest.get("plugins") or {}).items()

@@ -1,11 +1,9 @@
 """The whole way at profile=tiny, by the commands a person would type."""
 
 import importlib
-import itertools
 import json
 import re
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -29,9 +27,7 @@ from memmlp.config.compose import composed
 from memmlp.config.package_data import packaged
 from memmlp.experiment_tracking.follower_pipe import Tracking
 from memmlp.live.stream import Stream
-from memmlp.motion.clip import Skipped
 from memmlp.motion.dataset import MotionDataset
-from memmlp.motion.preparing.amass import S2_TEST, S2_TRAIN
 from memmlp.pipeline import run_stages
 from memmlp.pipeline.run_stages import make_upstream_runs, recording_outcome
 from memmlp.runs import environment
@@ -59,7 +55,7 @@ def test_a_run_leaves_everything(home):
     made = [path.stem for path in (*run.evaluations.iterdir(), *run.deployments.iterdir())]
     assert set(run.wanted) == set(made)
     assert set(run.results) == {"window", "stream", "latency"}
-    assert {run.manifest[fact] for fact in ("partial", "divided", "resampled")} == {None}
+    assert {run.manifest[fact] for fact in ("partial", "divided", "resampled", "unusual")} == {None}
     assert run.results["stream"]["rotation"]["MPJPE"] > 0
     assert run.results["latency"]["steps"] >= 200
     assert run.results["latency"]["onnx_parity"] < 1e-4
@@ -78,22 +74,6 @@ def test_a_run_leaves_everything(home):
     out = (home / "out.txt").read_text()
     assert "MPJPE" in out
     assert str(run.folder.relative_to(home)) in out
-
-
-def test_what_was_skipped_of_the_data_is_said():
-    bad = Skipped("b.npz", "NaN or Inf in 1 frames, first in frame 3")
-    assert run_stages.skipped_remark([]) is None
-    said = run_stages.skipped_remark([bad, replace(bad, file="c.npz")])
-    assert said.startswith("2 files were skipped, first b.npz (NaN or Inf in 1 frames, first in frame 3); ")
-    assert run_stages.skipped_remark([bad]).startswith("1 file was skipped, first b.npz (")
-
-
-def test_what_is_unusual_of_the_data_is_said():
-    assert run_stages.unusual_remark({}) is None
-    odd = {"a/1": "Z is not up", "a/2": "Z is not up", "b": "the pelvis is at z = 20 m", "c": "Z is not up"}
-    told = run_stages.unusual_remark(odd)
-    assert told == "4 clips are unusual, first a/1 (Z is not up), a/2, b; memmlp data inspect tells more"
-    assert run_stages.unusual_remark({"b": "high"}).startswith("1 clip is unusual, first b (high); ")
 
 
 def test_a_training_says_on_a_terminal_what_is_odd_about_its_data(capsys, monkeypatch):
@@ -338,106 +318,6 @@ def test_work_that_ended_well_is_no_death(tmp_path: Path):
     with pytest.raises(KeyboardInterrupt):
         evaluate(KeyboardInterrupt())
     assert deaths(run) == 1
-
-
-def test_a_single_group_of_test_clips_is_told_to_decide_nothing():
-    def clips(*groups: str) -> list[Any]:
-        return [SimpleNamespace(split="test", group=group) for group in groups]
-
-    train = [SimpleNamespace(split="train", group="c")]
-    assert run_stages.tested_clips_remark([*train, *clips("a", "b", "b")]) == "test clips: 3, in groups: 2"
-    assert (
-        "in groups: 1, too few to tell networks apart; more motion or a larger data.split.test"
-        in run_stages.tested_clips_remark([*train, *clips("a", "a")])
-    )
-
-
-@pytest.mark.parametrize(
-    ("names", "config", "said"),
-    [
-        (("CMU/01/a", "CMU/01/b", "KIT/3/a", "KIT/3/b"), {}, "clips of CMU/01 and 1 more are in"),
-        (("BMLrub/BioMotionLab_NTroje/7/a", "BMLrub/BioMotionLab_NTroje/7/b"), {}, "clips of BioMotion"),
-        (("amass/CMU/01/a", "amass/CMU/01/b"), {}, "clips of CMU/01 are in"),
-        (("h/BioMotionLab_NTroje/rub001/a_poses", "x/BMLrub/rub001/a_stageii"), {}, "clips of BioMotionLab_"),
-        (("Eyes_Japan_Dataset/A B/a", "EyesJapanDataset/A_B/b"), {}, "clips of Eyes_Japan_Dataset/A B are"),
-        (("DanceDB/1/a", "DanceDB/1/b"), {}, "clips of DanceDB/1 are in"),
-        (("CMU/01/a", "CMU/02/b"), {}, None),
-        (("CMU/a", "CMU/b", "mine/01/a", "mine/01/b"), {}, None),
-        (("CMU/01/a", "CMU/01/b"), {"split": {"folder": "LISTS"}}, None),
-        (("cmu/salsa/01", "cmu/salsa/02"), {"sources": {"cmu": {}}}, None),
-    ],
-)
-def test_a_split_that_tests_on_the_people_that_it_trains_on_says_so(names, config, said):
-    parts = zip(names, itertools.cycle(["train", "test"]))
-    clips = [SimpleNamespace(name=name, split=part, fps=60.0) for name, part in parts]
-    found = run_stages.divided_subjects_remark({"split": {}, **config}, clips)
-    assert found.startswith(said) if said else found == ""
-    manifest = SimpleNamespace(coverage=SimpleNamespace(whole=True), clips=clips, listed={"CMU": 1})
-    data = SimpleNamespace(manifest=manifest)
-    experiment = SimpleNamespace(config={"data": {"name": "mine", "split": {}, **config}})
-    assert run_stages.data_warnings(experiment, data) == {
-        "partial": None,
-        "divided": found or None,
-        "resampled": None,
-    }
-
-
-def test_clips_that_were_recorded_at_a_lower_rate_are_said():
-    """Straight lines between 30 frames a second give jerks to the truth itself."""
-    rates = {"a": 30.0, "b": 30.0, "c": 60.0, "d": 59.94, "e": 120.0, "f": 100.0}
-    clips = [SimpleNamespace(name=name, split="test", fps=fps) for name, fps in rates.items()]
-    clips.append(SimpleNamespace(name="g", split="train", fps=25.0))
-    lines, splines = SimpleNamespace(interpolation="lines"), SimpleNamespace(interpolation="splines")
-    said = run_stages.low_rates_remark(lines, clips, "clips")
-    assert said.startswith("3 of 7 clips were recorded at 25 to 30 Hz and go on by straight lines")
-    assert run_stages.low_rates_remark(lines, clips[2:6], "clips") is None
-    assert run_stages.low_rates_remark(splines, clips, "clips") is None
-    whole = SimpleNamespace(whole=True)
-    manifest = SimpleNamespace(coverage=whole, clips=clips, interpolation="lines", listed={"CMU": 1})
-    experiment = SimpleNamespace(config={"data": {"name": "mine", "split": {}}})
-    said = run_stages.data_warnings(experiment, SimpleNamespace(manifest=manifest))["resampled"]
-    assert said.startswith("2 of 6 test clips were recorded at 30 Hz and go on by straight lines")
-
-
-@pytest.mark.parametrize(
-    ("whole", "fraction", "words"),
-    [
-        (True, {}, None),
-        (True, {"train_fraction": 1.0}, None),
-        (True, {"train_fraction": 0.125}, "s1, 12.5 % of its training groups"),
-        (False, {}, "s1, 7 of 8"),
-        (False, {"train_fraction": 0.5}, "s1, 7 of 8, 50 % of its training groups"),
-    ],
-)
-def test_a_part_of_the_data_is_told(whole, fraction, words):
-    """A protocol with a part of its training clips is not the protocol, and says so."""
-
-    class Coverage(SimpleNamespace):
-        __str__ = lambda self: "7 of 8"  # noqa: E731
-
-    data = SimpleNamespace(manifest=SimpleNamespace(coverage=Coverage(whole=whole), listed={"CMU": 8}))
-    experiment = SimpleNamespace(config={"data": {"name": "s1", "split": fraction}})
-    assert run_stages.partial_words(experiment, data) == words
-
-
-@pytest.mark.parametrize(
-    ("name", "listed", "clips", "words"),
-    [
-        ("amass_s1", ["CMU", "BMLrub", "HDM05"], ["CMU/1/a"], None),
-        ("amass_s1", ["CMU"], ["CMU/1/a"], "1 of 3 subsets (without BioMotionLab_NTroje, MPI_HDM05)"),
-        ("amass_s3", [], [f"{name}/1/a" for name in (*S2_TRAIN, *S2_TEST, "DanceDB")], None),
-        ("amass_s3", [], ["x/KIT/1/a", "CMU/1/a"], "2 of 14 subsets (without MPI_Limits, "),
-        ("amass_s2", ["CMU"], ["CMU/1/a"], None),
-        ("mocap", [], ["CMU/1/a"], None),
-    ],
-)
-def test_a_protocol_without_some_of_its_subsets_is_told(name, listed, clips, words):
-    """Lists of one subset, or its folder alone, are whole in themselves, and no protocol."""
-    every = {"coverage": SimpleNamespace(whole=True), "listed": dict.fromkeys(listed, 1)}
-    every |= {"left_out": {}, "groups": {clip: clip for clip in clips}}
-    data = SimpleNamespace(manifest=SimpleNamespace(**every))
-    found = run_stages.partial_words(SimpleNamespace(config={"data": {"name": name, "split": {}}}), data)
-    assert found.startswith(f"{name}, {words}") if words else found is None
 
 
 def test_metrics_of_other_code_are_measured_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

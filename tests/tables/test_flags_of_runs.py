@@ -567,6 +567,7 @@ def test_a_part_of_a_list_is_said_wherever_its_runs_are(sweep: Sweep, tmp_path: 
             "clips of CMU/01 and 2 more are in training and in test; data=amass_s3 keeps subjects apart",
         ),
         ("resampled", "2 of 6 test clips were recorded at 30 Hz and go on by straight lines"),
+        ("unusual", "1 of 6 test clips are unusual, first a (Z is not up)"),
     ],
 )
 def test_what_runs_say_of_their_data_is_flagged_with_their_names(

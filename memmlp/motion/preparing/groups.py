@@ -107,6 +107,19 @@ class Grouping:
         return {name: rows.get(group[0], group[0]) for group in self.tied(seen) for name in group}
 
 
+def untied(split: Mapping[str, Any], name: str) -> bool:
+    """Whether none of a split's patterns of groups fits a clip, so that none ties it to other clips.
+
+    Args:
+        split: the split's settings (`Split.describe`).
+        name: the clip's name.
+    """
+    for source, own in split.get("sources", {}).items():
+        if name.startswith(f"{source}/"):
+            return untied(own, name.removeprefix(f"{source}/"))
+    return not any(re.search(pattern, unpacked(name)) for pattern in split.get("groups", ()))
+
+
 def unfitting(split: Mapping[str, Any], names: Collection[str]) -> str:
     """Return a warning if a split has patterns of groups and none of them matches a clip; empty otherwise.
 
@@ -119,7 +132,7 @@ def unfitting(split: Mapping[str, Any], names: Collection[str]) -> str:
         below = [name.removeprefix(f"{source}/") for name in names if name.startswith(f"{source}/")]
         said += [f"{source}: {one}"] if (one := unfitting(own, below)) else []
     patterns = split.get("groups", ())
-    if patterns and not any(re.search(one, unpacked(name)) for one in patterns for name in names):
+    if patterns and all(untied(split, name) for name in names):
         said += [
             "each clip counts as independent of all others, and clips of one person may lie in training and "
             f"in test: no clip's name fits the {len(patterns)} patterns of data.split.groups that tie clips "

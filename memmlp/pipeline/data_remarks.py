@@ -1,0 +1,160 @@
+"""What is to be known of an experiment's data: remarks before a run, warnings in its manifest for tables."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from memmlp.motion.body import FPS
+from memmlp.motion.clip import LINES, Skipped
+from memmlp.motion.motion_source import Prepared
+from memmlp.motion.preparing.amass import absent_subsets, divided_subjects
+from memmlp.motion.preparing.groups import unfitting, untied
+from memmlp.motion.preparing.manifest import ClipRecord, Manifest
+from memmlp.pipeline.experiment import Experiment
+
+SLOW = 0.99  # of the network's rate, below which a recording lacks frames: 59.94 Hz is as good as 60
+
+
+def data_remarks(experiment: Experiment, data: Prepared) -> list[str]:
+    """Return what the user should know of the data before a run begins."""
+    manifest, config = data.manifest, experiment.config["data"]
+    every = (
+        skipped_remark(manifest.skipped),
+        unusual_remark(manifest.unusual),
+        low_rates_remark(manifest, manifest.clips, "clips"),
+        divided_remark(config, manifest),
+        unfitting(manifest.split, [clip.name for clip in manifest.clips]),
+    )
+    return list(filter(None, every))
+
+
+def tested_clips_remark(clips: Sequence[ClipRecord]) -> str:
+    """Say how many test clips and groups there are, and whether they are too few for conclusions."""
+    tested = [clip.group for clip in clips if clip.split == "test"]
+    counts = f"test clips: {len(tested)}, in groups: {len(set(tested))}"
+    if len(set(tested)) > 1:
+        return counts
+    return f"{counts}, too few to tell networks apart; more motion or a larger data.split.test tests on more"
+
+
+def divided_remark(config: Mapping[str, Any], manifest: Manifest) -> str:
+    """Say that a seeded split may have the same people in training and in test; empty if it does not.
+
+    It is also empty for published lists, which are used as they were published.
+    """
+    if "folder" in config["split"]:
+        return ""
+    return divided_subjects_remark(manifest) or divided_folders_remark(manifest)
+
+
+def divided_subjects_remark(manifest: Manifest) -> str:
+    """Say that subjects of AMASS are in both training and test; empty if there are none."""
+    divided = divided_subjects((_of_source(manifest, clip.name)[1], clip.split) for clip in manifest.clips)
+    if not divided:
+        return ""
+    more = f" and {len(divided) - 1} more" if len(divided) > 1 else ""
+    apart = "data=amass_s3 with one release of AMASS keeps subjects apart"
+    return f"clips of {divided[0]}{more} are in training and in test; {apart}"
+
+
+def divided_folders_remark(manifest: Manifest) -> str:
+    """Say that folders have clips in both training and test which no group ties together; empty if none has.
+
+    A folder is often a person or a session. A source whose clips are all in one folder has no such folders.
+    """
+    parts: dict[str, dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
+    for clip in manifest.clips:
+        source, below = _of_source(manifest, clip.name)
+        if clip.group == clip.name and untied(manifest.split, clip.name):
+            parts[source][below.rpartition("/")[0]].append(clip.split)
+    folders = [
+        (f"{source}{folder}", found.count("test"))
+        for source, own in parts.items()
+        for folder, found in own.items()
+        if len(own) > 1 and {"train", "test"} <= set(found)
+    ]
+    if not folders:
+        return ""
+    tested = f"{sum(count for _, count in folders)} test clips are tied to no others (data.split.groups)"
+    more = f" and {len(folders) - 1} more" if len(folders) > 1 else ""
+    return f"{tested}, and clips of their folders, {folders[0][0] or 'the top one'}{more}, are in training"
+
+
+def _of_source(manifest: Manifest, name: str) -> tuple[str, str]:
+    """Return the beginning of a clip's name that names its source, which may be empty, and the rest."""
+    for source in manifest.split.get("sources", ()):
+        if name.startswith(f"{source}/"):
+            return f"{source}/", name.removeprefix(f"{source}/")
+    return "", name
+
+
+def low_rates_remark(manifest: Manifest, clips: Sequence[ClipRecord], what: str) -> str | None:
+    """Return a remark on clips of a lower rate than the network's that were interpolated by straight lines.
+
+    The lines give these clips kinks, which no person makes. It is None if there are no such clips.
+
+    Args:
+        manifest: the data's manifest.
+        clips: some or all of its clips.
+        what: what they are called, in the plural.
+    """
+    rates = sorted(clip.fps for clip in clips if clip.fps < SLOW * FPS)
+    if not rates or manifest.interpolation != LINES:
+        return None
+    hertz = f"{rates[0]:g}" + (f" to {rates[-1]:g}" if rates[-1] > rates[0] else "")
+    slow = f"{len(rates)} of {len(clips)} {what} were recorded at {hertz} Hz"
+    return (
+        f"{slow} and go on by straight lines (data.interpolation): their Jitter and velocities have its kinks"
+    )
+
+
+def skipped_remark(skipped: Sequence[Skipped]) -> str | None:
+    """Return what to say of files that are no usable clips; None if there are none."""
+    if not skipped:
+        return None
+    files = "1 file was" if len(skipped) == 1 else f"{len(skipped)} files were"
+    first = skipped[0]
+    return f"{files} skipped, first {first.file} ({first.reason}); data.strict=true stops there"
+
+
+def unusual_remark(unusual: Mapping[str, str]) -> str | None:
+    """Return what to say of clips that are odd but may be sound (name -> why); None if there are none."""
+    if not unusual:
+        return None
+    clips = "1 clip is" if len(unusual) == 1 else f"{len(unusual)} clips are"
+    first, *others = list(unusual)[:3]
+    names = ", ".join([f"{first} ({unusual[first]})", *others])
+    return f"{clips} unusual, first {names}; memmlp data inspect tells more"
+
+
+def unusual_tests_remark(unusual: Mapping[str, str], tested: Sequence[ClipRecord]) -> str | None:
+    """Return what to say of test clips that are odd, by whatever is told of a clip first; None if none is."""
+    odd = [clip.name for clip in tested if clip.name in unusual]
+    if not odd:
+        return None
+    return f"{len(odd)} of {len(tested)} test clips are unusual, first {odd[0]} ({unusual[odd[0]]})"
+
+
+def data_warnings(experiment: Experiment, data: Prepared) -> dict[str, Any]:
+    """Return warnings about a run's data for tables to flag, in words; None for each that does not apply."""
+    manifest = data.manifest
+    tested = [clip for clip in manifest.clips if clip.split == "test"]
+    return {
+        "partial": partial_words(experiment, data),
+        "divided": divided_remark(experiment.config["data"], manifest) or None,
+        "resampled": low_rates_remark(manifest, tested, "test clips"),
+        "unusual": unusual_tests_remark(manifest.unusual, tested),
+    }
+
+
+def partial_words(experiment: Experiment, data: Prepared) -> str | None:
+    """Describe in words what the data lacks of its protocol or of its training clips; None if nothing."""
+    config, manifest = experiment.config["data"], data.manifest
+    coverage, found = manifest.coverage, manifest.listed or (*manifest.left_out, *manifest.groups)
+    fraction = config["split"].get("train_fraction", 1)
+    parts = [] if coverage.whole else [str(coverage)]
+    parts += [absent] if (absent := absent_subsets(config["name"], found)) else []
+    parts += [f"{100 * fraction:g} % of its training groups"] if fraction < 1 else []
+    return ", ".join([config["name"], *parts]) if parts else None

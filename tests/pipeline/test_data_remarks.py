@@ -1,0 +1,183 @@
+"""What is said of data before a run, and what its manifest says of it to tables."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from memmlp.motion.clip import Skipped
+from memmlp.motion.preparing.amass import S2_TEST, S2_TRAIN
+from memmlp.pipeline import data_remarks
+
+
+def test_what_was_skipped_of_the_data_is_said():
+    bad = Skipped("b.npz", "NaN or Inf in 1 frames, first in frame 3")
+    assert data_remarks.skipped_remark([]) is None
+    said = data_remarks.skipped_remark([bad, replace(bad, file="c.npz")])
+    assert said.startswith("2 files were skipped, first b.npz (NaN or Inf in 1 frames, first in frame 3); ")
+    assert data_remarks.skipped_remark([bad]).startswith("1 file was skipped, first b.npz (")
+
+
+def test_what_is_unusual_of_the_data_is_said():
+    assert data_remarks.unusual_remark({}) is None
+    odd = {"a/1": "Z is not up", "a/2": "Z is not up", "b": "the pelvis is at z = 20 m", "c": "Z is not up"}
+    told = data_remarks.unusual_remark(odd)
+    assert told == "4 clips are unusual, first a/1 (Z is not up), a/2, b; memmlp data inspect tells more"
+    assert data_remarks.unusual_remark({"b": "high"}).startswith("1 clip is unusual, first b (high); ")
+
+
+def test_a_single_group_of_test_clips_is_told_to_decide_nothing():
+    def clips(*groups: str) -> list[Any]:
+        return [SimpleNamespace(split="test", group=group) for group in groups]
+
+    train = [SimpleNamespace(split="train", group="c")]
+    assert data_remarks.tested_clips_remark([*train, *clips("a", "b", "b")]) == "test clips: 3, in groups: 2"
+    assert (
+        "in groups: 1, too few to tell networks apart; more motion or a larger data.split.test"
+        in data_remarks.tested_clips_remark([*train, *clips("a", "a")])
+    )
+
+
+@pytest.mark.parametrize(
+    ("names", "config", "said"),
+    [
+        (("CMU/01/a", "CMU/01/b", "KIT/3/a", "KIT/3/b"), {}, "clips of CMU/01 and 1 more are in"),
+        (("BMLrub/BioMotionLab_NTroje/7/a", "BMLrub/BioMotionLab_NTroje/7/b"), {}, "clips of BioMotion"),
+        (("amass/CMU/01/a", "amass/CMU/01/b"), {}, "clips of CMU/01 are in"),
+        (("h/BioMotionLab_NTroje/rub001/a_poses", "x/BMLrub/rub001/a_stageii"), {}, "clips of BioMotionLab_"),
+        (("Eyes_Japan_Dataset/A B/a", "EyesJapanDataset/A_B/b"), {}, "clips of Eyes_Japan_Dataset/A B are"),
+        (("DanceDB/1/a", "DanceDB/1/b"), {}, "clips of DanceDB/1 are in"),
+        (("CMU/01/a", "CMU/02/b"), {}, None),
+        (("CMU/a", "CMU/b", "mine/01/a", "mine/01/b"), {}, None),
+        (("CMU/01/a", "CMU/01/b"), {"split": {"folder": "LISTS"}}, None),
+        (("cmu/salsa/01", "cmu/salsa/02"), {"sources": {"cmu": {}}}, None),
+    ],
+)
+def test_a_split_that_tests_on_the_people_that_it_trains_on_says_so(names, config, said):
+    parts = zip(names, itertools.cycle(["train", "test"]))
+    clips = [SimpleNamespace(name=name, split=part, fps=60.0, group="tied") for name, part in parts]
+    known = {"coverage": SimpleNamespace(whole=True), "listed": {"CMU": 1}, "unusual": {}}
+    known["split"] = {"sources": config.get("sources", {})}
+    data = SimpleNamespace(manifest=SimpleNamespace(clips=clips, **known))
+    found = data_remarks.divided_remark({"split": {}, **config}, data.manifest)
+    assert found.startswith(said) if said else found == ""
+    experiment = SimpleNamespace(config={"data": {"name": "mine", "split": {}, **config}})
+    assert data_remarks.data_warnings(experiment, data) == {
+        "partial": None,
+        "divided": found or None,
+        "resampled": None,
+        "unusual": None,
+    }
+
+
+def manifest_of(parts: Sequence[tuple[str, str]], split: dict[str, Any], tied: Sequence[str] = ()) -> Any:
+    """A manifest with clips in parts; those of `tied` are in one group."""
+    clips = [
+        SimpleNamespace(name=name, split=part, group="tied" if name in tied else name) for name, part in parts
+    ]
+    return SimpleNamespace(clips=clips, split=split)
+
+
+SOURCES: dict[str, Any] = {"sources": {"x": {}, "y": {}}}
+TAKES = [("own/anna/1", "train"), ("own/anna/2", "test"), ("own/ben/1", "test"), ("own/ben/2", "train")]
+
+
+@pytest.mark.parametrize(
+    ("parts", "split", "said"),
+    [
+        (TAKES, {"groups": ["salsa/(.*)"]}, "2 test clips are tied to no others"),
+        (TAKES, {}, "2 test clips are tied to no others"),
+        (TAKES, {"groups": ["own/(.*?)/"]}, ""),
+        (TAKES[:2], {}, ""),  # all in one folder, which is no person
+        ([("a/1", "train"), ("a/2", "val"), ("b/1", "test")], {}, ""),
+        ([(f"x/{name}", part) for name, part in TAKES], SOURCES, "2 test clips"),
+        (
+            [("x/1", "train"), ("x/2", "test"), ("y/1", "test"), ("y/2", "train")],
+            SOURCES,
+            "",
+        ),
+    ],
+)
+def test_folders_with_clips_in_training_and_in_test_are_told(parts, split, said):
+    """A folder of one's own is often a person, whom the shipped patterns of groups know nothing of."""
+    found = data_remarks.divided_remark({"split": {}}, manifest_of(parts, split))
+    assert found.startswith(said) if said else found == ""
+    assert not data_remarks.divided_remark({"split": {"folder": "LISTS"}}, manifest_of(parts, split))
+    tied = [name for name, _ in parts]  # by a column file
+    assert not data_remarks.divided_remark({"split": {}}, manifest_of(parts, split, tied))
+    if "sources" in split and said:
+        assert "x/own/anna and 1 more, are in training" in found
+
+
+def test_odd_test_clips_are_a_fact_of_the_run():
+    clips = manifest_of([("a", "test"), ("b", "test"), ("c", "train")], {}).clips
+    odd = {"b": "Z is not up", "c": "knees bend backwards"}
+    said = "1 of 2 test clips are unusual, first b (Z is not up)"
+    assert data_remarks.unusual_tests_remark(odd, clips[:2]) == said
+    assert data_remarks.unusual_tests_remark(odd, clips[:1]) is None
+
+
+def test_clips_that_were_recorded_at_a_lower_rate_are_said():
+    """Straight lines between 30 frames a second give jerks to the truth itself."""
+    rates = {"a": 30.0, "b": 30.0, "c": 60.0, "d": 59.94, "e": 120.0, "f": 100.0}
+    clips = [SimpleNamespace(name=name, split="test", fps=fps) for name, fps in rates.items()]
+    clips.append(SimpleNamespace(name="g", split="train", fps=25.0))
+    lines, splines = SimpleNamespace(interpolation="lines"), SimpleNamespace(interpolation="splines")
+    said = data_remarks.low_rates_remark(lines, clips, "clips")
+    assert said.startswith("3 of 7 clips were recorded at 25 to 30 Hz and go on by straight lines")
+    assert data_remarks.low_rates_remark(lines, clips[2:6], "clips") is None
+    assert data_remarks.low_rates_remark(splines, clips, "clips") is None
+    whole = SimpleNamespace(whole=True)
+    known = {"coverage": whole, "interpolation": "lines", "listed": {"CMU": 1}, "unusual": {}, "split": {}}
+    for clip in clips:
+        clip.group = "tied"
+    manifest = SimpleNamespace(clips=clips, **known)
+    experiment = SimpleNamespace(config={"data": {"name": "mine", "split": {}}})
+    said = data_remarks.data_warnings(experiment, SimpleNamespace(manifest=manifest))["resampled"]
+    assert said.startswith("2 of 6 test clips were recorded at 30 Hz and go on by straight lines")
+
+
+@pytest.mark.parametrize(
+    ("whole", "fraction", "words"),
+    [
+        (True, {}, None),
+        (True, {"train_fraction": 1.0}, None),
+        (True, {"train_fraction": 0.125}, "s1, 12.5 % of its training groups"),
+        (False, {}, "s1, 7 of 8"),
+        (False, {"train_fraction": 0.5}, "s1, 7 of 8, 50 % of its training groups"),
+    ],
+)
+def test_a_part_of_the_data_is_told(whole, fraction, words):
+    """A protocol with a part of its training clips is not the protocol, and says so."""
+
+    class Coverage(SimpleNamespace):
+        __str__ = lambda self: "7 of 8"  # noqa: E731
+
+    data = SimpleNamespace(manifest=SimpleNamespace(coverage=Coverage(whole=whole), listed={"CMU": 8}))
+    experiment = SimpleNamespace(config={"data": {"name": "s1", "split": fraction}})
+    assert data_remarks.partial_words(experiment, data) == words
+
+
+@pytest.mark.parametrize(
+    ("name", "listed", "clips", "words"),
+    [
+        ("amass_s1", ["CMU", "BMLrub", "HDM05"], ["CMU/1/a"], None),
+        ("amass_s1", ["CMU"], ["CMU/1/a"], "1 of 3 subsets (without BioMotionLab_NTroje, MPI_HDM05)"),
+        ("amass_s3", [], [f"{name}/1/a" for name in (*S2_TRAIN, *S2_TEST, "DanceDB")], None),
+        ("amass_s3", [], ["x/KIT/1/a", "CMU/1/a"], "2 of 14 subsets (without MPI_Limits, "),
+        ("amass_s2", ["CMU"], ["CMU/1/a"], None),
+        ("mocap", [], ["CMU/1/a"], None),
+    ],
+)
+def test_a_protocol_without_some_of_its_subsets_is_told(name, listed, clips, words):
+    """Lists of one subset, or its folder alone, are whole in themselves, and no protocol."""
+    every = {"coverage": SimpleNamespace(whole=True), "listed": dict.fromkeys(listed, 1)}
+    every |= {"left_out": {}, "groups": {clip: clip for clip in clips}}
+    data = SimpleNamespace(manifest=SimpleNamespace(**every))
+    found = data_remarks.partial_words(SimpleNamespace(config={"data": {"name": name, "split": {}}}), data)
+    assert found.startswith(f"{name}, {words}") if words else found is None
