@@ -110,3 +110,13 @@ def load_rest_joints(body: str | Path) -> np.ndarray:
     if not np.isfinite(joints).all() or tuple(parents[1:]) != PARENTS[1:]:
         raise InputError(f"data.body: {path} has not SMPL's tree of 22 body joints")
     return joints[:N_JOINTS]
+
+
+def _other_side(name: str) -> str:
+    """Return the name of the joint that takes a joint's place in the mirror."""
+    side, _, rest = name.partition("_")
+    return {"left": f"right_{rest}", "right": f"left_{rest}"}.get(side, name)
+
+
+SWAPPED = tuple(JOINTS.index(_other_side(name)) for name in JOINTS)
+"""The joints that take the joints' places in a mirror, as indices: left and right change places."""

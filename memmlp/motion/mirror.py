@@ -5,20 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from memmlp.motion.body import FRAME_DIM, JOINTS, TRACKED
+from memmlp.motion.body import FRAME_DIM, SWAPPED, TRACKED
 from memmlp.motion.dataset import MotionDataset
 
 SIXD_SIGNS = (1.0, -1.0, -1.0, -1.0, 1.0, 1.0)  # the first two columns of S R S with S = diag(-1, 1, 1)
 POINT_SIGNS = (-1.0, 1.0, 1.0)  # S p
 
 
-def _other_side(name: str) -> str:
-    """Return the name of the joint that takes a joint's place in the mirror."""
-    side, _, rest = name.partition("_")
-    return {"left": f"right_{rest}", "right": f"left_{rest}"}.get(side, name)
-
-
-SWAPPED = tuple(JOINTS.index(_other_side(name)) for name in JOINTS)
 TRACKED_SWAPPED = tuple(TRACKED.index(SWAPPED[joint]) for joint in TRACKED)
 
 

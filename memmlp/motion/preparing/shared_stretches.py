@@ -1,9 +1,10 @@
-"""Stretches that two clips share: cuts of one recording that overlap, and copies in another precision.
+"""Stretches that two clips share: overlapping cuts of a recording, copies in another precision or mirrored.
 
 Such clips have the same poses for a while, wherever in the clips and in the world that is. So a few frames of
 each clip are marked by their content alone, which marks the same ones in both: those at which a fixed sum of
 the rotations is largest or smallest for a quarter of a second on either side. Where marked frames of two
-clips are alike, the frames around them are compared.
+clips are alike, the frames around them are compared. Some data sets ship their motion mirrored, too, and
+would test on what they train on; so each clip is compared as it is and as a mirror shows it.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from memmlp.motion.body import SWAPPED
 from memmlp.motion.clip import LINES, Clip, resample
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.preparing.manifest import ClipRecord
@@ -29,10 +31,12 @@ ALIKE = (
 )
 NEAR = 0.05  # distance of two marked frames' signatures, from which on nobody compares them
 SIGNATURE = 24  # numbers
+OTHERS = np.array(SWAPPED[1:]) - 1  # of the joints without the root, which the mirror has in their places
+SIGNS = np.outer((-1, 1, 1), (-1, 1, 1)).reshape(9).astype(np.float32)  # of S R S with S = diag(-1, 1, 1)
 
 
-class Marks(NamedTuple):
-    """The marked frames of a clip.
+class Marked(NamedTuple):
+    """The marked frames of a clip, or of its mirror image.
 
     Attributes:
         frames: their numbers (M,) at 60 Hz.
@@ -43,16 +47,32 @@ class Marks(NamedTuple):
     signatures: np.ndarray
 
 
+class Marks(NamedTuple):
+    """The marked frames of a clip as it is, and of its mirror image."""
+
+    plain: Marked
+    mirrored: Marked
+
+
 def marks(clip: Clip) -> Marks:
-    """Return the marked frames of a clip at 60 Hz: those around which it moves."""
+    """Return the marked frames, around which there is motion, of a clip at 60 Hz and of its mirror image."""
     turns = _turns(clip)
+    return Marks(_marked(turns), _marked(in_mirror(turns)))
+
+
+def in_mirror(turns: np.ndarray) -> np.ndarray:
+    """Return local rotations (N, 21, 9) of all joints but the root as a mirror shows them."""
+    return turns[:, OTHERS] * SIGNS
+
+
+def _marked(turns: np.ndarray) -> Marked:
     sums = turns.reshape(len(turns), -1) @ _weights()
     found = set()
     for signal in (sums[:, 0], -sums[:, 0]):
         found |= set(np.flatnonzero(signal == maximum_filter1d(signal, 2 * REACH + 1)))
     inside = sorted(frame for frame in found if REACH <= frame < len(turns) - REACH)
     moving = [frame for frame in inside if _moves(turns[frame - REACH : frame + REACH + 1])]
-    return Marks(np.array(moving, int), sums[moving].astype(np.float32))
+    return Marked(np.array(moving, int), sums[moving].astype(np.float32))
 
 
 def sharing(
@@ -65,11 +85,9 @@ def sharing(
         clips: records of sound clips.
         marked: clip -> its marked frames.
     """
-    owners = np.repeat(np.arange(len(clips)), [len(marked[clip.name].frames) for clip in clips])
-    if not len(owners):
+    plain, mirrored = (_together([marked[clip.name][side] for clip in clips]) for side in (0, 1))
+    if not len(plain.owners):
         return
-    frames = np.concatenate([marked[clip.name].frames for clip in clips])
-    tree = cKDTree(np.concatenate([marked[clip.name].signatures for clip in clips]))
 
     @lru_cache(maxsize=16)
     def turns(index: int) -> np.ndarray:
@@ -77,13 +95,39 @@ def sharing(
         return _turns(resample(read_clip(root / clip.file, clip.name), interpolation=LINES)[0])
 
     done: set[tuple[int, int]] = set()
-    for mark, other in np.sort(tree.query_pairs(NEAR, output_type="ndarray"), axis=1):
-        pair = int(owners[mark]), int(owners[other])
-        if pair in done or len({clips[index].content for index in pair}) == 1:
-            continue
-        if _alike(turns(pair[0]), frames[mark], turns(pair[1]), frames[other]):
-            done.add(pair)
-            yield clips[pair[0]], clips[pair[1]]
+    for others, seen in ((plain, turns), (mirrored, lambda index: in_mirror(turns(index)))):
+        for mark, other in _near(plain, others):
+            one, two = int(plain.owners[mark]), int(others.owners[other])
+            pair = min(one, two), max(one, two)
+            if pair in done or clips[one].content == clips[two].content:
+                continue
+            if _alike(turns(one), plain.frames[mark], seen(two), others.frames[other]):
+                done.add(pair)
+                yield clips[pair[0]], clips[pair[1]]
+
+
+class _Together(NamedTuple):
+    """The marked frames of all clips: each one's clip, its number there, and the tree of their signatures."""
+
+    owners: np.ndarray
+    frames: np.ndarray
+    tree: cKDTree
+
+
+def _together(every: Sequence[Marked]) -> _Together:
+    owners = np.repeat(np.arange(len(every)), [len(one.frames) for one in every])
+    signatures = np.concatenate([one.signatures for one in every])
+    return _Together(owners, np.concatenate([one.frames for one in every]), cKDTree(signatures))
+
+
+def _near(one: _Together, other: _Together) -> np.ndarray:
+    """Return pairs (P, 2) of marks with signatures that are near each other, in order; each only once."""
+    if one is other:
+        pairs = np.sort(one.tree.query_pairs(NEAR, output_type="ndarray"), axis=1)
+    else:
+        found = one.tree.query_ball_tree(other.tree, NEAR)
+        pairs = np.array([(mark, near) for mark, those in enumerate(found) for near in those], int)
+    return pairs.reshape(-1, 2)
 
 
 def _weights() -> np.ndarray:

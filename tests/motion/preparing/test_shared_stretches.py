@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from memmlp.motion.body import SWAPPED
 from memmlp.motion.clip import Clip, resample
 from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.preparing.cache import ClipFolder, prepare
 from memmlp.motion.preparing.folder_survey import survey
-from memmlp.motion.preparing.shared_stretches import REACH, marks
+from memmlp.motion.preparing.shared_stretches import REACH, _turns, marks
+from memmlp.motion.preparing.shared_stretches import in_mirror as in_mirror_of_turns
 from memmlp.motion.preparing.splits import ListSplit, SeededSplit
 from memmlp.motion.synthetic import synthesize_clip
 
@@ -57,6 +59,30 @@ def test_what_has_some_of_a_clips_frames_is_seen(root: Path, changed):
     assert survey(root).duplicates == {f"{activity}_part": activity for activity in ACTIVITIES}
 
 
+def in_mirror(clip: Clip) -> Clip:
+    """As data sets ship it: left and right joints change places, and rotation vectors keep their x alone."""
+    poses = clip.poses[:, list(SWAPPED)] * np.array([1, -1, -1])
+    return replace(clip, poses=poses, trans=clip.trans * np.array([-1, 1, 1], np.float32))
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [in_mirror, lambda clip: rounded(cut(in_mirror(clip), 97, 230)), lambda clip: elsewhere(in_mirror(clip))],
+    ids=["whole", "middle", "place"],
+)
+def test_a_clip_and_its_mirror_image_are_one(root: Path, changed):
+    """Otherwise one of them is in test and the other in training."""
+    for activity in ACTIVITIES:
+        write_clip(root / f"{activity}_mirrored.npz", changed(synthesize_clip(activity, 1, seconds=5.0)))
+    assert survey(root).duplicates == {f"{activity}_mirrored": activity for activity in ACTIVITIES}
+
+
+def test_mirrored_rotations_are_those_of_mirrored_frames():
+    clip = synthesize_clip("waving", 1, seconds=5.0)
+    found = in_mirror_of_turns(_turns(clip))
+    np.testing.assert_allclose(found, _turns(in_mirror(clip)), atol=1e-6)
+
+
 def test_windows_of_one_recording_are_one(root: Path):
     """Each overlaps the next by two seconds, and the first and the last have nothing in common."""
     recording = synthesize_clip("reaching", 5, seconds=14.0)
@@ -95,8 +121,9 @@ def test_who_stands_still_is_like_many_others(root: Path):
 @pytest.mark.parametrize("frames", [1, 2, 2 * REACH, 2 * REACH + 1])
 def test_a_clip_too_short_for_a_stretch_has_no_marks_beyond_its_middle(frames: int):
     clip = cut(synthesize_clip("walking", 1, seconds=2.0), 0, frames)
-    assert set(marks(clip).frames) <= {REACH}
-    assert marks(clip).signatures.shape == (len(marks(clip).frames), 24)
+    for marked in marks(clip):
+        assert set(marked.frames) <= {REACH}
+        assert marked.signatures.shape == (len(marked.frames), 24)
 
 
 @pytest.mark.parametrize("seed", range(3))
