@@ -1,12 +1,12 @@
 """Clips with the same frames: they are never in two parts of a split, and form one group.
 
 Copies are found by their frames, so a file that was saved again is a copy, and so are one at another frame
-rate (`resampled_duplicates`) and one that has some of the frames, or is mirrored (`shared_stretches`). Clips
-without any motion can't be told apart, so they do not count as copies. If the split divides all clips in the folder,
-copies are drawn together, like any group. If it is a published list with copies in several parts, those in
-training give way to those in validation, and both to those in test: the test set stays as published, and
-nothing in it was seen in training. Copies within one part stay, as in the list; statistics count their group
-once.
+rate (`resampled_duplicates`) and one that has some of the frames, or is mirrored (`shared_stretches`).
+Clips without any motion can't be told apart, so they do not count as copies. If the split divides all clips
+in the folder, copies are drawn together, like any group. If it is a published list with copies in several
+parts, those in training give way to those in validation, and both to those in test: the test set stays as
+published, and nothing in it was seen in training. Copies within one part stay, as in the list; statistics
+count their group once.
 """
 
 from __future__ import annotations

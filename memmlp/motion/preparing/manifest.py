@@ -15,7 +15,7 @@ from memmlp.common.files import atomic_write
 from memmlp.motion.clip import Skipped
 from memmlp.motion.preparing.split_coverage import Coverage
 
-FORMAT = 7  # number of the cache's format; a new one makes every cache again
+FORMAT = 8  # number of the cache's format; a new one makes every cache again
 MANIFEST = "manifest.json"
 STILL = "still"  # the content of every clip without motion
 
