@@ -221,7 +221,7 @@ def test_a_cache_from_before_there_were_groups_is_made_anew(root, tmp_path):
     for clip in old["clips"]:
         del clip["group"]
     path.write_text(json.dumps(old))
-    with pytest.raises(InputError, match="format 1, not 7; prepare the data again"):
+    with pytest.raises(InputError, match="format 1, not 8; prepare the data again"):
         Manifest.load(tmp_path / "cache")
     assert prepare(source(root), tmp_path / "cache") == first
 
