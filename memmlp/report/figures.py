@@ -155,19 +155,18 @@ def _names(axis: Axes, points: Iterable[SpeedAndError]) -> None:
 def curves(name: str, panels: Mapping[str, Mapping[str, Sequence[Curve]]]) -> str:
     """Draw values by training step: a panel for each metric, a colour for each arm, a line for each run."""
     figure, axes = _panels(len(panels), 2.6 * -(-len(panels) // PANELS), sharey=False)
+    labels = list(dict.fromkeys(label for arms in panels.values() for label in arms))
+    colours = {label: SERIES[number % len(SERIES)] for number, label in enumerate(labels)}  # in each panel
     for axis, (metric, arms) in zip(axes, panels.items(), strict=True):
-        for number, runs in enumerate(arms.values()):
+        for label, runs in arms.items():
             for curve in runs:
-                axis.plot(
-                    curve.steps, curve.values, color=SERIES[number % len(SERIES)], linewidth=1, alpha=0.8
-                )
+                axis.plot(curve.steps, curve.values, color=colours[label], linewidth=1, alpha=0.8)
         values = [value for runs in arms.values() for curve in runs for value in curve.values]
         if min(values) > 0 and max(values) > 10 * min(values):
             axis.set_yscale("log")
         axis.set(title=metric, xlabel="step")
         axis.xaxis.set_major_locator(MaxNLocator(4))
         axis.grid(alpha=0.6)
-    labels = list(dict.fromkeys(label for arms in panels.values() for label in arms))
     _legend(figure, labels, ["-"] * len(labels))
     return _svg(figure, f"curves-{name}", "training curves")
 

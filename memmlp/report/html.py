@@ -23,6 +23,7 @@ from memmlp.tables.formats import as_html
 from memmlp.tables.measured_run import UNKNOWN, Measured, Origin
 from memmlp.tables.table import Table
 from memmlp.tables.table_text import better, caption, decimals
+from memmlp.tables.timed_alone import measured_for
 
 ERROR = "MPJRE"  # the error in Fig. 1, by Sec. 4.3
 MOST_POINTS = 200  # about how many points a curve has at most
@@ -235,14 +236,14 @@ def _drawn(point: SpeedAndError) -> bool:
 
 
 def _points(chapter: Chapter) -> list[SpeedAndError]:
-    """Return each arm's mean frames per second and mean error."""
+    """Return each arm's mean frames per second and mean error, each of the runs that count in tables."""
     points = []
     for label, runs in chapter.runs.items():
-        values = [(run.costs.get("FPS"), run.value("stream", "rotation", ERROR)) for run in runs.values()]
-        known = [(fps, error) for fps, error in values if fps is not None and error is not None]
-        if known:
-            fps, error = (sum(column) / len(known) for column in zip(*known, strict=True))
-            points.append(SpeedAndError(label, fps, error))
+        rates = [run.costs["FPS"] for run in measured_for("FPS", runs).values() if "FPS" in run.costs]
+        values = [run.value("stream", "rotation", ERROR) for run in runs.values()]
+        errors = [error for error in values if error is not None]
+        if rates and errors:
+            points.append(SpeedAndError(label, sum(rates) / len(rates), sum(errors) / len(errors)))
     return points
 
 

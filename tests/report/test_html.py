@@ -9,6 +9,7 @@ import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from processes import finished
 
 from memmlp.common.errors import InputError
 from memmlp.report import figures
-from memmlp.report.html import Chapter, _accuracy, _robust_words, page, published
+from memmlp.report.html import Chapter, _accuracy, _points, _robust_words, page, published
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.plan import Entry, Plan
 from memmlp.sweep.sweep_file import load_sweep
@@ -166,6 +167,25 @@ def test_an_arm_that_diverges_on_hard_clips_does_not_look_better_for_it(tmp_path
 def test_an_interquartile_mean_below_a_tenth_has_two_digits():
     found = [_robust_words(Distribution("a", np.zeros((1, 1)), middle, None)) for middle in (0.0034, 4.2)]
     assert found == [("0.0034", "-"), ("4.20", "-")]
+
+
+def test_an_arm_has_its_colour_in_each_panel():
+    """Also where the first arm has no curve, as one that was validated only once."""
+    curve = figures.Curve((0, 1, 2), (2.0, 2.0, 2.0))
+    loss = {label: [curve] for label in "ABC"}
+    svg = figures.curves("losses", {"loss": loss, "MPJPE": {"B": [curve], "C": [curve]}})
+    found = re.findall(r"stroke: var\(--series(\d)\)", svg)
+    assert found == ["0", "1", "2", "1", "2", "0", "1", "2"]  # two panels and the legend
+
+
+def test_a_point_of_accuracy_is_what_the_table_says():
+    """Its time is that of the seed that had a core to itself, its error that of all seeds."""
+    runs = {
+        seed: SimpleNamespace(costs={"FPS": fps, "core share": share}, value=lambda *_, seed=seed: 3.0 + seed)
+        for seed, (fps, share) in enumerate([(1000.0, 0.99), (400.0, 0.4), (420.0, 0.45)])
+    }
+    (point,) = _points(SimpleNamespace(runs={"arm": runs}))
+    assert (point.fps, point.error) == (1000.0, 4.0)
 
 
 def test_an_arm_that_diverged_is_no_point_of_accuracy_and_is_named(tmp_path: Path):
