@@ -158,6 +158,7 @@ def show(chosen: Sweep, plan: Plan, labels: Collection[str]) -> None:
     from memmlp.tables.flags_of_code import older_code
 
     shown = plan.of_arms(labels)
+    click.echo(f"overrides: {' '.join(chosen.command_line) or 'none'}")  # others are another sweep
     if shown.entries:
         states = shown.states()
         Console(highlight=False).print(render(shown, states))

@@ -31,7 +31,7 @@ def show(outcome: Outcome) -> None:
         console.print(f"on a part of the data: {partial}", style="yellow", soft_wrap=True)
     if changed := run.changed_sources:
         console.print(older_code(run, changed), style="yellow", soft_wrap=True)
-    if hardly := hardly_trained({"frames": frames_seen(run)}):
+    if hardly := untrained_remark(run):
         console.print(hardly, style="yellow", soft_wrap=True)
     console.print(metrics_table(results))
     for table in source_tables(run, outcome.stage_ids):
@@ -40,6 +40,11 @@ def show(outcome: Outcome) -> None:
         show_latency(console, results["latency"])
     console.print(f"run      {run.folder}", soft_wrap=True)
     console.print(f"picture  {run.picture}", soft_wrap=True)
+
+
+def untrained_remark(run: Run) -> str:
+    """Say that a run's network hardly saw motion in training; empty if it did."""
+    return hardly_trained({"frames": frames_seen(run)})
 
 
 def show_side_by_side(outcomes: Mapping[str, Outcome]) -> None:

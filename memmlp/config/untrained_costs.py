@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from memmlp.common.errors import InputError
-from memmlp.common.progress import progress_bar
+from memmlp.common.progress import counting
 from memmlp.config.build import build_deployment, untrained
 from memmlp.config.compose import composed
 from memmlp.deploy.deployment import GRAPHS, Deployment
@@ -31,10 +31,12 @@ def with_costs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> tuple[dict[str, 
     check_costs(sweep)
     timed = not set(sweep.metrics) <= set(SIZES)
     without = [arm for arm in sweep.runnable() if not runs[arm.label]]
-    costs = {
-        arm.label: {sweep.seeds_of(arm)[0]: measure_costs(sweep.overrides(arm), timed)}
-        for arm in progress_bar(without, "networks", len(without))
-    }
+    costs: dict[str, RunsBySeed] = {}
+    with counting("networks", len(without)) as count:
+        for arm in without:
+            count.note(arm.label)  # a large one takes minutes
+            costs[arm.label] = {sweep.seeds_of(arm)[0]: measure_costs(sweep.overrides(arm), timed)}
+            count.advance()
     names = ", ".join(f"'{label}'" for label in costs)
     flags = (f"networks that were not trained, with random weights: {names}",) if costs else ()
     return {label: dict(costs.get(label, found)) for label, found in runs.items()}, flags

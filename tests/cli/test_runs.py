@@ -146,6 +146,13 @@ def test_diff(memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch, wi
         line.split() for line in ran.out.splitlines()
     ]
     assert "memory.layers" not in ran.out
+    assert "\none run of each: such changes may be chance; memmlp sweep compares over seeds\n" in ran.out
+
+
+def test_diff_says_that_a_network_hardly_saw_motion(memmlp: Memmlp, outputs: Path):
+    little = {"model": {"frames": 41}, "optim": {"steps": 20, "batch": 8}}
+    Run.of(outputs, "d" * 16).begin("memmlp", little, data="d" * 64, upstream=None)
+    assert "run dddddddd: hardly trained, on 1.8 minutes of motion" in memmlp("runs", "diff", "a", "d").out
 
 
 def test_diff_cuts_no_number(memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch):

@@ -75,6 +75,7 @@ def test_status_and_dry_run_show_and_do_nothing(home: Path):
     assert "full" in said
     assert "failed" in said
     assert "3 done, 1 failed" in said
+    assert said.startswith(f"overrides: {' '.join(TINY)}")
     assert "has changed since" not in said
     older = next(
         run for run in list_runs(home / "outputs") if run.config.get("memory", {}).get("name") == "none"
