@@ -263,7 +263,7 @@ def summary(setup: Setup, study: Study) -> None:
 
     from memmlp.pipeline.data_remarks import partial_words
     from memmlp.sweep.search.progress_table import counts, figures, row, trials_table
-    from memmlp.sweep.search.results import at_an_end, importances
+    from memmlp.sweep.search.results import IMPORTANCE, at_an_end, importances, too_few_trials
 
     console = Console(highlight=False)
     best = study.best()
@@ -274,7 +274,9 @@ def summary(setup: Setup, study: Study) -> None:
             row(table, study.search, trial, Text(figures(trial)))
         console.print(table)
     if found := importances(study):
-        click.echo("importance: " + ", ".join(f"{key} {share:.2f}" for key, share in found))
+        click.echo(f"importance, {IMPORTANCE}: {', '.join(f'{key} {share:.2f}' for key, share in found)}")
+    elif few := too_few_trials(study.study):
+        click.echo(f"importance: {few}")
     for line in at_an_end(study.study):
         click.echo(line)
     click.echo(counts(study))

@@ -15,11 +15,11 @@ import onnx
 import onnxruntime
 import torch
 from onnx import TensorProto, helper
-from torch.utils.flop_counter import FlopCounterMode
 
 from memmlp.common.core_share import CoreClock
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.motion.body import SPARSE_DIM
+from memmlp.networks.flop_counter import counting_flops
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.streaming import StreamingGraph
 from memmlp.networks.vqvae import EMACodebook
@@ -171,7 +171,7 @@ def running_means(model: MotionModel) -> int:
 @torch.no_grad()
 def macs(model: MotionModel | StreamingGraph) -> int:
     """Count the multiply-adds of the matrix products of one streaming step."""
-    with FlopCounterMode(display=False) as counter:
+    with counting_flops() as counter:
         model.advance(torch.zeros(1, 1, SPARSE_DIM), model.initial_state(1), 1)
     return counter.get_total_flops() // 2
 

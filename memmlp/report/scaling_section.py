@@ -81,9 +81,10 @@ def _explained(found: Trends) -> list[str]:
         ),
     ]
     if (ends := found.measured(COMPUTE)) is not None:
+        history = "; calls without gradients, by which a rollout makes its history, are left out"
         lines.append(
             "compute: FLOPs of the matrix products of the control's training, forward and backward; "
-            f"measured from {power(ends[0])} to {power(ends[1])}"
+            f"measured from {power(ends[0])} to {power(ends[1])}{history if found.own_history else ''}"
         )
     lines.append(
         "lines: random-effects regression on the logarithms, whose cells share their test clips "

@@ -18,6 +18,7 @@ from memmlp.tables.statistics.paired_differences import LEVEL
 from memmlp.tables.table import Key
 
 MODE = "stream"
+OWN_HISTORY = "rollout.own_predictions"  # a component whose calls without gradients compute leaves out
 
 
 class TrendVerdict(StrEnum):
@@ -162,6 +163,8 @@ class Trends:
         predict: the overrides whose compute the effects are predicted for; None for none.
         compute: that compute, FLOPs; None if it is not known.
         seconds: the total duration of the trainings.
+        own_history: whether controls were trained on their own predictions, made by calls without gradients,
+            which compute leaves out.
     """
 
     name: str
@@ -173,6 +176,7 @@ class Trends:
     predict: str | None
     compute: float | None
     seconds: float
+    own_history: bool = False
 
     @property
     def series(self) -> tuple[str, ...]:
@@ -210,6 +214,7 @@ def trends(
     words = " ".join(sweep.scale.predict) or None
     compute = (predicted or {}).get(words or "")
     every = {run.id: run for seeds in runs.values() for run in seeds.values()}
+    controls = [run for _, other in in_cells(sweep) for run in runs.get(other.label, {}).values()]
     return Trends(
         name=sweep.name,
         title=sweep.title,
@@ -220,6 +225,7 @@ def trends(
         predict=words,
         compute=compute,
         seconds=sum(run.training.get("seconds", 0.0) for run in every.values()),
+        own_history=any(OWN_HISTORY in run.origin.recipes for run in controls),
     )
 
 

@@ -1,7 +1,7 @@
 """How many operations a training takes.
 
-The count covers the FLOPs of matrix products in training calls, forward and backward, as torch's own counter
-sees them (torch.utils.flop_counter); a multiplication and an addition are two FLOPs. For a network whose
+The count covers the FLOPs of matrix products in training calls, forward and backward, as
+memmlp.networks.flop_counter counts them; a multiplication and an addition are two FLOPs. For a network whose
 weights are all trained, this is close to 3 x 2 x MACs of the forward pass (Kaplan et al. 2020, "Scaling laws
 for neural language models", Sec. 2.1), minus the gradients that are not needed: those of the inputs, and of a
 frozen VQ-VAE. It does not cover the optimiser, element-wise operations, calls without gradients by which a
@@ -10,15 +10,13 @@ rollout or the network itself makes its history, validations, or the runs upstre
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import torch
-from torch.utils.flop_counter import FlopCounterMode, flop_registry
 
 from memmlp.motion.body import FRAME_DIM
 from memmlp.motion.dataset import MotionDataset
+from memmlp.networks.flop_counter import counting_flops
 from memmlp.networks.motion_model import MotionModel
 from memmlp.training.losses import Loss
 from memmlp.training.optim import Optim
@@ -49,24 +47,11 @@ def step_flops(model: MotionModel, loss: Loss, optim: Optim) -> int:
     """Count the FLOPs of one training step, by taking it on random frames."""
     task = MotionTask(model, loss, TeacherForcing(), _frames(model), optim, 0, validate=lambda network: {})
     task.module.train()
-    with FlopCounterMode(display=False, custom_mapping=_WITH_GRADIENT) as forward:
+    with counting_flops(with_gradients_alone=True) as forward:
         loss_of_step = task.step(0).loss
-    with FlopCounterMode(display=False) as backward:
+    with counting_flops() as backward:
         loss_of_step.backward()
     return int(forward.get_total_flops() + backward.get_total_flops())
-
-
-def _with_gradient(count: Callable[..., int]) -> Callable[..., int]:
-    """Return a function that counts an operation's FLOPs, but not in calls without gradients."""
-
-    def counted(*args: Any, **kwargs: Any) -> int:
-        return count(*args, **kwargs) if torch.is_grad_enabled() else 0
-
-    counted._get_raw = True  # type: ignore[attr-defined]  # it is given tensors, as the registry's are
-    return counted
-
-
-_WITH_GRADIENT = {operation: _with_gradient(count) for operation, count in flop_registry.items()}
 
 
 def _frames(model: MotionModel) -> MotionDataset:

@@ -46,6 +46,7 @@ def folder_of(home: Path) -> Path:
 def test_a_search_ends_with_its_best_trial_and_the_command_for_it(home: Path):
     said = (home / "said.txt").read_text()
     assert "3 of 3 trials: 3 complete" in said
+    assert "importance: told from 25 complete trials on; of 3 it would be chance" in said
     rows = list(csv.DictReader((folder_of(home) / "trials.csv").read_text().splitlines()))
     assert rows[0]["loss.rotation_velocity"] == "30.0"
     assert examine(home / "outputs", 3) == []

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import tiny
 import torch
-from torch.utils.flop_counter import FlopCounterMode
 
 from memmlp.config.build import build_architecture, untrained
 from memmlp.config.compose import composed
@@ -15,6 +14,7 @@ from memmlp.evaluation.modes import joint_positions
 from memmlp.motion.body import HANDS, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.network_coordinates import Heading
 from memmlp.networks.architectures import RefinedArchitecture
+from memmlp.networks.flop_counter import counting_flops
 from memmlp.networks.refiner import HIDDEN, Refined
 from memmlp.networks.streaming import has_stream, streaming
 
@@ -89,7 +89,7 @@ def test_calls_of_any_size_and_clips_side_by_side():
 def test_a_step_is_a_few_products_more():
     counts = []
     for one in (streaming(network("avatar_poser").network), streaming(network("avatar_poser"))):
-        with FlopCounterMode(display=False) as counter:
+        with counting_flops() as counter:
             one.advance(SPARSE[:, :1], one.initial_state())
         counts.append(counter.get_total_flops() // 2)
     kinematics = 21 * (27 + 9)  # a turn and an offset for each joint but the root

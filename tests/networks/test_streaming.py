@@ -9,13 +9,13 @@ import exported
 import pytest
 import tiny
 import torch
-from torch.utils.flop_counter import FlopCounterMode
 
 from memmlp.common.errors import InputError
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import parity
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
+from memmlp.networks.flop_counter import counting_flops
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import CodeMemory, GRUMemory, JointCodeMemory, LSTMMemory, NoCodesMemory, NoMemory
 from memmlp.networks.predictor_slot import RotationOnly, TwoBranch, TwoBranchMemory
@@ -99,7 +99,7 @@ def test_less_work(name):
     model = tiny.model() if name == "mem_mlp" else tiny.baseline(name)
     counts = []
     for network in (model, streaming(model)):
-        with FlopCounterMode(display=False) as counter:
+        with counting_flops() as counter:
             network.advance(CLIP[:, :1], network.initial_state(1), 1)
         counts.append(counter.get_total_flops())
     assert counts[1] == counts[0] if name in tiny.WINDOWLESS else counts[1] < counts[0]

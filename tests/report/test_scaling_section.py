@@ -17,6 +17,7 @@ from memmlp.report.scaling_figure import figure_is_of, scaling_figure
 from memmlp.report.scaling_section import bounds_words, power, scaling_section
 from memmlp.tables.build_table import make_table
 from memmlp.tables.effects_along_axes import Bounds, Trends, trends
+from memmlp.tables.measured_run import Measured
 from memmlp.tables.table_text import MINUS
 
 PAPER = {"profile=paper": STEP * 8000 * 30}
@@ -65,6 +66,22 @@ def test_the_section_has_what_the_lines_say(found: Trends):
 )
 def test_how_far_a_prediction_may_be_trusted_follows_from_the_numbers(found: Trends, compute, words: str):
     assert words in scaling_section(replace(found, compute=compute))
+
+
+@pytest.mark.parametrize("rollout", ["teacher_forcing", "own_predictions"])
+def test_calls_that_compute_leaves_out_are_told_where_there_are_any(tmp_path: Path, rollout: str):
+    """A rollout on own predictions makes its history by calls without gradients; the control's count."""
+    sweep, runs = cells(tmp_path, lambda steps: 1.0)
+    for label in runs:
+        made = rollout if label.startswith("full") else "own_predictions"
+        runs[label] = {seed: trained_with(run, f"rollout.{made}") for seed, run in runs[label].items()}
+    text = scaling_section(trends(sweep, runs))
+    told = "8.0 · 10¹²; calls without gradients, by which a rollout makes its history, are left out\n" in text
+    assert told == (rollout == "own_predictions")
+
+
+def trained_with(run: Measured, component: str) -> Measured:
+    return replace(run, origin=replace(run.origin, recipes={**run.origin.recipes, component: 1}))
 
 
 def test_without_lines_it_says_why(found: Trends):

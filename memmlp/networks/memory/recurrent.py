@@ -8,7 +8,6 @@ from typing import ClassVar
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.utils.flop_counter import register_flop_formula
 
 from memmlp.common.float32_regions import in_float32
 from memmlp.motion.body import SPARSE_DIM
@@ -54,24 +53,6 @@ class Recurrence(nn.Module):
     def run(self, x: Tensor, states: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
         """Run the recurrent layer over inputs (B, n, 54) from a sequence of states, each (1, B, k)."""
         raise NotImplementedError
-
-
-@register_flop_formula(torch.ops.aten.mkldnn_rnn_layer)
-def lstm_flops(x: Sequence[int], to_gates: Sequence[int], again: Sequence[int], *shapes, **rest) -> int:
-    """Count the FLOPs of an LSTM on a CPU, an operation that torch's counter does not know.
-
-    The arguments are the shapes of the operation's arguments: the inputs (n, B, inputs), the weights of the
-    inputs (4 k, inputs), and the weights of the hidden state (4 k, k).
-    """
-    return 2 * x[0] * x[1] * (to_gates[0] * to_gates[1] + again[0] * again[1])
-
-
-@register_flop_formula(torch.ops.aten.mkldnn_rnn_layer_backward)
-def lstm_backward_flops(
-    x: Sequence[int], to_gates: Sequence[int], again: Sequence[int], *shapes, **rest
-) -> int:
-    """Count the FLOPs of the gradients of the weights and of the inputs; see `lstm_flops`."""
-    return 2 * lstm_flops(x, to_gates, again)
 
 
 class LSTM(Recurrence):

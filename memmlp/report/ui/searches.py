@@ -109,7 +109,7 @@ def _study(folder: Path, url: str | None) -> optuna.Study:
 def _of_study(study: optuna.Study) -> dict[str, Any]:
     from optuna.trial import TrialState
 
-    from memmlp.sweep.search.results import at_an_end, study_importances
+    from memmlp.sweep.search.results import IMPORTANCE, at_an_end, study_importances, too_few_trials
 
     trials = [trial for trial in study.get_trials(deepcopy=False) if trial.state != TrialState.WAITING]
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
@@ -131,6 +131,8 @@ def _of_study(study: optuna.Study) -> dict[str, Any]:
         "best": [_trial(trial) for trial in complete if trial.number in front][:1],
         "trials": [_trial(trial) for trial in trials],
         "ends": at_an_end(study),
+        "importance_is": IMPORTANCE,
+        "too_few": too_few_trials(study),
         "importance": [[key, round(share, 4)] for key, share in study_importances(study)],
     }
 

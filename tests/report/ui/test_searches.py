@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
-from fake_search import director, finish, open_study, with_a_pruned_trial
+from fake_search import director, finish, open_study, to_the_end, with_a_pruned_trial
 
 from memmlp.common.files import write_json
 from memmlp.report.ui.searches import Searches
@@ -42,3 +42,14 @@ def test_a_search_in_a_storage_of_ones_own_is_read_again(folder: Path, tmp_path:
     one.look(1).save(plan)
     assert searches.page("mine")["counts"] == {"complete": 1, "running": 1}
     assert searches.stamp() != before
+
+
+def test_of_few_trials_it_says_why_there_is_no_importance(folder: Path):
+    study = open_study(folder, n_trials=2)
+    write_json(folder / "search.json", asdict(study.search))
+    to_the_end(study, folder)
+    page = Searches(folder.parents[1]).page("mine")
+    assert (page["importance"], page["too_few"]) == (
+        [],
+        "told from 25 complete trials on; of 2 it would be chance",
+    )

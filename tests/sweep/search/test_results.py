@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import optuna
 import pytest
 import yaml
@@ -20,6 +22,8 @@ from fake_search import (
     to_the_end,
     with_a_pruned_trial,
 )
+from optuna.distributions import FloatDistribution
+from optuna.trial import create_trial
 
 from memmlp.sweep.search import results
 from memmlp.sweep.search.search_file import Range
@@ -108,8 +112,7 @@ def test_what_a_search_leaves(tmp_path: Path):
     assert f"loss.hand={best.params['loss.hand']}" in arms["manual, searched"]["overrides"]
     plots = results.write_plots(study, tmp_path)
     assert {path.name for path in plots} == {
-        "optimization_history.png", "parallel_coordinate.png", "slice.png", "param_importances.png",
-        "study.html",
+        "optimization_history.png", "parallel_coordinate.png", "slice.png", "study.html",
     }  # fmt: skip
     assert all(path.stat().st_size > 5000 for path in plots)
     page = (tmp_path / "study.html").read_text()
@@ -182,6 +185,54 @@ def test_a_best_value_at_an_end_of_what_was_tried_is_told(tried, values, said):
         study.tell(trial, -number)
     found = results.at_an_end(study)
     assert [line.startswith(f"optim.lr: the best value, {said}") for line in found] == [True] * bool(said)
+
+
+def add_random_trials(
+    study: optuna.Study, number: int, names: Sequence[str] = ("acts", "inert", "also inert")
+):
+    """Add complete trials of random values, of which the first alone decides."""
+    between = dict.fromkeys(names, FloatDistribution(0.0, 1.0))
+    for values in np.random.default_rng(0).random((number, len(names))):
+        params = dict(zip(names, map(float, values), strict=True))
+        study.add_trial(create_trial(params=params, distributions=between, value=(values[0] - 0.5) ** 2))
+
+
+@pytest.mark.parametrize("number", [6, 10, 24])
+def test_of_few_trials_no_importance_is_told(number: int):
+    """It would be chance: an inert key ranks first in most random searches of ten trials."""
+    study = optuna.create_study()
+    assert results.too_few_trials(study) is None
+    add_random_trials(study, number)
+    assert results.study_importances(study) == []
+    assert results.too_few_trials(study) == f"told from 25 complete trials on; of {number} it would be chance"
+
+
+def test_of_enough_trials_the_key_that_acts_is_the_most_important():
+    study = optuna.create_study()
+    add_random_trials(study, results.ENOUGH_TRIALS)
+    (first, share), *rest = results.study_importances(study)
+    assert (first, len(rest), share > 0.5) == ("acts", 2, True)
+    assert results.too_few_trials(study) is None
+
+
+def test_a_single_key_has_no_importance():
+    study = optuna.create_study()
+    add_random_trials(study, 10, ["acts"])
+    assert results.too_few_trials(study) is None
+    add_random_trials(study, 20, ["acts"])
+    assert results.study_importances(study) == []
+
+
+@pytest.mark.slow
+def test_the_plot_of_importance_is_of_the_same_kind(tmp_path: Path):
+    """Optuna's own choice of what it measures is another in other versions."""
+    study = open_study(tmp_path)
+    add_random_trials(study.study, 24)
+    assert "param_importances" not in results.plots(study)
+    add_random_trials(study.study, 1)
+    kind = results.plots(study)["param_importances"]["evaluator"]
+    assert isinstance(kind, optuna.importance.PedAnovaImportanceEvaluator)
+    assert tmp_path / "param_importances.png" in results.write_plots(study, tmp_path)
 
 
 def test_a_front_reaches_to_the_ends():

@@ -54,10 +54,16 @@ function body(search) {
     h('div', { class: 'sum' }, summary, h('p', { class: 'best' }, best.length === 1 ? 'Best: ' : `On the Pareto front: `, best.slice(0, 8).map((trial, i) => [i ? ', ' : '', runLink(trial), ' ', h('b', { class: 'n' }, trial.values.map(value => number(value, 3)).join(' / '))])), search.ends.map(line => h('p', { class: 'faint' }, line))),
     search.objectives.length > 1 ? h('div', { class: 'tools' }, select('Objective', search.objectives.map(one => [one, one]), wanted, value => { remember({ objective: value }); dispatchEvent(new HashChangeEvent('hashchange')); })) : null,
     search.objectives.length === 2 ? section('Pareto front', scatter(complete.map(trial => ({ id: trial.number, x: trial.values[0], y: trial.values[1], text: text(trial) })), { x: search.objectives[0], y: search.objectives[1], front, title: 'text' })) : null,
-    h('div', { class: 'pair' }, section('History', history(listed, { label: wanted, choose: open })), search.importance.length ? section('Importance', bars(search.importance.map(([key, value]) => ({ name: short.get(key), value })), { label: `share in the variation of ${search.objectives[0]}` })) : null),
+    h('div', { class: 'pair' }, section('History', history(listed, { label: wanted, choose: open })), importance(search, short)),
     section('All trials', h('p', { class: 'faint' }, `A line a trial, darker where ${wanted} is lower; the best stands out.`), parallel(lines, axes, { label: 'Parallel axes' })),
     section('Trials', trials(search, short)),
   ];
+}
+
+function importance(search, short) {
+  if (search.too_few) return section('Importance', h('p', { class: 'faint' }, search.too_few));
+  if (!search.importance.length) return null;
+  return section('Importance', bars(search.importance.map(([key, value]) => ({ name: short.get(key), value })), { label: `${search.importance_is}, by ${search.objectives[0]}` }));
 }
 
 function runLink(trial) {
