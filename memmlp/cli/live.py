@@ -273,9 +273,12 @@ def send_clip(given: InputOptions) -> None:
     port, pack = (given.udp, to_json) if given.udp is not None else (given.osc, to_osc)
     assert port is not None
     click.echo(f"sending {source.name} to port {port}")
-    sent, samples = send(source, port, pack, space_of(given.space)), source.count
+    (sent, refused), samples = send(source, port, pack, space_of(given.space)), source.count
     late = f" of {samples}: the others were due while this machine was busy" if sent < samples else ""
     click.echo(f"{sent} packets sent{late}")
+    if refused:
+        kind = "--udp" if given.udp is not None else "--osc"
+        note(f"nothing listened at port {port} for some or all of them; memmlp live RUN {kind} {port} does")
 
 
 def serve(given: InputOptions, shown: ShowOptions) -> None:

@@ -324,16 +324,23 @@ def bind(listener: socket.socket, port: int, host: str = HOST) -> None:
         ) from None
 
 
-def send(source: ClipSource, port: int, pack: Callable[[Packet], bytes], space: Space) -> int:
+def send(source: ClipSource, port: int, pack: Callable[[Packet], bytes], space: Space) -> tuple[int, bool]:
     """Send a clip's samples in a frame of reference to a UDP port of this machine, for all rounds.
 
     Returns:
-        The number of samples sent.
+        The number of samples sent, and whether any was refused, since nothing listened at the port then.
+        Not every system tells.
     """
-    sent = 0
+    sent, refused = 0, False
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.connect((HOST, port))  # so that a refusal is told, with the next packet
         while not source.over and (sample := source.read()) is not None:
             trackers = in_space(sample.trackers, space)
-            sender.sendto(pack(Packet(trackers, sample.time, source.next - 1)), (HOST, port))
+            packet = pack(Packet(trackers, sample.time, source.next - 1))
+            try:
+                sender.send(packet)
+            except ConnectionRefusedError:  # of the one before
+                refused = True
+                sender.send(packet)
             sent += 1
-    return sent
+    return sent, refused

@@ -231,3 +231,16 @@ def test_only_this_machine_is_listened_to():
         PacketSource("UDP", arrives.port, from_json, "amass")
     arrives.close()
     PacketSource("UDP", arrives.port, from_json, "amass").close()
+
+
+@pytest.mark.parametrize("heard", [True, False])
+def test_a_sender_knows_whether_anybody_listens(clip: TrackedClip, heard: bool):
+    """A listener that takes nothing out of its port still has it."""
+    played = source(clip, 60, Clock())
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        listener.bind((HOST, 0))
+        port = listener.getsockname()[1]
+        if not heard:
+            listener.close()
+        sent, refused = send(played, port, lambda packet: b"{}", SPACES["amass"])
+    assert (sent, refused) == (played.count, not heard)
