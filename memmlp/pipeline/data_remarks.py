@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -62,24 +62,35 @@ def divided_subjects_remark(manifest: Manifest) -> str:
 def divided_folders_remark(manifest: Manifest) -> str:
     """Say that folders have clips in both training and test which no group ties together; empty if none has.
 
-    A folder is often a person or a session. A source whose clips are all in one folder has no such folders.
+    A folder is often a person or a session, unless it holds all clips of its source.
     """
-    parts: dict[str, dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
+    every = {clip.name: _of_source(manifest, clip.name) for clip in manifest.clips}
+    clips = Counter(source for source, _ in every.values())
+    held = Counter((source, folder) for source, below in every.values() for folder in _folders(below))
+    parts: dict[tuple[str, str], list[str]] = defaultdict(list)
     for clip in manifest.clips:
-        source, below = _of_source(manifest, clip.name)
         if clip.group == clip.name and untied(manifest.split, clip.name):
-            parts[source][below.rpartition("/")[0]].append(clip.split)
+            source, below = every[clip.name]
+            own, *above = _folders(below)
+            # Where each take has a folder to itself, the person is the one above.
+            shared = next((folder for folder in (own, *above) if held[source, folder] > 1), own)
+            parts[source, shared].append(clip.split)
     folders = [
         (f"{source}{folder}", found.count("test"))
-        for source, own in parts.items()
-        for folder, found in own.items()
-        if len(own) > 1 and {"train", "test"} <= set(found)
+        for (source, folder), found in parts.items()
+        if held[source, folder] < clips[source] and {"train", "test"} <= set(found)
     ]
     if not folders:
         return ""
     tested = f"{sum(count for _, count in folders)} test clips are tied to no others (data.split.groups)"
     more = f" and {len(folders) - 1} more" if len(folders) > 1 else ""
     return f"{tested}, and clips of their folders, {folders[0][0] or 'the top one'}{more}, are in training"
+
+
+def _folders(name: str) -> list[str]:
+    """Return the folders that a clip is in, the innermost first; "" if there is none."""
+    folders = name.split("/")[:-1]
+    return ["/".join(folders[:depth]) for depth in range(len(folders), 0, -1)] or [""]
 
 
 def _of_source(manifest: Manifest, name: str) -> tuple[str, str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
@@ -21,6 +21,7 @@ from memmlp.tables.timed_alone import core_share, timed_alone
 DescribeRun = Callable[[Arm, int], str | None]
 BUILT_IN = "builtin"
 ALIKE = 1.1  # how many times the frames of its control an arm may see in training before a flag says so
+UNTIED = 0.75  # share of test clips that are groups of their own from which on a flag asks for groups
 SMPLH = (1, 2, 3)  # the paper's tables on AMASS, on the rest joints of SMPL-H bodies
 ORIGIN = {
     "code": "code", "data": "data", "hardware": "hardware", "device": "device", "gpu": "GPU",
@@ -352,8 +353,8 @@ def _replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
     measured = {label: list(found.values()) for label, found in runs.items() if found}
     if len(measured) < 2:
         return
-    groups = [len({run.group(clip) for clip in run.clips}) for found in measured.values() for run in found]
-    clips = [len(run.clips) for found in measured.values() for run in found]
+    every = [run for found in measured.values() for run in found]
+    groups = [len({run.group(clip) for clip in run.clips}) for run in every]
     one_seed, one_group = max(map(len, measured.values())) == 1, max(groups) == 1
     if one_seed and one_group:
         yield "one seed an arm and one group of test clips: no interval, and nothing is starred"
@@ -361,13 +362,21 @@ def _replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
         yield "one seed an arm: the intervals speak of other clips, not of other seeds; nothing is starred"
     else:
         yield from _single(sweep, runs, one_group)
-    if groups == clips and max(groups) > 1:
-        yield "each test clip is a group of its own (data.split.groups): right where none share a person"
+    if max(groups) > 1 and all(_alone(run) >= UNTIED * len(run.clips) for run in every):
+        alone, clips = min((_alone(run), len(run.clips)) for run in every if run.clips)
+        each = f"{alone} of {clips} test clips are groups of their own"
+        each = "each test clip is a group of its own" if alone == clips else each
+        yield f"{each} (data.split.groups): right where none share a person"
     if one_group and not one_seed:
         yield "one group of test clips: the intervals speak of other seeds, not of other takes or people"
     shared = [label for label, found in measured.items() if _one_upstream(found)]
     if shared:
         yield f"all seeds share one VQ-VAE, which they so do not replicate: {quoted(shared)}"
+
+
+def _alone(run: Measured) -> int:
+    """Return how many of a run's test clips are groups of their own."""
+    return list(Counter(map(run.group, run.clips)).values()).count(1)
 
 
 def _same(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:

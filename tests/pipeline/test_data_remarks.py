@@ -85,6 +85,8 @@ def manifest_of(parts: Sequence[tuple[str, str]], split: dict[str, Any], tied: S
 
 SOURCES: dict[str, Any] = {"sources": {"x": {}, "y": {}}}
 TAKES = [("own/anna/1", "train"), ("own/anna/2", "test"), ("own/ben/1", "test"), ("own/ben/2", "train")]
+FLAT = [("salsa/1", "train"), ("salsa/2", "test"), ("own/1", "train"), ("own/2", "test")]  # salsa is tied
+SESSIONS = [(f"{name.rpartition('/')[0]}/session{name[-1]}/take", part) for name, part in TAKES]
 
 
 @pytest.mark.parametrize(
@@ -101,6 +103,9 @@ TAKES = [("own/anna/1", "train"), ("own/anna/2", "test"), ("own/ben/1", "test"),
             SOURCES,
             "",
         ),
+        (FLAT, {"groups": ["salsa/(.*)"]}, "1 test clips are tied to no others"),
+        (SESSIONS, {}, "2 test clips are tied to no others"),
+        ([("c1/a", "train"), ("c2/a", "test"), ("c3/a", "train")], {}, ""),  # no folder is shared
     ],
 )
 def test_folders_with_clips_in_training_and_in_test_are_told(parts, split, said):
@@ -120,6 +125,11 @@ def test_odd_test_clips_are_a_fact_of_the_run():
     said = "1 of 2 test clips are unusual, first b (Z is not up)"
     assert data_remarks.unusual_tests_remark(odd, clips[:2]) == said
     assert data_remarks.unusual_tests_remark(odd, clips[:1]) is None
+    every = [SimpleNamespace(name=clip.name, split=clip.split, fps=60.0, group="tied") for clip in clips]
+    known = {"coverage": SimpleNamespace(whole=True), "listed": {"CMU": 1}, "split": {}}
+    data = SimpleNamespace(manifest=SimpleNamespace(clips=every, unusual=odd, **known))
+    experiment = SimpleNamespace(config={"data": {"name": "mine", "split": {}}})
+    assert data_remarks.data_warnings(experiment, data)["unusual"] == said
 
 
 def test_clips_that_were_recorded_at_a_lower_rate_are_said():

@@ -450,6 +450,25 @@ def test_equal_origins_are_not_flagged(table: Table):
     assert [flag for flag in table.flags if "a group of its own" not in flag] == []
 
 
+@pytest.mark.parametrize(
+    ("tied", "said"),
+    [
+        (0, "each test clip is a group of its own"),
+        (2, "10 of 12 test clips are groups of their own"),
+        (6, None),
+    ],
+)
+def test_test_clips_that_hardly_anything_ties_are_said(
+    sweep: Sweep, tmp_path: Path, tied: int, said: str | None
+):
+    """A single tied pair does not say that people were told apart."""
+    clips = [f"clip{number}" for number in range(12)]
+    groups = {clip: "tied" if number < tied else clip for number, clip in enumerate(clips)}
+    flags = table_of(sweep, fake_sweep(tmp_path, sweep, clips=clips, groups=groups)).flags
+    whole = f"{said} (data.split.groups): right where none share a person"
+    assert [flag for flag in flags if "of their own" in flag or "of its own" in flag] == [whole] * bool(said)
+
+
 def test_a_comparison_of_one_seed_among_others_of_more_is_said(sweep: Sweep, tmp_path: Path):
     find = fake_sweep(tmp_path, sweep)
     table = table_of(sweep, lambda arm, seed: find(arm, seed) if seed == 0 or "no" not in arm.label else None)

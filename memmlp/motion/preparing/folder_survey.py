@@ -18,7 +18,7 @@ from memmlp.motion.plausibility import check_plausible, unusual
 from memmlp.motion.preparing.duplicates import one_content
 from memmlp.motion.preparing.find_clips import FoundFiles, clip_name
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
-from memmlp.motion.preparing.resampled_duplicates import first_frame, resampled_copies
+from memmlp.motion.preparing.resampled_duplicates import first_frames, resampled_copies
 from memmlp.motion.preparing.several_folders import Root, find_all
 from memmlp.motion.preparing.shared_stretches import Marks, marks, sharing
 
@@ -87,7 +87,7 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
             skipped.append(Skipped(one_line(file), str(error).removeprefix(one_line(f"{root / file}: "))))
             short += [name] if isinstance(error, TooShort) else []
         else:
-            firsts[name], marked[name] = first_frame(clip), marks(resampled)
+            firsts[name], marked[name] = first_frames(clip), marks(resampled)
             odd |= {name: reason} if (reason := unusual(clip)) else {}
     records = list(clips.values())
     records = one_content(records, resampled_copies(root, records, firsts))

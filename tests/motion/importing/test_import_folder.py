@@ -97,17 +97,24 @@ def test_import_twice_is_the_same(source: Path, tmp_path: Path) -> None:
     assert (tmp_path / "out" / "import.json").read_bytes() == record
 
 
-def test_a_header_whose_frame_time_was_cut_off_is_told(tmp_path: Path) -> None:
-    text = person("cmu_daz", 3, 0).text(dt="0.016")
-    assert "Frame Time: 0.016\n" in text
+@pytest.mark.parametrize(
+    ("dt", "fps", "usual"), [("0.016", 62.5, 60), ("0.008", 125, 120), ("0.03", 33.3333, 30)]
+)
+def test_a_header_whose_frame_time_was_cut_off_is_told(
+    tmp_path: Path, dt: str, fps: float, usual: int
+) -> None:
+    text = person("cmu_daz", 3, 0).text(dt=dt)
+    assert f"Frame Time: {dt}\n" in text
     write(tmp_path / "source", text, "a.bvh")
     out = tmp_path / "out"
     report = import_folder(tmp_path / "source", out, ImportSettings(floor=NONE))
-    said = "the header's 62.5 Hz may be a frame time cut off too early; --fps 60 if that is meant (a.bvh)"
-    assert rates(out) == {"a.npz": 62.5}
-    assert [note for note in report.notes if "Hz" in note] == [said]
-    told = import_folder(tmp_path / "source", tmp_path / "told", ImportSettings(fps={"": 62.5}, floor=NONE))
-    assert not [note for note in told.notes if "Hz" in note]
+    told = f"the header's {fps:g} Hz may be a frame time cut off too early"
+    assert rates(out) == {"a.npz": pytest.approx(1 / float(dt))}  # asked, not guessed
+    assert [note for note in report.notes if "Hz" in note] == [
+        f"{told}; --fps {usual} if that is meant (a.bvh)"
+    ]
+    given = import_folder(tmp_path / "source", tmp_path / "given", ImportSettings(fps={"": fps}, floor=NONE))
+    assert not [note for note in given.notes if "may be" in note]
 
 
 @pytest.mark.parametrize(

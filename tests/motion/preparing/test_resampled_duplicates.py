@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from memmlp.motion.body import SWAPPED
 from memmlp.motion.clip import Clip, resample
 from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.preparing.cache import ClipFolder, prepare
@@ -34,6 +35,17 @@ def test_a_copy_at_another_rate_is_seen(root, fps):
     found = survey(root)
     assert found.duplicates == {f"b/{activity}_again": f"a/{activity}" for activity in ACTIVITIES}
     assert len(found.clips) == 2 * len(ACTIVITIES)
+
+
+@pytest.mark.parametrize("fps", [20.0, 60.0])
+def test_a_mirrored_copy_at_another_rate_is_seen(root, fps, monkeypatch):
+    """At 20 Hz quick motion has no stretch in common with its original that were alike enough."""
+    monkeypatch.setattr("memmlp.motion.preparing.folder_survey.sharing", lambda *_: [])
+    for activity in ACTIVITIES:
+        clip = resample(recorded(activity), fps)[0]
+        poses, trans = clip.poses[:, list(SWAPPED)] * np.array([1, -1, -1]), clip.trans * np.array([-1, 1, 1])
+        write_clip(root / "b" / f"{activity}_M.npz", replace(clip, poses=poses, trans=trans))
+    assert survey(root).duplicates == {f"b/{activity}_M": f"a/{activity}" for activity in ACTIVITIES}
 
 
 def test_copies_of_copies_are_one(root):
