@@ -13,7 +13,14 @@ from rich.table import Table
 from memmlp.common.core_share import LEAST_CORE_SHARE
 from memmlp.evaluation.units import UNITS
 from memmlp.pipeline.run_stages import Outcome
-from memmlp.runs.deployment_folder import as_deployed, deployed_precision
+from memmlp.runs.deployment_folder import (
+    INT8_PRECISIONS,
+    MAX_GROWTH,
+    MAX_JITTER_GROWTH,
+    accurate_enough,
+    as_deployed,
+    deployed_precision,
+)
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import BRANCHES
 from memmlp.tables.measured_run import CORE_SHARES, SAME, SHARED, Errors, frames_seen, hardly_trained, load
@@ -94,6 +101,8 @@ def show_latency(console: Console, record: Mapping[str, Any]) -> None:
         f"({measured['ratio_to_yardstick']:.2f} x the yardstick{plain})",
         soft_wrap=True,
     )
+    if said := less_precise_words(record):
+        console.print(said, style="yellow", soft_wrap=True)
     if (share := min(measured.get(key, 1.0) for key in CORE_SHARES.values())) < LEAST_CORE_SHARE:
         busy = f"the machine was busy: it had a core for {share:.0%} of the time, and its times are too long"
         console.print(busy, style="yellow", soft_wrap=True)
@@ -104,6 +113,17 @@ def show_latency(console: Console, record: Mapping[str, Any]) -> None:
             soft_wrap=True,
         )
     console.print(size(measured), soft_wrap=True)
+
+
+def less_precise_words(record: Mapping[str, Any]) -> str:
+    """Say that an int8 file is not used live, since its errors grow too much; empty if it is used."""
+    precision = deployed_precision(record)
+    cost = record.get(precision) or {}
+    if precision not in INT8_PRECISIONS or accurate_enough(cost) or "jitter_growth" not in cost:
+        return ""
+    growth, of_jitter = cost["growth"], cost["jitter_growth"]
+    limits = f"more than {MAX_GROWTH:.0%} and {MAX_JITTER_GROWTH:.0%} allow"
+    return f"{precision}: MPJPE {growth:+.1%}, Jitter {of_jitter:+.1%}, {limits}: live use takes float32"
 
 
 def size(measured: Mapping[str, Any]) -> str:

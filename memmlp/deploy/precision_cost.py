@@ -19,9 +19,7 @@ from memmlp.evaluation.metrics import positions_report
 from memmlp.evaluation.modes import joint_positions, rotations_report
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
-
-MAX_GROWTH = 0.01  # relative
-"""Of MPJPE, up to which less precision may stand for float32."""
+from memmlp.runs.deployment_folder import accurate_enough
 
 TEST_FRAMES = 20_000  # accuracy is measured on at most this many
 
@@ -65,7 +63,7 @@ def compared(
 
     Returns:
         The metrics of both files, the relative growth of MPJPE, of the branch in which that is larger, and of
-        Jitter, and whether the other file may be the default.
+        Jitter, and whether the other file may be the default (`accurate_enough`).
     """
     before = accuracy(exact, normalizer, clips)
     with tempfile.TemporaryDirectory() as folder:
@@ -75,7 +73,5 @@ def compared(
     growths = {name: after[name] / before[name] - 1 for name in ("MPJPE", "position MPJPE", "Jitter")}
     jitter = growths.pop("Jitter")
     growth = float(np.max(list(growths.values())))  # NaN if either is
-    allowed = growth <= MAX_GROWTH
-    return {
-        "fp32": before, precision: after, "growth": growth, "jitter_growth": jitter, "default": allowed,
-    }  # fmt: skip
+    grown = {"growth": growth, "jitter_growth": jitter}
+    return {"fp32": before, precision: after, **grown, "default": accurate_enough(grown)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,6 +21,9 @@ ONNX_FILES = {
 """The name of the ONNX file of each precision (`export.precision`)."""
 INT8_PRECISIONS = ("int8", "int8_blocks")
 """The precisions that are used live where they are accurate enough. At the paper's sizes they are quicker."""
+
+MAX_GROWTH, MAX_JITTER_GROWTH = 0.01, 0.10  # relative
+"""Of MPJPE and of Jitter, up to which less precision may stand for float32; unrest is the first to grow."""
 
 LATENCY = "latency.json"
 FILES = (LATENCY, *ONNX_FILES.values())
@@ -89,8 +93,17 @@ class DeploymentFolder:
     def accurate_int8(self) -> Path | None:
         """The int8 ONNX file, if there is one that is accurate enough to replace float32; else None."""
         record = self.record
-        accurate = [name for name in INT8_PRECISIONS if record.get(name, {}).get("default")]
+        accurate = [name for name in INT8_PRECISIONS if accurate_enough(record.get(name, {}))]
         return next((self.file(name) for name in accurate if self.file(name).exists()), None)
+
+
+def accurate_enough(cost: Mapping[str, Any]) -> bool:
+    """Return whether a file of less precision may stand for float32, given the growth of its errors.
+
+    Both growths have to be known: NaN, or a record without them, is not enough.
+    """
+    growth, of_jitter = (cost.get(name, math.inf) for name in ("growth", "jitter_growth"))
+    return growth <= MAX_GROWTH and of_jitter <= MAX_JITTER_GROWTH
 
 
 def deployed_precision(latency: Mapping[str, Any]) -> str:

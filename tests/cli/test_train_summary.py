@@ -74,6 +74,17 @@ def test_times_and_size_are_those_of_the_file_that_was_asked_for():
     assert "busy" not in said.getvalue()
 
 
+@pytest.mark.parametrize("jitter", [0.05, 0.356])
+def test_an_int8_file_that_is_not_used_live_is_told(jitter: float):
+    times = {"median_ms": 3.39, "p95_ms": 3.5, "ratio_to_yardstick": 1.2, "onnx_bytes": 600_000}
+    record = MEASURED | times | {"settings": {"precision": "int8"}}
+    said = io.StringIO()
+    cost = times | {"growth": 0.0016, "jitter_growth": jitter}
+    show_latency(Console(file=said, width=200), record | {"int8": cost})
+    line = "int8: MPJPE +0.2%, Jitter +35.6%, more than 1% and 10% allow: live use takes float32"
+    assert (line in said.getvalue()) == (jitter > 0.1)
+
+
 @pytest.mark.parametrize("key", ["core_share", "alone_core_share", "pose_core_share"])
 def test_times_of_a_busy_machine_say_so(key: str):
     times = {"median_ms": 3.39, "p95_ms": 3.5, "ratio_to_yardstick": 1.2, key: 0.31}

@@ -117,8 +117,8 @@ def test_a_run_in_int8_records_what_it_costs(home, memmlp, monkeypatch):
     assert cost["onnx_bytes"] == deployed.int8.stat().st_size
     assert made.verify() == []
     assert math.isclose(cost["fp32"]["MPJPE"], made.results["stream"]["rotation"]["MPJPE"], rel_tol=1e-3)
-    for default, used in ((True, deployed.int8), (False, deployed.onnx)):
-        cost["default"] = default
+    for jitter, used in ((0.1, deployed.int8), (0.36, deployed.onnx)):  # an error as small, but more unrest
+        cost |= {"growth": 0.001, "jitter_growth": jitter, "default": True}
         deployed.latency.write_text(json.dumps(record))
         assert made.preferred_onnx == used
         assert package.Stream(made).network.path == used

@@ -99,7 +99,7 @@ def test_todays_recipes_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         place.folder.mkdir(parents=True)
         for path in (place.onnx, *([place.int8] if graph == b"old" else [])):
             path.write_bytes(graph)
-        place.finish({"settings": deployment_settings(config), "int8": {"default": True}})
+        place.finish({"settings": deployment_settings(config), "int8": {"growth": 0.0, "jitter_growth": 0.0}})
 
     with monkeypatch.context() as today:
         today.setitem(memmlp.runs.recipe_versions.RECIPES, "metrics", 2)
