@@ -100,7 +100,7 @@ EXPORTING = ("out", "graph", "precision", "max_growth", "opset", "scope", "space
     default=1,
     show_default=True,
     type=click.IntRange(0),
-    help="How many test clips a float32 file is checked on; 0 for all.",
+    help="How many test clips a float32 file is checked on, the longest first; 0 for all.",
 )
 @click.option(
     "--check",
@@ -181,6 +181,7 @@ def write(run: str, out: Path, outputs: Path, form: Form, clips: int, max_growth
     from memmlp.common.progress import tell
     from memmlp.config.open_run import open_run
     from memmlp.deploy.deployment import GRAPHS
+    from memmlp.deploy.parity import clips_to_check
     from memmlp.networks.streaming import StreamingGraph, check_streams
     from memmlp.runs.lookup import find_run
 
@@ -191,8 +192,9 @@ def write(run: str, out: Path, outputs: Path, form: Form, clips: int, max_growth
     network = GRAPHS[form.graph](model)
     test = data.open("test").clips()
     if form.precision == "fp32":
-        tell(f"export: write {out}, and compare it with torch on {test_clips(test[: clips or None])}")
-        write_exact(model, network, out, found.id, test[: clips or None], form)
+        checked = clips_to_check(model, test, clips)
+        tell(f"export: write {out}, and compare it with torch on {test_clips(checked)}")
+        write_exact(model, network, out, found.id, checked, form)
     elif isinstance(network, StreamingGraph) and not (form.precision.startswith("int8") and form.full):
         tell(f"export: write {out} in {form.precision}, and measure what that costs on {test_clips(test)}")
         train = data.open("train").clips() if form.precision == "int8" else []

@@ -16,7 +16,7 @@ from memmlp.deploy.block_quantization import quantise_blocks
 from memmlp.deploy.half_precision import halve
 from memmlp.deploy.network_alone import network_alone
 from memmlp.deploy.opsets import NATIVE
-from memmlp.deploy.parity import TOLERANCE, parity, tolerated
+from memmlp.deploy.parity import TOLERANCE, clips_to_check, frames_of_full_past, parity, tolerated
 from memmlp.deploy.precision_cost import compared
 from memmlp.deploy.quantization import quantise
 from memmlp.networks.motion_model import MotionModel
@@ -59,7 +59,7 @@ class Deployment:
         train: Sequence[Tensor],
         test: Sequence[Tensor],
     ) -> dict[str, Any]:
-        """Write a run's ONNX files and check the float32 one against torch on the first test clip.
+        """Write a run's ONNX files and check the float32 one against torch on the longest test clip.
 
         Args:
             model: the trained network.
@@ -80,8 +80,11 @@ class Deployment:
         deployed.folder.mkdir(parents=True, exist_ok=True)
         network = GRAPHS[self.graph](model)
         export(network, deployed.onnx, run_id, self.opset)
-        worst = parity(model, deployed.onnx, test[0])
-        if not tolerated(model, deployed.onnx, test[0], worst):
+        (clip,) = clips_to_check(model, test)
+        if len(clip) < frames_of_full_past(model):
+            tell(f"export: the longest test clip has {len(clip)} frames, too few to compare with a full past")
+        worst = parity(model, deployed.onnx, clip)
+        if not tolerated(model, deployed.onnx, clip, worst):
             raise RuntimeError(
                 f"{deployed.onnx}: ONNX Runtime differs from torch by {worst:.2e} (> {TOLERANCE:.0e}), "
                 "which is more than rounding explains"
@@ -90,6 +93,7 @@ class Deployment:
         record |= {
             "graph": "streaming" if isinstance(network, StreamingGraph) else "naive",
             "onnx_parity": worst,
+            "parity_frames": len(clip),
         }
         if self.precision != "fp32":
             if isinstance(network, StreamingGraph):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import cast
@@ -24,6 +24,7 @@ TOLERANCE = 1e-4  # on 6D components and metres
 ROUNDING = 10 * TOLERANCE  # the most that is put down to rounding; see `tolerated`
 DRAWS = 4  # float32 computations whose errors tell how a frame is conditioned; see `each_within_rounding`
 SPREAD = 4  # how far above the largest of these errors a difference may be
+MARGIN = 60  # frames that are compared with a full past
 TIE = 1e-4  # the margin below which rounding may choose another code-vector; see `Codebook.margins`
 
 
@@ -39,6 +40,28 @@ def deterministic(model: nn.Module) -> Iterator[None]:
     finally:
         for blend, value in zip(sampled, values, strict=True):
             blend.value = value
+
+
+def clips_to_check(model: MotionModel, clips: Sequence[Tensor], count: int = 1) -> list[Tensor]:
+    """Return the longest clips (N, 252), each as far as it takes to see the network with a full past.
+
+    On a short clip a graph that forgets its past, or never drops it, computes what the network does. They are
+    at least as long as the first clip, where they can be.
+
+    Args:
+        model: the trained network.
+        clips: test clips (N, 252).
+        count: how many are wanted; 0 for all, whole.
+    """
+    if not count:
+        return list(clips)
+    enough = max(frames_of_full_past(model) + MARGIN, len(clips[0]))
+    return [clip[:enough] for clip in sorted(clips, key=len, reverse=True)[:count]]
+
+
+def frames_of_full_past(model: MotionModel) -> int:
+    """Return after how many frames the network's past, and what it recalls, are of the clip alone."""
+    return model.length + model.frames
 
 
 def parity(model: MotionModel, path: Path, clip: Tensor) -> float:

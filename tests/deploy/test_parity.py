@@ -13,10 +13,12 @@ import torch
 from memmlp.deploy.export import export
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import (
+    MARGIN,
     ROUNDING,
     TIE,
     TOLERANCE,
     begins_at_ties,
+    clips_to_check,
     each_within_rounding,
     in_torch,
     parity,
@@ -24,7 +26,9 @@ from memmlp.deploy.parity import (
     tolerated,
 )
 from memmlp.motion.body import ROTATION, SPARSE_DIM
+from memmlp.motion.network_coordinates import Heading
 from memmlp.networks.mem_mlp import MemMLP
+from memmlp.networks.memory.own_past import NoCodesMemory
 from memmlp.networks.streaming import streaming
 from memmlp.networks.vqvae import Codebook
 
@@ -37,6 +41,30 @@ CLIP = tiny.clip(50)
 def mem_mlp(step_files: Callable[[str], Path]) -> tuple[MemMLP, Path]:
     """A tiny Mem-MLP, to be changed at will, and the ONNX file of it."""
     return exported.NETWORKS["mem_mlp"](), step_files("mem_mlp")
+
+
+def test_a_file_is_checked_with_a_full_past_where_a_clip_is_long_enough():
+    model = exported.NETWORKS["mem_mlp"]()
+    full = model.length + model.frames
+    clips = [tiny.clip(frames, seed=frames) for frames in (20, full + 100, 30)]
+    (longest,) = clips_to_check(model, clips)
+    assert torch.equal(longest, clips[1][: full + MARGIN])
+    assert [len(clip) for clip in clips_to_check(model, clips, 2)] == [full + MARGIN, 30]
+    assert [len(clip) for clip in clips_to_check(model, clips[1:])] == [full + 100]  # no less than before
+    assert clips_to_check(model, clips, 0) == clips
+
+
+def test_a_forgotten_past_is_a_difference_there_and_none_on_a_short_clip():
+    """A memory that always recalls nothing is as one that has nothing to recall yet."""
+    model = tiny.model(NoCodesMemory, coordinates=Heading())
+    broken = copy.deepcopy(model)
+    broken.memory.remember = lambda motion, past, state, new: {"motion": torch.zeros_like(state["motion"])}
+    (clip,) = clips_to_check(model, [tiny.clip(200)])
+    there, short = (
+        float((in_torch(model, one) - in_torch(broken, one)).abs().max())
+        for one in (clip, clip[: model.frames])
+    )
+    assert there > TOLERANCE > short
 
 
 def test_parity_takes_one_thread_and_gives_the_others_back():
