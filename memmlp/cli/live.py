@@ -320,8 +320,8 @@ def open_stream(given: InputOptions, space: SpaceName, shown: ShowOptions) -> tu
     file, name = network_file(given)
     stream = Stream(file, space=space)
     known = known_of(shown, space, stream)
-    stream.offsets = known.offsets
     stream.fit(known.height, known.floor)
+    stream.offsets = known.offsets
     return stream, name
 
 

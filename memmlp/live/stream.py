@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from memmlp.common.errors import InputError
 from memmlp.live.exported import ExportedNetwork
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
-from memmlp.live.sample_warnings import OddSamples
+from memmlp.live.sample_warnings import OddSamples, SampleWarning
 from memmlp.live.spaces import SpaceName, space_of
 from memmlp.live.tracker_frames import TRACKERS, UPRIGHT, Features, Lost, TrackerFrames, heading_of, t_pose
 from memmlp.live.wearer import wearer
@@ -32,6 +32,8 @@ FARTHEST = 1e6  # metres; a tracker farther from the origin is taken as lost
 LATEST = 1e10  # seconds; at much later times floats can't tell frames of 1/60 s apart
 TILTED = np.radians(60)  # from upright; which way a device that is tilted further looks, nobody knows
 FAR = 0.25  # metres from a T-pose's joint, beyond which a device is not worn there
+ROUNDED = 5e-4  # metres by which a height may be given otherwise, as a page does that shows millimetres
+FORGOTTEN = "the calibration was of another height, and is forgotten"
 TOLERANCE = 1e-2  # how far a quaternion's norm may be from 1, or a matrix from orthonormal
 
 TrackerPose = tuple[ArrayLike, ArrayLike] | None
@@ -167,11 +169,24 @@ class Stream:
     def fit(self, height: float | None = None, floor: float = 0.0) -> None:
         """Set another body height (metres; None for the network's) and floor (metres), and begin anew.
 
+        Offsets of another height are forgotten, with a `SampleWarning`: kept, they would hold the hands some
+        centimetres away. Calibrate again, or set `offsets` after this.
+
         Raises:
             InputError: if the height is no person's, or the floor is no height.
         """
+        if self.refit(height, floor):
+            warnings.warn(f"offsets: {FORGOTTEN}", SampleWarning, stacklevel=2)
+
+    def refit(self, height: float | None, floor: float) -> bool:
+        """Do as `fit` does, without the warning; return whether offsets were forgotten."""
+        before = self.wearer.height
         self.wearer = wearer(self.network.skeleton, height, floor)
         self.reset()
+        if self.offsets is None or abs(self.wearer.height - before) <= ROUNDED:
+            return False
+        self.offsets = None
+        return True
 
     def reset(self) -> None:
         """Begin anew: the next sample counts as the first."""

@@ -11,8 +11,9 @@ import wearer as moving
 
 from memmlp.common.errors import InputError
 from memmlp.live.rotations import BodyTree
+from memmlp.live.sample_warnings import SampleWarning
 from memmlp.live.spaces import SPACES
-from memmlp.live.stream import Stream
+from memmlp.live.stream import Offsets, Stream
 from memmlp.live.tracker_frames import t_pose
 from memmlp.live.wearer import stature, wearer
 from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
@@ -104,3 +105,15 @@ def test_offsets_are_metres_of_the_wearer(file: Path):
     stream.calibrate(*devices)
     head = stream.step(*devices).positions[JOINTS.index("head")]
     assert np.linalg.norm(head - (joints[0] + away.mean(0))) < 1e-6
+
+
+def test_another_height_forgets_offsets_and_says_so(file: Path):
+    """Kept, they would hold the hands some centimetres away."""
+    offsets = Offsets(np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1)))
+    stream = Stream(file, height=HEIGHT, offsets=offsets)
+    stream.fit(HEIGHT, floor=0.1)
+    assert stream.offsets is not None
+    with pytest.warns(SampleWarning, match="offsets: the calibration was of another height"):
+        stream.fit(HEIGHT - 0.1)
+    assert stream.offsets is None
+    stream.fit(HEIGHT)  # without offsets there is nothing to say

@@ -17,11 +17,10 @@ from memmlp.common.errors import InputError
 from memmlp.live.calibration_file import Calibration, save_calibration
 from memmlp.live.session.packets import QuaternionPoses
 from memmlp.live.spaces import SpaceName
-from memmlp.live.stream import Stream
+from memmlp.live.stream import FORGOTTEN, Stream
 
 COUNTDOWN = 5.0  # seconds
 LONGEST = 60.0  # seconds of a countdown
-ROUNDED = 5e-4  # metres by which the page, which shows millimetres, may give the same height otherwise
 ACTIONS = ("calibrate", "touch_floor", "height", "floor", "forget", "cancel")
 
 Tell = Callable[[str, Mapping[str, Any]], None]
@@ -139,18 +138,10 @@ class Fitting:
         return self._floor(round(floor, 4))
 
     def _height(self, value: float | None) -> str:
-        """Set the wearer's body height, metres; None for the network's.
-
-        A calibration is forgotten, since its offsets are of another height: kept, they would hold the hands
-        some centimetres away, and a file would keep them as those of the new height.
-        """
-        before = self.stream.wearer.height
-        self.stream.fit(value, self.stream.wearer.floor)
+        """Set the wearer's body height, metres; None for the network's. A calibration is of one height."""
+        forgotten = self.stream.refit(value, self.stream.wearer.floor)
         self.own_height = value
-        if self.stream.offsets is None or abs(self.stream.wearer.height - before) <= ROUNDED:
-            return ""
-        self.stream.offsets = None
-        return "Calibrate again: the calibration was of another height, and is forgotten."
+        return f"Calibrate again: {FORGOTTEN}." if forgotten else ""
 
     def _floor(self, value: float | None) -> str:
         """Set the height of the floor, metres."""
