@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from memmlp.common.files import file_digest, plain, read_json
+from memmlp.runs.deployment_folder import with_times_as_deployed
 from memmlp.runs.evaluation_file import with_solvers
 from memmlp.runs.identity import flatten
 from memmlp.runs.metrics_log import Metrics, parsed
@@ -93,12 +94,12 @@ def facts_of(run: Run, running: bool = False) -> RunFacts:
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
     status = "running" if running else _status(run)
-    evaluations = run.evaluations_as_configured
-    results = flatten(with_solvers(run.results, evaluations.combined_by))
+    evaluations, deployed = run.evaluations_as_configured, run.deployment_shown(config)
+    results = flatten(with_solvers(with_times_as_deployed(run.results), evaluations.combined_by))
     started = _seconds(manifest.get("started"))
     own = (
         run.config_path, run.results_path, run.picture, run.folder / "code.patch",
-        run.onnx, run.preferred_deployment.latency,
+        deployed.onnx, deployed.latency,
     )  # fmt: skip
     return RunFacts(
         id=run.id,

@@ -70,6 +70,9 @@ UNNAMED = {"optim": "adamw"}
 UNNAMED_EXPORT = (("opset", 18), ("alone", False))
 """Settings of deployments from before they were keys; they do not count."""
 
+EXPORTED = {"graph": "auto", "precision": "fp32", "opset": 18}
+"""The keys of `export` that decide which file is made, with what they are where they are missing."""
+
 
 @dataclass(frozen=True)
 class Identity:
@@ -295,6 +298,18 @@ def belongs(run_id: str | None, folder: Path) -> bool:
 def used_as_configured(settings: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
     """Return whether a stage's settings use the network in the way that the run's own config does."""
     return all(settings.get(key) == value for key, value in inference(config).items())
+
+
+def exported_otherwise(settings: Mapping[str, Any], config: Mapping[str, Any]) -> str:
+    """Say in which settings a deployment's file is not the one of the run's config, such as "naive-int8".
+
+    It is empty where it is that file. A config without one (`export.graph=off`) stands for the default graph.
+    """
+    export = config.get("export") or {}
+    own = {**export, "graph": "auto"} if export.get("graph") in ("off", False) else export
+    made = {key: settings.get(key, default) for key, default in EXPORTED.items()}
+    other = {key: value for key, value in made.items() if value != own.get(key, EXPORTED[key])}
+    return "-".join(f"opset{value}" if key == "opset" else str(value) for key, value in other.items())
 
 
 def inference(config: Mapping[str, Any]) -> dict[str, Any]:

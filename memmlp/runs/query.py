@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import number_of
-from memmlp.runs.deployment_folder import as_deployed
+from memmlp.runs.deployment_folder import with_times_as_deployed
 from memmlp.runs.evaluation_file import with_solvers
 from memmlp.runs.identity import SLOTS, flatten, option_in_slot, trained_by
 from memmlp.runs.notes import read_notes
@@ -41,12 +41,12 @@ def record(run: Run) -> dict[str, Any]:
     by digest (`data_digest`); the keys of its config, with slots also under their name alone (`memory` for
     `memory.name`); and its results, with those of the rotation branch also without the branch (`stream.MPJPE`
     for `stream.rotation.MPJPE`), and after inverse kinematics with its name (`stream.combined-arms.MPJPE`).
-    Times and size are those of the file in the precision that was asked for.
+    Times and size are those of the file that the config asks for; those of another, if only that was
+    exported, have its name in the key (`latency-int8.median_ms`).
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
     found = with_solvers(run.results, run.evaluations_as_configured.combined_by)
-    results = flatten(found) | flatten(_times_as_deployed(found.get("latency", {})), "latency.")
-    results = {key: number_of(value) for key, value in results.items()}
+    results = {key: number_of(value) for key, value in flatten(with_times_as_deployed(found)).items()}
     flat = flatten(config)
     short = {key.replace(".rotation.", "."): value for key, value in results.items()}
     slots = {slot: option_in_slot(config, slot) for slot in SLOTS if slot in config}
@@ -56,12 +56,6 @@ def record(run: Run) -> dict[str, Any]:
     facts |= {"id": run.id, "name": run_name(manifest, flat), "status": run.status}
     facts |= {"tag": notes.tags, "note": notes.note}
     return {**flat, **slots, **short, **results, **facts}
-
-
-def _times_as_deployed(latency: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a deployment's own numbers, with those of the file that was asked for in float32's place."""
-    deployed = as_deployed(latency)
-    return {key: deployed[key] for key, value in latency.items() if isinstance(value, int | float)}
 
 
 def data_labels(records: Sequence[Record]) -> list[str]:

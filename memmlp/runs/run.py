@@ -33,7 +33,13 @@ from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.environment import changed, changes, code_digests, environment, host
 from memmlp.runs.evaluation_file import intact
 from memmlp.runs.evaluations_as_configured import EvaluationsAsConfigured
-from memmlp.runs.identity import NETWORK, belongs, used_as_configured
+from memmlp.runs.identity import (
+    NETWORK,
+    belongs,
+    deployment_settings,
+    exported_otherwise,
+    used_as_configured,
+)
 from memmlp.runs.metrics_log import Metrics, MetricsLog
 from memmlp.runs.resumed_origin import joined
 
@@ -50,6 +56,11 @@ LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # six times as quick, wh
 def _parsed(text: str) -> Any:
     """Return what YAML says; a list of runs asks for each config five times."""
     return yaml.load(text, LOADER)
+
+
+def latency_name(deployed: DeploymentFolder, config: Mapping[str, Any]) -> str:
+    """Return the name of a deployment's results: "latency", or another file's, such as "latency-int8"."""
+    return "-".join(filter(None, ["latency", exported_otherwise(deployed.settings, config)]))
 
 
 class Run:
@@ -153,19 +164,46 @@ class Run:
 
     @property
     def preferred_deployment(self) -> DeploymentFolder:
-        """The deployment to use, among those with the run's own settings.
+        """The deployment to use live, among those that use the network as the run's config does.
 
         One with the present recipe versions is preferred, then one whose int8 file is accurate enough, then
-        the one that was made last.
+        one of the file that the config asks for, then the one that was made last.
         """
-        return self.deployment_used(self.config)
+        config = self.config
+        return self._best_deployment(
+            config,
+            lambda one: (
+                one.current, bool(one.accurate_int8), not exported_otherwise(one.settings, config), one.made,
+            ),
+        )  # fmt: skip
 
-    def deployment_used(self, config: Mapping[str, Any]) -> DeploymentFolder:
-        """Return the preferred deployment, given the run's config if that was read already."""
+    @property
+    def deployment_as_configured(self) -> DeploymentFolder:
+        """The deployment whose measurements are shown (see `deployment_shown`)."""
+        return self.deployment_shown(self.config)
+
+    def deployment_shown(self, config: Mapping[str, Any]) -> DeploymentFolder:
+        """Return the deployment whose measurements are shown, given the run's config.
+
+        It is of the file that the config asks for, whatever else was exported since; if there are several,
+        one with the present recipe versions, then one with just the config's settings, then the last. Only
+        if there is none, another is shown, and named (`latency_name`).
+        """
+        asked = deployment_settings(config)
+        return self._best_deployment(
+            config,
+            lambda one: (
+                not exported_otherwise(one.settings, config), one.current, one.settings == asked, one.made,
+            ),
+        )  # fmt: skip
+
+    def _best_deployment(
+        self, config: Mapping[str, Any], rank: Callable[[DeploymentFolder], tuple[Any, ...]]
+    ) -> DeploymentFolder:
+        """Return the deployment of the highest rank that uses the network as the config does."""
         made = [DeploymentFolder(path.parent) for path in self.deployments.glob("*/latency.json")]
         own = [one for one in made if one.done and used_as_configured(one.settings, config)]
-        best = max(own, key=lambda one: (one.current, bool(one.accurate_int8), one.made), default=None)
-        return best or DeploymentFolder(self.deployments / "none")
+        return max(own, key=rank, default=None) or DeploymentFolder(self.deployments / "none")
 
     @property
     def preferred_onnx(self) -> Path:
@@ -336,6 +374,9 @@ class Run:
     def results(self) -> dict[str, Any]:
         """The results with the run's own settings: mode -> branch -> metric, and "latency".
 
+        Where only another file was exported than the config asks for, that is in the latter's name:
+        "latency-int8", "latency-naive" (`deployment_shown`).
+
         A VQ-VAE's run has its own results instead. Where a branch was evaluated by several kinds of inverse
         kinematics, that of the run's config counts, else the last one
         (`evaluations_as_configured.combined_by`); tables ask for an evaluation by its identity.
@@ -344,8 +385,9 @@ class Run:
             InputError: if the file of an evaluation is damaged.
         """
         found = read_json(self.results_path) | self.evaluations_as_configured.results
-        latency = self.preferred_deployment.record
-        return found | ({"latency": latency} if latency else {})
+        config = self.config
+        deployed = self.deployment_shown(config)
+        return found | ({latency_name(deployed, config): deployed.record} if deployed.record else {})
 
     @property
     def evaluations_as_configured(self) -> EvaluationsAsConfigured:

@@ -224,7 +224,7 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
         folder: the run's folder.
         stages: identities of the evaluations and the deployment to read. By default, or if none of these
             exist, all evaluations that use the network as the run's own config does, and the deployment that
-            the run prefers (`Run.preferred_deployment`).
+            the run shows (`Run.deployment_shown`).
 
     Raises:
         InputError: if a file is damaged; the message names it.
@@ -243,7 +243,7 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
             groups |= {clip["name"]: clip["group"]} if clip.get("group") else {}
             sources |= {clip["name"]: clip["source"]} if clip.get("source") else {}
     deployments = [run.deployment(name) for name in stages or () if run.deployment(name).done]
-    deployed = (deployments or [run.preferred_deployment])[-1]
+    deployed = (deployments or [run.deployment_as_configured])[-1]
     latency = deployed.record
     origin = _evaluated(_with_upstream(_origin(manifest), run), reports)
     origin = replace(origin, deployed=deployed_precision(latency))

@@ -12,17 +12,22 @@ from begun_runs import CONFIG, begun, complete
 from processes import finished
 
 import memmlp.runs.recipe_versions
+from memmlp.cli.runs.listing import shown_number
+from memmlp.cli.runs.printing import measured_numbers
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
+from memmlp.experiment_tracking.logged_values import facts_of
 from memmlp.report.ui.run_facts import facts
 from memmlp.runs.deployment_folder import ONNX_FILES
 from memmlp.runs.evaluation_file import intact, write_report
 from memmlp.runs.identity import (
     deployment_id,
+    deployment_id_of,
     deployment_settings,
     evaluation_id,
     evaluation_settings,
 )
+from memmlp.runs.query import record
 from memmlp.runs.run import Run
 from memmlp.tables.measured_run import load
 
@@ -83,6 +88,52 @@ def test_weights_that_changed_since_are_refused(tmp_path: Path):
     run.model.write_bytes(b"other")
     with pytest.raises(InputError, match="not the weights that were trained"):
         run.weights()
+
+
+def deploy(run: Run, made: str, measured: dict, **export) -> None:
+    """Add a deployment with those settings of `export`, made at that time."""
+    settings = deployment_settings({"export": {"graph": "auto", "precision": "fp32", **export}})
+    place = run.deployment(deployment_id_of(settings))
+    place.folder.mkdir(parents=True)
+    write_json(
+        place.latency, {"run": run.id, "settings": settings, "made": made, "artifacts": {}, **measured}
+    )
+
+
+INTEGERS = {"median_ms": 1.0, "onnx_bytes": 15, "int8": {"median_ms": 0.4, "onnx_bytes": 4}}
+
+
+@pytest.mark.parametrize("graph", ["auto", "off"])
+def test_times_shown_are_of_the_file_that_the_config_asks_for(tmp_path: Path, graph: str):
+    """Whatever else was exported since: another graph, another precision."""
+    run = begun(tmp_path, CONFIG | {"export": {"graph": graph, "precision": "fp32"}})
+    deploy(run, "2026-01-01", {"median_ms": 1.0, "onnx_bytes": 15})
+    deploy(run, "2026-01-02", INTEGERS, precision="int8")
+    deploy(run, "2026-01-03", {"median_ms": 5.0, "onnx_bytes": 14}, graph="naive")
+    one = record(run)
+    assert (one["latency.median_ms"], one["latency.onnx_bytes"]) == (1.0, 15)
+    assert not [key for key in one if key.startswith("latency-")]
+    assert load(run.folder).costs["ms"] == 1.0
+    assert facts(run.folder)["metrics"]["latency.median_ms"] == 1.0
+    assert run.preferred_deployment.settings["graph"] == "auto"
+
+
+@pytest.mark.parametrize(("export", "name", "time"), [
+    ({"precision": "int8"}, "int8", 0.4), ({"graph": "naive"}, "naive", 1.0),
+    ({"graph": "naive", "opset": 15}, "naive-opset15", 1.0),
+])  # fmt: skip
+def test_times_of_another_file_have_its_name(tmp_path: Path, export: dict, name: str, time: float):
+    run = begun(tmp_path, CONFIG | {"export": {"graph": "auto", "precision": "fp32"}})
+    deploy(run, "2026-01-02", INTEGERS, **export)
+    assert list(run.results) == [f"latency-{name}"]
+    one = record(run)
+    assert one[f"latency-{name}.median_ms"] == time
+    assert "latency.median_ms" not in one
+    assert facts(run.folder)["metrics"][f"latency-{name}.median_ms"] == time
+    assert shown_number(one, "latency.median_ms") == f"{time:.2f} {name}"
+    assert facts_of(run).results[f"latency-{name}/median_ms"] == time
+    assert measured_numbers(run)[f"latency-{name}.median_ms"] == time
+    assert f"latency-{name}.settings" not in " ".join(measured_numbers(run))
 
 
 def test_todays_recipes_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

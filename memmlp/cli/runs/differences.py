@@ -83,7 +83,7 @@ def origin_rows(first: Run, second: Run) -> list[tuple[str, ...]]:
 
     a, b = (
         flatten({key: run.manifest.get(key) for key in ORIGIN})
-        | {"latency": timed_on(run.preferred_deployment.record), **older_results(run)}
+        | {"latency": timed_on(run.deployment_as_configured.record), **older_results(run)}
         for run in (first, second)
     )
     used = {key for key in a | b if not key.startswith("recipes.") or (key in a and key in b)}

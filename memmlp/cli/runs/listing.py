@@ -211,7 +211,18 @@ def _columns(records: Sequence[Record], keys: Sequence[str], numbers: Mapping[st
     if any(one.get("tag") for one in records):
         yield Column("tags", ["\n".join(one.get("tag", ())) for one in records])
     for name, key in numbers.items():
-        yield Column(name, [number_text(one.get(key)) for one in records], number=True)
+        yield Column(name, [shown_number(one, key) for one in records], number=True)
+
+
+def shown_number(record: Record, key: str) -> str:
+    """Return a number as text; a time of another file than the config asks for with that file's name."""
+    if key in record:
+        return number_text(record[key])
+    group, _, name = key.partition(".")
+    for other, value in record.items():
+        if other.startswith(f"{group}-") and other.partition(".")[2] == name:
+            return f"{number_text(value)} {other.partition('.')[0].removeprefix(f'{group}-')}"
+    return number_text(None)
 
 
 def _with_wide_names(columns: Sequence[Column]) -> list[Column]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
@@ -41,17 +42,17 @@ def value_text(record: Record, key: str, whole: bool) -> str:
 
 def measured_numbers(run: Run) -> dict[str, Any]:
     """Return the numbers in a run's results by dotted key, with the names of inverse kinematics in these."""
+    from memmlp.runs.deployment_folder import with_times_as_deployed
     from memmlp.runs.evaluation_file import with_solvers
     from memmlp.runs.identity import flatten
 
     results = with_solvers(
         run.results, run.evaluations_as_configured.combined_by
     )  # which hold settings and digests, too
-    numbers = {key: value for key, value in flatten(results).items() if isinstance(value, int | float)}
+    every = flatten(with_times_as_deployed(results))
+    numbers = {key: value for key, value in every.items() if isinstance(value, int | float)}
     return {
-        key: value
-        for key, value in numbers.items()
-        if not key.startswith(("latency.settings", "latency.made"))
+        key: value for key, value in numbers.items() if not re.match(r"latency[^.]*\.(settings|made)", key)
     }
 
 

@@ -15,15 +15,22 @@ import yaml
 from memmlp.common.files import plain, read_json
 from memmlp.runs.deployment_folder import as_deployed
 from memmlp.runs.evaluation_file import combined_by, of_one_solver, preference, with_solvers
-from memmlp.runs.identity import INFERENCE, flatten, training_settings, used_as_configured
-from memmlp.runs.run import Run
+from memmlp.runs.identity import (
+    DEPLOYMENT,
+    EVALUATION,
+    INFERENCE,
+    flatten,
+    training_settings,
+    used_as_configured,
+)
+from memmlp.runs.run import Run, latency_name
 from memmlp.runs.shown_name import run_name
 
 HIDDEN = ("paths", "tracking", "tracker", "force", "hydra", "save_predictions")
 """Config groups that are not shown with a run."""
 
-ACTING = {"evaluation", *(key.split(".")[0] for key in INFERENCE)}
-"""Groups of the config that say how a trained network is used."""
+ACTING = {*EVALUATION, *DEPLOYMENT, *(key.split(".")[0] for key in INFERENCE)}
+"""Groups of the config that say how a trained network is used and deployed."""
 
 TAIL = 1 << 14  # bytes at the end of a metrics log in which its last entries are looked for
 RATE = 5  # how many of its last training entries tell how fast a run is
@@ -186,8 +193,9 @@ def _metrics(run: Run, config: Mapping[str, Any], reports: Sequence[Mapping[str,
     by = combined_by(means)
     for report in of_one_solver(means):
         found |= flatten(with_solvers({str(report.get("mode")): report["mean"]}, by))
-    record = as_deployed(run.deployment_used(config).record)
-    found |= {f"latency.{key}": record[key] for key in COSTS if key in record}
+    deployed = run.deployment_shown(config)
+    name, record = latency_name(deployed, config), as_deployed(deployed.record)
+    found |= {f"{name}.{key}": record[key] for key in COSTS if key in record}
     if run.results_path.exists():
         found |= flatten(read_json(run.results_path), "vqvae.")
     return {

@@ -10,6 +10,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
 from memmlp.report.ui.index import Index
 from memmlp.report.ui.run_facts import COSTS, read_config
+from memmlp.runs.deployment_folder import as_deployed
 from memmlp.runs.evaluation_file import with_solvers
 from memmlp.runs.identity import NEUTRAL, flatten, is_data_path
 from memmlp.runs.lookup import is_trained
@@ -269,9 +270,9 @@ def clips(run: Run) -> list[dict[str, Any]]:
 
 
 def latency(run: Run) -> dict[str, Any]:
-    """Return the measurements of the deployment that the run prefers."""
+    """Return the measurements of the deployment that the run shows, of the file that was asked for."""
     try:
-        record = run.preferred_deployment.record
+        record = as_deployed(run.deployment_as_configured.record)
     except InputError:
         return {}
     return {key: value for key, value in flatten(record).items() if isinstance(value, int | float | str)}

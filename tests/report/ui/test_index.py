@@ -33,6 +33,7 @@ def test_times_of_a_run_are_those_of_the_file_that_was_asked_for(outputs: Path):
     record = json.loads(path.read_text())
     changes = {"settings": {"precision": "int8"}, "int8": {"median_ms": 0.32, "onnx_bytes": 7}}
     path.write_text(json.dumps(record | changes))
+    run.config_path.write_text(json.dumps(run.config | {"export": {"precision": "int8"}}))
     found = facts(run.folder)["metrics"]
     assert (found["latency.median_ms"], found["latency.onnx_bytes"]) == (0.32, 7)
     assert found["latency.parameters"] == record["parameters"]
