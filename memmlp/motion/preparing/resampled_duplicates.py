@@ -22,7 +22,7 @@ from memmlp.motion.preparing.several_folders import Root
 DEGREES, METRES = 1.0, 0.01  # by which a copy is off at most, on average over frames and joints
 
 
-def in_mirror(clip: Clip) -> Clip:
+def mirrored_clip(clip: Clip) -> Clip:
     """Return a clip as it is mirrored at the plane X = 0, with left and right joints exchanged."""
     turns, place = np.array((1, -1, -1), np.float32), np.array((-1, 1, 1), np.float32)
     return replace(clip, poses=clip.poses[:, list(SWAPPED)] * turns, trans=clip.trans * place)
@@ -35,7 +35,7 @@ def first_frames(clip: Clip) -> np.ndarray:
         Of the clip as it is and of its mirror image (2, 201).
     """
     begin = replace(clip, poses=clip.poses[:1], trans=clip.trans[:1])
-    return np.stack([_first_frame(one) for one in (begin, in_mirror(begin))])
+    return np.stack([_first_frame(one) for one in (begin, mirrored_clip(begin))])
 
 
 def _first_frame(clip: Clip) -> np.ndarray:
@@ -55,7 +55,7 @@ def resampled_copies(
     """
     for one, other, mirrored in _candidates(clips, firsts):
         first, second = (read_clip(root / clip.file, clip.name) for clip in (one, other))
-        if _same_motion(in_mirror(first) if mirrored else first, second):
+        if _same_motion(mirrored_clip(first) if mirrored else first, second):
             yield one, other
 
 
