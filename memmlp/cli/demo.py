@@ -31,7 +31,8 @@ def demo(overrides: tuple[str, ...]) -> None:
     OVERRIDES are those of `memmlp train`, for example profile=tiny. With another model, or overrides that
     RecurrentPoser has no place for, the one network is shown alone.
     """
-    from memmlp.cli.train_summary import show_side_by_side, untrained_remark
+    from memmlp.cli.train_summary import show_side_by_side
+    from memmlp.runs.motion_seen import frames_seen, hardly_trained
 
     started = time.monotonic()
     both = fit_recurrent_poser(overrides)  # asked first: the first network takes minutes
@@ -40,7 +41,7 @@ def demo(overrides: tuple[str, ...]) -> None:
         outcomes += train_demo([*overrides, RECURRENT_POSER])
     if len(outcomes) == len(NETWORKS):
         show_side_by_side(dict(zip(NETWORKS, outcomes, strict=True)))
-        for said in dict.fromkeys(filter(None, (untrained_remark(one.run) for one in outcomes))):
+        for said in dict.fromkeys(filter(None, (hardly_trained(frames_seen(one.run)) for one in outcomes))):
             click.echo(said)
     click.echo(f"the demo took {(time.monotonic() - started) / 60:.1f} minutes")
     click.echo(next_steps(overrides, unentered(), [one.run.id for one in outcomes]))

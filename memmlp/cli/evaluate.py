@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from memmlp.cli.options import check_runs, device_option, outputs_option, plugins_option
+from memmlp.cli.run_remarks import remark_on
 from memmlp.common.errors import InputError
 
 
@@ -62,6 +63,7 @@ def evaluate(
     for fact in ("resampled", "unusual"):
         if warning := found.run.manifest.get(fact):
             click.echo(warning)
+    remark_on([found.run])
     if changed := found.run.changed_sources:
         click.echo(older_code(found.run, changed))
     for table in (metrics_table(results), *source_tables(found.run, experiment.stages)):

@@ -295,7 +295,7 @@ def serve(given: InputOptions, shown: ShowOptions) -> None:
         stream, name = open_stream(given, source.space, shown)
         files = page_files(shown.avatar, stream)
         outputs = outputs_of(shown, stream)
-        words = greeting(source, name, outputs)
+        words = greeting(source, name, outputs, remark_of(given))
         hub = Hub(with_avatar(words) if shown.avatar else words)
         fitting = Fitting(stream, source.space, shown.calibration, hub.tell) if source.worn else None
         ask = fitting.ask if fitting else None
@@ -304,6 +304,8 @@ def serve(given: InputOptions, shown: ShowOptions) -> None:
             LiveServer(hub, shown.port, shown.host, shown.token, files, ask) as server,
         ):
             click.echo(f"{server.url}  {source.name}; Ctrl-C ends")
+            if words["remark"]:
+                note(f"{name}: {words['remark']}")
             for output in outputs.outputs:
                 click.echo(f"  to {output.name}")
             if not shown.no_browser:
@@ -323,6 +325,16 @@ def open_stream(given: InputOptions, space: SpaceName, shown: ShowOptions) -> tu
     stream.fit(known.height, known.floor)
     stream.offsets = known.offsets
     return stream, name
+
+
+def remark_of(given: InputOptions) -> str:
+    """Return what people should know who see a run's network move; empty for nothing, and for a file."""
+    from memmlp.runs.lookup import find_run
+    from memmlp.runs.motion_seen import frames_seen, hardly_trained
+
+    if given.network.endswith(".onnx"):
+        return ""
+    return hardly_trained(frames_seen(find_run(given.outputs, given.network)))
 
 
 def network_file(given: InputOptions) -> tuple[Path, str]:

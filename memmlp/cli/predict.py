@@ -16,6 +16,7 @@ from memmlp.cli.options import (
     plugins_option,
     strict_option,
 )
+from memmlp.cli.run_remarks import remark_on
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
@@ -86,6 +87,7 @@ def predict(
         report = predict_test_clip(predictor, opened, source, out, format_)
     click.echo(f"run {found.id}: {chosen}, {mode} mode")
     show_exported(report, out)
+    remark_on([found])
 
 
 def chosen_branch(evaluation: Evaluation, branch: str | None) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from memmlp.cli.options import Finite, check_runs, outputs_option, plugins_option
+from memmlp.cli.run_remarks import remark_on
 
 if TYPE_CHECKING:
     import numpy as np
@@ -86,11 +87,13 @@ def render(
 
     check_picture(out, "--out")
     check_labels(runs, labels)
-    piece = piece_of([open_run(outputs, run) for run in runs], labels, clip, (begin, end), branch, mode)
+    opened = [open_run(outputs, run) for run in runs]
+    piece = piece_of(opened, labels, clip, (begin, end), branch, mode)
     tell(f"render: draw {out}")
     write_picture(out, piece, frames, "--out")
     errors = ", ".join(f"{label} {error.mean():.1f} cm" for label, error in piece.errors.items())
     click.echo(f"{out}: {piece.title}, {errors}")
+    remark_on(one.run for one in opened)
 
 
 def check_labels(runs: tuple[str, ...], labels: tuple[str, ...]) -> None:

@@ -21,9 +21,10 @@ from memmlp.runs.deployment_folder import (
     as_deployed,
     deployed_precision,
 )
+from memmlp.runs.motion_seen import frames_seen, hardly_trained
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import BRANCHES
-from memmlp.tables.measured_run import CORE_SHARES, SAME, SHARED, Errors, frames_seen, hardly_trained, load
+from memmlp.tables.measured_run import CORE_SHARES, SAME, SHARED, Errors, load
 
 STAGES = ("training", "evaluation", "deployment")
 COLUMNS = [(mode, branch) for mode in ("stream", "window") for branch in BRANCHES]
@@ -38,7 +39,7 @@ def show(outcome: Outcome) -> None:
         console.print(f"on a part of the data: {partial}", style="yellow", soft_wrap=True)
     if changed := run.changed_sources:
         console.print(older_code(run, changed), style="yellow", soft_wrap=True)
-    if hardly := untrained_remark(run):
+    if hardly := hardly_trained(frames_seen(run)):
         console.print(hardly, style="yellow", soft_wrap=True)
     console.print(metrics_table(results))
     for table in source_tables(run, outcome.stage_ids):
@@ -47,11 +48,6 @@ def show(outcome: Outcome) -> None:
         show_latency(console, results["latency"])
     console.print(f"run      {run.folder}", soft_wrap=True)
     console.print(f"picture  {run.picture}", soft_wrap=True)
-
-
-def untrained_remark(run: Run) -> str:
-    """Say that a run's network hardly saw motion in training; empty if it did."""
-    return hardly_trained({"frames": frames_seen(run)})
 
 
 def show_side_by_side(outcomes: Mapping[str, Outcome]) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from memmlp.cli.options import PATH, Finite, check_runs, outputs_option, plugins_option
+from memmlp.cli.run_remarks import remark_on
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
@@ -76,6 +77,7 @@ def web(
     )
     size = site.make(out)
     click.echo(f"{out}: {size / 1e6:.1f} MB; serve it with: python -m http.server --directory {out}")
+    remark_on(one.run for one in opened)
 
 
 def clips_of(opened: OpenedRun, count: int, seconds: float) -> list[SiteClip]:
@@ -94,6 +96,7 @@ def network_of(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:
     from memmlp.live.web.networks import SiteNetwork
     from memmlp.networks.streaming import check_streams
     from memmlp.runs.identity import flatten
+    from memmlp.runs.motion_seen import frames_seen, hardly_trained
     from memmlp.runs.shown_name import run_name
 
     network = opened.network()
@@ -101,7 +104,8 @@ def network_of(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:
     run, config = opened.run, flatten(opened.run.config)
     name, model = run_name(run.manifest, config).removeprefix("default · "), config["model.name"]
     name = name if f"model={model}" in name else f"{model} {name}"
-    return SiteNetwork(run.id, name, run.id, network, tuple(clip.key for clip in clips))
+    keys = tuple(clip.key for clip in clips)
+    return SiteNetwork(run.id, name, run.id, network, keys, hardly_trained(frames_seen(run)))
 
 
 def base() -> SiteNetwork:

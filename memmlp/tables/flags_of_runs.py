@@ -10,11 +10,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import numpy as np
 
 from memmlp.common.core_share import LEAST_CORE_SHARE
+from memmlp.runs.motion_seen import hardly_trained
 from memmlp.sweep.definition import COSTS, TIMES, Arm, Sweep
 from memmlp.tables import flags_of_code
 from memmlp.tables.effects import RunsBySeed, control_arm, one_and_the_same
 from memmlp.tables.flag_words import flags_of_difference, had_core, listed, quoted, unique
-from memmlp.tables.measured_run import SHARED, UNKNOWN, Measured, hardly_trained
+from memmlp.tables.measured_run import SHARED, UNKNOWN, Measured
 from memmlp.tables.table import STEADY
 from memmlp.tables.timed_alone import core_share, timed_alone
 
@@ -281,8 +282,9 @@ def _calmer_than_truth(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable
 
 def _hardly_trained(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
     """Flag arms whose networks saw so little motion that their errors are those of the first weights."""
-    for said in unique(hardly_trained(run.training) for _, run in every):
-        labels = unique(label for label, run in every if hardly_trained(run.training) == said)
+    found = [(label, hardly_trained(run.training.get("frames", 0.0))) for label, run in every]
+    for said in unique(said for _, said in found):
+        labels = unique(label for label, one in found if one == said)
         if said:
             which = "every arm" if len(labels) == len({label for label, _ in every}) else quoted(labels)
             yield f"{said}: {which}"

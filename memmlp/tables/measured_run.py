@@ -18,13 +18,13 @@ from memmlp.motion.preparing.groups import Grouping
 from memmlp.runs.deployment_folder import as_deployed, deployed_precision, timed_on
 from memmlp.runs.environment import computed_imports
 from memmlp.runs.evaluation_file import intact, of_one_solver
+from memmlp.runs.motion_seen import frames_seen
 from memmlp.runs.run import Run
 from memmlp.runs.upstream_origin import recorded_upstream, upstream_recipes
 
 Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # values by mode, branch and metric
 UNKNOWN = "?"
 SHARED = "MPJPE"  # a metric that both branches have
-LITTLE = 30 * 60 * 60  # frames: half an hour at 60 a second; `profile=small` draws 23 times as many
 CORE_SHARES = {
     "core share": "core_share",
     "network core share": "alone_core_share",
@@ -272,35 +272,6 @@ def _training(run: Run, manifest: Mapping[str, Any]) -> dict[str, float]:
     seconds, frames = (manifest.get("seconds") or {}).get("train"), frames_seen(run)
     took = {"seconds": float(seconds)} if seconds is not None else {}
     return took | ({"frames": frames} if frames else {})
-
-
-def frames_seen(run: Run) -> float:
-    """Return how many frames a run's network saw in training, with repetitions; 0 if that is unknown.
-
-    For a refiner, this includes the frames that the network before it saw, and the pieces of its own
-    training.
-    """
-    config = run.config
-    refiner, optim, model = (config.get(name) or {} for name in ("refiner", "optim", "model"))
-    length = (refiner or model).get("frames") or 0
-    seen = float((optim.get("steps") or 0) * (optim.get("batch") or 0) * length)
-    if not refiner:
-        return seen
-    before = frames_seen(Run(run.folder.parent / str(run.manifest.get("upstream"))))
-    return seen + before if seen and before else 0.0
-
-
-def hardly_trained(training: Mapping[str, float]) -> str:
-    """Return a warning if a network saw less than half an hour of motion in training; empty otherwise.
-
-    Args:
-        training: what its training took, as in `Measured.training`.
-    """
-    seen = training.get("frames") or math.inf
-    if seen >= LITTLE:
-        return ""
-    minutes = f"{seen / 3600:.2g} minutes of motion"
-    return f"hardly trained, on {minutes} with repetitions, so that errors say nothing of the network"
 
 
 def _join(known: dict[str, Any], more: Mapping[str, Any]) -> None:

@@ -48,7 +48,7 @@ def diff(a: str, b: str, outputs: Path) -> None:
     machine. The difference is how much more B has than A.
     """
     from memmlp.runs.lookup import find_run
-    from memmlp.tables.measured_run import frames_seen, hardly_trained
+    from memmlp.runs.motion_seen import frames_seen, hardly_trained
 
     first, second = find_run(outputs, a), find_run(outputs, b)
     for title, rows in (("config", config_rows(first, second)), ("results", result_rows(first, second))):
@@ -65,7 +65,7 @@ def diff(a: str, b: str, outputs: Path) -> None:
         if title == "results":
             click.echo("one run of each: such changes may be chance; memmlp sweep compares over seeds")
     for run in (first, second):
-        if hardly := hardly_trained({"frames": frames_seen(run)}):
+        if hardly := hardly_trained(frames_seen(run)):
             click.echo(f"run {run.id[:SHORT]}: {hardly}")
     if (one := first.manifest.get("data")) != (two := second.manifest.get("data")) and one and two:
         click.echo("their data differs, so that errors are those of other test clips")

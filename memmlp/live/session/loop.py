@@ -29,10 +29,19 @@ UNIT = 10_000  # whole numbers that a quaternion's 1 is sent as
 Publish = Callable[[dict[str, Any]], None]
 
 
-def greeting(source: TrackerSource, network: str, outputs: Outputs | None = None) -> dict[str, Any]:
-    """Return the message that a page gets before the first frame."""
+def greeting(
+    source: TrackerSource, network: str, outputs: Outputs | None = None, remark: str = ""
+) -> dict[str, Any]:
+    """Return the message that a page gets before the first frame.
+
+    Args:
+        source: where the trackers' samples come from.
+        network: the network's name.
+        outputs: where poses go beside the page.
+        remark: what people should know who see the network move, such as that it is hardly trained.
+    """
     limbs = [{"start": a, "end": b, "radii": radii, "tip": tip} for a, b, radii, tip in LIMBS]
-    words = {"network": network, "source": source.name, "fps": FPS, "joints": JOINTS}
+    words = {"network": network, "remark": remark, "source": source.name, "fps": FPS, "joints": JOINTS}
     words |= {"outputs": [output.name for output in outputs.outputs] if outputs else []}
     return words | {"limbs": limbs, "heat": HEAT, "top": TOP, "worn": source.worn}
 

@@ -43,6 +43,7 @@ class SiteNetwork:
         run: the id of the network's run; "random" for random weights.
         model: the network as it was trained.
         clips: the names of those of its test clips that are on the site.
+        remark: what people should know who see it move, such as that it is hardly trained; empty for none.
     """
 
     key: str
@@ -50,6 +51,7 @@ class SiteNetwork:
     run: str
     model: MotionModel
     clips: tuple[str, ...] = ()
+    remark: str = ""
 
     @property
     def trained(self) -> bool:
@@ -91,6 +93,7 @@ class Writer:
             "play": played,
             "graphs": graphs,
             "clips": list(network.clips),
+            "remark": network.remark,
         }
 
     def _played(self, network: SiteNetwork, stream: StreamingGraph | None, made: Path) -> Entry:

@@ -19,10 +19,12 @@ from memmlp.runs.identity import (
     DEPLOYMENT,
     EVALUATION,
     INFERENCE,
+    NETWORK,
     flatten,
     training_settings,
     used_as_configured,
 )
+from memmlp.runs.motion_seen import frames_seen, hardly_trained
 from memmlp.runs.run import Run, latency_name
 from memmlp.runs.shown_name import run_name
 
@@ -74,7 +76,16 @@ def facts(folder: Path) -> dict[str, Any]:
         "failure": _word(read_json(folder / "FAILED").get("reason")),
         **_notes(folder),
         "damage": damage,
+        "remark": _remark(run) if manifest.get("kind") == NETWORK and not damage else "",
     }
+
+
+def _remark(run: Run) -> str:
+    """Return a warning if the network saw next to no motion; empty if it saw enough, or that is unknown."""
+    try:
+        return hardly_trained(frames_seen(run))
+    except (ValueError, TypeError, AttributeError):  # a config that is none
+        return ""
 
 
 def last_entries(path: Path) -> list[list[Any]]:

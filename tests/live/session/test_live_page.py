@@ -83,10 +83,15 @@ def test_it_plays_pauses_and_goes_back(browser: Browser, url: str):
 def test_it_says_what_it_waits_for_and_when_the_command_has_ended(
     browser: Browser, clip: TrackedClip, worn: bool, what: str
 ):
-    with LiveServer(Hub(greeting(ClipSource(clip, 60), "tiny") | {"worn": worn}), 0) as server:
+    words = greeting(ClipSource(clip, 60), "tiny", remark="hardly trained" if worn else "")
+    with LiveServer(Hub(words | {"worn": worn}), 0) as server:
         browser.open(server.url)
         browser.wait(f"document.querySelector('#status').textContent == 'waiting for {what}'")
         assert browser.value("document.querySelector('#error').hidden")  # of no frame there is no error
+        assert browser.value("document.querySelector('#remark').hidden") != worn
+        if worn:
+            said = browser.value("document.querySelector('#remark').textContent")
+            assert said == "This network is hardly trained."
         browser.wait("document.querySelector('#trackers').classList.contains('waiting')")
         server.hub.publish({"dropped": 0, "malformed": 3})
         browser.wait("document.querySelector('#status').textContent.endsWith('3 packets malformed')")

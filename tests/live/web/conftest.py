@@ -27,6 +27,7 @@ from memmlp.networks.memory import NoMemory
 from memmlp.networks.motion_model import MotionModel
 
 RUN = "0123456789abcdef"
+REMARK = "hardly trained, in a test"
 PERSON = wearer.person(np.arange(60 * 4 + 1) / 60)
 
 
@@ -79,7 +80,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Made:
         if not made.step.exists():
             clip = packed("walk", PERSON.frames.numpy(), 4.0)
             Site(
-                networks=[SiteNetwork(RUN, "tiny", RUN, network(), (clip.key,))],
+                networks=[SiteNetwork(RUN, "tiny", RUN, network(), (clip.key,), REMARK)],
                 base=SiteNetwork("base", "AvatarPoser", "random", network()),
                 clips=[clip],
                 calibration=[PERSON.frames],

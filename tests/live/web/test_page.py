@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from chromium import Browser
-from live.web.conftest import PERSON, RUN, Made, package_files
+from live.web.conftest import PERSON, REMARK, RUN, Made, package_files
 
 from memmlp.common.npm import IWER
 from memmlp.live.stream import Offsets, Stream
@@ -33,13 +33,14 @@ NOTE = """{
 """What notes that the mirror's words have told of a calibration that is none."""
 TWO = """Promise.all([import('./wear.js'), fetch('site.json')]).then(async ([{ wear }, answer]) => {
   const site = await answer.json();
-  site.networks.push({ ...site.networks[0], key: 'other', name: 'other', run: 'other' });
+  site.networks.push({ ...site.networks[0], key: 'other', name: 'other', run: 'other', remark: '' });
   const page = document.createElement('div');
   document.querySelector('#content').replaceChildren(page);
   delete document.documentElement.dataset.wear;
   wear(page, site);
 })"""
 """The wearer's page anew, with a second network to choose."""
+REMARKED = "document.querySelector('#remark').textContent"
 TOLERANCE = 1e-4  # metres
 
 
@@ -126,6 +127,7 @@ def worn(browser: Browser, site: Made) -> dict[str, Any]:
     A calibration before, with exchanged hands and another height, is refused, and changes nothing.
     """
     go(browser, "wear", f"{SITE}.wear == 'ready'")
+    assert browser.value(REMARKED) == f"This network is {REMARK}."
     browser.resolved(TWO)
     browser.wait(f"{SITE}.wear == 'ready'")
     height = json.loads((site.folder / "site.json").read_text())["networks"][0]["body"]["height"]
@@ -154,6 +156,7 @@ def worn(browser: Browser, site: Made) -> dict[str, Any]:
     browser.resolved("headset.session.end()")
     choose = "s.value = 'other'; s.dispatchEvent(new Event('change'))"
     browser.value(f"(s => {{ {choose} }})(document.querySelector('#content select'))")
+    assert browser.value("document.querySelector('#remark').hidden")
     browser.value("document.querySelector('#save').click()")
     return json.loads(browser.wait("headset.saved")) | {"worn": browser.value("offsets")}
 
@@ -200,6 +203,7 @@ def check_play(browser: Browser) -> None:
     browser.value("document.querySelector('#pause').click()")
     browser.wait("document.querySelector('#pause').textContent == 'Play'")
     assert 0 < float(browser.value("document.querySelector('#mean').textContent")) < 200
+    assert browser.value(REMARKED) == f"This network is {REMARK}."
 
 
 def check_bench(browser: Browser, file: Path) -> None:

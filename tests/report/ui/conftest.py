@@ -34,7 +34,8 @@ def made(outputs: Path) -> Sweep:
     entries, tasks = [], []
     for arm, factor in ARMS.items():
         for seed in SEEDS:
-            config = {"memory": {"name": arm}, "seed": seed, "optim": {"steps": 2000, "lr": 1e-3}}
+            optim = {"steps": 2000, "batch": 1, "lr": 1e-3}  # which is little motion
+            config = {"memory": {"name": arm}, "seed": seed, "optim": optim, "model": {"frames": 11}}
             run = fake_run(outputs, arm, seed, factor, config=config, log=True)
             entries.append(Entry(arm, seed, run.id))
             tasks.append(RunTask(run.id, "memmlp", config))

@@ -25,6 +25,13 @@ def test_facts_of_a_finished_run(outputs: Path):
     assert found["metrics"]["latency.median_ms"] == pytest.approx(0.64)
     assert (found["tags"], found["note"]) == (["good", "7"], "<b>look</b>")
     assert found["recent"][-1][0] == 2000
+    assert found["remark"].startswith("hardly trained, on 6.1 minutes of motion")
+
+
+def test_who_saw_enough_motion_has_no_remark(outputs: Path):
+    run = run_of(outputs)
+    run.config_path.write_text(json.dumps(run.config | {"model": {"frames": 1100}}))
+    assert facts(run.folder)["remark"] == ""
 
 
 def test_times_of_a_run_are_those_of_the_file_that_was_asked_for(outputs: Path):

@@ -35,6 +35,8 @@ events.addEventListener('frame', event => {
 function greet(words) {
   greeting = words;
   $('about').textContent = `${words.network} · ${words.source}`;
+  $('remark').hidden = !words.remark;
+  $('remark').textContent = `This network is ${words.remark}.`;
   $('ramp').style.background = `linear-gradient(to right, ${words.heat.join(', ')})`;
   document.querySelector('.prediction').style.background = words.heat[1];
   $('top').textContent = `${words.top}+`;

@@ -59,7 +59,9 @@ class Play {
     this.time = h('output', {}, '0.00 s');
     this.trouble = h('p', { class: 'trouble', hidden: true });
     const facts = [['mean error', 'mean', 'cm'], ['step, median', 'middle', 'ms'], ['step, p95', 'p95', 'ms'], ['frames', 'frames', ''], ['dropped', 'lost', '']];
+    const { remark } = this.network;
     replace(this.page, choices,
+      remark && h('p', { class: 'warning', id: 'remark' }, `This network is ${remark}.`),
       h('div', { class: 'replay' },
         h('div', { class: 'view' }, h('div', { class: 'view-stage tall' }, this.canvas, this.trouble)),
         h('div', { class: 'transport' }, this.pause, this.scrub, this.time),

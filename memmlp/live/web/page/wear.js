@@ -50,10 +50,12 @@ class Wear {
         this.site.networks.length > 1 && select('Network', this.site.networks.map(({ key, name }) => [key, name]), this.network.key, key => {
           this.worn?.session.end();
           this.network = this.site.networks.find(network => network.key === key);
+          this.remarked();
           this.ready();
         }),
         h('label', { class: 'field' }, h('span', {}, 'Your height [cm]'), this.height),
         h('label', { class: 'tick' }, this.record, 'record'), this.save),
+      this.remark = h('p', { class: 'warning', id: 'remark' }),
       h('p', { class: 'faint', id: 'support' }, ''),
       this.seen = h('div', { class: 'replay' }, h('div', { class: 'view' }, h('div', { class: 'view-stage' }, this.canvas, this.trouble)),
         h('dl', { class: 'facts' }, facts.map(([name, id, unit]) => h('div', {}, h('dt', {}, name), h('dd', {}, named(id), ` ${unit}`))))),
@@ -61,6 +63,14 @@ class Wear {
         h('li', {}, 'Put on the headset, open this page in its browser, and choose Enter VR (or AR, to see your room).'),
         h('li', {}, 'Pull a trigger, or pinch, and stand in T-pose within three seconds: upright, arms to the sides, palms down, eyes forward.'),
         h('li', {}, 'Look into the mirror. Pull again to calibrate anew, as after changing between controllers and hands.')));
+    this.remarked();
+  }
+
+  // Say what who sees this network move should know, if there is anything.
+  remarked() {
+    const { remark } = this.network;
+    this.remark.hidden = !remark;
+    this.remark.textContent = remark ? `This network is ${remark}.` : '';
   }
 
   // Load the network, and ask the browser what it can enter.

@@ -20,6 +20,7 @@ export async function page(id) {
   function draw() {
     replace(top, head(run), run.failure && h('p', { class: 'warning' }, h('b', {}, 'Failed: '), run.failure),
       run.damage.length ? h('p', { class: 'warning' }, h('b', {}, 'Damaged: '), `${run.damage.join(', ')} cannot be read.`) : null,
+      run.remark ? h('p', { class: 'warning' }, h('b', {}, 'Its network: '), `${run.remark}.`) : null,
       run.changed.length ? h('p', { class: 'warning' }, h('b', {}, 'Changed since it was made: '), run.changed.join(', ')) : null,
       run.older.length ? h('p', { class: 'warning' }, h('b', {}, 'Measured by an earlier recipe: '), `${run.older.join(', ')}. memmlp eval ${run.id} measures it anew.`) : null, facts(run), results(run));
     replace(rest, run.clips.length ? clips(run, replay) : null, config(run), latency(run), files(run), provenance(run));
