@@ -62,7 +62,7 @@ def weights(graph: onnx.ModelProto) -> dict[str, int]:
 @pytest.mark.parametrize("network", ["mem_mlp", *tiny.BASELINES])
 def test_inner_layers_are_int8_and_the_ends_are_not(step_files, tmp_path, network):
     quantised, stream = tmp_path / "int8.onnx", streaming(exported.NETWORKS[network]())
-    quantise(step_files(network), quantised, stream.float32_modules, CLIPS)
+    quantise(step_files(network), quantised, stream.float32_modules, [CLIPS[0][:20]])
     kinds = weights(onnx.load(quantised))
     inner = [kind for name, kind in kinds.items() if ".blocks." in name or ".layers." in name]
     assert inner

@@ -15,22 +15,18 @@ from memmlp.deploy.export import export, save
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import TOLERANCE, parity
 from memmlp.motion.body import JOINTS, SPARSE_DIM
-from memmlp.motion.network_coordinates import Heading
 from memmlp.networks.memory import NoMemory
 from memmlp.networks.vqvae import VQVAE
 
 pytestmark = pytest.mark.slow
 
 CLIP = tiny.clip(50)
-CASES = {
-    "vq": {},
-    "frame-latest-heading": {"shift": "frame", "history": "latest", "coordinates": Heading()},
-}  # other graphs, networks as they were trained among them: tests/config/test_build.py
 
 
-@pytest.fixture(scope="module", params=CASES, ids=str)
-def exported(request, tmp_path_factory):
-    model = tiny.model(**CASES[request.param])
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """A network as it was trained; others are in tests/config/test_build.py, streams in exported.py."""
+    model = tiny.model()
     path = tmp_path_factory.mktemp("onnx") / "step.onnx"
     export(model, path, "0123456789abcdef")
     return model, path
