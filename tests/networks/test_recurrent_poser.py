@@ -19,7 +19,7 @@ from memmlp.networks.recurrent_cells import CELLS
 from memmlp.networks.recurrent_poser import OUTPUTS
 from memmlp.networks.streaming import streaming
 
-CLIP = tiny.clip(40)
+CLIP = tiny.clip(24)
 SPARSE = CLIP[None, :, :SPARSE_DIM]
 
 
@@ -34,7 +34,7 @@ def test_evaluation_and_the_live_graph_are_one_stream(form):
     sparse = SPARSE.double()
     unrolled = model.advance(sparse, model.initial_state())[0][0]
     state, made = model.initial_state(), []
-    for part in sparse.split([1, 9, 30], 1):
+    for part in sparse.split([1, 9, 14], 1):
         motion, state = model.advance(part, state)
         made.append(motion[0])
     graph, carried = streaming(model), streaming(model).initial_state()
