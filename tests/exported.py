@@ -17,6 +17,8 @@ from memmlp.networks.predictor_slot import RotationOnly
 if TYPE_CHECKING:
     from onnx import GraphProto
 
+BASELINES = [name for name in tiny.BASELINES if name != "manikin_l"]
+"""But for MANIKIN-L, the largest graph of all: AvatarJLM's, and then MANIKIN-S' solver."""
 DIFFUSIONS = ("agrol_diffusion", "bodiffusion")
 NETWORKS: dict[str, Callable[[], MotionModel]] = {
     "mem_mlp": partial(tiny.model, CodeMemory, coordinates=Heading()),
@@ -24,7 +26,7 @@ NETWORKS: dict[str, Callable[[], MotionModel]] = {
     "no_memory": partial(tiny.model, NoMemory),
     "rotation_only": partial(tiny.model, NoMemory, RotationOnly),
     "refined": lambda: tiny.refined(tiny.model(NoMemory, coordinates=Heading())),
-    **{name: partial(tiny.baseline, name, depth=1) for name in tiny.BASELINES},
+    **{name: partial(tiny.baseline, name, depth=1) for name in BASELINES},
     **{name: partial(tiny.baseline, name, depth=1, sampling_steps=2) for name in DIFFUSIONS},
     "avatar_poser": partial(tiny.baseline, "avatar_poser", Heading(), depth=1),
 }

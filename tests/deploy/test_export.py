@@ -76,7 +76,7 @@ def test_zeros_are_a_fresh_start(exported):
     assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
 
 
-def test_latency_and_size(exported):
+def test_latency_and_size(exported, small_yardstick):
     model, path = exported
     measured = latency.measure_step(path, steps=1)
     assert measured["steps"] == 200
@@ -97,7 +97,7 @@ def test_code_vectors_are_counted_however_they_are_learned(codebook, tmp_path):
     assert size["parameters_with_vqvae"] - size["parameters"] == encoder + 5 * 16 + decoder
 
 
-def test_a_thread_without_a_core_is_seen(exported, monkeypatch):
+def test_a_thread_without_a_core_is_seen(exported, small_yardstick, monkeypatch):
     clock = iter([5.0, 5.0 + 1e-9])
     monkeypatch.setattr(latency.time, "thread_time", lambda: next(clock))
     assert latency.measure_step(exported[1], steps=1)["core_share"] < 1e-6
