@@ -72,6 +72,26 @@ def _remember_exporter(module: Any) -> None:
         module.onnxscript_apis.get_torchlib_ops = functools.cache(module.onnxscript_apis.get_torchlib_ops)
 
 
+def _remember_operators(module: Any) -> None:
+    """Of torch.export: which of the operators known by now are made of others, a twentieth of an export."""
+    import torch
+
+    collect = module._collect_all_valid_cia_ops
+    if hasattr(collect, "__wrapped__"):
+        return
+    known: dict[tuple[tuple[str, int], ...], Any] = {}
+
+    @functools.wraps(collect)
+    def collected() -> Any:
+        spaces = ((name, getattr(torch.ops, name)) for name in torch.ops._dir)
+        key = tuple((name, len(getattr(space, "_dir", ()))) for name, space in spaces)
+        if key not in known:
+            known[key] = collect()
+        return known[key]  # which nobody changes
+
+    module._collect_all_valid_cia_ops = collected
+
+
 def _remember_signatures(module: Any) -> None:
     """Of ONNX's operators: their signatures, made anew for each node of a graph, a tenth of an export."""
     make = module.OpSignature.from_op_schema.__func__
@@ -235,6 +255,7 @@ def _remember_motion(module: Any) -> None:
 PATCHES = {
     **dict.fromkeys(("torch.cuda", "torch.mtia", "torch.xpu"), _forget_who_seeds),
     "torch.onnx._internal.exporter._registration": _remember_exporter,
+    **dict.fromkeys(("torch.export.exported_program", "torch.export.decomp_utils"), _remember_operators),
     "onnx_ir.schemas": _remember_signatures,
     "omegaconf.base": _remember_interpolations,
     "hydra._internal.config_repository": _remember_configs,

@@ -12,6 +12,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from onnx_ir import schemas
+from torch.export import exported_program
 
 from memmlp.config import compose
 from memmlp.motion import synthetic
@@ -72,6 +73,12 @@ def test_signatures_of_operators_are_those_that_onnx_makes():
         anew = made.__wrapped__(schemas.OpSignature, schema)
         assert repr(made(schema)) == repr(anew)
         assert made(schema) is made(schema)
+
+
+def test_operators_that_are_made_of_others_are_those_that_torch_collects():
+    found = [exported_program._collect_all_valid_cia_ops() for _ in range(2)]
+    assert found[0] is found[1]
+    assert found[0] == exported_program._collect_all_valid_cia_ops.__wrapped__() != set()
 
 
 def test_motion_is_made_once_and_is_that_of_its_seed(monkeypatch: pytest.MonkeyPatch):

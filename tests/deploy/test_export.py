@@ -15,22 +15,18 @@ from memmlp.deploy.export import export, save
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import TOLERANCE, parity
 from memmlp.motion.body import JOINTS, SPARSE_DIM
-from memmlp.motion.network_coordinates import Heading
 from memmlp.networks.memory import NoMemory
 from memmlp.networks.vqvae import VQVAE
 
 pytestmark = pytest.mark.slow
 
 CLIP = tiny.clip(50)
-CASES = {
-    "vq": {},
-    "frame-latest-heading": {"shift": "frame", "history": "latest", "coordinates": Heading()},
-}  # other graphs, networks as they were trained among them: tests/config/test_build.py
 
 
-@pytest.fixture(scope="module", params=CASES, ids=str)
-def exported(request, tmp_path_factory):
-    model = tiny.model(**CASES[request.param])
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """A network as it was trained; others are in tests/config/test_build.py, streams in exported.py."""
+    model = tiny.model()
     path = tmp_path_factory.mktemp("onnx") / "step.onnx"
     export(model, path, "0123456789abcdef")
     return model, path
@@ -80,7 +76,7 @@ def test_zeros_are_a_fresh_start(exported):
     assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
 
 
-def test_latency_and_size(exported):
+def test_latency_and_size(exported, small_yardstick):
     model, path = exported
     measured = latency.measure_step(path, steps=1)
     assert measured["steps"] == 200
@@ -101,7 +97,7 @@ def test_code_vectors_are_counted_however_they_are_learned(codebook, tmp_path):
     assert size["parameters_with_vqvae"] - size["parameters"] == encoder + 5 * 16 + decoder
 
 
-def test_a_thread_without_a_core_is_seen(exported, monkeypatch):
+def test_a_thread_without_a_core_is_seen(exported, small_yardstick, monkeypatch):
     clock = iter([5.0, 5.0 + 1e-9])
     monkeypatch.setattr(latency.time, "thread_time", lambda: next(clock))
     assert latency.measure_step(exported[1], steps=1)["core_share"] < 1e-6

@@ -20,6 +20,7 @@ from memmlp.deploy.half_precision import halve, halved, rounded
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import streamed
 from memmlp.deploy.quantization import inner_layers
+from memmlp.motion.network_coordinates import Heading
 from memmlp.networks.streaming import streaming
 
 pytestmark = pytest.mark.slow
@@ -92,7 +93,7 @@ def test_rounded_is_fp16_s_arithmetic(tmp_path: Path, size: float):
 
 def test_states_stay_float32(tmp_path: Path):
     """What a recurrent cell adds up is below the resolution of sixteen bits."""
-    graph = streaming(tiny.recurrent_poser(cell="lru"))
+    graph = streaming(tiny.recurrent_poser(Heading(), cell="lru", width=40))
     export(graph, tmp_path / "step.onnx", "0" * 16)
     halve(tmp_path / "step.onnx", tmp_path / "half.onnx", graph.float32_modules)
     made = onnx.shape_inference.infer_shapes(onnx.load(tmp_path / "half.onnx")).graph

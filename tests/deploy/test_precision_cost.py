@@ -37,7 +37,7 @@ def test_less_precision_may_stand_for_float32_only_if_it_is_as_good(pair, step_f
     assert cost["growth"] == pytest.approx(max(growth["MPJPE"], growth["position MPJPE"]))
     assert cost["jitter_growth"] == pytest.approx(growth["Jitter"])
     assert cost["default"] == (cost["growth"] <= 0.01 and cost["jitter_growth"] <= 0.1)
-    other = step_files("refined")  # of two networks the better one may stand for the other alone
+    other = step_files("rotation_only")  # of two networks the better one may stand for the other alone
     both = [compared(*files, "fp16", normalizer, CLIPS) for files in ((exact, other), (other, exact))]
     assert sorted(cost["default"] for cost in both) == [False, True]
     assert compared(exact, exact, "fp16", normalizer, CLIPS)["default"]

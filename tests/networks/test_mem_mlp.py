@@ -1,5 +1,7 @@
 """The network: sizes, streaming, memory, and that every switch changes something."""
 
+import functools
+
 import pytest
 import tiny
 import torch
@@ -169,7 +171,12 @@ def _name(value: object) -> str:
 
 
 def variant(**changes) -> torch.Tensor:
-    return run(tiny.model(**changes), SPARSE)[-1]
+    return run(tiny.model(**changes), SPARSE[:, :20])[-1]
+
+
+@functools.cache
+def unchanged() -> torch.Tensor:
+    return variant()
 
 
 @pytest.mark.parametrize(
@@ -197,7 +204,7 @@ def variant(**changes) -> torch.Tensor:
 )
 @torch.no_grad()
 def test_every_switch_changes_the_output(changes):
-    assert not torch.allclose(variant(**changes), variant(), atol=1e-5)
+    assert not torch.allclose(variant(**changes), unchanged(), atol=1e-5)
 
 
 @torch.no_grad()
@@ -240,7 +247,7 @@ def test_the_newest_frames_alone_are_the_same_numbers(kind, changes, predictor):
     # In float64: untrained networks on their own output may amplify float32's rounding.
     model = tiny.model(kind, predictor, **changes).double()
     whole = part = model.initial_state(1)
-    for sparse in SPARSE.double().split(1, 1):
+    for sparse in SPARSE[:, :20].double().split(1, 1):  # the past is full from the 14th on
         all_frames, whole = model.advance(sparse, whole)
         newest, part = model.advance(sparse, part, 2)
         torch.testing.assert_close(newest, all_frames[:, -2:], atol=1e-10, rtol=0)

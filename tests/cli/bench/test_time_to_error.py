@@ -11,7 +11,14 @@ from conftest import Memmlp, one_line
 
 from memmlp.cli.bench.time_to_error import conclusion, other_maker, summary
 
-TINY = ("profile=tiny", "data.synth.minutes=0.2", "threads=1", "memory=none", "optim.steps=4")
+TINY = (
+    "profile=tiny",
+    "model.depth=2",
+    "data.synth.minutes=0.1",
+    "threads=1",
+    "memory=none",
+    "optim.steps=4",
+)
 
 
 def row(seed: int, today: float, recipe: float | None) -> dict:

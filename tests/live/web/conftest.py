@@ -22,7 +22,6 @@ from memmlp.live.full_graph import export_full
 from memmlp.live.web.clips import packed
 from memmlp.live.web.networks import SiteNetwork
 from memmlp.live.web.site import Site
-from memmlp.motion.network_coordinates import World
 from memmlp.networks.memory import NoMemory
 from memmlp.networks.motion_model import MotionModel
 
@@ -40,7 +39,7 @@ class Made(NamedTuple):
 
 def network() -> MotionModel:
     """A tiny network of random weights that stands as a person does."""
-    return wearer.at_ease(tiny.model(NoMemory, coordinates=World()), PERSON.frames)
+    return wearer.at_ease(tiny.model(NoMemory), PERSON.frames)
 
 
 def once(write: Callable[..., None]) -> Callable[..., None]:

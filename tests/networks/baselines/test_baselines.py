@@ -1,5 +1,7 @@
 """What every baseline keeps to: streams, windows, joints."""
 
+import functools
+
 import pytest
 import tiny
 import torch
@@ -10,7 +12,7 @@ from memmlp.motion.network_coordinates import Heading
 
 NAMES = list(tiny.BASELINES)
 WINDOWED = [name for name in NAMES if name not in tiny.WINDOWLESS]
-CLIP = tiny.clip(40)
+CLIP = tiny.clip(24)
 SPARSE = CLIP[None, :, :SPARSE_DIM]
 
 
@@ -20,7 +22,7 @@ def test_a_stream_is_the_last_frame_of_windows_with_full_history(name):
     model = tiny.baseline(name, Heading())
     size = model.frames
     stream = evaluation.stream(model, [CLIP])[0]
-    for end in (size, 20, 40):
+    for end in (size, 13, 24):
         window = model.advance(SPARSE[:, end - size : end], model.initial_state(1))[0]
         torch.testing.assert_close(window[0, -1], stream[end - 1], atol=1e-5, rtol=0)
 
@@ -41,7 +43,7 @@ def test_without_a_window_both_modes_are_the_stream_in_calls_of_any_size(name):
     stream = evaluation.stream(model, [CLIP])[0]
     assert torch.equal(evaluation.window(model, [CLIP])[0], stream)
     state, made = model.initial_state(1), []
-    for part in SPARSE.split([1, 9, 30], 1):
+    for part in SPARSE.split([1, 9, 14], 1):
         motion, state = model.advance(part, state)
         made.append(motion[0])
     torch.testing.assert_close(torch.cat(made), stream, atol=1e-5, rtol=0)
@@ -53,7 +55,7 @@ def test_without_a_window_both_modes_are_the_stream_in_calls_of_any_size(name):
 @torch.no_grad()
 def test_side_by_side_is_one_by_one_and_short_clips_count(name, mode):
     model = tiny.baseline(name).double()
-    clips = [tiny.clip(n, seed=n).double() for n in (4, 25, 14)]
+    clips = [tiny.clip(n, seed=n).double() for n in (4, 17, 12)]
     for together, clip in zip(evaluation.predict(model, clips, mode, 8), clips, strict=True):
         assert together.shape == (len(clip), MOTION_DIM)
         alone = evaluation.predict(model, [clip], mode, 8)[0]
@@ -64,8 +66,9 @@ def test_side_by_side_is_one_by_one_and_short_clips_count(name, mode):
 @torch.no_grad()
 def test_positions_are_forward_kinematics_of_the_rotations(name):
     model = tiny.baseline(name, Heading())
-    motion = evaluation.stream(model, [CLIP])[0]
-    expected = model.normalizer.pose(motion, CLIP[:, :SPARSE_DIM]).flatten(1)
+    clip = CLIP[:12]
+    motion = evaluation.stream(model, [clip])[0]
+    expected = model.normalizer.pose(motion, clip[:, :SPARSE_DIM]).flatten(1)
     torch.testing.assert_close(motion[:, ROTATION.stop :], expected, atol=1e-5, rtol=0)
 
 
@@ -91,5 +94,11 @@ KNOBS = [
 @pytest.mark.parametrize(("name", "change"), KNOBS, ids=str)
 @torch.no_grad()
 def test_every_knob_changes_the_motion(name, change):
-    base, other = (evaluation.stream(tiny.baseline(name, **c), [CLIP])[0] for c in ({}, change))
-    assert not torch.allclose(base, other, atol=1e-4)
+    other = evaluation.stream(tiny.baseline(name, **change), [CLIP[:12]])[0]
+    assert not torch.allclose(unchanged(name), other, atol=1e-4)
+
+
+@functools.cache
+def unchanged(name: str) -> torch.Tensor:
+    """What a network makes of the clip's beginning, a little more than its window."""
+    return evaluation.stream(tiny.baseline(name), [CLIP[:12]])[0]
