@@ -336,7 +336,7 @@ def _measured(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str
     measured = Measured(
         id=name.partition("/")[0],
         means=errors,
-        clips={clip: _each(errors, lambda values, i=i: values[i]) for i, clip in enumerate(names)},
+        clips=_of_clips(errors, names),
         groups={clip: group for clip, group, *_ in clips},
         sources={clip: source[0] for clip, _, *source in clips if source},
         costs=record["costs"],
@@ -346,15 +346,15 @@ def _measured(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str
     return measured.over(names)
 
 
-def _each(errors: Mapping[str, Any], what: Any) -> Errors:
-    """Return the errors with `what` applied to each metric's list of values."""
-    return {
-        mode: {
-            branch: {metric: what(values) for metric, values in metrics.items()}
-            for branch, metrics in branches.items()
-        }
-        for mode, branches in errors.items()
-    }
+def _of_clips(errors: Mapping[str, Any], names: Sequence[str]) -> dict[str, Errors]:
+    """Return the errors of each clip, from each metric's list of values."""
+    clips: dict[str, dict[str, dict[str, Any]]] = {name: {mode: {} for mode in errors} for name in names}
+    for mode, branches in errors.items():
+        for branch, metrics in branches.items():
+            rows = zip(*metrics.values(), strict=True) if metrics else [()] * len(names)
+            for name, row in zip(names, rows, strict=True):
+                clips[name][mode][branch] = dict(zip(metrics, row, strict=True))
+    return clips  # type: ignore[return-value]
 
 
 def _every(errors: Mapping[str, Any]) -> list[Sequence[Any]]:

@@ -199,7 +199,8 @@ class Measured:
         errors. Clips on which the network diverged tell nothing about that.
         """
         names, branches = list(self.clips), ("rotation", "position")
-        sides = ([self.by_clip(names, mode, branch, SHARED) for branch in branches] for mode in self.means)
+        modes = [mode for mode, known in self.means.items() if all(branch in known for branch in branches)]
+        sides = ([self.by_clip(names, mode, branch, SHARED) for branch in branches] for mode in modes)
         known = ((one, other, np.isfinite(one + other)) for one, other in sides)
         return all(math.isclose(one[has].sum(), other[has].sum(), rel_tol=SAME) for one, other, has in known)
 
