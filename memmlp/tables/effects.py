@@ -89,11 +89,18 @@ def paired(
         if one_and_the_same(arm, other, ours, theirs):
             continue
         shared = _shared(ours, theirs)
-        for mode, metric in itertools.product(modes, sweep.metrics):
+        every = [runs[seed] for runs in (ours, theirs) for seed in shared.seeds]
+        seen = [mode for mode in modes if all(_has_mode(run, mode) for run in every)]
+        for mode, metric in itertools.product(seen, sweep.metrics):
             if metric not in COSTS:
                 branches = (arm.branch, other.branch)
                 found[Key(arm.label, mode, metric)] = _paired(ours, theirs, shared, branches, mode, metric)
     return {key: pair for key, pair in found.items() if pair.matrix.size}
+
+
+def _has_mode(run: Measured, mode: str) -> bool:
+    """Return whether a run was evaluated in a mode, on any clip."""
+    return any(mode in errors for errors in run.clips.values())
 
 
 def effects(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -> dict[Key, Effect]:
