@@ -115,14 +115,21 @@ def arguments(command: click.Command, name: str, words: list[str], whole: bool) 
     return made
 
 
+TAKEN: set[tuple[str, ...]] = set()
+"""The overrides that were composed; many lines have the same, and their placeholders are the same, too."""
+
+
 def composes(overrides: Sequence[str]) -> None:
     """Compose and check the config of every job of `memmlp train OVERRIDES`."""
+    if tuple(overrides) in TAKEN:
+        return
     args, _ = parse(list(overrides))
     if args.help or args.shell_completion:
         return
     register()
     version.setbase(VERSION_BASE)
     preflight(args)
+    TAKEN.add(tuple(overrides))
 
 
 def _sweeps(parsed: dict[str, Any]) -> None:

@@ -6,6 +6,8 @@ import functools
 import hashlib
 import json
 import math
+import os
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -48,37 +50,40 @@ def fake_run(
 ) -> Run:
     """A finished run whose errors are `factor` times the usual ones, with effects of seed, clip and both."""
     run = Run.of(outputs, hashlib.sha256(f"{name} {seed}".encode()).hexdigest()[:16])
-    run.folder.mkdir(parents=True, exist_ok=True)
-    rows = [_clip(clip, seed, factor, run.id, branches) for clip in clips]
-    for row in rows if groups else ():
-        row["group"] = (groups or {})[row["name"]]
     latency = {
         "median_ms": 0.8 * factor, "p95_ms": 1.1 * factor, "ratio_to_yardstick": 0.6, "parameters": 356_798,
         "macs": 13_000_000, "flops": 26_000_000, "onnx_bytes": 1_900_000,
     }  # fmt: skip
     manifest = {"id": run.id, "kind": "memmlp", "seconds": {"train": 300.0, "evaluate": 20.0}, **ORIGIN}
     manifest |= {"started": "2026-01-02T03:04:05+00:00", **(origin or {})}
+    deployment = run.deployment("fp32-0")
+    for folder in (run.folder, run.evaluations, deployment.folder):
+        os.makedirs(folder, exist_ok=True)
     files = {
         run.manifest_path: manifest,
         run.config_path: {"seed": seed, "memory": {"layers": [2, 4]}, **(config or {})},
         run.marker: {"id": run.id, "artifacts": {}},
-        run.deployment("fp32-0").latency: latency | {"made": "2026"},
+        deployment.latency: latency | {"made": "2026"},
     }
     for path, content in files.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(content))
-    for mode in ("window", "stream"):
-        clips_of_mode = [
-            {key: row[key] for key in ("name", "frames", "group") if key in row} | row[mode] for row in rows
-        ]
-        mean = _means([row[mode] for row in rows])
-        report = {"mode": mode, "settings": {}, "mean": mean, "clips": clips_of_mode, "made_by": manifest}
-        path = run.evaluation(f"{mode}-0")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(report | {"made": "2026"} | (evaluated or {})))
+        _write(path, json.dumps(content))
+    of_clips = tuple((clip, groups[clip] if groups else None) for clip in clips)
+    about = {"settings": {}, "made_by": manifest, "made": "2026"} | (evaluated or {})
+    words = json.dumps(about)[1:]
+    for mode, errors in _errors(run.id, seed, factor, of_clips, tuple(branches)).items():
+        _write(run.evaluation(f"{mode}-0"), f"{errors[:-1]}, {words}")
     if log:
-        _log(run, factor)
+        _write(run.metrics_path, _log(run.id, factor))
     return run
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a new file, or an existing one anew, with as few calls as can be: there are many such files."""
+    file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+    try:
+        os.write(file, text.encode())
+    finally:
+        os.close(file)
 
 
 def fake_sweep(
@@ -139,13 +144,32 @@ def _luck(word: str | int) -> float:
     return float(_draw(word).normal())
 
 
+@functools.lru_cache(maxsize=1024)
+def _errors(
+    name: str, seed: int, factor: float, clips: tuple[tuple[str, str | None], ...], branches: tuple[str, ...]
+) -> dict[str, str]:
+    """The errors in the files of a run's evaluations, by mode: tests ask for the same runs again and again.
+
+    `clips` are the names of clips and of their groups.
+    """
+    rows = {clip: _clip(clip, seed, factor, name, branches) for clip, _ in clips}
+    found = {}
+    for mode in ("window", "stream"):
+        of_mode = [
+            {"name": clip, "frames": 600, **({"group": group} if group else {}), **rows[clip][mode]}
+            for clip, group in clips
+        ]
+        mean = _means([rows[clip][mode] for clip, _ in clips])
+        found[mode] = json.dumps({"mode": mode, "mean": mean, "clips": of_mode})
+    return found
+
+
 def _clip(clip: str, seed: int, factor: float, name: str, branches: Sequence[str]) -> dict[str, Any]:
-    """A row of clips.json: the clip's difficulty and the seed's luck, the same for every run, and noise."""
+    """A clip's errors by mode: its difficulty and the seed's luck, the same for every run, and noise."""
     level = factor * math.exp(0.2 * _luck(clip) + 0.01 * _luck(seed))
     noise = iter(np.exp(0.01 * _draw(name, clip).normal(size=2 * len(branches) * len(BASE))).tolist())
-    row: dict[str, Any] = {"name": clip, "frames": 600}
-    for mode, jumps in (("window", 1.3), ("stream", 1.0)):
-        row[mode] = {
+    return {
+        mode: {
             branch: {
                 metric: round(base * level * (jumps if metric == "Jitter" else 1) * next(noise), 6)
                 for metric, base in BASE.items()
@@ -153,21 +177,29 @@ def _clip(clip: str, seed: int, factor: float, name: str, branches: Sequence[str
             }
             for branch in branches
         }
-    return row
-
-
-def _means(rows: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
-    return {
-        branch: {metric: float(np.mean([row[branch][metric] for row in rows])) for metric in values}
-        for branch, values in rows[0].items()
+        for mode, jumps in (("window", 1.3), ("stream", 1.0))
     }
 
 
-def _log(run: Run, factor: float) -> None:
-    """A metrics log that falls from far above to the run's level."""
-    noise = _draw(run.id)
+def _means(rows: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
+    means = {}
+    for branch, metrics in rows[0].items():
+        values = np.array([[row[branch][metric] for row in rows] for metric in metrics])
+        means[branch] = dict(zip(metrics, values.mean(1).tolist(), strict=True))
+    return means
+
+
+@functools.lru_cache(maxsize=256)
+def _log(name: str, factor: float) -> str:
+    """A metrics log that falls from far above to the run's level, as `Run.log` writes it."""
+    noise, now, lines = _draw(name), round(time.time(), 3), []
+
+    def write(step: int, phase: str, values: dict[str, float]) -> None:
+        lines.append(json.dumps({"step": step, "phase": phase, "time": now, "values": values}))
+
     for step in range(0, 2001, 100):
-        loss = factor * (1 + 4 * np.exp(-step / 300)) * float(np.exp(0.05 * noise.normal()))
-        run.log(step, {"loss": loss, "lr": 1e-3})
+        loss = float(factor * (1 + 4 * np.exp(-step / 300)) * float(np.exp(0.05 * noise.normal())))
+        write(step, "train", {"loss": loss, "lr": 1e-3})
         if step % 500 == 0:
-            run.log(step, {"rotation MPJPE": 6.5 * loss, "rotation MPJRE": 4.1 * loss}, "val")
+            write(step, "val", {"rotation MPJPE": 6.5 * loss, "rotation MPJRE": 4.1 * loss})
+    return "\n".join([*lines, ""])

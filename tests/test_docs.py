@@ -32,7 +32,11 @@ PAGES = [
     *(page for page in sorted(DOCS.rglob("*.md")) if not set(MADE) & set(page.parts)),
 ]
 LINES = list({line.text: line for page in PAGES for line in shell_lines(page)}.values())
-MENTIONS = list({line.text: line for page in PAGES for line in inline_lines(page)}.values())
+SHOWN = {line.text for line in LINES}
+MENTIONS = list(
+    {line.text: line for page in PAGES for line in inline_lines(page) if line.text not in SHOWN}.values()
+)
+"""The commands in sentences that are no line of a block, which are looked at more closely."""
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 MEASURED = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?= ?(?:ms|cm|°|%|times)(?!\w))|(?<![\w.])\d+\.\d+(?![\w.])")
 VERSIONS = re.compile(r"Python \d[\d.]*")

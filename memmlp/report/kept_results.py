@@ -10,6 +10,7 @@ import hashlib
 import json
 import math
 import re
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -93,10 +94,17 @@ class Kept:
         kinematics, a digest of the errors is appended; if they show several deployments, a digest of the
         costs follows.
         """
-        found: dict[tuple[str, str, str], Measured] = {}
+        of_id: dict[str, list[Measured]] = defaultdict(list)
         for run in (run for runs in self.runs.values() for run in runs.values()):
-            found[_key(run)] = run
-        return {self._name(key, found): run for key, run in found.items()}
+            of_id[run.id].append(run)
+        named: dict[str, Measured] = {}
+        for run_id, runs in of_id.items():
+            if all(run is runs[0] for run in runs):
+                named[run_id] = runs[0]
+                continue
+            found = {_key(run): run for run in runs}
+            named |= {self._name(key, found): run for key, run in found.items()}
+        return named
 
     def name(self, run: Measured) -> str:
         """Return a run's name in the file."""
@@ -328,7 +336,7 @@ def _measured(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str
     measured = Measured(
         id=name.partition("/")[0],
         means=errors,
-        clips={clip: _each(errors, lambda values, i=i: values[i]) for i, clip in enumerate(names)},
+        clips=_of_clips(errors, names),
         groups={clip: group for clip, group, *_ in clips},
         sources={clip: source[0] for clip, _, *source in clips if source},
         costs=record["costs"],
@@ -338,15 +346,15 @@ def _measured(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str
     return measured.over(names)
 
 
-def _each(errors: Mapping[str, Any], what: Any) -> Errors:
-    """Return the errors with `what` applied to each metric's list of values."""
-    return {
-        mode: {
-            branch: {metric: what(values) for metric, values in metrics.items()}
-            for branch, metrics in branches.items()
-        }
-        for mode, branches in errors.items()
-    }
+def _of_clips(errors: Mapping[str, Any], names: Sequence[str]) -> dict[str, Errors]:
+    """Return the errors of each clip, from each metric's list of values."""
+    clips: dict[str, dict[str, dict[str, Any]]] = {name: {mode: {} for mode in errors} for name in names}
+    for mode, branches in errors.items():
+        for branch, metrics in branches.items():
+            rows = zip(*metrics.values(), strict=True) if metrics else [()] * len(names)
+            for name, row in zip(names, rows, strict=True):
+                clips[name][mode][branch] = dict(zip(metrics, row, strict=True))
+    return clips  # type: ignore[return-value]
 
 
 def _every(errors: Mapping[str, Any]) -> list[Sequence[Any]]:
@@ -358,4 +366,7 @@ def _every(errors: Mapping[str, Any]) -> list[Sequence[Any]]:
 
 def _short(value: float) -> float | str | None:
     """Return a number rounded to six digits; None for NaN, and infinity as a word."""
-    return None if math.isnan(value) else plain(float(f"{value:.{DIGITS}g}"))
+    short = float(f"{value:.{DIGITS}g}")
+    if math.isfinite(short):
+        return short
+    return None if math.isnan(short) else str(short)

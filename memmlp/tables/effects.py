@@ -89,11 +89,18 @@ def paired(
         if one_and_the_same(arm, other, ours, theirs):
             continue
         shared = _shared(ours, theirs)
-        for mode, metric in itertools.product(modes, sweep.metrics):
+        every = [runs[seed] for runs in (ours, theirs) for seed in shared.seeds]
+        seen = [mode for mode in modes if all(_has_mode(run, mode) for run in every)]
+        for mode, metric in itertools.product(seen, sweep.metrics):
             if metric not in COSTS:
                 branches = (arm.branch, other.branch)
                 found[Key(arm.label, mode, metric)] = _paired(ours, theirs, shared, branches, mode, metric)
     return {key: pair for key, pair in found.items() if pair.matrix.size}
+
+
+def _has_mode(run: Measured, mode: str) -> bool:
+    """Return whether a run was evaluated in a mode, on any clip."""
+    return any(mode in errors for errors in run.clips.values())
 
 
 def effects(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -> dict[Key, Effect]:
@@ -106,7 +113,7 @@ def effects(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) 
         for arm, mode, metric in itertools.product(sweep.runnable(), modes, sweep.metrics)
     }
     return _costs(sweep, runs, modes) | _judged(
-        tested(paired(sweep, runs, modes), sweep.smallest), sweep.smallest, printed
+        tested(paired(sweep, runs, modes), sweep.smallest, sensitivity=True), sweep.smallest, printed
     )
 
 
@@ -195,15 +202,25 @@ def alike(pairs: Mapping[Key, Paired]) -> Iterator[tuple[list[Key], np.ndarray, 
         yield keys, np.stack([pairs[key].matrix for key in keys]), pairs[keys[0]].groups
 
 
-def tested(pairs: Mapping[Key, Paired], smallest: Mapping[str, float]) -> dict[Key, Effect]:
-    """Return the effects with their own p-values, not corrected yet, in the order of the pairs."""
+def tested(
+    pairs: Mapping[Key, Paired], smallest: Mapping[str, float], sensitivity: bool
+) -> dict[Key, Effect]:
+    """Return the effects with their own p-values, not corrected yet, in the order of the pairs.
+
+    Args:
+        pairs: the differences.
+        smallest: the smallest effect of interest of each metric.
+        sensitivity: whether the effects that such tables would find are wanted, which take as long as the
+            rest.
+    """
     found: dict[Key, Effect] = {}
     comparisons = max(1, testable(pairs))  # with none, nothing computed by it is shown
     for keys, differences, groups in alike(pairs):
         size = {"seeds": differences.shape[1], "clips": differences.shape[2], "groups": len(set(groups))}
         margins = np.array([smallest.get(key.metric, np.nan) for key in keys])
         same = equivalence_p(differences, margins, groups)
-        seen = detectable(differences, comparisons, groups)
+        nothing = np.full(len(keys), np.nan)
+        seen = detectable(differences, comparisons, groups) if sensitivity else nothing
         numbers = paired_effects(differences, groups)
         columns = zip(keys, numbers.mean, numbers.low, numbers.high, numbers.p, same, seen, strict=True)
         for key, mean, low, high, p, equal, least in columns:

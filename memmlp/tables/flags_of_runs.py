@@ -256,6 +256,8 @@ def _lacking(run: Measured, mode: str, branch: str, metric: str) -> set[str]:
     """Return the clips for which a run has no finite number."""
     names = list(run.clips)
     known = np.isfinite(run.by_clip(names, mode, branch, metric))
+    if known.all():
+        return set()
     return {name for name, there in zip(names, known, strict=True) if not there}
 
 

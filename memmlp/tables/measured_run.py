@@ -144,7 +144,11 @@ class Measured:
 
     def by_clip(self, names: Sequence[str], mode: str, branch: str, metric: str) -> np.ndarray:
         """Return a metric for each of these clips (C,); NaN for clips for which the run has none."""
-        found = [self.clips[name].get(mode, {}).get(branch, {}).get(metric) for name in names]
+        clips = self.clips
+        try:
+            found = [clips[name][mode][branch][metric] for name in names]
+        except KeyError:
+            found = [clips[name].get(mode, {}).get(branch, {}).get(metric) for name in names]
         return np.array(found, float)  # None becomes NaN
 
     def group(self, clip: str) -> str:
@@ -195,8 +199,9 @@ class Measured:
         errors. Clips on which the network diverged tell nothing about that.
         """
         names, branches = list(self.clips), ("rotation", "position")
-        sides = [[self.by_clip(names, mode, branch, SHARED) for branch in branches] for mode in self.means]
-        known = [(one, other, np.isfinite(one + other)) for one, other in sides]
+        modes = [mode for mode, known in self.means.items() if all(branch in known for branch in branches)]
+        sides = ([self.by_clip(names, mode, branch, SHARED) for branch in branches] for mode in modes)
+        known = ((one, other, np.isfinite(one + other)) for one, other in sides)
         return all(math.isclose(one[has].sum(), other[has].sum(), rel_tol=SAME) for one, other, has in known)
 
 

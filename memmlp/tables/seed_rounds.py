@@ -347,7 +347,8 @@ def _seen(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed], look: Lo
     """Return all comparisons of a look's arms, over exactly the look's seeds."""
     seeds = rounds.seeds[: look.seeds]
     cut = {label: {s: found[s] for s in seeds if s in found} for label, found in runs.items()}
-    return tested(paired(with_existing_branches(sweep, cut), cut, MODES, look.runs), sweep.smallest)
+    pairs = paired(with_existing_branches(sweep, cut), cut, MODES, look.runs)
+    return tested(pairs, sweep.smallest, sensitivity=False)
 
 
 def _corrected(

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import fake_cells
 import pytest
 from conftest import Memmlp, one_line
-from fake_runs import fake_sweep
+from fake_runs import CLIPS, fake_sweep
 
 from memmlp.cli.results import _count
 from memmlp.config import compose_plan
@@ -27,7 +27,7 @@ def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     """Replace planning: every run of a sweep is there, but for Table 10, which has none."""
 
     def plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
-        find = fake_sweep(tmp_path / sweep.name, sweep)
+        find = fake_sweep(tmp_path / sweep.name, sweep, clips=CLIPS[-4:])
         entries = [(arm, seed) for arm in sweep.runnable() for seed in sweep.seeds]
         found = [Entry(arm.label, seed, find(arm, seed).id) for arm, seed in entries]  # type: ignore[union-attr]
         return Plan(sweep.name, tmp_path / sweep.name, () if sweep.name == "table10" else tuple(found), ())
@@ -53,7 +53,7 @@ def test_kept_results_are_shown_without_a_run(memmlp: Memmlp, planned: None):
     memmlp("results", "save", "14")
     ran = memmlp("results", "show", "table14", "--together", "(salsa)")
     assert ran.code == 0
-    assert "3 groups of test clips in place of 12" in " ".join(ran.out.split())
+    assert "3 groups of test clips in place of 4" in " ".join(ran.out.split())
     kept = memmlp("results", "show", "table14").out
     assert "in place of" not in kept
     assert kept.splitlines()[2:20] == memmlp("table", "14").out.splitlines()[2:20]

@@ -161,7 +161,7 @@ def test_the_first_failure_ends_the_sweep_where_that_is_wanted(tmp_path: Path):
     assert len(runs) <= 2  # the last arm's was not begun
     until(lambda: not any(run.doing for run in runs), "the workers end")
     assert [run.status for run in runs].count("failed") == 1
-    assert "0 of 3 runs done" in run_apart(tmp_path, *words, code=1)  # a run that failed before ends it again
+    assert "0 of 3 runs done" in run(tmp_path, *words, code=1)  # a run that failed before ends it again
     assert len(list_runs(tmp_path / "outputs")) == len(runs)
 
 

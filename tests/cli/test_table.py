@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from conftest import Memmlp, one_line
-from fake_runs import fake_sweep
+from fake_runs import CLIPS, fake_sweep
 
 from memmlp.common.errors import InputError
 from memmlp.sweep.definition import Sweep
@@ -22,7 +22,7 @@ def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     def plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
         if sweep.table == 1 or "bad=1" in sweep.command_line:
             raise InputError("data.root: has no value")
-        find = fake_sweep(tmp_path / sweep.name, sweep)
+        find = fake_sweep(tmp_path / sweep.name, sweep, clips=CLIPS[-4:])
         entries = [(arm, seed) for arm in sweep.runnable() for seed in sweep.seeds]
         found = [Entry(arm.label, seed, find(arm, seed).id) for arm, seed in entries]  # type: ignore[union-attr]
         return Plan(sweep.name, tmp_path / sweep.name, tuple(found), ())
@@ -48,7 +48,7 @@ def test_command_shows_another_branch(memmlp: Memmlp, planned: None):
 
 def test_command_puts_clips_together(memmlp: Memmlp, planned: None):
     out = " ".join(memmlp("table", "14", "--together", "(salsa)").out.split())
-    assert "3 groups of test clips in place of 12" in out
+    assert "3 groups of test clips in place of 4" in out
     assert one_line(
         memmlp("table", "14", "--together", "walk"), "--together walk: puts no test clips together"
     )

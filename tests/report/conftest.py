@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from fake_runs import CLIPS, fake_sweep, runs_of
+from fake_runs import CLIPS, Find, fake_sweep, runs_of
 
 from memmlp.report.kept_results import Kept, overrides_of
 from memmlp.sweep.definition import Sweep
@@ -20,7 +20,13 @@ def sweep() -> Sweep:
     return load_sweep(ROOT / "sweeps" / "table14.yaml")
 
 
+@pytest.fixture(scope="session")
+def find(tmp_path_factory: pytest.TempPathFactory) -> Find:
+    """What finds the sweep's runs, which hold still."""
+    sweep = load_sweep(ROOT / "sweeps" / "table14.yaml")
+    return fake_sweep(tmp_path_factory.mktemp("kept"), sweep, {"2": 1.1, "2, 4": 1.03}, groups=GROUPS)
+
+
 @pytest.fixture
-def kept(sweep: Sweep, tmp_path: Path) -> Kept:
-    find = fake_sweep(tmp_path, sweep, {"2": 1.1, "2, 4": 1.03}, groups=GROUPS)
+def kept(sweep: Sweep, find: Find) -> Kept:
     return Kept("table14", ("data=mocap",), runs_of(sweep, find), overrides_of(sweep))

@@ -340,7 +340,7 @@ def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
         if sweep.table not in (5, 6):
             raise InputError("data.root: has no value")
-        find = fake_sweep(tmp_path / sweep.name, sweep)
+        find = fake_sweep(tmp_path / sweep.name, sweep, clips=CLIPS[:4])
         entries = [(arm, seed) for arm in sweep.runnable() for seed in sweep.seeds]
         found = [Entry(arm.label, seed, find(arm, seed).id) for arm, seed in entries]  # type: ignore[union-attr]
         return Plan(sweep.name, tmp_path / sweep.name, tuple(found), ())

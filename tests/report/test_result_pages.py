@@ -20,7 +20,8 @@ from memmlp.report.kept_results import Kept, dumps, overrides_of
 from memmlp.report.result_pages import KeptTable, Placeholders, _whole, origin_words, pages
 from memmlp.sweep.definition import Sweep
 from memmlp.tables.build_table import make_table, together
-from memmlp.tables.statistics import Verdict, holm, paired_effects
+from memmlp.tables.statistics import Verdict, holm
+from memmlp.tables.statistics.crossed import error
 from memmlp.tables.table import Cell, Effect
 from memmlp.tables.table_text import MINUS
 
@@ -175,11 +176,13 @@ def by_hand(
     }
     sides = []
     for (label, runs), names in zip(every.items(), clips, strict=True):
-        places = [list(names).index(clip) for clip in groups]
+        place = {clip: at for at, clip in enumerate(names)}
+        places = [place[clip] for clip in groups]
         errors = [run["errors"][mode][branches[label]][metric] for run in runs]
         sides.append(np.array(errors)[:, places])
-    effects = paired_effects((sides[0] - sides[1])[None], np.array(list(groups.values())))
-    return float(effects.low[0]), float(effects.high[0])
+    differences = (sides[0] - sides[1])[None]
+    half = error(differences, np.array(list(groups.values()))).half(0.05)[0]
+    return float(differences.mean() - half), float(differences.mean() + half)
 
 
 def test_the_way_from_the_first_arm_to_the_last_is_the_sum_of_its_steps(sweep: Sweep, tmp_path: Path):

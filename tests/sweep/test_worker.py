@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import os
 import signal
 import subprocess
 import sys
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from machines import Clock, apart, without_locks
-from processes import PATIENCE, started, until
+from processes import PATIENCE, forked, started, until
 
 from memmlp.common import lease
 from memmlp.common.errors import InputError, TrainingDiverged
@@ -31,8 +33,6 @@ CODES = RunTask("c" * 16, "vqvae", {})
 ONE, TWO, ALONE = (
     RunTask(str(n) * 16, "memmlp", {}, above) for n, above in ((1, CODES.id), (2, CODES.id), (3, None))
 )
-
-WITHOUT_LOCKS = "import fcntl; fcntl.flock = lambda *_: None\n"
 
 
 def plan(outputs: Path, *tasks: RunTask, **changes) -> Plan:
@@ -233,27 +233,35 @@ def test_a_run_that_kills_its_workers_fails_at_last(tmp_path: Path):
     assert run.status == "done"
 
 
+def _log_tasks(path: Path, log: Path, locks: bool) -> None:
+    """Work off a plan, with a line in the log for each task."""
+    if not locks:
+        fcntl.flock = lambda *_: None
+    worker.PAUSE = 0.01
+
+    def perform(plan: Plan, task: RunTask) -> None:
+        with open(log, "ab", buffering=0) as file:
+            file.write(f"{task.id}\n".encode())
+        run = plan.run_of(task)
+        run.begin(task.kind, {}, data="d", upstream=None)
+        time.sleep(0.02)
+        run.results_path.write_text("{}")
+        run.finish(["results.json"])
+
+    work_off(path, perform)
+
+
 @pytest.mark.slow
 def test_many_workers_perform_each_task_exactly_once(tmp_path: Path):
     """Some with the kernel's locks, some with such that do nothing."""
     tasks = [RunTask(f"{n:016x}", "memmlp", {}, CODES.id if n % 2 else None) for n in range(12)]
     path = saved(tmp_path, CODES, *tasks)
-    code = (
-        "import os, sys, time; from pathlib import Path; from memmlp.sweep.worker import work_off\n"
-        "import memmlp.sweep.worker as w; w.PAUSE = 0.01\n"
-        "def perform(plan, task):\n"
-        "    with open(sys.argv[2], 'ab', buffering=0) as log: log.write((task.id + '\\n').encode())\n"
-        "    run = plan.run_of(task)\n"
-        "    run.begin(task.kind, {}, data='d', upstream=None); time.sleep(0.02)\n"
-        "    run.results_path.write_text('{}'); run.finish(['results.json'])\n"
-        "work_off(Path(sys.argv[1]), perform)"
-    )
     log = tmp_path / "log"
     with contextlib.ExitStack() as stack:
-        codes = [code, code, WITHOUT_LOCKS + code, WITHOUT_LOCKS + code]
-        lines = [[sys.executable, "-c", one, str(path), str(log)] for one in codes]
-        workers = [stack.enter_context(started(line)) for line in lines]
-        assert [process.wait(PATIENCE) for process in workers] == [0] * 4
+        workers = [
+            stack.enter_context(forked(_log_tasks, path, log, locks)) for locks in (True, True, False, False)
+        ]
+        assert [process.wait() for process in workers] == [0] * 4
     assert Counter(log.read_text().split()) == Counter([CODES.id, *(task.id for task in tasks)])
     assert not any(Lock(folder).held for folder in tmp_path.glob("runs/*"))
 

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
-from fake_runs import fake_sweep, table_of
+from fake_runs import CLIPS, fake_sweep, table_of
 from fake_table import SHIPPED, cell, printed
 
 from memmlp.sweep.definition import Sweep
@@ -33,7 +33,8 @@ def test_long_labels_fold_so_that_four_metrics_fit(tmp_path: Path):
 def shipped(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Sweep, Table]:
     """A shipped sweep, and a table of runs of all its arms."""
     sweep = load_sweep(request.param)
-    return sweep, table_of(sweep, fake_sweep(tmp_path_factory.mktemp("shipped"), sweep))
+    runs = fake_sweep(tmp_path_factory.mktemp("shipped"), sweep, clips=CLIPS[:4])
+    return sweep, table_of(sweep, runs)
 
 
 @pytest.mark.slow

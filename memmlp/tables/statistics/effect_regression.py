@@ -89,11 +89,23 @@ class FittedLine:
             another: whether the intervals are for the effect of one more cell at x, which is as far from the
                 line and as noisy as these cells are; otherwise they are for the line.
         """
-        factors = self._factors(np.atleast_2d(x))
-        mean, known = factors @ self.effects, self._error(factors, another)
+        mean, known = self._read(x, another)
         half = known.half(level)
         p = np.full_like(mean, np.nan) if known.conditional else known.level(np.abs(mean))
         return Estimate(mean, mean - half, mean + half, p)
+
+    def interval(
+        self, x: np.ndarray, level: float = LEVEL, another: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the ends (Q,) of the intervals of `at`, without the p-values, which take the longest."""
+        mean, known = self._read(x, another)
+        half = known.half(level)
+        return mean - half, mean + half
+
+    def _read(self, x: np.ndarray, another: bool) -> tuple[np.ndarray, Error]:
+        """Return the line at covariates (Q, P), with its error."""
+        factors = self._factors(np.atleast_2d(x))
+        return factors @ self.effects, self._error(factors, another)
 
     def slope(self, column: int) -> Estimate:
         """Return the coefficient of a column of the covariates, as arrays of one."""

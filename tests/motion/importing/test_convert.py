@@ -73,11 +73,16 @@ def test_bandai_namco_as_in_the_file(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def walking() -> Clip:
-    return synthesize_clip("walking", 1, seconds=3.0)
+    return synthesize_clip("walking", 1, seconds=1.5)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-@pytest.mark.parametrize("skeleton", shipped_skeletons())
+def random_zero_poses() -> list[tuple[str, int]]:
+    """Each skeleton twice; once where the file of the skeleton gives the zero pose, which has no chance."""
+    given = {name for name in shipped_skeletons() if isinstance(load_skeleton(name).rest, dict)}
+    return [(name, seed) for name in shipped_skeletons() for seed in ([1] if name in given else [1, 2])]
+
+
+@pytest.mark.parametrize(("skeleton", "seed"), random_zero_poses())
 def test_any_zero_pose_is_as_in_the_file(tmp_path: Path, walking: Clip, skeleton: str, seed: int) -> None:
     chosen = load_skeleton(skeleton)
     sample = own_tree(chosen)

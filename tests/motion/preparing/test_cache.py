@@ -1,7 +1,7 @@
 """Caches: content, manifest, bad files, digests, interruption, concurrency."""
 
+import contextlib
 import json
-import multiprocessing
 import os
 import re
 import shutil
@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from processes import forked
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import builtin_rest_joints
@@ -171,14 +172,17 @@ def test_an_interrupted_prepare_is_redone(root, tmp_path, monkeypatch):
     assert len(prepare(source(root), tmp_path / "cache").clips) == 10
 
 
-def _digest(args: tuple[Path, Path]) -> str:
-    return prepare(source(args[0]), args[1]).digest
+def _digest(root: Path, cache: Path, said: Path) -> None:
+    said.write_text(prepare(source(root), cache).digest)
 
 
 @pytest.mark.slow
 def test_two_processes_at_once(root, tmp_path):
-    with multiprocessing.get_context("spawn").Pool(2) as pool:
-        digests = pool.map(_digest, [(root, tmp_path / "cache")] * 2)
+    said = [tmp_path / "one.txt", tmp_path / "other.txt"]
+    with contextlib.ExitStack() as running:
+        both = [running.enter_context(forked(_digest, root, tmp_path / "cache", path)) for path in said]
+        assert [process.wait() for process in both] == [0, 0]
+    digests = [path.read_text() for path in said]
     assert len(set(digests)) == 1
     assert Manifest.load(tmp_path / "cache").digest == digests[0]
 

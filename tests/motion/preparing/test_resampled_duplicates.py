@@ -1,5 +1,6 @@
 """Copies at another frame rate: one motion, and so one part and one group."""
 
+import functools
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from memmlp.motion.synthetic import synthesize_clip
 ACTIVITIES = ("walking", "running", "idling", "waving", "jumping", "punching")
 
 
+@functools.cache
 def recorded(activity: str, seed: int = 1) -> Clip:
     return synthesize_clip(activity, seed, seconds=2.0, fps=120.0)
 
@@ -28,7 +30,7 @@ def root(tmp_path: Path) -> Path:
     return tmp_path / "clips"
 
 
-@pytest.mark.parametrize("fps", [20.0, 30.0, 50.0, 60.0, 100.0, 119.88, 250.0])
+@pytest.mark.parametrize("fps", [20.0, 50.0, 60.0, 119.88, 250.0])
 def test_a_copy_at_another_rate_is_seen(root, fps):
     for activity in ACTIVITIES:
         write_clip(root / "b" / f"{activity}_again.npz", resample(recorded(activity), fps)[0])
@@ -70,7 +72,7 @@ def test_what_begins_alike_and_goes_on_otherwise_is_no_copy(root, monkeypatch):
     assert survey(root).duplicates == {}
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_copies_are_drawn_together(root, tmp_path, seed):
     for activity in ACTIVITIES:
         write_clip(root / "b" / f"{activity}_again.npz", resample(recorded(activity), 30.0)[0])

@@ -39,10 +39,9 @@ def coverage(kind: str, groups: int, tables: int, seed: int = 7) -> tuple[np.nda
         line = fit(drawn(rng, *KINDS[kind], groups), X)
         assert line is not None
         more = rng.normal(size=len(ASKED)) * np.hypot(own, noise)
-        for found, at, true in zip(
-            within, (line.at(ASKED), line.at(ASKED, another=True)), (0, more), strict=True
-        ):
-            found += (at.low <= true) & (true <= at.high)
+        for found, another, true in zip(within, (False, True), (0, more), strict=True):
+            low, high = line.interval(ASKED, another=another)
+            found += (low <= true) & (true <= high)
     return 100 * within[0] / tables, 100 * within[1] / tables
 
 
@@ -77,6 +76,7 @@ def test_one_group_of_clips_is_a_regression_of_the_means():
     slope = line.slope(1)
     half = stats.t.isf(0.025, 9) * textbook.stderr
     assert slope.mean[0] == pytest.approx(textbook.slope)
+    assert line.interval(np.array([0, 1])) == (slope.low, slope.high)
     assert (slope.low[0], slope.high[0]) == pytest.approx((textbook.slope - half, textbook.slope + half))
     assert np.isnan(slope.p[0])
     there = line.at(np.array([1, 20.0]), another=True)
