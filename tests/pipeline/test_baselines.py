@@ -14,7 +14,8 @@ NAMES = [name for name in tiny.BASELINES if name != "sage"]  # its parts are run
 CLIP = tiny.clip(40)
 SHORT = [
     "profile=tiny",
-    "data.synth.minutes=0.1",
+    "data.synth.minutes=0.04",
+    "data.min_frames=26",
     "tracking=none",
     "threads=1",
     "optim.steps=2",
