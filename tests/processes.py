@@ -95,7 +95,7 @@ PRELOADED = [
     "memmlp.config.build", "memmlp.pipeline.run_stages", "memmlp.deploy.export", "memmlp.motion.synthetic",
     "memmlp.render.heatmap", "torch.onnx", "torch._dynamo", "submitit.local.local", "warm_server",
 ]  # fmt: skip
-"""What a training imports, its optimiser, its export and its picture included; then what else is done once."""
+"""What a training imports, its optimiser, its export and its picture included; what else is done once."""
 
 
 class Forked:
