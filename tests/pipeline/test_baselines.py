@@ -39,7 +39,7 @@ def test_one_command_trains_evaluates_and_finds_it_again(name, memmlp):
 
 @pytest.mark.slow
 def test_one_command_exports_it(memmlp, large_pictures):
-    words = ["model=avatar_poser", *SHORT]
+    words = ["model=avatar_poser", *SHORT, "model.depth=1"]
     assert memmlp("train", *words).code == 0
     (run,) = list_runs(Path("outputs"))
     assert run.results["latency"]["onnx_parity"] <= TOLERANCE
