@@ -93,9 +93,9 @@ def started(line: Sequence[str], **options: Any) -> Iterator[subprocess.Popen]:
 
 PRELOADED = [
     "memmlp.config.build", "memmlp.pipeline.run_stages", "memmlp.deploy.export", "memmlp.motion.synthetic",
-    "memmlp.render.heatmap", "torch.onnx", "torch._dynamo", "submitit.local.local",
+    "memmlp.render.heatmap", "torch.onnx", "torch._dynamo", "submitit.local.local", "warm_server",
 ]  # fmt: skip
-"""What a training imports, its optimiser, its export and its picture included."""
+"""What a training imports, its optimiser, its export and its picture included; what else is done once."""
 
 
 class Forked:
@@ -110,7 +110,9 @@ class Forked:
     ):
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload(PRELOADED)
-        self._process = context.Process(target=_saying, args=(address(), said, environment, work, arguments))
+        with _tests_on_path():
+            server = address()
+        self._process = context.Process(target=_saying, args=(server, said, environment, work, arguments))
         self._process.start()
 
     @property
@@ -135,6 +137,20 @@ class Forked:
         """Return the exit code once the process has ended."""
         self._process.join(timeout)
         return self.returncode
+
+
+@contextlib.contextmanager
+def _tests_on_path() -> Iterator[None]:
+    """A server that starts herein finds the modules of the tests; it takes them off the path again."""
+    before = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parent), before or ""])
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONPATH"]
+        else:
+            os.environ["PYTHONPATH"] = before
 
 
 def _saying(

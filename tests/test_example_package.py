@@ -59,7 +59,7 @@ def test_components_of_ones_own_go_through_everything(
     # searched by workers: by its metric, over the weight of its term
     space = "+search.space.term.weight={low: 0.01, high: 1.0, log: true}"
     search = ["search.objectives=[FootSkate]", space, "search.n_trials=1"]
-    tuned = run_apart(home, "tune", *OWN, *TINY, "optim.steps=20", *search, "--workers", "1")
+    tuned = run_apart(home, "tune", *OWN, *TINY, "optim.steps=6", *search, "--workers", "1")
     assert "1 of 1 trials: 1 complete" in tuned
 
     # somewhere else, without the package

@@ -10,7 +10,9 @@ from pathlib import Path
 
 import processes
 import pytest
-from processes import end_all, marked, started, until
+from processes import end_all, forked, marked, started, until
+
+from memmlp.runs import environment
 
 # A process that ignores interrupts, and starts one like itself in a session of its own.
 STUBBORN = """
@@ -72,3 +74,15 @@ def test_a_wait_fails_when_its_process_has_ended_or_in_the_end(monkeypatch: pyte
     monkeypatch.setattr(processes, "PATIENCE", 0.01)
     with pytest.raises(AssertionError, match="not within 0 s: it works"):
         until(lambda: False, "it works")
+
+
+def told(path: Path) -> None:
+    """Write down what a forked process finds done, and its search path."""
+    done = environment._code_digests.cache_info().currsize
+    path.write_text(f"{done} {os.environ.get('PYTHONPATH')}")
+
+
+def test_a_forked_process_finds_done_what_each_would_do_first(tmp_path: Path):
+    with forked(told, tmp_path / "told") as process:
+        assert process.wait() == 0
+    assert (tmp_path / "told").read_text() == f"1 {os.environ.get('PYTHONPATH')}"

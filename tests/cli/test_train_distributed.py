@@ -3,31 +3,56 @@
 from __future__ import annotations
 
 import os
-import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 import torch
-from command_line import TINY, run
-from processes import finished
+from command_line import TINY, in_folder, run
+from processes import forked, until
 
 from memmlp.networks import checkpoint
 from memmlp.runs.lookup import list_runs
 
-TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-ROOT = Path(__file__).parent.parent.parent
+STANDING = "env -0 > rank.part$RANK && mv rank.part$RANK rank$RANK; until [ -e ended ]; do sleep 0.1; done"
+"""What torchrun starts twice: a shell that writes its environment down, and stays until all is done."""
+
+
+def torchrun(folder: Path) -> None:
+    """Torchrun itself, which keeps the store through which its processes meet."""
+    from torch.distributed.run import main
+
+    os.chdir(folder)
+    main(["--standalone", "--nproc-per-node", "2", "--no-python", "sh", "-c", STANDING])
+
+
+def environment(file: Path) -> dict[str, str]:
+    """The environment that torchrun gave one of its processes."""
+    return dict(word.split("=", 1) for word in file.read_text().split("\0") if word)
 
 
 @pytest.mark.slow
 def test_two_processes_make_the_run_of_one(tiny_home: Path, tmp_path: Path):
-    """Its VQ-VAE and its network; the first process alone writes and evaluates (and would deploy)."""
-    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
-    ran = finished(
-        [*TORCHRUN, "-m", "memmlp", "train", *TINY, "export.graph=off"], cwd=tmp_path, env=environment
-    )
-    assert ran.returncode == 0, ran.stdout + ran.stderr
-    assert ran.stdout.count("MPJPE") == 1
+    """Its VQ-VAE and its network; the first process alone writes and evaluates (and would deploy).
+
+    The processes have torchrun's environments, and are forked, since each would import torch for seconds.
+    """
+    ranks = [tmp_path / f"rank{rank}" for rank in range(2)]
+    said = [tmp_path / f"said{rank}" for rank in range(2)]
+    words = ["train", *TINY, "export.graph=off"]
+    with forked(torchrun, tmp_path) as launcher, ExitStack() as stack:
+        until(lambda: all(file.exists() for file in ranks), "both are started", launcher)
+        both = []
+        for file, rank in zip(said, ranks, strict=True):
+            file.touch()
+            given = {**environment(rank), "OMP_NUM_THREADS": "1"}
+            both.append(stack.enter_context(forked(in_folder, tmp_path, *words, said=str(file), **given)))
+        codes = [process.wait() for process in both]
+        (tmp_path / "ended").touch()
+        assert launcher.wait() == 0
+    text = "".join(file.read_text() for file in said)
+    assert codes == [0, 0], text
+    assert text.count("MPJPE") == 1
     runs = {run.id: run for run in list_runs(tmp_path / "outputs")}
     assert runs.keys() == {run.id for run in list_runs(tiny_home / "outputs")}
     for one in list_runs(tiny_home / "outputs"):

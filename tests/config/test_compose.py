@@ -305,11 +305,9 @@ def test_a_bad_command_line_is_one_line(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "arguments", [["model.width=abc"], ["-m", "seed=0,-1"], ["+typo=1"], ["a b"], ["--nope"]]
-)
+@pytest.mark.parametrize("arguments", [["model.width=abc"], ["-m", "seed=0,-1"], ["--nope"]])
 def test_a_bad_command_line_in_a_process_of_its_own(tmp_path: Path, arguments: list[str]):
-    command = [sys.executable, "-m", "memmlp.cli.main", "train", *arguments]
+    command = [sys.executable, "-m", "memmlp", "train", *arguments]
     ran = finished(command, cwd=tmp_path)
     assert (ran.returncode, ran.stdout) == (2, "")
     assert ran.stderr.startswith("memmlp: ")
@@ -331,8 +329,17 @@ def test_a_bad_file_of_the_users_own(memmlp: Memmlp, tmp_path: Path, value: str,
     assert one_line(memmlp("train", "--config-dir", "mine", "experiment=own"), "model.width", word)
 
 
-@pytest.mark.parametrize("place", ["--config-dir", "--cfg", "hydra.searchpath", "sweep"])
-@pytest.mark.parametrize("option", ["experiment/paper.yaml", "memory/gru.yaml", "train.yaml"])
+@pytest.mark.parametrize(
+    ("place", "option"),
+    [
+        ("--config-dir", "experiment/paper.yaml"),
+        ("--cfg", "experiment/paper.yaml"),
+        ("hydra.searchpath", "experiment/paper.yaml"),
+        ("sweep", "experiment/paper.yaml"),
+        ("--config-dir", "memory/gru.yaml"),
+        ("--config-dir", "train.yaml"),
+    ],
+)
 def test_an_option_of_ones_own_that_ours_hides_is_refused(
     memmlp: Memmlp, tmp_path: Path, place: str, option: str
 ):

@@ -14,7 +14,8 @@ NAMES = [name for name in tiny.BASELINES if name != "sage"]  # its parts are run
 CLIP = tiny.clip(40)
 SHORT = [
     "profile=tiny",
-    "data.synth.minutes=0.1",
+    "data.synth.minutes=0.04",
+    "data.min_frames=26",
     "tracking=none",
     "threads=1",
     "optim.steps=2",
@@ -38,7 +39,7 @@ def test_one_command_trains_evaluates_and_finds_it_again(name, memmlp):
 
 @pytest.mark.slow
 def test_one_command_exports_it(memmlp, large_pictures):
-    words = ["model=avatar_poser", *SHORT]
+    words = ["model=avatar_poser", *SHORT, "model.depth=1"]
     assert memmlp("train", *words).code == 0
     (run,) = list_runs(Path("outputs"))
     assert run.results["latency"]["onnx_parity"] <= TOLERANCE

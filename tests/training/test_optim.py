@@ -93,7 +93,7 @@ def test_the_weights_that_are_validated_are_kept(name: str, averaged: bool, tmp_
     ids=str,
 )  # fmt: skip
 def test_every_knob_changes_the_weights(name: str, changes: dict, tmp_path: Path):
-    optim = replace(OPTIMS[name], steps=8)
+    optim = replace(OPTIMS[name], steps=4)
     one, other = trained(optim, tmp_path / "a")[0], trained(replace(optim, **changes), tmp_path / "b")[0]
     assert not torch.equal(one.model.stem.weight, other.model.stem.weight)
 
