@@ -184,7 +184,8 @@ def _power(table: Table) -> list[str]:
             what = f"{' or '.join(words)} {unit(metric)}"
             blind = dict.fromkeys(label for mode in seen for label in table.blind(mode, metric))
             but = f" but {', '.join(repr(label) for label in blind)}" if blind else ""
-            lines.append(f"{metric}: in every arm{but} {what} would have been found, with 80 % power")
+            found = f"{metric}: a true difference of {what} would have been found in every arm{but}"
+            lines.append(f"{found} with 80 % power, a smaller one perhaps not")
         elif seen:
             lines.append(
                 f"{metric}: too few seeds, in some arm even a difference as large as the values may be missed"
