@@ -187,9 +187,8 @@ def docs(folder: Path, check: bool) -> None:
     else:
         _write(folder, made, stale)
         _draw(folder, drawn)
-    click.echo(
-        f"{len(made)} page{'s' * (len(made) != 1)}, {len(differing)} {'differ' if check else 'written'}"
-    )
+    count = f"{len(made)} page{'s' * (len(made) != 1)}"
+    click.echo(f"{folder}: {count}, {len(differing)} {'differ' if check else 'written'}")
 
 
 def kept_tables(folder: Path) -> dict[str, KeptTable]:

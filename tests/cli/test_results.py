@@ -42,8 +42,8 @@ def test_kept_results_become_pages(memmlp: Memmlp, planned: None):
     templates.mkdir()
     (templates / "README.md").write_text('{{ effect("table14", "2", "stream", "MPJPE") }}\n')
     assert memmlp("results", "docs", "--check").code == 1
-    assert memmlp("results", "docs").out == "2 pages, 2 written\n"
-    assert memmlp("results", "docs", "--check").out == "2 pages, 0 differ\n"
+    assert memmlp("results", "docs").out == "docs/results: 2 pages, 2 written\n"
+    assert memmlp("results", "docs", "--check").out == "docs/results: 2 pages, 0 differ\n"
     page = Path("docs/results/table14.md")
     assert page.read_text().count("| 3/3 |") == 8
     assert ", open" in Path("docs/results/README.md").read_text()
@@ -172,7 +172,7 @@ def test_a_sweep_with_a_scale_has_a_figure_beside_its_page(
     )
     Path("cells.yaml").write_text(json.dumps(fake_cells.content()))
     memmlp("results", "save", "cells.yaml", "--name", "small")
-    assert memmlp("results", "docs").out == "1 page, 1 written\n"
+    assert memmlp("results", "docs").out == "docs/results: 1 page, 1 written\n"
     page, figure = Path("docs/results/small.md"), Path("docs/results/small.png")
     assert "(small.png)" in page.read_text()
     figure.write_bytes(b"")

@@ -155,6 +155,23 @@ def test_diff_says_that_a_network_hardly_saw_motion(memmlp: Memmlp, outputs: Pat
     assert "run dddddddd: hardly trained, on 1.8 minutes of motion" in memmlp("runs", "diff", "a", "d").out
 
 
+def test_list_names_the_networks_that_hardly_saw_motion(memmlp: Memmlp, outputs: Path):
+    """Of finished ones alone: one that trains has seen less than its config says."""
+    said = "hardly trained, so that errors say nothing of the networks:"
+    assert said not in memmlp("runs", "list").out
+    little = {"model": {"frames": 41}, "optim": {"steps": 20, "batch": 8}}
+    for digit in "de":
+        run = Run.of(outputs, digit * 16)
+        run.begin("memmlp", little, data="d" * 64, upstream=None)
+        if digit == "d":
+            write_json(run.results_path, RESULTS)
+            run.finish(["results.json"])
+    assert f"{said} dddddddd\n" in memmlp("runs", "list").out
+    for name in (A, B):
+        Run.of(outputs, name).config_path.write_text(json.dumps(little))
+    assert f"{said} all finished ones\n" in memmlp("runs", "list").out
+
+
 def test_diff_cuts_no_number(memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch):
     """Half a number is another number: keys get narrow first."""
     numbers = ["1.7190123e+05", "3.9876543e+05", "+2.2686e+05", "10^2 m/s^3"]

@@ -36,7 +36,7 @@ SHOWN = {
     # the column's head -> the key of its number
     "MPJPE\nstream": "stream.rotation.MPJPE",
     "MPJPE\nwindow": "window.rotation.MPJPE",
-    "Jitter": "stream.rotation.Jitter",
+    "Jitter\nstream": "stream.rotation.Jitter",
     "ms": "latency.median_ms",
 }
 LEGEND = {
@@ -45,7 +45,10 @@ LEGEND = {
     "Jitter": f"Jitter [{UNITS['Jitter']}]: rotation branch",
     "ms": "ms: a frame on one core",
 }
-SPARED = ("ms", "age"), ("Jitter", "MPJPE\nwindow")  # what a narrow screen has no room for: first, and later
+SPARED = (
+    ("ms", "age"),
+    ("Jitter\nstream", "MPJPE\nwindow"),
+)  # what a narrow screen has no room for: first, and later
 DEAR = 3  # keys that have room before the second half of these
 TOLD = 4  # keys without room that are named below the table
 FOLD = 12  # characters of a value in a line, where it can be broken
@@ -89,7 +92,7 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
         listed = sorted_by(listed, records, sort)
     keys = wanted(columns, records, listed)
     hidden = show_runs([{**records[run.id], "age": age(run)} for run in listed], keys, bool(columns))
-    for line in older_results_lines(listed):
+    for line in (*older_results_lines(listed), *hardly_trained_lines(listed)):
         click.echo(line)
     if hidden:
         more = f" and {len(hidden) - TOLD} keys more" if len(hidden) > TOLD else ""
@@ -111,10 +114,27 @@ def older_results_lines(listed: Sequence[Run]) -> list[str]:
         for results, by in older_results(run).items():
             found.setdefault((results, by), []).append(run.id[:SHORT])
     return [
-        f"{results} {by}; memmlp eval RUN measures them anew: {', '.join(ids[:NEWEST])}"
-        + (f" and {len(ids) - NEWEST} more" if len(ids) > NEWEST else "")
+        f"{results} {by}; memmlp eval RUN measures them anew: {_some(ids)}"
         for (results, by), ids in found.items()
     ]
+
+
+def hardly_trained_lines(listed: Sequence[Run]) -> list[str]:
+    """Return a line that names the finished runs whose networks hardly saw motion; none if there are none."""
+    from memmlp.runs.motion_seen import frames_seen, hardly_trained
+
+    networks = [run for run in listed if run.manifest.get("kind") == NETWORK and run.done]
+    ids = [run.id[:SHORT] for run in networks if hardly_trained(frames_seen(run))]
+    if not ids:
+        return []
+    which = "all finished ones" if len(ids) == len(networks) > 1 else _some(ids)
+    return [f"hardly trained, so that errors say nothing of the networks: {which}"]
+
+
+def _some(ids: Sequence[str]) -> str:
+    """List ids, the first few of many."""
+    more = f" and {len(ids) - NEWEST} more" if len(ids) > NEWEST else ""
+    return ", ".join(ids[:NEWEST]) + more
 
 
 def is_finished_upstream(run: Run) -> bool:
