@@ -75,7 +75,7 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     data = experiment.data.prepare()
     clips = data.manifest.clips
     tell(f"data: {len(clips)} clips ({tested_clips_remark(clips)}), prepared in {data.cache}")
-    for said in data_remarks(experiment, data):
+    for said in data_remarks(data):
         remark(f"data: {said}")
     run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
     if not run.done:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -43,93 +41,30 @@ def test_a_single_group_of_test_clips_is_told_to_decide_nothing():
     )
 
 
-@pytest.mark.parametrize(
-    ("names", "config", "said"),
-    [
-        (("CMU/01/a", "CMU/01/b", "KIT/3/a", "KIT/3/b"), {}, "clips of CMU/01 and 1 more are in"),
-        (("BMLrub/BioMotionLab_NTroje/7/a", "BMLrub/BioMotionLab_NTroje/7/b"), {}, "clips of BioMotion"),
-        (("amass/CMU/01/a", "amass/CMU/01/b"), {}, "clips of CMU/01 are in"),
-        (("h/BioMotionLab_NTroje/rub001/a_poses", "x/BMLrub/rub001/a_stageii"), {}, "clips of BioMotionLab_"),
-        (("Eyes_Japan_Dataset/A B/a", "EyesJapanDataset/A_B/b"), {}, "clips of Eyes_Japan_Dataset/A B are"),
-        (("DanceDB/1/a", "DanceDB/1/b"), {}, "clips of DanceDB/1 are in"),
-        (("CMU/01/a", "CMU/02/b"), {}, None),
-        (("CMU/a", "CMU/b", "mine/01/a", "mine/01/b"), {}, None),
-        (("CMU/01/a", "CMU/01/b"), {"split": {"folder": "LISTS"}}, None),
-        (("cmu/salsa/01", "cmu/salsa/02"), {"sources": {"cmu": {}}}, None),
-    ],
-)
-def test_a_split_that_tests_on_the_people_that_it_trains_on_says_so(names, config, said):
-    parts = zip(names, itertools.cycle(["train", "test"]))
-    clips = [SimpleNamespace(name=name, split=part, fps=60.0, group="tied") for name, part in parts]
-    known = {"coverage": SimpleNamespace(whole=True), "listed": {"CMU": 1}, "unusual": {}}
-    known["split"] = {"sources": config.get("sources", {})}
-    data = SimpleNamespace(manifest=SimpleNamespace(clips=clips, **known))
-    found = data_remarks.divided_remark({"split": {}, **config}, data.manifest)
-    assert found.startswith(said) if said else found == ""
-    experiment = SimpleNamespace(config={"data": {"name": "mine", "split": {}, **config}})
-    assert data_remarks.data_warnings(experiment, data) == {
-        "partial": None,
-        "divided": found or None,
-        "resampled": None,
-        "unusual": None,
-    }
-
-
-def manifest_of(parts: Sequence[tuple[str, str]], split: dict[str, Any], tied: Sequence[str] = ()) -> Any:
-    """A manifest with clips in parts; those of `tied` are in one group."""
-    clips = [
-        SimpleNamespace(name=name, split=part, group="tied" if name in tied else name) for name, part in parts
-    ]
-    return SimpleNamespace(clips=clips, split=split)
-
-
-SOURCES: dict[str, Any] = {"sources": {"x": {}, "y": {}}}
-TAKES = [("own/anna/1", "train"), ("own/anna/2", "test"), ("own/ben/1", "test"), ("own/ben/2", "train")]
-FLAT = [("salsa/1", "train"), ("salsa/2", "test"), ("own/1", "train"), ("own/2", "test")]  # salsa is tied
-SESSIONS = [(f"{name.rpartition('/')[0]}/session{name[-1]}/take", part) for name, part in TAKES]
-
-
-@pytest.mark.parametrize(
-    ("parts", "split", "said"),
-    [
-        (TAKES, {"groups": ["salsa/(.*)"]}, "2 test clips are tied to no others"),
-        (TAKES, {}, "2 test clips are tied to no others"),
-        (TAKES, {"groups": ["own/(.*?)/"]}, ""),
-        (TAKES[:2], {}, ""),  # all in one folder, which is no person
-        ([("a/1", "train"), ("a/2", "val"), ("b/1", "test")], {}, ""),
-        ([(f"x/{name}", part) for name, part in TAKES], SOURCES, "2 test clips"),
-        (
-            [("x/1", "train"), ("x/2", "test"), ("y/1", "test"), ("y/2", "train")],
-            SOURCES,
-            "",
-        ),
-        (FLAT, {"groups": ["salsa/(.*)"]}, "1 test clips are tied to no others"),
-        (SESSIONS, {}, "2 test clips are tied to no others"),
-        ([("c1/a", "train"), ("c2/a", "test"), ("c3/a", "train")], {}, ""),  # no folder is shared
-    ],
-)
-def test_folders_with_clips_in_training_and_in_test_are_told(parts, split, said):
-    """A folder of one's own is often a person, whom the shipped patterns of groups know nothing of."""
-    found = data_remarks.divided_remark({"split": {}}, manifest_of(parts, split))
-    assert found.startswith(said) if said else found == ""
-    assert not data_remarks.divided_remark({"split": {"folder": "LISTS"}}, manifest_of(parts, split))
-    tied = [name for name, _ in parts]  # by a column file
-    assert not data_remarks.divided_remark({"split": {}}, manifest_of(parts, split, tied))
-    if "sources" in split and said:
-        assert "x/own/anna and 1 more, are in training" in found
-
-
 def test_odd_test_clips_are_a_fact_of_the_run():
-    clips = manifest_of([("a", "test"), ("b", "test"), ("c", "train")], {}).clips
+    parts = {"a": "test", "b": "test", "c": "train"}
+    clips = [SimpleNamespace(name=name, split=part, fps=60.0, group="tied") for name, part in parts.items()]
     odd = {"b": "Z is not up", "c": "knees bend backwards"}
     said = "1 of 2 test clips are unusual, first b (Z is not up)"
     assert data_remarks.unusual_tests_remark(odd, clips[:2]) == said
     assert data_remarks.unusual_tests_remark(odd, clips[:1]) is None
-    every = [SimpleNamespace(name=clip.name, split=clip.split, fps=60.0, group="tied") for clip in clips]
     known = {"coverage": SimpleNamespace(whole=True), "listed": {"CMU": 1}, "split": {}}
-    data = SimpleNamespace(manifest=SimpleNamespace(clips=every, unusual=odd, **known))
+    data = SimpleNamespace(manifest=SimpleNamespace(clips=clips, unusual=odd, **known))
     experiment = SimpleNamespace(config={"data": {"name": "mine", "split": {}}})
     assert data_remarks.data_warnings(experiment, data)["unusual"] == said
+
+
+def test_people_in_training_and_in_test_are_a_fact_of_the_run():
+    parts = {"CMU/01/a": "train", "CMU/01/b": "test"}
+    clips = [SimpleNamespace(name=name, split=part, fps=60.0, group="tied") for name, part in parts.items()]
+    known = {"coverage": SimpleNamespace(whole=True), "listed": {"CMU": 1}, "unusual": {}}
+    experiment = SimpleNamespace(config={"data": {"name": "mine", "split": {}}})
+    for split, said in (({}, "clips of CMU/01 are in training and in test"), ({"kind": "lists"}, "")):
+        data = SimpleNamespace(manifest=SimpleNamespace(clips=clips, split=split, **known))
+        found = data_remarks.data_warnings(experiment, data)
+        assert (found["divided"] or "").startswith(said)
+        assert bool(found["divided"]) == bool(said)
+        assert found["partial"] is found["resampled"] is found["unusual"] is None
 
 
 def test_clips_that_were_recorded_at_a_lower_rate_are_said():

@@ -13,6 +13,7 @@ from rich.table import Table
 from memmlp.common.errors import one_line
 from memmlp.motion.body import FPS
 from memmlp.motion.clip import INTERPOLATED
+from memmlp.motion.preparing.divided_clips import divided_remark
 from memmlp.motion.preparing.groups import unfitting
 from memmlp.motion.preparing.several_folders import source_of
 
@@ -26,7 +27,7 @@ MOST_NAMED = 8  # skipped files that are named on the screen; the manifest lists
 
 
 def show_manifest(manifest: Manifest) -> None:
-    """Print the parts, frame rates and skipped files of a cache."""
+    """Print the parts, frame rates and skipped files of a cache, and what is doubtful about its split."""
     table = Table("part")
     for name in ("clips", "frames", "hours"):
         table.add_column(name, justify="right")
@@ -44,7 +45,8 @@ def show_manifest(manifest: Manifest) -> None:
         f"{len(manifest.clips)} clips; skipped {len(manifest.skipped)}, left out by the split {left_out}, "
         f"listed but missing {len(manifest.missing)}; body {manifest.body}"
     )
-    if said := unfitting(manifest.split, [clip.name for clip in manifest.clips]):
+    names = [clip.name for clip in manifest.clips]
+    for said in filter(None, (divided_remark(manifest), unfitting(manifest.split, names))):
         click.echo(said)
     if not manifest.coverage.whole:
         click.echo(f"{manifest.coverage}: {manifest.coverage.gaps}")
