@@ -49,8 +49,8 @@ def report(
 
     chosen = [word for word in words if "=" not in word and not word.startswith("~")]
     chapters = chapters_of(chosen or EVERY, [word for word in words if word not in chosen], outputs)
-    if not chosen:  # tables without a run stand below those with some
-        chapters.sort(key=lambda chapter: not any(chapter.runs.values()))
+    if not chosen:
+        chapters.sort(key=_lacking)
     folder = packaged("sweeps")
     systems = published(load_sweep(folder / "table01.yaml"), load_sweep(folder / "table17.yaml"))
     git = environment()["git"] or {}
@@ -61,6 +61,12 @@ def report(
     else:
         text = one_file(chapters, outputs, fragment(chapters, systems, when, code), not no_replays)
     write(out or outputs / "report.html", text)
+
+
+def _lacking(chapter: Chapter) -> float:
+    """Return the share of a table's arms that has no run: what a reader looks for first has most of them."""
+    arms = chapter.sweep.runnable()
+    return sum(not chapter.runs.get(arm.label) for arm in arms) / max(len(arms), 1)
 
 
 def one_file(chapters: Sequence[Chapter], outputs: Path, extra: str, replays: bool) -> str:
