@@ -41,6 +41,7 @@ TWO = """Promise.all([import('./wear.js'), fetch('site.json')]).then(async ([{ w
 })"""
 """The wearer's page anew, with a second network to choose."""
 REMARKED = "document.querySelector('#remark').textContent"
+OPEN = "document.querySelector('nav a[aria-current]')?.hash"
 TOLERANCE = 1e-4  # metres
 
 
@@ -77,7 +78,9 @@ def test_it_is_worn_played_timed_and_copied_without_the_server(site: Made, tmp_p
         browser.before(NOTE)
         server = Server(site.folder)
         try:
+            check_without_headset(server.url)
             browser.open(server.url)
+            browser.wait(f"{OPEN} == '#/wear'")
             browser.wait(f"{SITE}.offline == 'ready' && {SITE}.wear == 'ready'")
             browser.wait("navigator.serviceWorker.controller !== null")
         finally:
@@ -88,6 +91,13 @@ def test_it_is_worn_played_timed_and_copied_without_the_server(site: Made, tmp_p
         check_bench(browser, tmp_path / "rows.json")
         check_phone(browser)
         assert browser.errors == []
+
+
+def check_without_headset(url: str) -> None:
+    """Where nothing can be worn, the site opens on the clips."""
+    with Browser(360, 280) as browser:
+        browser.open(url)
+        browser.wait(f"{OPEN} == '#/play'")
 
 
 def go(browser: Browser, page: str, until: str) -> None:

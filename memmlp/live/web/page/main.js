@@ -8,6 +8,7 @@ import { wear } from './wear.js';
 const PAGES = { wear, play, bench };
 const content = document.getElementById('content');
 let leave = () => {};
+let home = 'wear';
 
 async function begin() {
   try {
@@ -16,6 +17,7 @@ async function begin() {
     const site = await answer.json();
     about(site);
     if (!site.base) document.querySelector('nav a[href="#/bench"]').remove();
+    if (!(await wearable())) home = 'play';
     addEventListener('hashchange', () => show(site));
     show(site);
   } catch (error) {
@@ -24,9 +26,15 @@ async function begin() {
   offline();
 }
 
+// Whether this browser can enter VR or AR; one that cannot has nothing to wear, but clips to play.
+async function wearable() {
+  const asked = ['immersive-vr', 'immersive-ar'].map(mode => navigator.xr?.isSessionSupported(mode).catch(() => false) ?? false);
+  return (await Promise.all(asked)).some(Boolean);
+}
+
 function show(site) {
   const named = location.hash.replace(/^#\//, '').split('?')[0];
-  const name = named in PAGES && (named !== 'bench' || site.base) ? named : 'wear';
+  const name = named in PAGES && (named !== 'bench' || site.base) ? named : home;
   leave();
   document.title = `memmlp ${name}`;
   for (const link of document.querySelectorAll('.top nav a')) {
