@@ -8,7 +8,6 @@ import os
 import re
 import shutil
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -18,6 +17,7 @@ import pytest
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 from remembered import keep_exports, remember
+from scratch_in_memory import scratch_in_memory
 from small_pictures import draw_large, draw_small
 
 from memmlp.common.python_gc import collect_seldom
@@ -26,14 +26,7 @@ if Path("/dev/nvidiactl").exists():
     os.environ["CUDA_VISIBLE_DEVICES"] = ""  # what the tests compare with was computed on a CPU
 
 
-MEMORY = "/dev/shm"
-PLENTY = 8 * 2**30  # bytes: several times what the tests of all processes write
-
-if "TMPDIR" not in os.environ and os.path.isdir(MEMORY):
-    # Tens of thousands of small files are made and removed: a disk takes a tenth of the time of some tests.
-    state = os.statvfs(MEMORY)
-    if state.f_bavail * state.f_frsize >= PLENTY and not state.f_flag & os.ST_NOEXEC:
-        os.environ["TMPDIR"], tempfile.tempdir = MEMORY, None  # looked for anew
+scratch = scratch_in_memory()
 
 
 @pytest.hookimpl(wrapper=True)
@@ -70,9 +63,11 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.hookimpl(trylast=True)
-def pytest_sessionfinish() -> None:
-    """What a test process left that died itself."""
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """What a test process left that died itself, and, unless a test failed, what all wrote."""
     processes.end_all()
+    if scratch is not None and not session.testsfailed:
+        shutil.rmtree(scratch, ignore_errors=True)
 
 
 class Ran(NamedTuple):
