@@ -1,6 +1,6 @@
 """Where tests write: in memory, where there is plenty of it.
 
-They make and remove tens of thousands of small files, which a disk needs a tenth of the time of some tests for.
+They make and remove tens of thousands of small files: a tenth of the time of some tests, on a disk.
 """
 
 from __future__ import annotations
