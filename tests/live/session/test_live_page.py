@@ -51,6 +51,7 @@ def stage(browser: Browser) -> np.ndarray:
 
 
 def test_it_plays_pauses_and_goes_back(browser: Browser, url: str):
+    browser.size(480, 400)  # software draws what is small sooner; the buttons are in it
     browser.open(url)
     browser.wait(f"{SHOWN} > 20")
     picture = stage(browser)
@@ -83,6 +84,7 @@ def test_it_plays_pauses_and_goes_back(browser: Browser, url: str):
 def test_it_says_what_it_waits_for_and_when_the_command_has_ended(
     browser: Browser, clip: TrackedClip, worn: bool, what: str
 ):
+    browser.size(240, 200)  # nothing is clicked
     words = greeting(ClipSource(clip, 60), "tiny", remark="hardly trained" if worn else "")
     with LiveServer(Hub(words | {"worn": worn}), 0) as server:
         browser.open(server.url)
@@ -107,6 +109,7 @@ def frame(number: int) -> dict[str, object]:
 
 def test_another_command_at_the_address_gets_a_page_of_its_own(browser: Browser, clip: TrackedClip):
     """Nothing of the network before is left: not its frames, which would be told as the new one's."""
+    browser.size(240, 200)  # nothing is clicked
     source, about = ClipSource(clip, 60), "document.querySelector('#about').textContent"
     with LiveServer(Hub(greeting(source, "tiny")), 0) as server:
         port = server.server_port

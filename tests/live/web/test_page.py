@@ -72,7 +72,7 @@ class Server(ThreadingHTTPServer):
 def test_it_is_worn_played_timed_and_copied_without_the_server(site: Made, tmp_path: Path):
     """In one browser, whose start and first load take seconds."""
     (script,) = package_files(IWER, "build/iwer.min.js")
-    with Browser(360, 280) as browser:
+    with Browser(160, 120) as browser:
         browser.before(script.decode() + HEADSET.read_text())
         browser.before(COPY)
         browser.before(NOTE)
