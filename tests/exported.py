@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from onnx import GraphProto
 
 BASELINES = [name for name in tiny.BASELINES if name != "manikin_l"]
-"""But for MANIKIN-L, the largest graph of all: AvatarJLM's, and then MANIKIN-S' solver."""
+"""But for MANIKIN-L, the largest graph of all (LARGEST): AvatarJLM's, and then MANIKIN-S' solver."""
 DIFFUSIONS = ("agrol_diffusion", "bodiffusion")
 NETWORKS: dict[str, Callable[[], MotionModel]] = {
     "mem_mlp": partial(tiny.model, CodeMemory, coordinates=Heading()),
@@ -32,6 +32,9 @@ NETWORKS: dict[str, Callable[[], MotionModel]] = {
 }
 """By name. Few are relative to the heading, whose hundred nodes are the same in each graph."""
 
+LARGEST: dict[str, Callable[[], MotionModel]] = {"manikin_l": partial(tiny.baseline, "manikin_l", depth=1)}
+"""Whose export takes seconds, and whose file so has one test (tests/networks/test_streaming.py)."""
+
 
 def write(name: str, path: Path) -> None:
     """Export a network's streaming step."""
@@ -39,7 +42,7 @@ def write(name: str, path: Path) -> None:
     from memmlp.deploy.export import export
     from memmlp.networks.streaming import streaming
 
-    export(streaming(NETWORKS[name]()), path, "0123456789abcdef")
+    export(streaming((NETWORKS | LARGEST)[name]()), path, "0123456789abcdef")
 
 
 DATA_DEPENDENT = {

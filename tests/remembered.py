@@ -67,9 +67,28 @@ def _without_extras(export: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _remember_exporter(module: Any) -> None:
-    """Of torch's exporter: the functions that it knows, half a second of each export."""
-    if not hasattr(module.onnxscript_apis.get_torchlib_ops, "cache_info"):
-        module.onnxscript_apis.get_torchlib_ops = functools.cache(module.onnxscript_apis.get_torchlib_ops)
+    """Of torch's exporter: the functions that it knows and their signatures, an eighth of a small export."""
+    registry = module.ONNXRegistry
+    make = registry.from_torchlib.__func__
+    if hasattr(make, "__wrapped__"):
+        return
+    known: dict[tuple[Any, ...], Any] = {}
+
+    @functools.wraps(make)
+    def from_torchlib(cls: type, *version: Any, **named: Any) -> Any:
+        key = (cls, version, *named.items())
+        if key not in known:
+            known[key] = make(cls, *version, **named)
+        made = copy.copy(known[key])
+        made.functions = {target: list(kinds) for target, kinds in known[key].functions.items()}
+        return made  # to which functions may be added
+
+    registry.from_torchlib = classmethod(from_torchlib)
+
+
+def _share_origins(module: Any) -> None:
+    """Of torch.fx: what a node was made from, copied anew in each pass, and which memmlp never reads."""
+    module.copy = types.SimpleNamespace(copy=copy.copy, deepcopy=list)
 
 
 def _remember_operators(module: Any) -> None:
@@ -255,6 +274,7 @@ def _remember_motion(module: Any) -> None:
 PATCHES = {
     **dict.fromkeys(("torch.cuda", "torch.mtia", "torch.xpu"), _forget_who_seeds),
     "torch.onnx._internal.exporter._registration": _remember_exporter,
+    "torch.fx.traceback": _share_origins,
     **dict.fromkeys(("torch.export.exported_program", "torch.export.decomp_utils"), _remember_operators),
     "onnx_ir.schemas": _remember_signatures,
     "omegaconf.base": _remember_interpolations,

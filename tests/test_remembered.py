@@ -12,6 +12,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from onnx_ir import schemas
+from remembered import remember
 from torch.export import exported_program
 
 from memmlp.config import compose
@@ -76,6 +77,7 @@ def test_signatures_of_operators_are_those_that_onnx_makes():
 
 
 def test_operators_that_are_made_of_others_are_those_that_torch_collects():
+    exported_program._collect_all_valid_cia_ops()  # which may itself make more of them known
     found = [exported_program._collect_all_valid_cia_ops() for _ in range(2)]
     assert found[0] is found[1]
     assert found[0] == exported_program._collect_all_valid_cia_ops.__wrapped__() != set()
@@ -95,3 +97,15 @@ def test_motion_is_made_once_and_is_that_of_its_seed(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(synthetic, "solve", synthetic.solve.__wrapped__)
     assert clips() == twice[0] == twice[1] == again
     assert len(set(again)) == len(cases)
+
+
+def test_functions_that_the_exporter_knows_are_those_that_it_finds():
+    from torch.onnx._internal.exporter import _registration
+
+    remember()
+    made = _registration.ONNXRegistry.from_torchlib
+    found, anew = made(), made.__wrapped__(_registration.ONNXRegistry)
+    assert found.opset_version == anew.opset_version
+    assert repr(found.functions) == repr(anew.functions)
+    found.functions.clear()
+    assert repr(made().functions) == repr(anew.functions)

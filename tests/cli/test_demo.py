@@ -13,7 +13,7 @@ from memmlp.cli.demo import fit_recurrent_poser, next_steps, unentered
 
 @pytest.mark.slow
 def test_each_stage_has_a_line_without_a_terminal(memmlp):
-    ran = memmlp("demo", *TINY)
+    ran = memmlp("demo", *TINY, "data.synth.minutes=0.1", "evaluation.modes=[stream]")
     assert ran.code == 0
     stages = [line.partition(":")[0] for line in ran.err.splitlines()]
     again = ["data", "network", "evaluation", "deployment"]

@@ -47,7 +47,7 @@ def test_networks_without_a_run_are_measured_and_said_to_be_untrained(tmp_path: 
 def test_times_are_measured_where_the_table_shows_them():
     timed = {
         "metrics": ["ms", "network ms", "pose ms", "ratio"],
-        "base": ["profile=tiny", "export.alone=true"],
+        "base": ["profile=tiny", "export.alone=true", "model.depth=1"],
     }
     sweep = parse_sweep("times", {"arms": {"AvatarPoser": ARMS["AvatarPoser"]}, "seeds": [0], **timed})
     runs, _ = with_costs(sweep, {"AvatarPoser": {}})

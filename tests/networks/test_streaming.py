@@ -115,8 +115,8 @@ def test_what_has_no_stream_is_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("network", exported.NETWORKS)
+@pytest.mark.parametrize("network", [*exported.NETWORKS, *exported.LARGEST])
 def test_its_file_is_the_network_in_onnx_runtime(step_files: Callable[[str], Path], network: str):
     path = step_files(network)
-    assert parity(exported.NETWORKS[network](), path, tiny.clip(40)[:20]) < 1e-4
+    assert parity((exported.NETWORKS | exported.LARGEST)[network](), path, tiny.clip(40)[:20]) < 1e-4
     assert "state.count" in OnnxStream(path).state
