@@ -15,8 +15,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from command_line import MAIN, run, run_apart
-from command_line import TINY as SMALLEST
+from command_line import BRIEF, MAIN, run, run_apart
 from processes import PATIENCE, forked, ignoring_interrupts, started, until
 
 from memmlp.cli.main import main
@@ -30,7 +29,7 @@ from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan
 from memmlp.sweep.progress_table import name
 
-TINY = [*SMALLEST, "export.graph=off"]
+TINY = [*BRIEF, "export.graph=off"]
 ARMS = {"full": [], "none": ["memory=none"], "wild": ["optim.lr=1e30"]}
 
 
