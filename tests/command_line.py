@@ -19,12 +19,11 @@ from memmlp.cli.main import main
 # For a process of its own. Ctrl-C reaches it where the tests were started with SIGINT ignored (nohup, &).
 INTERRUPTIBLE = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
 MAIN = [sys.executable, "-c", f"{INTERRUPTIBLE}; from memmlp.cli.main import main; main()"]
-SMALL = [
-    "profile.depth=2",
-    "profile.memory_layers=[2]",
-    "data.synth.minutes=0.2",
-]  # smaller than profile=tiny
-TINY = ["profile=tiny", *SMALL, "tracking=none", "threads=1", "optim.steps=6", "vqvae.steps=6"]
+SIZES = ["profile.depth=2", "profile.memory_layers=[2]"]
+SMALL = [*SIZES, "data.synth.minutes=0.1"]  # smaller than profile=tiny
+FEW = ["tracking=none", "threads=1", "optim.steps=6", "vqvae.steps=6"]
+TINY = ["profile=tiny", *SIZES, "data.synth.minutes=0.2", *FEW]
+BRIEF = ["profile=tiny", *SMALL, *FEW]  # half as much motion, where no two runs' weights are compared
 
 
 def run(folder: Path, *arguments: str, code: int = 0) -> str:

@@ -8,16 +8,17 @@ import os
 import re
 import shutil
 import signal
-import subprocess
+import sys
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import yaml
-from command_line import MAIN, run, run_apart
-from command_line import TINY as SMALLEST
-from processes import PATIENCE, ignoring_interrupts, started, until
+from command_line import BRIEF, MAIN, run, run_apart
+from processes import PATIENCE, forked, ignoring_interrupts, started, until
 
+from memmlp.cli.main import main
 from memmlp.cli.workers import split_executor
 from memmlp.common.errors import InputError
 from memmlp.config.compose_plan import find_sweep, kept_or_new_plan, orphans, plan_anew
@@ -28,7 +29,7 @@ from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan
 from memmlp.sweep.progress_table import name
 
-TINY = [*SMALLEST, "export.graph=off"]
+TINY = [*BRIEF, "export.graph=off"]
 ARMS = {"full": [], "none": ["memory=none"], "wild": ["optim.lr=1e30"]}
 
 
@@ -254,20 +255,35 @@ def test_a_look_at_other_seeds_or_without_the_data_leaves_a_sweep_as_it_was(
     assert "orphaned" not in run(copy, "runs", "gc")
 
 
+def as_typed(folder: Path, *arguments: str) -> None:
+    """What `processes.forked` does for a command line that is the whole process."""
+    os.chdir(folder)
+    sys.argv = ["memmlp", *arguments]
+    main()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_sweep_ends_its_workers_and_goes_on_later(tmp_path: Path, ending: int):
+    """By Ctrl-C as a user starts it, under nohup; by a scheduler's signal, for which it may be forked."""
     write(tmp_path, {"none": ["memory=none"]})
-    line = [*MAIN, "sweep", "trial.yaml", *TINY, "optim.steps=100000"]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-    with ignoring_interrupts(), started(line, cwd=tmp_path, text=True, **pipes) as process:
+    words = ["sweep", "trial.yaml", *TINY, "optim.steps=100000"]
+    file = tmp_path / "said.txt"
+    file.touch()
+    with ExitStack() as stack:
+        if ending == signal.SIGINT:
+            stack.enter_context(ignoring_interrupts())
+            log = stack.enter_context(file.open("w"))
+            process = stack.enter_context(started([*MAIN, *words], cwd=tmp_path, stdout=log, stderr=log))
+        else:
+            process = stack.enter_context(forked(as_typed, tmp_path, *words, said=str(file), **os.environ))
         begun = lambda: any(run.step for run in list_runs(tmp_path / "outputs"))  # noqa: E731
         until(begun, "the run's first steps", process)
         run = list_runs(tmp_path / "outputs")[0]
         assert run.doing
-        process.send_signal(ending)
-        said, _ = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 130, said
+        os.kill(process.pid, ending)
+        left, said = process.wait(PATIENCE), file.read_text()
+    assert left == 130, said
     assert "interrupted" in said
     assert "Traceback" not in said
     until(lambda: run.status in ("stopped", "lost"), "its worker ends")

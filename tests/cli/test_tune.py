@@ -10,9 +10,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from command_line import TINY as BASE
+from command_line import BRIEF, run_apart
 from command_line import run as command
-from command_line import run_apart
 from filelock import FileLock
 
 from memmlp.cli.bench.chaos import examine
@@ -27,7 +26,7 @@ from memmlp.sweep.search.director import Director
 from memmlp.sweep.search.search_file import Range
 from memmlp.sweep.search.study import Study
 
-TINY = [*BASE, "optim.validate_every=3"]
+TINY = [*BRIEF, "optim.validate_every=3"]
 
 
 @pytest.fixture(scope="module")

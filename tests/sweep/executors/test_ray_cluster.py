@@ -56,7 +56,7 @@ def test_ray_is_refused_where_it_is_not():
 def two_gpus():
     """A Ray cluster on this machine that says it has two GPUs."""
     ray = pytest.importorskip("ray")
-    ray.init(num_cpus=4, num_gpus=2, include_dashboard=False, log_to_driver=False, configure_logging=False)
+    ray.init(num_cpus=2, num_gpus=2, include_dashboard=False, log_to_driver=False, configure_logging=False)
     yield ray
     ray.shutdown()
 
