@@ -17,7 +17,7 @@ import pytest
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 from remembered import keep_exports, remember
-from scratch_in_memory import scratch_in_memory
+from scratch_in_memory import remove_at_exit, scratch_in_memory
 from small_pictures import draw_large, draw_small
 
 from memmlp.common.python_gc import collect_seldom
@@ -67,7 +67,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     """What a test process left that died itself, and, unless a test failed, what all wrote."""
     processes.end_all()
     if scratch is not None and not session.testsfailed:
-        shutil.rmtree(scratch, ignore_errors=True)
+        remove_at_exit(scratch)
 
 
 class Ran(NamedTuple):

@@ -9,6 +9,7 @@ import contextlib
 import os
 import shutil
 import tempfile
+from multiprocessing.util import Finalize
 from pathlib import Path
 
 MEMORY = Path("/dev/shm")
@@ -35,6 +36,11 @@ def scratch_in_memory(memory: Path = MEMORY, plenty: int = PLENTY) -> Path | Non
     scratch.mkdir(mode=0o700)
     os.environ["TMPDIR"], tempfile.tempdir = str(scratch), None  # which is looked for anew
     return scratch
+
+
+def remove_at_exit(scratch: Path) -> None:
+    """Remove a folder at this process' end, after multiprocessing has removed its own folder below it."""
+    Finalize(None, shutil.rmtree, args=(scratch,), kwargs={"ignore_errors": True}, exitpriority=-200)
 
 
 def _has_room(memory: Path, plenty: int) -> bool:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import random
 import shutil
+import signal
+import subprocess
 from pathlib import Path
 
 import pytest
 from command_line import SMALL, run
 from kills.storms import forked_controllers
 
-from memmlp.cli.bench.chaos import check, compare
+from memmlp.cli.bench.chaos import check, compare, storm
 from memmlp.common.lease import Lock
 from memmlp.common.liveness import myself
 from memmlp.runs.run import Run
@@ -23,6 +26,22 @@ def test_a_sweep_under_kills_ends_as_an_undisturbed_one(tmp_path: Path, monkeypa
     said = run(tmp_path, "bench", "chaos", *words)
     assert "with 3 kills" in said
     assert "3 kills: as undisturbed: 0 differences" in said
+
+
+def test_a_storm_over_processes_that_end_at_once_ends_too(tmp_path: Path):
+    """They live shorter than the pauses between kills, as a sweep's do whose runs are all done."""
+    launched = []
+
+    def launch() -> subprocess.Popen[bytes]:
+        launched.append(subprocess.Popen(["sleep", "0.2"]))
+        return launched[-1]
+
+    try:
+        assert storm([launch, launch], tmp_path, 2, (0.6, 0.8), random.Random(0)) == 2
+    finally:
+        for process in launched:
+            process.kill()
+    assert sorted(process.wait() for process in launched)[:2] == [-signal.SIGKILL] * 2
 
 
 def finished(outputs: Path, name: str, weights: bytes = b"w") -> Run:

@@ -165,18 +165,23 @@ def storm(
 ) -> int:
     """Keep the processes running until all have ended well, and kill random ones meanwhile.
 
-    A process that was killed, or that ended before all kills were made, is started again.
+    A process that was killed, or that ended before all kills were made, is started again. Where all have
+    ended before anything could be killed, the next pause is half as long: when their work is done they live
+    shorter than any pause was meant for.
 
     Returns:
         The number of kills.
     """
     processes = [launch() for launch in launches]
-    killed = 0
+    killed, share = 0, 1.0
     while killed < kills or any(process.poll() != 0 for process in processes):
-        time.sleep(dice.uniform(*pauses))
-        if killed < kills and (victim := choose(processes, outputs, dice)) is not None:
-            os.kill(victim, signal.SIGKILL)
-            killed += 1
+        time.sleep(share * dice.uniform(*pauses))
+        if killed < kills:
+            victim = choose(processes, outputs, dice)
+            share = share / 2 if victim is None else 1.0
+            if victim is not None:
+                os.kill(victim, signal.SIGKILL)
+                killed += 1
         for index, launch in enumerate(launches):
             code = processes[index].poll()
             if code not in (None, 0) or (code == 0 and killed < kills):
