@@ -346,7 +346,7 @@ def _measured(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str
     return measured.over(names)
 
 
-def _of_clips(errors: Mapping[str, Any], names: Sequence[str]) -> dict[str, Errors]:
+def _of_clips(errors: Mapping[str, Any], names: Sequence[str]) -> Mapping[str, Errors]:
     """Return the errors of each clip, from each metric's list of values."""
     clips: dict[str, dict[str, dict[str, Any]]] = {name: {mode: {} for mode in errors} for name in names}
     for mode, branches in errors.items():
@@ -354,7 +354,7 @@ def _of_clips(errors: Mapping[str, Any], names: Sequence[str]) -> dict[str, Erro
             rows = zip(*metrics.values(), strict=True) if metrics else [()] * len(names)
             for name, row in zip(names, rows, strict=True):
                 clips[name][mode][branch] = dict(zip(metrics, row, strict=True))
-    return clips  # type: ignore[return-value]
+    return clips
 
 
 def _every(errors: Mapping[str, Any]) -> list[Sequence[Any]]:
