@@ -50,6 +50,9 @@ def _without_extras(export: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(export)
     def exported(*arguments: Any, **options: Any) -> Any:
+        import torch.onnx._internal.exporter._compat  # as the first export does
+
+        remember()
         collecting, noting = gc.isenabled(), getattr(torch.fx.config, SILENT, None)
         gc.disable()
         try:

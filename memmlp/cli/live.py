@@ -303,9 +303,9 @@ def serve(given: InputOptions, shown: ShowOptions) -> None:
             closed_in_peace(outputs),
             LiveServer(hub, shown.port, shown.host, shown.token, files, ask) as server,
         ):
-            click.echo(f"{server.url}  {source.name}; Ctrl-C ends")
             if words["remark"]:
                 note(f"{name}: {words['remark']}")
+            click.echo(f"{server.url}  {source.name}; Ctrl-C ends")
             for output in outputs.outputs:
                 click.echo(f"  to {output.name}")
             if not shown.no_browser:
