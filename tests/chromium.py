@@ -28,7 +28,7 @@ DRAWN = """{
 """What lets a page draw so seldom that everything else has its turn, too: software draws slowly."""
 STALL = "GPU stall due to ReadPixels"
 """What a driver warns of where software puts a page together: no fault of the page."""
-UNSEEN = ("WebUIOmniboxPopup", "WebUIOmniboxFullPopup", "WebUIOmniboxAimPopup", "SpareRendererForSitePerProcess")
+UNSEEN = [f"WebUIOmnibox{which}Popup" for which in ("", "Full", "Aim")] + ["SpareRendererForSitePerProcess"]
 """Features that load a page of the browser's own beside each of a test's: a second of CPU time."""
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 

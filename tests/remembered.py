@@ -6,6 +6,7 @@ import copy
 import functools
 import gc
 import hashlib
+import importlib
 import pickle
 import sys
 import types
@@ -50,8 +51,7 @@ def _without_extras(export: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(export)
     def exported(*arguments: Any, **options: Any) -> Any:
-        import torch.onnx._internal.exporter._compat  # as the first export does
-
+        importlib.import_module("torch.onnx._internal.exporter._compat")  # as the first export does
         remember()
         collecting, noting = gc.isenabled(), getattr(torch.fx.config, SILENT, None)
         gc.disable()
