@@ -17,9 +17,9 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP)
 	$(BIN)/memmlp demo
 
-# Twice as many processes as small machines have cores: some tests wait for others' processes. The fast ones don't.
+# One process more than small machines have cores: some tests wait for others' processes. The fast ones don't.
 # What they compile is kept, whatever the environment says: dozens of interpreters are started.
-PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder -n 4
+PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder -n 3
 
 test: $(STAMP)
 	$(PYTEST)

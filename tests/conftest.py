@@ -78,8 +78,6 @@ class Ran(NamedTuple):
     err: str
 
 
-processes.mark()
-
 # The same examples each time, and no complaint that a busy machine is slow.
 settings.register_profile(
     "memmlp", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
@@ -88,6 +86,8 @@ settings.load_profile("memmlp")
 
 # Networks are tiny and test processes many: more threads only wait for each other.
 THREADS = int(os.environ.setdefault("OMP_NUM_THREADS", "1"))
+
+processes.mark()
 
 # Begun first, so that no process is left alone with one of them at the end. Those that mostly wait for other
 # processes stand among those that compute.

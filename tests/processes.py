@@ -30,9 +30,14 @@ def mark() -> None:
     a test process begins with that of the one that distributes the tests, which so finds all.
     """
     os.environ[MARK] = f"{os.environ.get(MARK, '')}/{uuid.uuid4().hex}"
+    if not BEGUN:
+        BEGUN.update(os.environ)
     OLDER.update(_entries())
     FOREIGN.clear()
 
+
+BEGUN: dict[str, str] = {}
+"""The environment at the first mark, before any test changed it."""
 
 OLDER: set[tuple[str, int]] = set()
 """The processes from before the mark, which they cannot have. A number given anew has a new inode."""
@@ -110,7 +115,7 @@ class Forked:
     ):
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload(PRELOADED)
-        with _tests_on_path():
+        with _as_begun():
             server = address()
         self._process = context.Process(target=_saying, args=(server, said, environment, work, arguments))
         self._process.start()
@@ -140,17 +145,25 @@ class Forked:
 
 
 @contextlib.contextmanager
-def _tests_on_path() -> Iterator[None]:
-    """A server that starts herein finds the modules of the tests; it takes them off the path again."""
-    before = os.environ.get("PYTHONPATH")
-    os.environ["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parent), before or ""])
+def _as_begun() -> Iterator[None]:
+    """A server that starts herein has the environment of the beginning, and finds the modules of the tests.
+
+    What the first test that forks has set is not found by the others. The path it takes back itself.
+    """
+    now = dict(os.environ)
+    begun = BEGUN or now
+    path = os.pathsep.join([str(Path(__file__).parent), begun.get("PYTHONPATH", "")])
+    _become({**begun, "PYTHONPATH": path})
     try:
         yield
     finally:
-        if before is None:
-            del os.environ["PYTHONPATH"]
-        else:
-            os.environ["PYTHONPATH"] = before
+        _become(now)
+
+
+def _become(environment: dict[str, str]) -> None:
+    for name in os.environ.keys() - environment.keys():
+        del os.environ[name]
+    os.environ.update(environment)
 
 
 def _saying(

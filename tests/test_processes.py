@@ -77,12 +77,18 @@ def test_a_wait_fails_when_its_process_has_ended_or_in_the_end(monkeypatch: pyte
 
 
 def told(path: Path) -> None:
-    """Write down what a forked process finds done, and its search path."""
+    """Write down what a forked process finds done, its search path, and a variable."""
     done = environment._code_digests.cache_info().currsize
-    path.write_text(f"{done} {os.environ.get('PYTHONPATH')}")
+    path.write_text(f"{done} {os.environ.get('PYTHONPATH')} {os.environ.get('MEMMLP_OUTPUTS')}")
 
 
-def test_a_forked_process_finds_done_what_each_would_do_first(tmp_path: Path):
+def test_a_forked_process_finds_done_what_each_would_do_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """And the environment as it was before any test: processes of many tests are forked off one server."""
+    before = os.environ.get("PYTHONPATH")
+    monkeypatch.setenv("PYTHONPATH", "elsewhere")
+    monkeypatch.setenv("MEMMLP_OUTPUTS", "elsewhere")
     with forked(told, tmp_path / "told") as process:
         assert process.wait() == 0
-    assert (tmp_path / "told").read_text() == f"1 {os.environ.get('PYTHONPATH')}"
+    assert (tmp_path / "told").read_text() == f"1 {before} {processes.BEGUN.get('MEMMLP_OUTPUTS')}"

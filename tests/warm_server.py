@@ -14,7 +14,7 @@ from remembered import remember
 from memmlp.config.compose import composed
 from memmlp.runs import environment
 
-_, _, before = os.environ["PYTHONPATH"].partition(os.pathsep)  # processes._tests_on_path
+_, _, before = os.environ["PYTHONPATH"].partition(os.pathsep)  # processes._as_begun
 if before:
     os.environ["PYTHONPATH"] = before
 else:

@@ -94,6 +94,8 @@ def read(package: Package, names: Collection[str]) -> dict[str, bytes]:
             name = member.name.split("/", 1)[-1]  # all lie in one folder, "package" as a rule
             if member.isfile() and name in names and (file := archive.extractfile(member)):
                 found[name] = file.read()
+            if len(found) == len(set(names)):
+                break  # what follows need not be unpacked
     if missing := sorted(set(names) - set(found)):
         raise KeyError(f"{package} has no {', '.join(missing)}")
     return found
