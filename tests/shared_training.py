@@ -69,9 +69,9 @@ def dying(step: Callable, die: Callable[[], object]) -> Callable:
 
 
 def alone(folder: Path) -> Run:
-    """Bring a run of 110 steps to its end."""
+    """Bring a run of 200 steps to its end."""
     torch.set_num_threads(1)
-    optim = replace(OPTIM, steps=110, checkpoint_every=7)
+    optim = replace(OPTIM, steps=200, checkpoint_every=7)
     task, run = motion_task(optim=optim), Run(folder)
     run.folder.mkdir(exist_ok=True)
     train(task, optim, run, 0, "whole")
