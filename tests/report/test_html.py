@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import base64
 import html
 import math
 import re
 import shutil
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from chromium import Browser
 from conftest import Memmlp, one_line
 from fake_runs import CLIPS, fake_sweep, nothing, runs_of, table_of
-from processes import finished
+from processes import until
 
 from memmlp.common.errors import InputError
 from memmlp.report import figures
@@ -29,7 +30,6 @@ from memmlp.tables.error_distributions import Distribution, distributions
 from memmlp.tables.table_text import caption
 
 SHIPPED = Path(__file__).parent.parent.parent / "sweeps"
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 NAMES = ("table01", "table04", "table06", "table14", "table17")
 
 
@@ -236,25 +236,6 @@ def test_nothing_measured_is_said():
     assert "<svg" not in text
 
 
-def browser(tmp_path: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run Chromium without a window and without a network."""
-    if CHROMIUM is None:
-        pytest.skip("Chromium is not installed (apt-get install chromium)")
-    command = [
-        CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run",
-        "--host-resolver-rules=MAP * ~NOTFOUND", "--enable-logging=stderr", "--v=0",
-        f"--user-data-dir={tmp_path / 'profile'}", *arguments,
-    ]  # fmt: skip
-    ran = finished(command)
-    assert ran.returncode == 0, ran.stderr[-2000:]
-    return ran
-
-
-def console(ran: subprocess.CompletedProcess[str]) -> list[str]:
-    """Return what the page wrote to the browser's console."""
-    return [line for line in ran.stderr.splitlines() if "CONSOLE" in line]
-
-
 def test_deployments_of_one_run_have_a_row_each(tmp_path: Path):
     sweep = replace(load_sweep(SHIPPED / "table14.yaml"), seeds=(0,))
     runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
@@ -299,23 +280,28 @@ def test_more_may_be_better(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert "Further up and left is better, of MPJPE further down and right." in text
 
 
-@pytest.mark.slow
-def test_browser_shows_the_page(tmp_path: Path, text: str, chapters: list[Chapter]):
-    probe = """<script>
-      const wide = [...document.querySelectorAll('main *')].filter(e => !e.closest('.scroll'))
-        .filter(e => e.getBoundingClientRect().right > innerWidth + 1);
-      const flat = [...document.querySelectorAll('svg, table')]
-        .filter(e => e.getBoundingClientRect().height < 30);
-      document.documentElement.dataset.report = [innerWidth, wide.length, flat.length].join(' ');
-    </script>"""
+@pytest.fixture
+def report(tmp_path: Path, text: str) -> str:
+    """The address of the page as a file."""
     path = tmp_path / "report.html"
-    path.write_text(text.replace("</body>", f"{probe}</body>"), encoding="utf-8")
-    for width in (1280, 500):  # Chromium's windows are not narrower
-        ran = browser(tmp_path, f"--window-size={width},900", "--dump-dom", path.as_uri())
-        assert console(ran) == []
-        assert f'data-report="{width} 0 0"' in ran.stdout
-        assert ran.stdout.count("<svg") == 11
-        assert all(f'id="{chapter.sweep.name}"' in ran.stdout for chapter in chapters)
+    path.write_text(text, encoding="utf-8")
+    return path.as_uri()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [1280, 390])
+def test_browser_shows_the_page(report: str, chapters: list[Chapter], width: int):
+    with Browser(width, 900) as browser:
+        browser.open(report)
+        assert browser.value("innerWidth") == width
+        outside = "!e.closest('.scroll') && e.getBoundingClientRect().right > innerWidth + 1"
+        assert browser.value(f"[...document.querySelectorAll('main *')].filter(e => {outside}).length") == 0
+        heights = "[...document.querySelectorAll('svg, table')].map(e => e.getBoundingClientRect().height)"
+        assert min(browser.value(heights)) >= 30
+        assert browser.value("document.querySelectorAll('svg').length") == 11
+        for chapter in chapters:
+            assert browser.value(f"document.getElementById('{chapter.sweep.name}') !== null")
+        assert browser.errors == []
 
 
 @pytest.mark.slow
@@ -323,15 +309,17 @@ def test_browser_tells_of_errors(tmp_path: Path):
     """What a page's script throws is seen, so that the test above can fail."""
     path = tmp_path / "bad.html"
     path.write_text("<script>throw new Error('loud')</script><img src='http://example.invalid/x.png'>")
-    assert any("loud" in line for line in console(browser(tmp_path, "--dump-dom", path.as_uri())))
+    with Browser() as browser:
+        browser.open(path.as_uri())
+        said = lambda: browser.value("true") and any("loud" in error for error in browser.errors)  # noqa: E731
+        until(said, "the error")
 
 
 @pytest.mark.slow
-def test_browser_prints_and_takes_a_picture(tmp_path: Path, text: str):
-    path = tmp_path / "report.html"
-    path.write_text(text, encoding="utf-8")
-    browser(tmp_path, f"--print-to-pdf={tmp_path / 'report.pdf'}", path.as_uri())
-    assert (tmp_path / "report.pdf").stat().st_size > 50_000
+def test_browser_prints_the_page(report: str):
+    with Browser() as browser:
+        browser.open(report)
+        assert len(base64.b64decode(browser.call("Page.printToPDF")["data"])) > 50_000
 
 
 @pytest.fixture
