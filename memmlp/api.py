@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args, overload
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.evaluation.units import UNITS
+from memmlp.evaluation.metric_facts import UNITS
 from memmlp.live.stream import Offsets, Stream
 from memmlp.runs.evaluation_file import COMBINED
 from memmlp.runs.lookup import check_trained, find_run, is_trained, list_runs

@@ -112,7 +112,7 @@ def network(model: MotionModel) -> Numbers:
     clip = torch.stack([tiny.clip(80, seed) for seed in range(2)])
     torch.manual_seed(7)
     model.train()
-    past, new = clip[:, : model.length], clip[:, model.length : model.length + model.frames]
+    past, new = clip[:, : model.past_frames], clip[:, model.past_frames : model.past_frames + model.frames]
     motion, _, terms = model.learn(new[..., :SPARSE_DIM], model.true_state(past), new)
     (motion.square().mean() + sum(terms.values(), torch.zeros(()))).backward()
     slopes = torch.cat([p.grad.flatten() for p in model.parameters() if p.grad is not None])

@@ -12,7 +12,7 @@ from command_line import SMALL
 from memmlp.common.plugin import METRICS
 from memmlp.config import plugins
 from memmlp.config.schema import SCHEMAS
-from memmlp.evaluation.units import HIGHER, SMALLEST, UNITS
+from memmlp.evaluation.metric_facts import HIGHER, SMALLEST, UNITS
 from memmlp.runs.recipe_versions import RECIPES
 
 EXAMPLE = Path(__file__).parent.parent / "docs/examples/feet"

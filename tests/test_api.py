@@ -18,7 +18,7 @@ from PIL import Image
 
 import memmlp
 from memmlp.common.files import read_json, write_json
-from memmlp.evaluation.units import UNITS
+from memmlp.evaluation.metric_facts import UNITS
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.lookup import list_runs
 

@@ -20,7 +20,7 @@ from memmlp.cli.main import COMMANDS
 from memmlp.config.build import build_loss
 from memmlp.config.compose import composed
 from memmlp.config.plugins import activate
-from memmlp.evaluation.units import SMALLEST, UNITS
+from memmlp.evaluation.metric_facts import SMALLEST, UNITS
 from memmlp.motion.importing.skeleton_map import SkeletonMap
 from memmlp.runs.identity import flatten
 from memmlp.sweep.sweep_file import load_sweep

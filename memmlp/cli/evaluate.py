@@ -66,7 +66,7 @@ def evaluate(
     remark_on([found.run])
     if changed := found.run.changed_sources:
         click.echo(older_code(found.run, changed))
-    for table in (metrics_table(results), *source_tables(found.run, experiment.stages)):
+    for table in (metrics_table(results), *source_tables(found.run, experiment.stage_ids)):
         Console(highlight=False).print(table)
     if json_path is not None:
         write_json(json_path, {"mean": results, "clips": clip_rows(experiment, found.run)})

@@ -73,7 +73,7 @@ def predict(
     found = find_run(outputs, run)
     experiment = experiment_of(found, device, [] if ik is None else [f"evaluation.ik={ik}"])
     chosen = chosen_branch(experiment.evaluation, branch)
-    interpolation = experiment.data.clips.interpolation
+    interpolation = experiment.motion.clips.interpolation
     predictor = ClipPredictor(
         trained_network(found, experiment), mode, chosen, experiment.evaluation, interpolation
     )

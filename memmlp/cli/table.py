@@ -105,9 +105,9 @@ def table(
     if seeds_needed and (form or out or add):
         raise InputError("--seeds-needed: goes to the screen alone, without --format, --out and --add")
     measured = [rows_measured_in_browsers.read(path) for path in add]
-    part = Part(branch, source, together, untrained)
+    selection = TableSelection(branch, source, together, untrained)
     with _uncollected():
-        found = gathered([name], overrides, outputs, SHOWN_MODES[mode], functools.cache(load), part)
+        found = gathered([name], overrides, outputs, SHOWN_MODES[mode], functools.cache(load), selection)
     if seeds_needed:
         seeds_on_screen(found, SHOWN_MODES[mode])
         return
@@ -135,7 +135,7 @@ def _uncollected() -> Iterator[None]:
         gc.enable()
 
 
-class Part(NamedTuple):
+class TableSelection(NamedTuple):
     """What of a sweep's results its table shows.
 
     Attributes:
@@ -151,7 +151,7 @@ class Part(NamedTuple):
     untrained: bool = False
 
 
-WHOLE = Part()
+WHOLE = TableSelection()
 
 
 class SweepTable(NamedTuple):
@@ -168,7 +168,7 @@ def gathered(
     outputs: Path,
     modes: Sequence[str],
     read: Read,
-    part: Part = WHOLE,
+    selection: TableSelection = WHOLE,
 ) -> list[SweepTable]:
     """Gather the tables with the given names.
 
@@ -181,10 +181,10 @@ def gathered(
         outputs: the folder of runs and caches.
         modes: modes of evaluation to show.
         read: reads a run (`memmlp.tables.measured_run.load`).
-        part: what of the results is shown.
+        selection: what of the results is shown.
 
     Raises:
-        InputError: if none of them can be composed with the command line's overrides, or has that part.
+        InputError: if none of them can be composed with the command line's overrides, or has that selection.
     """
     from memmlp.cli.shown_sweep import shown_sweep
     from memmlp.common.progress import progress_bar
@@ -193,19 +193,19 @@ def gathered(
     found, failures = [], []
     sweeps = find_sweeps(names, overrides)
     for sweep, command in progress_bar(sweeps, "tables") if len(sweeps) > 1 else sweeps:
-        sweep = sweep.with_branch(part.branch) if part.branch else sweep
-        if part.untrained:
+        sweep = sweep.with_branch(selection.branch) if selection.branch else sweep
+        if selection.untrained:
             from memmlp.config.untrained_costs import check_costs
 
             check_costs(sweep)
         try:
             known = shown_sweep(sweep, overrides, outputs.absolute())
-            found.append(table_of_plan(known, modes, command, read, part))
+            found.append(table_of_plan(known, modes, command, read, selection))
         except InputError as error:
             failures.append(error)
             table = without_runs(sweep, modes, f"nothing measured: {error}")
             found.append(SweepTable(sweep, {arm.label: {} for arm in sweep.runnable()}, table))
-    asked = overrides or part.source or part.together or found[0].sweep.table is None
+    asked = overrides or selection.source or selection.together or found[0].sweep.table is None
     if failures and asked and len(failures) == len(found):
         raise failures[0]
     return found
@@ -216,32 +216,32 @@ def table_of_plan(
     modes: Sequence[str],
     command: str,
     read: Read,
-    part: Part = WHOLE,
+    selection: TableSelection = WHOLE,
 ) -> SweepTable:
     """Return a planned sweep's finished runs, and the table of a part of their results."""
     from memmlp.tables.build_table import finished_runs, make_table, on_source, titled, together
     from memmlp.tables.runs_of_plan import older_run_finder, run_finder, state_finder
 
     sweep, plan, rounds, flags = shown
-    for option, given in (("source", part.source), ("together", " ".join(part.together))):
+    for option, given in (("source", selection.source), ("together", " ".join(selection.together))):
         if given and rounds:
             raise InputError(
                 f"--{option} {given}: allowed for a fixed number of seeds, not for --until-decided"
             )
     runs = finished_runs(sweep, run_finder(plan, read))
-    if part.untrained:
+    if selection.untrained:
         from memmlp.config.untrained_costs import with_costs
 
         runs, measured = with_costs(sweep, runs)
         flags = (*flags, *measured)
-    if part.source:
-        sweep, runs, left_out = on_source(sweep, runs, part.source)
+    if selection.source:
+        sweep, runs, left_out = on_source(sweep, runs, selection.source)
         flags = (*left_out, *flags)
-    runs, tied = together(runs, part.together)
+    runs, tied = together(runs, selection.together)
     flags = (*tied, *flags)
     command = f"{command} --until-decided" if rounds else command
     table = make_table(sweep, runs, modes, command, state_finder(plan), older_run_finder(plan), rounds)
-    table = titled(table, part.source) if part.source else table
+    table = titled(table, selection.source) if selection.source else table
     return SweepTable(sweep, runs, replace(table, flags=(*table.flags, *flags)))
 
 

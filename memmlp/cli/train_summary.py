@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from memmlp.common.core_share import LEAST_CORE_SHARE
-from memmlp.evaluation.units import UNITS
+from memmlp.evaluation.metric_facts import UNITS
 from memmlp.pipeline.run_stages import Outcome
 from memmlp.runs.deployment_folder import (
     INT8_PRECISIONS,

@@ -139,7 +139,7 @@ def _check_space(setup: Setup) -> str:
             config refuses a value.
     """
     from memmlp.common.files import digest
-    from memmlp.runs.identity import inference, trained_with
+    from memmlp.runs.identity import changes_training, inference
 
     space = setup.search.space
     for word in setup.words:
@@ -155,7 +155,8 @@ def _check_space(setup: Setup) -> str:
     configs = [experiment.config for experiment in experiments]
     _check_validation(configs)
     for one in space:
-        counts = any(trained_with(one.key, config) for config in configs)  # some do at other values than 0
+        # Some change it at other values than 0.
+        counts = any(changes_training(one.key, config) for config in configs)
         if not isinstance(configs[0].get(one.key), Mapping) and not counts:
             raise InputError(f"search.space: {one.key}: changes no training; allowed are keys that do")
     first = _tasks(setup, next(iter(setup.search.first_trials()), {}))[0][-1]
@@ -184,7 +185,7 @@ def _tasks(setup: Setup, values: Mapping[str, Value]) -> list[Sequence[RunTask]]
     from memmlp.config.compose_plan import tasks_of
 
     experiments = _experiments(setup, values)
-    return [tasks_of(experiment, experiment.data.prepare().digest) for experiment in experiments]
+    return [tasks_of(experiment, experiment.motion.prepare().digest) for experiment in experiments]
 
 
 def _experiments(setup: Setup, values: Mapping[str, Value]) -> list[Experiment]:
@@ -221,7 +222,7 @@ def search(setup: Setup, study: Study, workers: Workers) -> None:
 
     plan = Plan(setup.folder.name, setup.outputs, (), (), open=True)
     base = _experiments(setup, {})[0]
-    check = partial(_check_same_clips, base, base.data.prepare().digest)
+    check = partial(_check_same_clips, base, base.motion.prepare().digest)
     director = Director(study, partial(_tasks, setup), plan, check)
     path, fleet = hire(setup.folder, plan, workers, {base.config["device"]})
     direct(director, fleet, SearchBoard(setup.outputs), path)
@@ -229,10 +230,10 @@ def search(setup: Setup, study: Study, workers: Workers) -> None:
 
 def _check_same_clips(base: Experiment, digest: str) -> None:
     """Raise InputError if the data has another digest now, so that further trials would be judged by it."""
-    if base.data.prepare().digest != digest:
+    if base.motion.prepare().digest != digest:
         raise InputError(
-            f"{base.data.clips.root}: its clips changed since the search began; put them back, or start the "
-            "search again, which begins another one"
+            f"{base.motion.clips.root}: its clips changed since the search began; put them back, or start "
+            "the search again, which begins another one"
         )
 
 
@@ -281,7 +282,7 @@ def summary(setup: Setup, study: Study) -> None:
         click.echo(line)
     click.echo(counts(study))
     experiment = _experiments(setup, {})[0]
-    if part := partial_words(experiment, experiment.data.prepare()):
+    if part := partial_words(experiment, experiment.motion.prepare()):
         click.echo(f"on a part of the data: {part}")
     click.echo(f"in {setup.folder}")
     if best:
@@ -319,6 +320,6 @@ def _makes(setup: Setup, words: Sequence[str], run_id: str) -> bool:
         cfg = composed(words)
         cfg.paths.outputs = str(setup.outputs)
         experiment = build_experiment(cfg, elsewhere=True)
-        return tasks_of(experiment, experiment.data.prepare().digest)[-1].id == run_id
+        return tasks_of(experiment, experiment.motion.prepare().digest)[-1].id == run_id
     except InputError:
         return False

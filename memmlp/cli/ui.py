@@ -60,7 +60,7 @@ def predict(run: Run, clip: str, mode: str) -> Mapping[str, np.ndarray]:
 
     torch.set_num_threads(1)  # trainings beside it need the others
     experiment = experiment_of(run)
-    if experiment.data.digest() is None:
+    if experiment.motion.digest() is None:
         raise InputError(f"run {run.id}: its data is not prepared here; memmlp eval {run.id} prepares it")
     opened = OpenedRun(run, experiment, data_of(run, experiment))
     with torch.inference_mode():

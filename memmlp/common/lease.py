@@ -247,7 +247,7 @@ class Lock:
 
 
 def _open(claim: Claim | None, idle: float) -> bool:
-    """Return whether only waiting can tell if the claim's owner lives, after `idle` seconds without sign."""
+    """Return whether it is still unknown if the owner lives, `idle` seconds after its last sign of life."""
     return claim is not None and not claim.free and claim.lives is None and idle <= LEASE
 
 

@@ -44,11 +44,11 @@ def find_sweep(name: str, overrides: Sequence[str] = ()) -> Sweep:
     activate(named(overrides))
     sweep = load_sweep(_path(name), lambda base: activate(named(base))).with_overrides(overrides)
     for arm in sweep.runnable():
-        check_experiment(sweep, arm)
+        check_preset(sweep, arm)
     return sweep
 
 
-def check_experiment(sweep: Sweep, arm: Arm) -> None:
+def check_preset(sweep: Sweep, arm: Arm) -> None:
     """Check that an arm's `experiment=NAME` sets all that it should, and replaces no other experiment.
 
     Hydra lets a group or key on the command line win over an experiment's, wherever it stands, and the last
@@ -235,7 +235,7 @@ def tasks_of(experiment: Experiment, data: str) -> list[RunTask]:
         *upstream, network = tasks_of(experiment.unrefined, data)
         upstream = [*upstream, replace(network, stages=())]
     last = upstream[-1].id if upstream else None
-    return [*upstream, RunTask(own.id, own.kind, experiment.config, last, experiment.stages, own.what)]
+    return [*upstream, RunTask(own.id, own.kind, experiment.config, last, experiment.stage_ids, own.what)]
 
 
 def _data_digest(experiment: Experiment, prepare: bool, known: dict[str, dict[str, Any]]) -> str | None:
@@ -246,10 +246,10 @@ def _data_digest(experiment: Experiment, prepare: bool, known: dict[str, dict[st
     config = {"data": experiment.config["data"], "paths": experiment.config["paths"]}
     key = digest(config)
     if key not in known:
-        found = experiment.data.prepare().digest if prepare else experiment.data.digest()
+        found = experiment.motion.prepare().digest if prepare else experiment.motion.digest()
         if found is None:
             return None
-        known[key] = {"config": config, "digest": found, "groups": experiment.data.groups_digest}
+        known[key] = {"config": config, "digest": found, "groups": experiment.motion.groups_digest}
     return known[key]["digest"]
 
 

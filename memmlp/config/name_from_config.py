@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from memmlp.config.compose import VERSION_BASE
 from memmlp.config.package_data import packaged
 from memmlp.config.schema import register
-from memmlp.runs.identity import NETWORK, SLOTS, flatten, option_in_slot, trained_by
+from memmlp.runs.identity import NETWORK, SLOTS, flatten, option_in_slot, training_config
 from memmlp.runs.shown_name import kind_words
 
 MOST = 6  # words
@@ -71,7 +71,7 @@ def _keys(config: Mapping[str, Any], default: Mapping[str, Any], foreign: list[s
     """Yield words for the keys whose values differ from the default; a custom component has no default."""
     own, usual = flatten(config), {"data.weighting": "frames"} | flatten(default)
     for key in dict.fromkeys(
-        [*trained_by(config), *trained_by(default)]
+        [*training_config(config), *training_config(default)]
     ):  # either may count it where it is set
         slot, _, last = key.partition(".")
         if slot in foreign or last in ("name", "_target_", "_partial_") or key in ("seed", "vqvae.seed"):

@@ -19,7 +19,7 @@ from memmlp.motion.motion_source import Prepared
 from memmlp.networks.motion_model import MotionModel
 from memmlp.pipeline.devices import device
 from memmlp.pipeline.experiment import Experiment
-from memmlp.runs.identity import DEPLOYMENT, EVALUATION, INFERENCE, trained_by
+from memmlp.runs.identity import DEPLOYMENT, EVALUATION, INFERENCE, training_config
 from memmlp.runs.lookup import find_run
 from memmlp.runs.run import Run
 
@@ -69,9 +69,9 @@ def open_found(run: Run, device_name: str = "cpu", overrides: Sequence[str] = ()
 def data_of(run: Run, experiment: Experiment) -> Prepared:
     """Return the prepared data of a run. Raises InputError if it has changed since the training."""
     # What it was trained on may be looked at, however much of its list that is: the digest proves it.
-    data = replace(experiment.data, partial=True).prepare()
+    data = replace(experiment.motion, partial=True).prepare()
     if data.digest != run.manifest["data"]:
-        root = experiment.data.clips.root
+        root = experiment.motion.clips.root
         raise InputError(f"run {run.id}: its data has changed since (data.root={root})")
     return data
 
@@ -81,7 +81,7 @@ def experiment_of(run: Run, device_name: str = "cpu", overrides: Sequence[str] =
     experiment = replace(
         build_experiment(config_of(run, overrides), elsewhere=True), device=device(device_name)
     )
-    if trained_by(run.config) != trained_by(experiment.config):
+    if training_config(run.config) != training_config(experiment.config):
         words = ", ".join(overrides)
         raise InputError(f"{words}: changes the training; allowed are keys of evaluation and export")
     _check_acting(overrides)

@@ -28,7 +28,7 @@ from memmlp.common import plugin as known
 from memmlp.common.errors import InputError
 from memmlp.common.plugin import Plugin
 from memmlp.config.package_data import packaged
-from memmlp.evaluation.units import HIGHER, SMALLEST, UNITS
+from memmlp.evaluation.metric_facts import HIGHER, SMALLEST, UNITS
 from memmlp.runs.environment import own_code_digests
 from memmlp.runs.identity import flatten
 from memmlp.runs.recipe_versions import RECIPES

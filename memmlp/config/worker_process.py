@@ -85,7 +85,7 @@ def perform(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
     check_identity(experiment, task)
     use_threads(experiment.config["threads"] or threads)
     if task.kind != NETWORK:
-        make_upstream_runs(experiment, experiment.data.prepare(), task.id)
+        make_upstream_runs(experiment, experiment.motion.prepare(), task.id)
     else:
         run_experiment(experiment, partial(check_wanted, path, task.id))
 
@@ -94,7 +94,7 @@ def check_identity(experiment: Experiment, task: RunTask) -> None:
     """Prepare the data, and raise InputError if the task's identity is no longer the plan's."""
     from memmlp.config.compose_plan import tasks_of
 
-    digest = experiment.data.prepare().digest
+    digest = experiment.motion.prepare().digest
     known = tasks_of(experiment, digest)
     if task.key not in {key for found in known for key in (found.id, found.key)}:
         raise InputError(f"run {task.id}: the data or the code changed since the sweep began; start it again")

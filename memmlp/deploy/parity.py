@@ -60,8 +60,8 @@ def clips_to_check(model: MotionModel, clips: Sequence[Tensor], count: int = 1) 
 
 
 def frames_of_full_past(model: MotionModel) -> int:
-    """Return after how many frames the network's past, and what it recalls, are of the clip alone."""
-    return model.length + model.frames
+    """Return the number of frames after which nothing of the fresh start is left in the network's past."""
+    return model.past_frames + model.frames
 
 
 def parity(model: MotionModel, path: Path, clip: Tensor) -> float:

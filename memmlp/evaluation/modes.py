@@ -9,8 +9,8 @@ Some networks are evaluated otherwise in window mode. A network that recalls the
 before gets each window frame by frame, so that it recalls what it was trained on: in one call it would get
 the window of T frames ago. Its result for a window is the last call's output. A network without a window is a
 stream in both modes; so is, to rounding, one that makes each frame from the window that ends with it, as its
-authors evaluate it. A network that makes the windows of a clip together (`MotionModel.joint`) gets the whole
-clip, and can't be a stream.
+authors evaluate it. A network that makes the windows of a clip together gets the whole clip
+(`MotionModel.takes_whole_clip`), and can't be a stream.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Evaluable(Protocol):
         """Whether the network has no window, so that it is a stream in both modes."""
 
     @property
-    def joint(self) -> bool:
+    def takes_whole_clip(self) -> bool:
         """Whether window mode passes a whole clip to `whole`, which makes all its windows together."""
 
     def initial_state(self, batch: int = 1) -> State:
@@ -76,7 +76,7 @@ def window(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor]:
     """Predict the world motion (N, 198) of clips (N, 252), by non-overlapping windows."""
     if network.windowless:
         return stream(network, clips)
-    if network.joint:
+    if network.takes_whole_clip:
         return clip_by_clip(network, clips)
     if 0 < network.shift < network.frames:
         return frame_by_frame(network, clips, network.frames)

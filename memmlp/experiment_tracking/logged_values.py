@@ -17,7 +17,7 @@ from memmlp.common.files import file_digest, plain, read_json
 from memmlp.runs.deployment_folder import with_times_as_deployed
 from memmlp.runs.evaluation_file import with_solvers
 from memmlp.runs.identity import flatten
-from memmlp.runs.metrics_log import Metrics, parsed
+from memmlp.runs.metrics_log import LogRecord, parsed
 from memmlp.runs.notes import read_notes
 from memmlp.runs.run import Run
 from memmlp.runs.shown_name import run_name
@@ -142,7 +142,7 @@ def _origin(manifest: Mapping[str, Any]) -> dict[str, str]:
     return {name: str(value) for name, value in tags.items() if value is not None}
 
 
-def points(entry: Metrics) -> Iterator[CurvePoint]:
+def points(entry: LogRecord) -> Iterator[CurvePoint]:
     """Yield the values of one record of a metrics log."""
     for key, value in entry.values.items():
         yield CurvePoint(f"{entry.phase}/{key}", value, entry.step, entry.time)
@@ -192,7 +192,7 @@ class Tail:
             found += points(entry)
         return found
 
-    def _entries(self, most: int) -> Iterator[Metrics]:
+    def _entries(self, most: int) -> Iterator[LogRecord]:
         for path in filter(Path.exists, self.places):
             with open(path, "rb") as file:
                 file.seek(self.places[path])

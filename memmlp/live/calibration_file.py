@@ -104,7 +104,10 @@ def _check_body(fields: dict[str, Any], body: BodyTree) -> None:
 
 
 def tracked_joints(body: BodyTree) -> np.ndarray:
-    """Return the rest positions of head and wrists from their mean (3, 3), metres: offsets are of these."""
+    """Return the rest positions (3, 3) of head and wrists relative to their mean, metres.
+
+    A calibration's offsets hold for a body with these positions alone.
+    """
     joints = body.rest[body.tracked]
     return joints - joints.mean(0)
 

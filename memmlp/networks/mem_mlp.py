@@ -52,9 +52,9 @@ class MemMLP(MotionModel):
         return self.memory.settled
 
     @property
-    def length(self) -> int:
+    def past_frames(self) -> int:
         """How many past frames of inputs the memory needs in the buffer."""
-        return self.memory.length
+        return self.memory.past_frames
 
     def initial_state(self, batch: int = 1) -> State:
         """Return the state of a fresh start, all zeros.
@@ -65,7 +65,7 @@ class MemMLP(MotionModel):
         return super().initial_state(batch) | {name: t.to(self.normalizer.mean) for name, t in kept.items()}
 
     def true_state(self, frames: Tensor) -> State:
-        """Return the state after world frames [X | Theta] (B, length, 252), with the truth as its history."""
+        """Return the state after world frames [X | Theta] (B, past, 252), with the truth as its history."""
         encoded = self.normalizer.encode(frames)
         true = self.memory.true_state(encoded[..., :SPARSE_DIM], encoded[..., SPARSE_DIM:])
         return super().true_state(frames) | true

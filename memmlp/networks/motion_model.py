@@ -72,7 +72,7 @@ class MotionModel(nn.Module):
         return True
 
     @property
-    def joint(self) -> bool:
+    def takes_whole_clip(self) -> bool:
         """Whether window mode passes a whole clip to `whole`, which makes all its windows together.
 
         Such windows may overlap.
@@ -80,7 +80,7 @@ class MotionModel(nn.Module):
         return False
 
     @property
-    def length(self) -> int:
+    def past_frames(self) -> int:
         """How many past frames of inputs the buffer holds; the last one directly precedes the new ones."""
         return self.frames - 1
 
@@ -94,20 +94,20 @@ class MotionModel(nn.Module):
 
         At the first call the first frame's inputs stand for those of all frames before it.
         """
-        state = {"sparse": torch.zeros(batch, self.length, SPARSE_DIM), "started": torch.zeros(batch, 1)}
+        state = {"sparse": torch.zeros(batch, self.past_frames, SPARSE_DIM), "started": torch.zeros(batch, 1)}
         return {name: tensor.to(self.normalizer.mean) for name, tensor in state.items()}
 
     def running_state(self, sparse: Tensor) -> State:
-        """Return the state after world inputs (B, length, 54), without any history of motion yet."""
+        """Return the state after world inputs (B, past, 54), without any history of motion yet."""
         fresh = self.initial_state(len(sparse))
         return fresh | {"sparse": sparse, "started": torch.ones_like(fresh["started"])}
 
     def true_state(self, frames: Tensor) -> State:
-        """Return the state after true world frames [X | Theta] (B, length, 252), the truth as its history."""
+        """Return the state after true world frames [X | Theta] (B, past, 252), the truth as its history."""
         return self.running_state(frames[..., :SPARSE_DIM])
 
     def taken_in(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
-        """Return past and new inputs together (B, length + n, 54), and the buffers after them.
+        """Return past and new inputs together (B, past + n, 54), and the buffers after them.
 
         Args:
             sparse: new world inputs (B, n, 54).
@@ -115,7 +115,7 @@ class MotionModel(nn.Module):
         """
         before = torch.where(state["started"][..., None] > 0, state["sparse"], sparse[:, :1])
         inputs = torch.cat([before, sparse], 1)
-        return inputs, {"sparse": inputs[:, -self.length :], "started": state["started"].clamp_min(1)}
+        return inputs, {"sparse": inputs[:, -self.past_frames :], "started": state["started"].clamp_min(1)}
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         """Take in the newest frames.

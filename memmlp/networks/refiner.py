@@ -93,9 +93,9 @@ class Refined(MotionModel):
         return self.network.count_parameters() + sum(own)
 
     @property
-    def length(self) -> int:
+    def past_frames(self) -> int:
         """How many past frames of inputs the network's buffer holds."""
-        return self.network.length
+        return self.network.past_frames
 
     def initial_state(self, batch: int = 1) -> State:
         """Return the state of a fresh start, zeros: the network's, and the hidden one (B, depth, width)."""
@@ -103,11 +103,11 @@ class Refined(MotionModel):
         return {**self.network.initial_state(batch), HIDDEN: hidden.to(self.normalizer.mean)}
 
     def running_state(self, sparse: Tensor) -> State:
-        """Return the state after world inputs (B, length, 54), without any history of motion yet."""
+        """Return the state after world inputs (B, past, 54), without any history of motion yet."""
         return self.initial_state(len(sparse)) | self.network.running_state(sparse)
 
     def true_state(self, frames: Tensor) -> State:
-        """Return the state after world frames (B, length, 252), without any corrections yet."""
+        """Return the state after world frames (B, past, 252), without any corrections yet."""
         return self.initial_state(len(frames)) | self.network.true_state(frames)
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:

@@ -21,7 +21,7 @@ class WindowlessModel(MotionModel):
         return True
 
     @property
-    def length(self) -> int:
+    def past_frames(self) -> int:
         """How many past frames of inputs are kept in a buffer; 0 here."""
         return 0
 

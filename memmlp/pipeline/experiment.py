@@ -60,7 +60,7 @@ class Experiment:
         outputs: folder of runs and caches.
         device: device of training and evaluation.
         force: whether a finished run is made again.
-        data: the source of the motion.
+        motion: the source of the motion.
         architecture: builds the networks.
         upstream: how to train the runs that the network builds upon; each builds upon the one before.
         training: how the network is trained.
@@ -76,7 +76,7 @@ class Experiment:
     outputs: Path
     device: torch.device
     force: bool
-    data: MotionSource
+    motion: MotionSource
     architecture: Architecture
     upstream: tuple[UpstreamTraining, ...]
     training: NetworkTraining | RefinerTraining
@@ -90,9 +90,8 @@ class Experiment:
     @property
     def evaluations(self) -> dict[str, str]:
         """The identity of the evaluation, by mode."""
-        return {
-            mode: evaluation_id(self.config, mode, self.data.groups_digest) for mode in self.evaluation.modes
-        }
+        groups = self.motion.groups_digest
+        return {mode: evaluation_id(self.config, mode, groups) for mode in self.evaluation.modes}
 
     @property
     def deployments(self) -> dict[str, Deployment]:
@@ -100,23 +99,25 @@ class Experiment:
         return {deployment_id(self.config): self.deployment} if self.deployment else {}
 
     @property
-    def stages(self) -> tuple[str, ...]:
+    def stage_ids(self) -> tuple[str, ...]:
         """The identities of the stages after training: the evaluations and the deployment."""
         return (*self.evaluations.values(), *self.deployments)
 
-    def upstream_identities(self, data: str) -> list[Identity]:
+    def upstream_identities(self, data_digest: str) -> list[Identity]:
         """Return the identities of the runs upstream, in order, given the digest of the data."""
         found: list[Identity] = []
         for training in self.upstream:
-            found.append(Identity(training.kind, training.config, data, found[-1] if found else None))
+            found.append(Identity(training.kind, training.config, data_digest, found[-1] if found else None))
         return found
 
-    def identity(self, data: str) -> Identity:
+    def identity(self, data_digest: str) -> Identity:
         """Return the identity of the network's run, given the digest of the data."""
         # The identity of a frozen VQ-VAE's run covers its config. A joint VQ-VAE is trained with the network,
         # so only the keys of its architecture act.
         own = {key: value for key, value in self.config.items() if key != "vqvae"}
         if self.architecture.trains_codes:
             own["vqvae"] = {key: self.config["vqvae"][key] for key in VQVAE_SETTINGS}
-        upstream = [self.unrefined.identity(data)] if self.unrefined else self.upstream_identities(data)
-        return Identity(NETWORK, own, data, upstream[-1] if upstream else None)
+        if self.unrefined:
+            return Identity(NETWORK, own, data_digest, self.unrefined.identity(data_digest))
+        upstream = self.upstream_identities(data_digest)
+        return Identity(NETWORK, own, data_digest, upstream[-1] if upstream else None)

@@ -33,7 +33,7 @@ def run_in_processes(experiment: Experiment) -> Outcome | None:
 def _train_along(experiment: Experiment) -> None:
     """Train the stages that the first process names, until it says that it is at the end."""
     while (stage := distributed.broadcast("")) != "end":
-        data = experiment.data.prepare()  # the first process has prepared it
+        data = experiment.motion.prepare()  # the first process has prepared it
         chain = [*experiment.upstream_identities(data.digest), experiment.identity(data.digest)]
         runs = [Run.of(experiment.outputs, identity.id) for identity in chain]
         number = [identity.kind for identity in chain].index(stage)

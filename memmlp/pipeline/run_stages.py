@@ -72,7 +72,7 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
         experiment: what to run.
         watch: called after each validation with the step and its values; it may raise to stop the run.
     """
-    data = experiment.data.prepare()
+    data = experiment.motion.prepare()
     clips = data.manifest.clips
     tell(f"data: {len(clips)} clips ({tested_clips_remark(clips)}), prepared in {data.cache}")
     for said in data_remarks(data):
@@ -99,7 +99,7 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
             model = experiment.architecture.load(run.weights()).to(experiment.device)
             test = data.open("test").to(experiment.device)
             save_predictions(experiment.evaluation, model, test, experiment.predictions)
-    return Outcome(run, tuple(made), results_of(experiment, run), experiment.stages)
+    return Outcome(run, tuple(made), results_of(experiment, run), experiment.stage_ids)
 
 
 def complete_stages(
@@ -133,7 +133,7 @@ def make_missing_stages(experiment: Experiment, run: Run, data: Prepared) -> lis
     facts = data_warnings(experiment, data)
     if not facts.keys() <= run.manifest.keys():  # a run from before these were recorded
         run.write_manifest(facts)
-    run.want(experiment.stages)
+    run.want(experiment.stage_ids)
     if missing := unmeasured(experiment, run):
         if any(run.has(experiment.evaluations[mode]) for mode in missing):
             tell("evaluation: code of the metrics' packages has changed since they were measured")
@@ -247,7 +247,7 @@ def recording_outcome(experiment: Experiment, run: Run, again: bool = False) -> 
     Only failures of the work itself are recorded. Bad input, interruptions, a full disk, a closed output
     pipe, and the loss of the run to another process are not.
     """
-    missing = again or not run.done or not all(map(run.has, experiment.stages))
+    missing = again or not run.done or not all(map(run.has, experiment.stage_ids))
     missing = missing or bool(unmeasured(experiment, run))
     tracking = experiment.tracking if missing else Tracking((), experiment.outputs)
     with tracking.following(run):
@@ -277,7 +277,7 @@ def train_run(
     if files := computed_imports(run.manifest.get("plugins") or {}):
         remark(f"plugins: edits are not seen of what is imported by computed names ({files})")
     run.write_manifest({"body": data.manifest.body, **data_warnings(experiment, data)})
-    run.want(experiment.stages)
+    run.want(experiment.stage_ids)
     run.clear_stages()
     weights = upstream.weights() if upstream else None
     distributed.broadcast(NETWORK)  # tells the others what is trained now
@@ -296,7 +296,7 @@ def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequen
         model = experiment.architecture.load(run.weights()).to(experiment.device)
         test = data.open("test").to(experiment.device)
         for mode in modes:
-            settings = evaluation_settings(experiment.config, mode, experiment.data.groups_digest)
+            settings = evaluation_settings(experiment.config, mode, experiment.motion.groups_digest)
             name = experiment.evaluations[mode]
             report = {"mode": mode, "run": run.manifest["id"], "name": name, "settings": settings}
             report |= {"recipes": evaluation_recipes(settings), **machine(experiment), **own_code(experiment)}
@@ -311,7 +311,7 @@ def deploy_run(experiment: Experiment, run: Run, data: Prepared, name: str) -> N
     tell("deployment: export to ONNX, compare with torch, and time a frame")
     with timed(run, "export"):
         model = experiment.architecture.load(run.weights())
-        clips = [data.open(split).clips() for split in ("train", "test")]
+        clips = [data.open(part).clips() for part in ("train", "test")]
         deployed = run.deployment(name)
         deployed.latency.unlink(missing_ok=True)  # it lacks a file and is made again, from the start
         deployment = experiment.deployments[name]

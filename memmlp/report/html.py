@@ -14,8 +14,8 @@ from typing import Any
 from memmlp.report import figures
 from memmlp.report.figures import Curve, SpeedAndError
 from memmlp.runs.deployment_folder import as_deployed
-from memmlp.runs.identity import trained_by
-from memmlp.runs.metrics_log import Metrics
+from memmlp.runs.identity import training_config
+from memmlp.runs.metrics_log import LogRecord
 from memmlp.sweep.definition import COSTS, Sweep
 from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.error_distributions import Distribution, distributions
@@ -23,7 +23,7 @@ from memmlp.tables.formats import as_html
 from memmlp.tables.measured_run import UNKNOWN, Measured, Origin
 from memmlp.tables.table import Table
 from memmlp.tables.table_text import better, caption, decimals
-from memmlp.tables.timed_alone import measured_for
+from memmlp.tables.undisturbed_times import measured_for
 
 ERROR = "MPJRE"  # the error in Fig. 1, by Sec. 4.3
 MOST_POINTS = 200  # about how many points a curve has at most
@@ -53,7 +53,7 @@ class ReportedRun:
     @cached_property
     def config(self) -> dict[str, Any]:
         """The config keys, dotted, that can change the run's result."""
-        return trained_by(self.measured.run.config) if self.measured.run else {}
+        return training_config(self.measured.run.config) if self.measured.run else {}
 
 
 def page(chapters: Sequence[Chapter], published: Sequence[SpeedAndError], generated: str, commit: str) -> str:
@@ -280,7 +280,7 @@ def _curves(chapter: Chapter) -> dict[str, dict[str, list[Curve]]]:
     return panels
 
 
-def _curve(log: Sequence[Metrics], phase: str, name: str) -> Curve:
+def _curve(log: Sequence[LogRecord], phase: str, name: str) -> Curve:
     """Return a value over the training steps, thinned out evenly if it is long; the last point is kept."""
     points = [
         (entry.step, entry.values[name]) for entry in log if entry.phase == phase and name in entry.values

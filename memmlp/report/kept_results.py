@@ -181,7 +181,7 @@ class Kept:
     def sources(self) -> tuple[str, ...]:
         """The names of the sources of the test clips; empty if there is only one source."""
         every = (run for runs in self.runs.values() for run in runs.values())
-        return tuple(sorted({source for run in every for source in run.sources.values()}))
+        return tuple(sorted({source for run in every for source in run.clip_sources.values()}))
 
     def of(self, sweep: Sweep) -> dict[str, RunsBySeed]:
         """Return the runs of the arms and seeds that the sweep has now.
@@ -319,7 +319,7 @@ def _record(run: Measured) -> dict[str, Any]:
 
 def _clips(run: Measured) -> list[list[str]]:
     """Return the names of the test clips, each with its group, and with its source if there are several."""
-    sources = run.sources
+    sources = run.clip_sources
     return [[name, run.group(name), *([sources[name]] if sources else [])] for name in run.clips]
 
 
@@ -338,7 +338,7 @@ def _measured(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str
         means=errors,
         clips=_of_clips(errors, names),
         groups={clip: group for clip, group, *_ in clips},
-        sources={clip: source[0] for clip, _, *source in clips if source},
+        clip_sources={clip: source[0] for clip, _, *source in clips if source},
         costs=record["costs"],
         origin=Origin(**origin),
         training=record.get("training", {}),

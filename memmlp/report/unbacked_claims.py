@@ -18,7 +18,7 @@ import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from memmlp.evaluation.units import UNITS
+from memmlp.evaluation.metric_facts import UNITS
 
 WORDS = (
     "lose", "loses", "raise", "raises", "raised", "lower", "lowers", "lowered", "higher", "better", "best",

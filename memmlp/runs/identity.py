@@ -152,12 +152,12 @@ def evaluation_settings(
 
     `groups_digest` is a digest of the column file that says which clips belong together; None without a file.
     """
-    group = config.get("evaluation", {})
-    ik = group.get("ik", "off")
-    solver = {"ik": ik} | ({"ik_iterations": group.get("ik_iterations")} if ik == "lbfgs" else {})
+    chosen = config.get("evaluation", {})
+    ik = chosen.get("ik", "off")
+    solver = {"ik": ik} | ({"ik_iterations": chosen.get("ik_iterations")} if ik == "lbfgs" else {})
     groups = _groups(config.get("data") or {}) | ({"groups_file": groups_digest} if groups_digest else {})
-    drawn = {"batch": group.get("batch")} if inference(config).get("memory.blend") == "sampled" else {}
-    measured = {"metrics": own} if (own := _own_metrics(group.get("metrics") or ())) else {}
+    drawn = {"batch": chosen.get("batch")} if inference(config).get("memory.blend") == "sampled" else {}
+    measured = {"metrics": own} if (own := _own_metrics(chosen.get("metrics") or ())) else {}
     return {"mode": mode, **solver, **inference(config), **groups, **drawn, **measured}
 
 
@@ -244,7 +244,7 @@ def option_in_slot(config: Mapping[str, Any], slot: str) -> str | None:
     return (config.get(slot) or {}).get("name", UNNAMED.get(slot))
 
 
-def trained_by(config: Mapping[str, Any]) -> dict[str, Any]:
+def training_config(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the config values that can change a training's result, by dotted key; null counts as no key."""
     later = (*EVALUATION, *DEPLOYMENT, *(() if _rolls_out(config) else INFERENCE))
     out = (*NEUTRAL, *FORMER, *later, *_unused(config))
@@ -267,12 +267,12 @@ def _draws(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _training(kind: str, config: Mapping[str, Any], data: str, upstream: str | None) -> dict[str, Any]:
-    return {"kind": kind, "config": trained_by(config), "data": data, "upstream": upstream}
+    return {"kind": kind, "config": training_config(config), "data": data, "upstream": upstream}
 
 
-def trained_with(key: str, config: Mapping[str, Any]) -> bool:
+def changes_training(key: str, config: Mapping[str, Any]) -> bool:
     """Return whether a dotted key can change the training of this config, or its data."""
-    counting = trained_by(config).keys() - _inert(config).keys()
+    counting = training_config(config).keys() - _inert(config).keys()
     return key.startswith("data.") or any(_below(name, [key]) for name in counting)
 
 
@@ -351,9 +351,9 @@ def _unused(config: Mapping[str, Any]) -> Iterable[str]:
 
 
 def _inert(config: Mapping[str, Any]) -> dict[str, float]:
-    """Return the fixed weights of loss terms that this config has not, with the values that they count as.
+    """Return the keys of fixed loss weights that have no effect with this config, each with its default.
 
-    These are their defaults, which runs from before this rule have.
+    A run's identity takes the default in place of what the config says: runs from before this rule have it.
     """
     if option_in_slot(config, "loss") != "manual":
         return {}
@@ -369,9 +369,10 @@ def _below(key: str, names: Iterable[str]) -> bool:
 
 
 def _is_path(key: str, flat: Mapping[str, Any]) -> bool:
-    """Return whether a key is the path of a class of this package that has another name.
+    """Return whether a key holds the import path of a class that the config also names in another way.
 
-    That is a slot's class, and what stands deeper and is named. A foreign class has no other name.
+    That is the class of a slot, or of a component below one, if it is of this package: `name` says which it
+    is. Of classes of users' packages, the path is the only name.
     """
     node, _, last = key.rpartition(".")
     named = "." not in node or f"{node}.name" in flat

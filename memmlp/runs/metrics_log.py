@@ -15,7 +15,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, plain
 
 
-class Metrics(NamedTuple):
+class LogRecord(NamedTuple):
     """One record of the log.
 
     Attributes:
@@ -31,11 +31,11 @@ class Metrics(NamedTuple):
     time: float
 
 
-def parsed(line: bytes) -> Metrics:
+def parsed(line: bytes) -> LogRecord:
     """Return the record in a line. Raises ValueError, KeyError or TypeError if it has none."""
     entry = json.loads(line)
     values = {key: float(value) for key, value in entry["values"].items()}
-    return Metrics(entry["step"], entry["phase"], values, entry["time"])
+    return LogRecord(entry["step"], entry["phase"], values, entry["time"])
 
 
 class MetricsLog:
@@ -76,7 +76,7 @@ class MetricsLog:
             atomic_write(self.path, content[: content.rfind(b"\n") + 1])
         self._whole = True
 
-    def read(self) -> list[Metrics]:
+    def read(self) -> list[LogRecord]:
         """Read all records, leaving out an incomplete last line.
 
         If a resumed run repeated a step, its last record is used.
@@ -86,7 +86,7 @@ class MetricsLog:
         """
         if not self.path.exists():
             return []
-        entries: dict[tuple[str, int], Metrics] = {}
+        entries: dict[tuple[str, int], LogRecord] = {}
         for number, line in enumerate(self.path.read_bytes().split(b"\n")[:-1], 1):
             try:
                 metrics = parsed(line)

@@ -16,7 +16,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import number_of
 from memmlp.runs.deployment_folder import with_times_as_deployed
 from memmlp.runs.evaluation_file import with_solvers
-from memmlp.runs.identity import SLOTS, flatten, option_in_slot, trained_by
+from memmlp.runs.identity import SLOTS, flatten, option_in_slot, training_config
 from memmlp.runs.notes import read_notes
 from memmlp.runs.run import STATUSES, Run
 from memmlp.runs.shown_name import run_name
@@ -88,7 +88,7 @@ def differing(configs: Sequence[Mapping[str, Any]], data: Sequence[str] = ()) ->
         data: the digests of their data.
     """
     flats = [flatten(config) for config in configs]
-    counting = {key for config in configs for key in (*trained_by(config), *_later(config))}
+    counting = {key for config in configs for key in (*training_config(config), *_later(config))}
     counting |= _of_data(flats, data)
     names = [key for key in dict.fromkeys(key for flat in flats for key in flat) if key in counting]
     different = [key for key in names if len({repr(flat.get(key)) for flat in flats}) > 1]

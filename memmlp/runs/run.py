@@ -40,7 +40,7 @@ from memmlp.runs.identity import (
     exported_otherwise,
     used_as_configured,
 )
-from memmlp.runs.metrics_log import Metrics, MetricsLog
+from memmlp.runs.metrics_log import LogRecord, MetricsLog
 from memmlp.runs.resumed_origin import joined
 
 STAGE_WORDS = {"training": "training", "evaluation": "evaluating", "deployment": "exporting"}
@@ -296,7 +296,7 @@ class Run:
         (self.folder / "FAILED").unlink(missing_ok=True)
 
     def forgive(self) -> None:
-        """Let no attempt so far count as one that died, since it ended well or is to be tried again."""
+        """Stop counting attempts so far as ones that died: the run ended well, or is to be tried again."""
         manifest = self.manifest
         attempts = len(manifest.get("attempts", []))
         if attempts > manifest.get("forgiven", 0):
@@ -412,7 +412,7 @@ class Run:
         """The last logged training step; 0 before the first."""
         return max((entry.step for entry in self.metrics()), default=0)
 
-    def metrics(self) -> list[Metrics]:
+    def metrics(self) -> list[LogRecord]:
         """Read the metrics log (see `MetricsLog.read`)."""
         return self._log.read()
 

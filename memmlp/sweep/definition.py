@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.evaluation.units import SMALLEST
+from memmlp.evaluation.metric_facts import SMALLEST
 
 MODES = ("stream", "window")
 BRANCHES = ("rotation", "position", "combined")

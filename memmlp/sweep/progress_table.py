@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from memmlp.runs.identity import NETWORK, training_settings
-from memmlp.runs.metrics_log import Metrics
+from memmlp.runs.metrics_log import LogRecord
 from memmlp.runs.run import Run
 from memmlp.runs.shown_name import kind_words
 from memmlp.sweep.plan import Plan, RunTask
@@ -202,7 +202,7 @@ def _words(seconds: float | None) -> str:
     return f" {seconds / 60:.0f} min" if seconds >= 90 else f" {seconds:.0f} s"
 
 
-def time_left(log: list[Metrics], total: int) -> float | None:
+def time_left(log: list[LogRecord], total: int) -> float | None:
     """Return the seconds to the end of training, at the rate of the log's last five entries.
 
     Return None if there is no rate yet.

@@ -32,7 +32,7 @@ from typing import Any
 import yaml
 
 from memmlp.common.errors import InputError, why_unreadable
-from memmlp.evaluation.units import SMALLEST, UNITS
+from memmlp.evaluation.metric_facts import SMALLEST, UNITS
 from memmlp.sweep.definition import (
     BRANCHES,
     COMPUTE,

@@ -12,7 +12,7 @@ from memmlp.tables.effects import RunsBySeed, control_arm, effects, paper_effect
 from memmlp.tables.flags_of_runs import DescribeRun, early_looks, flags, silent
 from memmlp.tables.measured_run import Measured
 from memmlp.tables.table import Cell, Effect, Key, Row, Table
-from memmlp.tables.timed_alone import measured_for
+from memmlp.tables.undisturbed_times import measured_for
 
 if TYPE_CHECKING:
     from memmlp.tables.seed_rounds import Rounds

@@ -16,7 +16,7 @@ from memmlp.sweep.definition import COSTS, TIMES, Arm, Sweep
 from memmlp.tables.measured_run import SHARED, Measured
 from memmlp.tables.statistics import detectable, equivalence_p, holm, paired_effects, verdict
 from memmlp.tables.table import STEADY, Effect, Key
-from memmlp.tables.timed_alone import measured_for
+from memmlp.tables.undisturbed_times import measured_for
 
 RunsBySeed = Mapping[int, Measured]  # an arm's finished runs by seed
 
@@ -27,13 +27,13 @@ class SharedClips(NamedTuple):
     Attributes:
         seeds: the seeds that both arms have (S).
         clips: the names of the clips that all runs have (C).
-        names: the names of the clips' groups (C).
+        group_names: the names of the clips' groups (C).
         groups: the groups' numbers (C,).
     """
 
     seeds: list[int]
     clips: list[str]
-    names: list[str]
+    group_names: list[str]
     groups: np.ndarray
 
 
@@ -44,14 +44,14 @@ class Paired(NamedTuple):
         matrix: the arm's errors minus the control's (S, C), by seed and clip.
         groups: the number of each clip's group (C,).
         clips: the names of these clips (C).
-        takes: the names of their groups (C).
+        group_names: the names of their groups (C).
         diverged: whether further clips were lost because a network diverged on them.
     """
 
     matrix: np.ndarray
     groups: np.ndarray
     clips: tuple[str, ...] = ()
-    takes: tuple[str, ...] = ()
+    group_names: tuple[str, ...] = ()
     diverged: bool = False
 
     @property
@@ -147,7 +147,7 @@ def _paired(
     metric: str,
 ) -> Paired:
     """Return ours minus theirs, over the shared seeds and the clips for which all runs have a number."""
-    seeds, clips, names, groups = shared
+    seeds, clips, group_names, groups = shared
 
     def errors(metric: str) -> np.ndarray:
         """Return a metric of both sides (2, S, C)."""
@@ -161,8 +161,8 @@ def _paired(
     known = np.isfinite(values).all((0, 1))
     diverged = not known.all() and _diverged(values, errors(SHARED))
     own, others = values[:, :, known]
-    left, takes = (tuple(itertools.compress(words, known)) for words in (clips, names))
-    return Paired(own - others, groups[known], left, takes, diverged)
+    left, their_groups = (tuple(itertools.compress(words, known)) for words in (clips, group_names))
+    return Paired(own - others, groups[known], left, their_groups, diverged)
 
 
 def _diverged(values: np.ndarray, positions: np.ndarray) -> bool:

@@ -18,7 +18,8 @@ from memmlp.tables.statistics.paired_differences import LEVEL
 from memmlp.tables.table import Key
 
 MODE = "stream"
-OWN_HISTORY = "rollout.own_predictions"  # a component whose calls without gradients compute leaves out
+OWN_HISTORY = "rollout.own_predictions"
+"""A component that also calls the network without gradients. The count of compute lacks these calls."""
 
 
 class TrendVerdict(StrEnum):
@@ -342,7 +343,7 @@ def _shared(pairs: Sequence[Paired]) -> tuple[np.ndarray, np.ndarray, int]:
     Returns:
         Differences (K, C), the clips' groups (C,), and how many further clips only some cells have.
     """
-    takes = {clip: take for pair in pairs for clip, take in zip(pair.clips, pair.takes, strict=True)}
+    takes = {clip: take for pair in pairs for clip, take in zip(pair.clips, pair.group_names, strict=True)}
     rows = [dict(zip(pair.clips, pair.matrix.mean(0), strict=True)) for pair in pairs]
     clips = [clip for clip in takes if all(clip in row for row in rows)]
     differences = np.array([[row[clip] for clip in clips] for row in rows]).reshape(len(pairs), len(clips))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from memmlp.evaluation.units import HIGHER
+from memmlp.evaluation.metric_facts import HIGHER
 from memmlp.sweep.definition import COSTS, Arm, Sweep
 from memmlp.tables.effects import RunsBySeed, control_arm, with_existing_branches
 from memmlp.tables.statistics import interquartile_mean, probability_of_improvement

@@ -17,7 +17,7 @@ from memmlp.tables.effects import RunsBySeed, control_arm, one_and_the_same
 from memmlp.tables.flag_words import flags_of_difference, had_core, listed, quoted, unique
 from memmlp.tables.measured_run import SHARED, UNKNOWN, Measured
 from memmlp.tables.table import STEADY
-from memmlp.tables.timed_alone import core_share, timed_alone
+from memmlp.tables.undisturbed_times import core_share, undisturbed
 
 DescribeRun = Callable[[Arm, int], str | None]
 BUILT_IN = "builtin"
@@ -325,7 +325,7 @@ def _busy(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
     """Flag arms whose times were measured while other work ran on the machine."""
     found, fewer = [], []
     for arm in sweep.runnable():
-        counted = timed_alone(runs[arm.label])
+        counted = undisturbed(runs[arm.label])
         shares = [share for run in counted.values() if (share := core_share(run)) is not None]
         ratios = [run.costs["ratio"] for run in counted.values() if "ratio" in run.costs]
         if shares and min(shares) < LEAST_CORE_SHARE:
@@ -393,7 +393,7 @@ def _same(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
 
 
 def _apart(ours: RunsBySeed, theirs: RunsBySeed) -> str:
-    """Say what the difference between two arms with the same runs and errors affects."""
+    """Say in what two arms differ whose runs and errors are the same: in costs, or in nothing."""
     if any(ours[seed].costs != theirs[seed].costs for seed in ours.keys() & theirs.keys()):
         return "they differ in how it is deployed, and in nothing but costs"
     return "what tells them apart has no effect here"

@@ -116,7 +116,7 @@ class Measured:
             core (CORE_SHARES).
         origin: what the run was made from.
         latency: all measurements of its streaming step.
-        sources: the source of each clip, if the data has several sources.
+        clip_sources: the source of each clip, if the data has several sources.
         run: the run's folder; None for results that were kept without it.
         training: what its training took, as far as known: `seconds`; `frames`, the frames seen, each counted
             as often as it was drawn in a window; and `flops` for kept results.
@@ -132,7 +132,7 @@ class Measured:
     origin: Origin
     latency: Mapping[str, Any] = field(default_factory=dict)
     run: Run | None = None
-    sources: Mapping[str, str] = field(default_factory=dict)
+    clip_sources: Mapping[str, str] = field(default_factory=dict)
     training: Mapping[str, float] = field(default_factory=dict)
     code: Mapping[str, str] = field(default_factory=dict)
 
@@ -167,9 +167,9 @@ class Measured:
 
     def by_source(self) -> dict[str, Measured]:
         """Return the results on each source's clips alone, by source; empty if there is only one source."""
-        own: dict[str, list[str]] = {name: [] for name in sorted(set(self.sources.values()))}
+        own: dict[str, list[str]] = {name: [] for name in sorted(set(self.clip_sources.values()))}
         for clip in self.clips if own else ():
-            own[self.sources[clip]].append(clip)
+            own[self.clip_sources[clip]].append(clip)
         return {name: self.over(clips) for name, clips in own.items()}
 
     def over(self, clips: Sequence[str]) -> Measured:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from memmlp.evaluation.units import HIGHER, UNITS
+from memmlp.evaluation.metric_facts import HIGHER, UNITS
 from memmlp.sweep.definition import COSTS
 from memmlp.tables.statistics import Verdict
 from memmlp.tables.table import STEADY, Cell, Row, Table

@@ -61,7 +61,7 @@ class TeacherForcing(Rollout):
     ) -> TrainingCall:
         """Draw the training call of a step."""
         clips, end = map(distributed.own_rows, sampler.draw(step))
-        past, stride = model.length, model.stride
+        past, stride = model.past_frames, model.stride
         segment = dataset.segments(clips, end, past + stride)
         state = model.true_state(segment[:, :past])
         return TrainingCall(segment[:, past:, :SPARSE_DIM], state, segment[:, -model.frames :], clips)
@@ -83,7 +83,7 @@ class OwnPredictions(Rollout):
     ) -> TrainingCall:
         """Draw the training call of a step, after the calls that make its history."""
         clips, end = map(distributed.own_rows, sampler.draw(step))
-        past, stride = model.length, model.stride
+        past, stride = model.past_frames, model.stride
         passes = int(torch.randint(self.max_passes + 1, ())) if model.shift else 0
         segment = dataset.segments(clips, end, past + stride * (passes + 1))
         sparse = segment[..., :SPARSE_DIM]
@@ -135,7 +135,7 @@ class PersistentStreams(Rollout):
     ) -> TrainingCall:
         """Draw the training call of a step: the next streams, each moved on by one stride.
 
-        Whose states `keep` gets is remembered until then, so that the two are called in turn.
+        Call `keep` before the next draw: it stores the new states of the streams that were drawn last.
         """
         clips, end = sampler.draw(step)
         who = (step * len(clips) + torch.arange(len(clips), device=clips.device)) % self.streams
@@ -146,7 +146,7 @@ class PersistentStreams(Rollout):
         self.end[who] = torch.where(going, self.end[who] + model.stride, end)
         self.lives[who] = True
         self.who, mine, going = who, distributed.own_rows(who), distributed.own_rows(going)
-        past, stride = model.length, model.stride
+        past, stride = model.past_frames, model.stride
         segment = dataset.segments(self.clip[mine], self.end[mine], past + stride)
         fresh = model.running_state(segment[:, :past, :SPARSE_DIM])
         state = {}

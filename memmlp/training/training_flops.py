@@ -56,7 +56,7 @@ def step_flops(model: MotionModel, loss: Loss, optim: Optim) -> int:
 
 def _frames(model: MotionModel) -> MotionDataset:
     """Return a dataset of one clip of random frames, as long as a training call needs."""
-    length = model.length + model.stride
+    length = model.past_frames + model.stride
     draw = torch.Generator().manual_seed(0)
     frames = torch.randn(length, FRAME_DIM, generator=draw)
     return MotionDataset(frames, torch.tensor([0]), torch.tensor([length]), ["random"])

@@ -121,7 +121,7 @@ def trained(overrides: list[str]) -> Arm:
 
 def train_and_stream(cfg: DictConfig) -> Arm:
     experiment = build_experiment(cfg)
-    data = experiment.data.prepare()
+    data = experiment.motion.prepare()
     above = make_upstream_runs(experiment, data)
     run = Run(Path(mkdtemp(dir=".", prefix="arm-")))
     weights = above.model if above else None

@@ -45,7 +45,7 @@ def mem_mlp(step_files: Callable[[str], Path]) -> tuple[MemMLP, Path]:
 
 def test_a_file_is_checked_with_a_full_past_where_a_clip_is_long_enough():
     model = exported.NETWORKS["mem_mlp"]()
-    full = model.length + model.frames
+    full = model.past_frames + model.frames
     clips = [tiny.clip(frames, seed=frames) for frames in (20, full + 100, 30)]
     (longest,) = clips_to_check(model, clips)
     assert torch.equal(longest, clips[1][: full + MARGIN])

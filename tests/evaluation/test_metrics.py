@@ -74,7 +74,7 @@ class Copy:
     """A network that knows the truth and looks it up by its inputs."""
 
     shift = 0
-    windowless = joint = False
+    windowless = takes_whole_clip = False
 
     def __init__(self, clips, error=0.0, frames=7):
         self.normalizer, self.frames, self.error = tiny.normalizer(), frames, error

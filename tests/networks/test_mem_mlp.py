@@ -60,7 +60,7 @@ def test_first_frame_fills_the_window(kind, changes):
     """A fresh stream acts as if the first frame had stood for a window."""
     model = tiny.model(kind, **changes)
     first = model.advance(SPARSE[:, :1], model.initial_state(1))[0]
-    still = model.running_state(SPARSE[:, :1].expand(-1, model.memory.length, -1))
+    still = model.running_state(SPARSE[:, :1].expand(-1, model.memory.past_frames, -1))
     torch.testing.assert_close(first, model.advance(SPARSE[:, :1], still)[0])
 
 

@@ -169,7 +169,7 @@ def test_every_knob_changes_the_motion(change):
 
 def test_a_training_window_is_all_that_a_step_moves_by():
     model = tiny.recurrent_poser(frames=9)
-    assert (model.frames, model.stride, model.length) == (9, 9, 0)
+    assert (model.frames, model.stride, model.past_frames) == (9, 9, 0)
 
 
 @pytest.mark.parametrize(

@@ -139,7 +139,7 @@ def base(home: Path) -> Outcome:
 def outcome(folder: Path, overrides: list[str]) -> Outcome:
     """Make everything but the data in an empty folder, so that no run can be found by a wrong identity."""
     experiment = replace(build_experiment(composed([*BASE, *overrides])), outputs=folder)
-    data = experiment.data.prepare()
+    data = experiment.motion.prepare()
     identity = experiment.identity(data.digest)
     codes = make_upstream_runs(replace(experiment, tracking=Tracking((), folder)), data).model
     run = Run(folder / "run")
@@ -227,7 +227,7 @@ def test_other_synthetic_motion_is_another_identity():
     def identity(*overrides: str) -> str:
         synthetic = [word for word in BASE if not word.startswith("data")]
         experiment = build_experiment(composed([*synthetic, "data.synth.minutes=0.1", *overrides]))
-        return experiment.identity(experiment.data.prepare().digest).id
+        return experiment.identity(experiment.motion.prepare().digest).id
 
     assert len({identity(), identity("data.synth.seed=1"), identity("data.synth.minutes=0.25")}) == 3
 

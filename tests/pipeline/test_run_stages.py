@@ -107,7 +107,7 @@ def test_the_same_command_finds_the_run_and_others_share_the_vqvae(home, monkeyp
     assert len(codes) == 1
     monkeypatch.chdir(home)
     experiment = build_experiment(composed([*TINY, "seed=1"]))  # by default a VQ-VAE follows its run's seed
-    assert make_upstream_runs(experiment, experiment.data.prepare()).id not in codes
+    assert make_upstream_runs(experiment, experiment.motion.prepare()).id not in codes
 
 
 def test_what_a_finished_run_was_built_upon_is_not_trained_again(home):
@@ -274,7 +274,7 @@ def test_every_experiment_trains_and_streams(home, name, monkeypatch: pytest.Mon
     monkeypatch.chdir(home)
     cfg = composed([f"experiment={name}", *TINY, "optim.steps=2"])
     experiment = build_experiment(cfg)
-    data = experiment.data.prepare()
+    data = experiment.motion.prepare()
     above = make_upstream_runs(experiment, data)
     run = Run(home / "variants" / name)
     run.folder.mkdir(parents=True, exist_ok=True)

@@ -66,7 +66,7 @@ def test_one_command_trains_each_part_and_then_the_whole(memmlp):
     weights = chain[2].model.read_bytes()
     chain[2].reset()
     experiment = build_experiment(composed(SHORT))
-    made = make_upstream_runs(experiment, experiment.data.prepare(), chain[2].id)
+    made = make_upstream_runs(experiment, experiment.motion.prepare(), chain[2].id)
     assert (made.id, made.model.read_bytes()) == (chain[2].id, weights)
     assert "finished already" in memmlp("train", *SHORT).out
 

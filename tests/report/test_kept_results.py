@@ -128,7 +128,8 @@ def test_two_evaluations_of_one_run_are_kept_apart(sweep: Sweep, kept: Kept, tmp
     """Arms may show inverse kinematics of two kinds of one training."""
     one, two = list(kept.runs)[:2]
     solved = {
-        seed: replace(run, id=kept.runs[one][seed].id, sources={}) for seed, run in kept.runs[two].items()
+        seed: replace(run, id=kept.runs[one][seed].id, clip_sources={})
+        for seed, run in kept.runs[two].items()
     }
     save(tmp_path / "kept.json", replace(kept, runs=kept.runs | {two: solved}))
     read = load_kept(tmp_path / "kept.json")
@@ -150,10 +151,12 @@ def test_two_deployments_of_one_run_are_kept_apart(sweep: Sweep, kept: Kept, tmp
     """Arms may show what two graphs of one training cost, and one of them two evaluations, too."""
     one, two, three = list(kept.runs)[:3]
     slower = {
-        seed: replace(run, costs={**run.costs, "ms": 5.0}, sources={}) for seed, run in kept.runs[one].items()
+        seed: replace(run, costs={**run.costs, "ms": 5.0}, clip_sources={})
+        for seed, run in kept.runs[one].items()
     }
     solved = {
-        seed: replace(run, id=kept.runs[one][seed].id, sources={}) for seed, run in kept.runs[three].items()
+        seed: replace(run, id=kept.runs[one][seed].id, clip_sources={})
+        for seed, run in kept.runs[three].items()
     }
     save(tmp_path / "kept.json", replace(kept, runs=kept.runs | {two: slower, three: solved}))
     read = load_kept(tmp_path / "kept.json")

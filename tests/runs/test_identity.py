@@ -9,10 +9,10 @@ import memmlp.runs.recipe_versions
 from memmlp.runs.identity import (
     NEUTRAL,
     Identity,
+    changes_training,
     deployment_id,
     evaluation_id,
     flatten,
-    trained_with,
 )
 
 
@@ -158,4 +158,4 @@ def test_weights_of_terms_that_are_not_there_do_not_count():
     assert of("off", alone, position=9.0, velocity=9.0, hand=9.0) == of("off", alone)
     assert of("off", alone, rotation=9.0) != of("off", alone)
     config = {**CONFIG, "hand": {"name": "off"}, "loss": {"name": "manual", **weights}}
-    assert [trained_with(f"loss.{name}", config) for name in ("hand", "position")] == [False, True]
+    assert [changes_training(f"loss.{name}", config) for name in ("hand", "position")] == [False, True]

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from memmlp.runs.metrics_log import Metrics
+from memmlp.runs.metrics_log import LogRecord
 from memmlp.runs.run import Run
 from memmlp.sweep import progress_table
 from memmlp.sweep.plan import Entry, Plan, RunTask
@@ -106,7 +106,7 @@ def test_the_time_left_follows_from_the_last_five_entries(monkeypatch: pytest.Mo
     """Earlier steps took a hundred times as long: of a training's beginning, or of a busier machine."""
     slow = [(100 * n, 1000.0 * n) for n in range(10)]
     quick = [(900 + 100 * n, 9000 + 10.0 * n) for n in range(1, 5)]
-    log = [Metrics(step, "train", {"loss": 1.0}, time) for step, time in slow + quick]
+    log = [LogRecord(step, "train", {"loss": 1.0}, time) for step, time in slow + quick]
     monkeypatch.setattr("time.time", lambda: 9043.0)
     assert time_left(log, 1900) == pytest.approx(600 * 0.1 - 3)
     assert time_left(log[:1], 1900) is None

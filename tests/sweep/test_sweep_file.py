@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from memmlp.common.errors import InputError
-from memmlp.evaluation.units import SMALLEST, UNITS
+from memmlp.evaluation.metric_facts import SMALLEST, UNITS
 from memmlp.sweep import sweep_file
 from memmlp.sweep.sweep_file import load_sweep, parse_sweep
 

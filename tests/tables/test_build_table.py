@@ -68,7 +68,7 @@ def test_arms_without_a_sources_clips_are_left_out_and_named(tmp_path: Path):
 
     def mixed(label: str) -> dict:
         sources = dict.fromkeys(clips, "old") if label == "one" else halves
-        return {seed: replace(run, sources=sources) for seed, run in runs[label].items()}
+        return {seed: replace(run, clip_sources=sources) for seed, run in runs[label].items()}
 
     runs = {label: mixed(label) for label in runs}
     part = on_source(sweep, runs, "new")

@@ -130,7 +130,7 @@ def mixed(outputs) -> Measured:
 
 def test_means_of_one_sources_clips(tmp_path):
     measured = mixed(tmp_path)
-    assert measured.sources == SOURCES
+    assert measured.clip_sources == SOURCES
     found = measured.by_source()
     assert list(found) == ["kicks", "salsa"]
     assert list(found["kicks"].clips) == ["kicks/01", "kicks/02"]

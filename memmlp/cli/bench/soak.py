@@ -57,7 +57,7 @@ def _test_clips(outputs: Path, run: str) -> MotionDataset:
     from memmlp.config.build import build_experiment, config_of
     from memmlp.runs.lookup import find_run
 
-    return build_experiment(config_of(find_run(outputs, run))).data.prepare().open("test")
+    return build_experiment(config_of(find_run(outputs, run))).motion.prepare().open("test")
 
 
 def _synthetic() -> MotionDataset:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from memmlp.cli.options import Finite, config_dir_option, plugins_option
-from memmlp.evaluation.units import UNITS
+from memmlp.evaluation.metric_facts import UNITS
 
 if TYPE_CHECKING:
     from memmlp.pipeline.experiment import Experiment
@@ -111,7 +111,7 @@ def train(
 
 
 def of_processor(threads: int) -> str:
-    """Return in words whose time is measured: that of several threads together is no time of a clock."""
+    """Return in words whose time is measured. Threads' times are added up, so they exceed a clock's."""
     return "of the processor" + (f", of all {threads} threads together" if threads > 1 else "")
 
 
@@ -217,7 +217,7 @@ def measure_seed(
     """
     from memmlp.common.errors import InputError
 
-    data = {arm: experiment.data.prepare() for arm, experiment in experiments.items()}
+    data = {arm: experiment.motion.prepare() for arm, experiment in experiments.items()}
     runs = {arm: experiment.identity(data[arm].digest) for arm, experiment in experiments.items()}
     ids = {arm: run.id for arm, run in runs.items()}
     if known is not None:
@@ -331,7 +331,7 @@ def show_breakdown(arm: str, words: Sequence[str], steps: int) -> None:
     from memmlp.training.step_profile import PARTS, step_parts
 
     experiment = compose_experiment((*words, f"optim.steps={WARM_UP + 2 * steps}"))
-    one = learner(experiment, experiment.data.prepare())
+    one = learner(experiment, experiment.motion.prepare())
     one.take(WARM_UP)
     before = one.seconds
     one.take(steps)

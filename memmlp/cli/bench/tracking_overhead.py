@@ -43,7 +43,7 @@ def tracking(blocks: int, steps: int, uri: str | None, overrides: tuple[str, ...
         follower = feed.process
         run = PiecewiseRun(Path(folder) / "runs" / ("0" * 16), follower.pid if follower else None)
         with experiment.tracking.following(run):
-            train_run(experiment, run, experiment.data.prepare(), None)
+            train_run(experiment, run, experiment.motion.prepare(), None)
         feed.close()
         if follower is not None:
             follower.kill()  # its folder goes

@@ -17,7 +17,7 @@ from memmlp.cli.runs.printing import (
     text_of,
     value_text,
 )
-from memmlp.evaluation.units import UNITS
+from memmlp.evaluation.metric_facts import UNITS
 
 if TYPE_CHECKING:
     from memmlp.runs.run import Run

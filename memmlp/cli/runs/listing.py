@@ -23,7 +23,7 @@ from memmlp.cli.runs.printing import (
     recorded,
     value_text,
 )
-from memmlp.evaluation.units import UNITS
+from memmlp.evaluation.metric_facts import UNITS
 from memmlp.runs.identity import NETWORK
 from memmlp.runs.shown_name import kind_words
 

@@ -106,14 +106,14 @@ def run_loop(
         whole = 1000 * (time.perf_counter() - arrived)
         times = {"ms": round(1000 * stream.network_seconds, 3), "whole": round(whole, 3)}
         told = source.malformed + refused, source.foreign
-        head = {
+        opening = {
             "number": number,
             "time": round(pose.time, 4),
             "held": pose.held,
             "jumping": stream.odd.jumping,
         }
         message = (
-            head
+            opening
             | times
             | refusals_message(dropped, *told)
             | joints_message(stream.space, pose, source.truth(pose.time))

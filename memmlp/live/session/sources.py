@@ -203,17 +203,18 @@ class ClipSource:
         self.sleep(max(self.began + index / self.hz - now, 0))
         self.next = index + 1
         turn, step = divmod(index, self.count)
-        return SourceSample(turn * self.round + step / self.hz, self.clip.trackers(step / self.hz), dropped)
+        within = step / self.hz
+        return SourceSample(turn * self.round_seconds + within, self.clip.trackers(within), dropped)
 
     @property
-    def round(self) -> float:
+    def round_seconds(self) -> float:
         """The seconds from the beginning of one round to the beginning of the next."""
         return (self.count - 1) / self.hz + PAUSE
 
     def truth(self, time: float) -> np.ndarray:
         """Return the true joints (22, 3), metres, AMASS' world."""
         half = PAUSE / 2  # nearer to a round's beginning it belongs to it, even where floats put it before
-        return self.clip.truth((time + half) % self.round - half)
+        return self.clip.truth((time + half) % self.round_seconds - half)
 
     def close(self) -> None:
         """Do nothing, since this source holds no resources."""

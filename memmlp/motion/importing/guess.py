@@ -20,7 +20,7 @@ from memmlp.motion.importing.anatomy import CHAINS, unit
 from memmlp.motion.importing.axes import with_unit_and_up
 from memmlp.motion.importing.calibration_frame import JUMP, MAYBE, first_step
 from memmlp.motion.importing.convert import convert
-from memmlp.motion.importing.limbs_by_shape import Limbs, Pair, Tree, find_limbs, middle, read_tree
+from memmlp.motion.importing.limbs_by_shape import LimbNodes, Pair, Tree, find_limbs, middle, read_tree
 from memmlp.motion.importing.node_names import NodeWords, without_namespace, words
 from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.skeleton_map import SkeletonMap
@@ -109,7 +109,7 @@ def _head_by_name(tree: Tree, said: Sequence[NodeWords]) -> int | None:
     )
 
 
-def _by_name(tree: Tree, said: Sequence[NodeWords], limbs: Limbs) -> Found:
+def _by_name(tree: Tree, said: Sequence[NodeWords], limbs: LimbNodes) -> Found:
     """Return the joints that names identify: `0.knee` and `1.knee` for the knees of both chains."""
     found: Found = {}
     for side in (0, 1):
@@ -145,7 +145,7 @@ def _spelt(
 # Tree and lengths
 
 
-def _by_shape(tree: Tree, limbs: Limbs) -> Found:
+def _by_shape(tree: Tree, limbs: LimbNodes) -> Found:
     """Return the joints that tree and lengths identify, with the keys of `_by_name`."""
     found: Found = {"pelvis": limbs.trunk[0]}
     for side in (0, 1):
@@ -171,7 +171,7 @@ def _toes(tree: Tree, legs: Pair, side: int) -> int | None:
     return next((node for node in after if tree.lengths[node] > TOES * legs.size), None)
 
 
-def _neck_and_head(tree: Tree, limbs: Limbs) -> tuple[int | None, int]:
+def _neck_and_head(tree: Tree, limbs: LimbNodes) -> tuple[int | None, int]:
     """Return the nodes of neck and head: the head's node is the last before its tip, or before its eyes."""
     line = [node for node in limbs.head if not tree.is_end(node)] or list(limbs.head)
     branching = next((node for node in line[1:] if len(tree.children[node]) > 1), None)
@@ -186,7 +186,7 @@ def _neck_and_head(tree: Tree, limbs: Limbs) -> tuple[int | None, int]:
 
 
 def _sides(
-    tree: Tree, said: Sequence[NodeWords], limbs: Limbs, shape: Found
+    tree: Tree, said: Sequence[NodeWords], limbs: LimbNodes, shape: Found
 ) -> tuple[dict[tuple[str, bool], int], list[str]]:
     """Return which chain is on which side, by (side, whether it is a leg), and the doubts about it."""
     result: dict[tuple[str, bool], int] = {}

@@ -98,7 +98,7 @@ class Pair(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Limbs:
+class LimbNodes:
     """A person's limbs as nodes.
 
     Attributes:
@@ -113,7 +113,7 @@ class Limbs:
     head: tuple[int, ...]
 
 
-def find_limbs(path: object, tree: Tree, head: int | None = None) -> Limbs:
+def find_limbs(path: object, tree: Tree, head: int | None = None) -> LimbNodes:
     """Find the limbs of a tree.
 
     Args:
@@ -137,7 +137,7 @@ def find_limbs(path: object, tree: Tree, head: int | None = None) -> Limbs:
     if not up:
         wrong = f"nothing between the arms at {tree.nodes[arms.branch]} that could be a head"
         raise InputError(f"{path}: {wrong}; allowed: a skeleton with a head")
-    return Limbs(legs, arms, tuple(chest[chest.index(shared[-1]) :]), tuple(up))
+    return LimbNodes(legs, arms, tuple(chest[chest.index(shared[-1]) :]), tuple(up))
 
 
 def _reach(tree: Tree) -> np.ndarray:

@@ -131,7 +131,7 @@ def _near(one: _Together, other: _Together) -> np.ndarray:
 
 
 def _weights() -> np.ndarray:
-    """Return what a frame's rotations are summed with (189, 24), such that distances are nearly kept."""
+    """Return the matrix (189, 24) from a frame's rotations to its signature. It nearly keeps distances."""
     return np.random.default_rng(0).standard_normal((189, SIGNATURE)) / np.sqrt(SIGNATURE)
 
 

@@ -122,7 +122,7 @@ class BoDiffusion(WholeWindow):
         return not self.offline
 
     @property
-    def joint(self) -> bool:
+    def takes_whole_clip(self) -> bool:
         """Whether window mode denoises all windows of a clip together; true in the published mode."""
         return self.offline
 

@@ -157,7 +157,9 @@ def twist(rotation: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def untwisting(local: Tensor, bone: Tensor, axis: Tensor) -> Tensor:
-    """Return the smallest rotations (..., 4, 3, 3) about the limbs' axes that limit the bases' twists.
+    """Return rotations (..., 4, 3, 3) about the limbs' axes that bring the bases' twists within limits.
+
+    Each is the smallest that does.
 
     If h is half of such a rotation's angle, the twist of the rotated base is a ratio of sums of sin h and cos
     h, from which tan h follows. A base within its limits is not rotated.
@@ -210,7 +212,7 @@ def handed(arms: Tensor, hands: Tensor, forearm: Tensor) -> tuple[Tensor, Tensor
 
 
 def footed(shins: Tensor, toe: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the unit vectors (..., 2, 3) where feet point at rest and where they should, as knees see them.
+    """Return unit vectors (..., 2, 3) in the knees' frames: to the toe at rest, and to where it should be.
 
     Args:
         shins: global rotations (..., 2, 3, 3) of the knees.

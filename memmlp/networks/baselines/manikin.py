@@ -1,9 +1,9 @@
 """MANIKIN (Jiang et al., ECCV 2024): networks predict the trunk and where limbs end; the limbs are solved.
 
-MANIKIN-S has AvatarPoser's encoder, MANIKIN-L AvatarJLM's network. What they predict of a frame (`Parts`) is
-turned into a pose in closed form (memmlp.networks.baselines.limb_solver). Readings: all heights are the
-world's, since a stream does not know the lowest foot of its clip; the head has its tracker's rotation; and a
-straight limb does not keep the swivel of the frame before.
+MANIKIN-S has AvatarPoser's encoder, MANIKIN-L AvatarJLM's network. What they predict of a frame
+(`PredictedParts`) is turned into a pose in closed form (memmlp.networks.baselines.limb_solver). Readings: all
+heights are the world's, since a stream does not know the lowest foot of its clip; the head has its tracker's
+rotation; and a straight limb does not keep the swivel of the frame before.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def follows(joint: int) -> bool:
 PLACED = [joint for joint in range(N_JOINTS) if follows(joint)]
 
 
-class Parts(NamedTuple):
+class PredictedParts(NamedTuple):
     """What the network predicts for a frame, in its own coordinates without z-scores.
 
     Attributes:
@@ -82,7 +82,7 @@ class Parts(NamedTuple):
     toe: Tensor
 
     @classmethod
-    def of(cls, made: Tensor, normalizer: Normalizer) -> Parts:
+    def of(cls, made: Tensor, normalizer: Normalizer) -> PredictedParts:
         """Return the parts of a network's outputs (..., 86 or more)."""
         chosen = [ROOT, *KEPT]
         mean, std = (
@@ -184,7 +184,7 @@ class Manikin(MotionModel):
         Limbs are solved in float32 in a mixed-precision training, too.
         """
         with in_float32(made.device):
-            return Parts.of(made.to(encoded.dtype), self.normalizer).posed(encoded, self.normalizer)
+            return PredictedParts.of(made.to(encoded.dtype), self.normalizer).posed(encoded, self.normalizer)
 
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
         """Make a training call in which each window is turned by its own random heading; see MotionModel."""
@@ -279,7 +279,7 @@ class ManikinS(Manikin, AvatarPoser):
         would have no bound where a limb is nearly along the axis from which its swivel is measured, as in a
         standing leg, and trainings diverged. The losses of middles and of swivels are sums over the limbs.
         """
-        parts = Parts.of(made, self.normalizer)
+        parts = PredictedParts.of(made, self.normalizer)
         _, turned, joints = parts.body(self.normalizer.rest)
         base, middle, end = true.limbs()
         up, angle = turned[..., list(BASES), :, 1].detach(), F.normalize(parts.swivel, dim=-1)
@@ -369,7 +369,7 @@ class ManikinL(Manikin, AvatarJLM):
         Swivels are compared as angles, measured from the true shoulders and hips. Toes are compared with the
         head on its tracker.
         """
-        parts = Parts.of(made, self.normalizer)
+        parts = PredictedParts.of(made, self.normalizer)
         turned, _ = forward_kinematics(
             sixd_to_matrix(true.sixd), torch.zeros_like(true.joints[..., ROOT, :]), self.normalizer.rest
         )

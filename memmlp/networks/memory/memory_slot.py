@@ -24,7 +24,7 @@ class Memory(nn.Module):
         trains_codes: whether it has a VQ-VAE of its own that is trained with the network.
         shift: how many frames before the newest one the recalled past ends, which is also how many frames a
             training step moves on; 0 without a past.
-        length: how many past frames of inputs the buffer holds; the last one directly precedes the new ones.
+        past_frames: how many past frames of inputs the buffer holds; the last one directly precedes the new.
         frames: T, the window's length.
         settled: whether what is recalled of a frame never changes, so that a stream may compute it once. For
             a custom memory that does not set it, only the graph of the network as trained can be exported.
@@ -33,7 +33,7 @@ class Memory(nn.Module):
     uses_codes: ClassVar[bool] = False
     trains_codes: ClassVar[bool] = False
     shift: int
-    length: int
+    past_frames: int
     frames: int
     settled: bool = False
 
@@ -50,7 +50,7 @@ class Memory(nn.Module):
         return {}
 
     def true_state(self, sparse: Tensor, motion: Tensor) -> State:
-        """Return the state after inputs (B, length, 54), with the true motion (B, length, 198) as history."""
+        """Return the state after inputs (B, past, 54), with the true motion (B, past, 198) as history."""
         return {}
 
     def needed(self, new: int) -> int:
@@ -61,7 +61,7 @@ class Memory(nn.Module):
         """Return what the memory blocks see of the past.
 
         Args:
-            sparse: inputs (B, length + new, 54) in network space.
+            sparse: inputs (B, past + new, 54) in network space.
             state: what the last call returned, or `initial_state`.
             new: how many of the inputs are new.
         """
@@ -99,7 +99,7 @@ class NoMemory(Memory):
         super().__init__()
         self.hidden, self.frames = hidden, frames
         self.shift = 0
-        self.length = frames - 1
+        self.past_frames = frames - 1
 
     def block(self, layer: int) -> nn.Module:
         """Make the backbone's block of a layer (1-based)."""

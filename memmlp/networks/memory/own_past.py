@@ -51,14 +51,14 @@ class OwnPastMemory(FeatureMemory):
         self.history, self.blend = history, Blend(blend)
         self.settled = history == "first"
         self.shift = {"frame": 1, "window": frames}[shift]
-        self.length = frames + self.shift - 1
+        self.past_frames = frames + self.shift - 1
 
     def initial_state(self, batch: int) -> State:
         """Return zeros as the past motion, the paper's fallback where there is no previous prediction."""
-        return {"motion": torch.zeros(batch, self.length, MOTION_DIM)}
+        return {"motion": torch.zeros(batch, self.past_frames, MOTION_DIM)}
 
     def true_state(self, sparse: Tensor, motion: Tensor) -> State:
-        """Return the true motion (B, length, 198) as history, for teacher forcing."""
+        """Return the true motion (B, past, 198) as history, for teacher forcing."""
         return {"motion": motion}
 
     def needed(self, new: int) -> int:
@@ -71,8 +71,8 @@ class OwnPastMemory(FeatureMemory):
         If that window would reach into the new frames, it ends just before the first of them instead.
 
         Args:
-            sparse: inputs (B, length + new, 54).
-            state: the motion before the new frames (B, length, 198).
+            sparse: inputs (B, past + new, 54).
+            state: the motion before the new frames (B, past, 198).
             new: how many of the inputs are new.
         """
         # The buffers begin T + shift - 1 frames before the first new one, so the window begins at new - 1,
@@ -95,9 +95,9 @@ class OwnPastMemory(FeatureMemory):
             state: the state before the new frames.
             new: how many of the output's last frames are new.
         """
-        buffer = torch.cat([state["motion"], motion[:, -new:]], 1)[:, -self.length :]
+        buffer = torch.cat([state["motion"], motion[:, -new:]], 1)[:, -self.past_frames :]
         if self.history == "latest":
-            buffer = torch.cat([buffer[:, : self.length - self.frames], motion], 1)
+            buffer = torch.cat([buffer[:, : self.past_frames - self.frames], motion], 1)
         return {"motion": buffer}
 
 

@@ -114,7 +114,7 @@ class RecurrentMemory(FeatureMemory):
         super().__init__(layers, width, fusion, hidden=hidden, frames=frames, depth=depth)
         self.recurrences = nn.ModuleList()
         self.shift = frames
-        self.length = frames - 1
+        self.past_frames = frames - 1
 
     def feature(self) -> nn.Module:
         """Add one more recurrent layer and make the module that looks up its output."""
@@ -128,12 +128,12 @@ class RecurrentMemory(FeatureMemory):
         return states | {"features": torch.zeros(batch, blocks, self.frames - 1, self.width)}
 
     def true_state(self, sparse: Tensor, motion: Tensor) -> State:
-        """Return hidden states projected from the last of the inputs (B, length, 54), for teacher forcing."""
+        """Return hidden states projected from the last of the inputs (B, past, 54), for teacher forcing."""
         hidden = torch.stack([layer.begin(sparse[:, -1]) for layer in self._layers()], 1)
         return {"hidden": hidden.float()}
 
     def recall(self, sparse: Tensor, state: State, new: int) -> Recurred:
-        """Run the layers over the `new` last inputs of (B, length + new, 54), and recall the window."""
+        """Run the layers over the `new` last inputs of (B, past + new, 54), and recall the window."""
         features, states = [], []
         for index, layer in enumerate(self._layers()):
             carried = [state[name][:, index] for name in layer.carried]

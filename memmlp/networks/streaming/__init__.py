@@ -23,43 +23,43 @@ from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.recurrent_poser import RecurrentPoser
 from memmlp.networks.refiner import Refined
 from memmlp.networks.streaming.baselines import (
-    AGRoLDiffusionStream,
-    AGRoLMLPStream,
-    AvatarJLMStream,
-    AvatarPoserStream,
-    EgoPoserStream,
-    HMDPoserStream,
-    ManikinLStream,
-    ManikinSStream,
-    RPMStream,
-    StillPoseStream,
-    VAEHMDStream,
+    AGRoLDiffusionGraph,
+    AGRoLMLPGraph,
+    AvatarJLMGraph,
+    AvatarPoserGraph,
+    EgoPoserGraph,
+    HMDPoserGraph,
+    ManikinLGraph,
+    ManikinSGraph,
+    RPMGraph,
+    StillPoseGraph,
+    VAEHMDGraph,
 )
-from memmlp.networks.streaming.bodiffusion import BoDiffusionStream
+from memmlp.networks.streaming.bodiffusion import BoDiffusionGraph
 from memmlp.networks.streaming.graph import StreamingGraph
-from memmlp.networks.streaming.mem_mlp import MemMLPStream
-from memmlp.networks.streaming.recurrent_poser import RecurrentPoserStream
-from memmlp.networks.streaming.refined import RefinedStream
-from memmlp.networks.streaming.sage_net import SAGENetStream
+from memmlp.networks.streaming.mem_mlp import MemMLPGraph
+from memmlp.networks.streaming.recurrent_poser import RecurrentPoserGraph
+from memmlp.networks.streaming.refined import RefinedGraph
+from memmlp.networks.streaming.sage_net import SAGENetGraph
 
 __all__ = ["StreamingGraph", "check_streams", "has_stream", "streaming"]
 
 STREAMS: dict[type[MotionModel], type[StreamingGraph]] = {
-    MemMLP: MemMLPStream,
-    AvatarPoser: AvatarPoserStream,
-    EgoPoser: EgoPoserStream,
-    HMDPoser: HMDPoserStream,
-    AvatarJLM: AvatarJLMStream,
-    RPM: RPMStream,
-    VAEHMD: VAEHMDStream,
-    StillPose: StillPoseStream,
-    RecurrentPoser: RecurrentPoserStream,
-    ManikinS: ManikinSStream,
-    ManikinL: ManikinLStream,
-    AGRoLMLP: AGRoLMLPStream,
-    AGRoLDiffusion: AGRoLDiffusionStream,
-    BoDiffusion: BoDiffusionStream,
-    SAGENet: SAGENetStream,
+    MemMLP: MemMLPGraph,
+    AvatarPoser: AvatarPoserGraph,
+    EgoPoser: EgoPoserGraph,
+    HMDPoser: HMDPoserGraph,
+    AvatarJLM: AvatarJLMGraph,
+    RPM: RPMGraph,
+    VAEHMD: VAEHMDGraph,
+    StillPose: StillPoseGraph,
+    RecurrentPoser: RecurrentPoserGraph,
+    ManikinS: ManikinSGraph,
+    ManikinL: ManikinLGraph,
+    AGRoLMLP: AGRoLMLPGraph,
+    AGRoLDiffusion: AGRoLDiffusionGraph,
+    BoDiffusion: BoDiffusionGraph,
+    SAGENet: SAGENetGraph,
 }
 
 
@@ -83,7 +83,7 @@ def streaming(model: MotionModel) -> StreamingGraph:
             "export.graph=streaming: a part of one's own has none; allowed is export.graph=naive"
         )
     if isinstance(model, Refined):
-        return RefinedStream(model, streaming(model.network))
+        return RefinedGraph(model, streaming(model.network))
     return STREAMS[type(model)](model)
 
 

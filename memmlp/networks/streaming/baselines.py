@@ -30,7 +30,7 @@ from memmlp.networks.streaming.graph import StreamingGraph, filled, slid
 from memmlp.networks.windowless_model import WindowlessModel
 
 
-class AvatarPoserStream(StreamingGraph):
+class AvatarPoserGraph(StreamingGraph):
     """AvatarPoser's streaming graph."""
 
     float32_modules: tuple[str, ...] = ("model.embedding", "model.orientation", "model.rotation")
@@ -70,10 +70,10 @@ class AvatarPoserStream(StreamingGraph):
         return self.model.read(newest)
 
 
-class ManikinSStream(AvatarPoserStream):
+class ManikinSGraph(AvatarPoserGraph):
     """MANIKIN-S' streaming graph: AvatarPoser's graph, then the solver of the newest frame's limbs."""
 
-    float32_modules = (*AvatarPoserStream.float32_modules, "model.swivel", "model.places")
+    float32_modules = (*AvatarPoserGraph.float32_modules, "model.swivel", "model.places")
     model: ManikinS
 
     def rotation(self, newest: Tensor, encoded: Tensor) -> Tensor:
@@ -92,7 +92,7 @@ def newest_frame(layers: list[EncoderLayer], h: Tensor) -> Tensor:
     )
 
 
-class EgoPoserStream(StreamingGraph):
+class EgoPoserGraph(StreamingGraph):
     """EgoPoser's streaming graph, which carries the embedding's output for each frame, in order of time.
 
     At every step the slow view pairs other frames, so nothing after the embedding can be carried. The
@@ -128,7 +128,7 @@ class EgoPoserStream(StreamingGraph):
         return self.normalizer.posed(self.model.read(newest), sparse), kept
 
 
-class AGRoLStream(StreamingGraph):
+class AGRoLGraph(StreamingGraph):
     """The base of the streaming graphs of AGRoL's networks; it carries the stem's outputs."""
 
     float32_modules: tuple[str, ...] = ("model.stem", "model.head")
@@ -153,7 +153,7 @@ class AGRoLStream(StreamingGraph):
         raise NotImplementedError
 
 
-class AGRoLMLPStream(AGRoLStream):
+class AGRoLMLPGraph(AGRoLGraph):
     """The streaming graph of AGRoL's MLP."""
 
     model: AGRoLMLP
@@ -177,7 +177,7 @@ class AGRoLMLPStream(AGRoLStream):
         return self.model.head(last.newest(window, 1))
 
 
-class AGRoLDiffusionStream(AGRoLStream):
+class AGRoLDiffusionGraph(AGRoLGraph):
     """The streaming graph of AGRoL's diffusion model.
 
     The shift that each block adds for the diffusion time is the same at every step of a stream, so it is
@@ -221,7 +221,7 @@ class AGRoLDiffusionStream(AGRoLStream):
         return self.model.head(block.newest(h + shift, count))
 
 
-class FrameStream(StreamingGraph):
+class FrameGraph(StreamingGraph):
     """The streaming graph of a network without a window: the network itself, one frame per step."""
 
     model: WindowlessModel
@@ -241,7 +241,7 @@ class FrameStream(StreamingGraph):
         return motion[0], kept
 
 
-class HMDPoserStream(FrameStream):
+class HMDPoserGraph(FrameGraph):
     """HMD-Poser's streaming graph."""
 
     float32_modules = ("model.trackers", "model.hands", "model.others", "model.pose")
@@ -253,7 +253,7 @@ class HMDPoserStream(FrameStream):
         return self.normalizer.posed(self.model.pose(features[0]), sparse), kept
 
 
-class VAEHMDStream(FrameStream):
+class VAEHMDGraph(FrameGraph):
     """VAE-HMD's streaming graph."""
 
     float32_modules = ("model.encoder.stem", "model.decoder.head")
@@ -265,21 +265,21 @@ class VAEHMDStream(FrameStream):
         return self.normalizer.posed(self.model.decoder(mean), sparse), {}
 
 
-class StillPoseStream(FrameStream):
+class StillPoseGraph(FrameGraph):
     """The streaming graph of one pose, in which nothing can be quantised."""
 
     float32_modules = ()
     model: StillPose
 
 
-class RPMStream(FrameStream):
+class RPMGraph(FrameGraph):
     """RPM's streaming graph."""
 
     float32_modules = ("model.motion", "model.sparse", "model.head")
     model: RPM
 
 
-class AvatarJLMStream(StreamingGraph):
+class AvatarJLMGraph(StreamingGraph):
     """AvatarJLM's streaming graph, which carries the tokens of each frame, in order of time.
 
     The tokens' position embeddings change at every step and attention looks both ways in time, so all layers
@@ -320,7 +320,7 @@ class AvatarJLMStream(StreamingGraph):
         return self.model.regressor(features)
 
 
-class ManikinLStream(AvatarJLMStream):
+class ManikinLGraph(AvatarJLMGraph):
     """MANIKIN-L's streaming graph: AvatarJLM's graph, then the solver of the newest frame's limbs."""
 
     model: ManikinL

@@ -12,10 +12,10 @@ from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.networks.baselines.ancestral_diffusion import Denoised
 from memmlp.networks.baselines.bodiffusion import NOISY, BoDiffusion, DiTBlock
 from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.streaming.baselines import AGRoLStream
+from memmlp.networks.streaming.baselines import AGRoLGraph
 
 
-class BoDiffusionStream(AGRoLStream):
+class BoDiffusionGraph(AGRoLGraph):
     """BoDiffusion's streaming graph, in which successive layers without a non-linearity between are merged.
 
     The stem's output for each frame's inputs is carried, in order of time. What the blocks compute from the

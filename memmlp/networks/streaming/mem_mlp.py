@@ -21,7 +21,7 @@ from memmlp.networks.streaming.one_frame_normalizer import OneFrameNormalizer
 from memmlp.networks.streaming.recall import recall
 
 
-class MemMLPStream(StreamingGraph):
+class MemMLPGraph(StreamingGraph):
     """Mem-MLP's streaming graph."""
 
     float32_modules = (
@@ -55,7 +55,7 @@ class MemMLPStream(StreamingGraph):
         """Return zeros: windows (T, d) of stem outputs and of contributions, and the memory's state."""
         memory, window = self.recall.memory, torch.zeros(self.frames, self.stem.out_features)
         return {
-            "sparse": torch.zeros(1, memory.length, SPARSE_DIM),
+            "sparse": torch.zeros(1, memory.past_frames, SPARSE_DIM),
             **{name: window.clone() for name in ("stem", *self.contributions)},
             **memory.initial_state(1),
         }

@@ -26,7 +26,7 @@ from memmlp.networks.vqvae import VQVAE
 Pieces = Sequence[Tensor]
 
 
-class Projections(nn.Module):
+class ProjectionsAtOnce(nn.Module):
     """The projections that several memory blocks make of the same input, computed at once.
 
     Args:
@@ -57,7 +57,7 @@ class CodeTable(nn.Module):
 
     def __init__(self, parts: Sequence[Projection], vectors: Tensor):
         super().__init__()
-        self.projected = nn.Parameter(Projections(parts)(vectors).detach())
+        self.projected = nn.Parameter(ProjectionsAtOnce(parts)(vectors).detach())
 
     def forward(self, index: Tensor) -> Tensor:
         """Map the index (1,) of a code-vector to its projections (1, blocks, k)."""
@@ -89,7 +89,7 @@ class Recall(nn.Module):
         super().__init__()
         # The memory is asked for windows of one frame: only the frame that enters is new to the stream.
         self.memory = copy.copy(memory)
-        self.memory.frames, self.memory.length = 1, memory.length - memory.frames + 1
+        self.memory.frames, self.memory.past_frames = 1, memory.past_frames - memory.frames + 1
         self.parts = nn.ModuleList(block.feature_part for block in blocks)
         if features:
             self.gather(features)
@@ -130,7 +130,7 @@ class OwnPast(Recall):
 
     def projections(self, name: str, parts: Sequence[Projection]) -> nn.Module:
         """Join all blocks' projections of the input with the given name: "sparse", "motion" or "codes"."""
-        return Projections(parts)
+        return ProjectionsAtOnce(parts)
 
     def feature(self, past: Past) -> Tensor:
         """Return the features (1, blocks, k) of the frame that enters."""

@@ -7,11 +7,11 @@ from torch import Tensor
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.recurrent_poser import RecurrentPoser
-from memmlp.networks.streaming.baselines import FrameStream
+from memmlp.networks.streaming.baselines import FrameGraph
 from memmlp.networks.streaming.one_frame_normalizer import OneFrameNormalizer
 
 
-class RecurrentPoserStream(FrameStream):
+class RecurrentPoserGraph(FrameGraph):
     """RecurrentPoser's streaming graph: the network itself, with cells written as plain layers for one frame.
 
     When the graph is quantised, only the cells become int8: a state averages the rounding errors of many

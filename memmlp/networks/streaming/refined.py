@@ -11,7 +11,7 @@ from memmlp.networks.streaming.blocks import FrameGRU
 from memmlp.networks.streaming.graph import StreamingGraph
 
 
-class RefinedStream(StreamingGraph):
+class RefinedGraph(StreamingGraph):
     """The network's own streaming graph, followed by a step of the refiner's recurrent layers.
 
     Args:

@@ -19,7 +19,7 @@ from memmlp.networks.streaming.bodiffusion import linear
 from memmlp.networks.streaming.graph import StreamingGraph, slid
 
 
-class SAGENetStream(StreamingGraph):
+class SAGENetGraph(StreamingGraph):
     """SAGE-Net's streaming graph, which carries what each of the three parts computes from single frames.
 
     What the blocks compute from the diffusion times is the same at every step of a stream, so it is computed

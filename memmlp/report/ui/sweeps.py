@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import file_digest, plain
-from memmlp.evaluation.units import UNITS
+from memmlp.evaluation.metric_facts import UNITS
 from memmlp.report.ui.index import Index
 from memmlp.runs.identity import NETWORK, training_settings
 from memmlp.runs.run import STAGE_WORDS

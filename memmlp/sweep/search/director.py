@@ -17,7 +17,7 @@ from optuna.trial import Trial, TrialState
 from memmlp.common import lease_fences
 from memmlp.common.errors import InputError
 from memmlp.runs.identity import inference
-from memmlp.runs.metrics_log import Metrics
+from memmlp.runs.metrics_log import LogRecord
 from memmlp.runs.run import Run
 from memmlp.sweep.controller import LOOK, Fleet
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
@@ -194,7 +194,7 @@ class Director:
             raise InputError(f"all {len(ended)} trials failed, the last one so: {reason}")
 
 
-def validations(run: Run) -> list[Metrics]:
+def validations(run: Run) -> list[LogRecord]:
     """Return a run's logged results on the validation split."""
     return [entry for entry in run.metrics() if entry.phase == "val"]
 

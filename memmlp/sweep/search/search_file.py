@@ -29,7 +29,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.evaluation.units import HIGHER, UNITS
+from memmlp.evaluation.metric_facts import HIGHER, UNITS
 
 SAMPLERS = ("tpe", "random", "grid")
 PRUNERS = ("median", "none")

@@ -9,7 +9,12 @@ errors without testing. docs/statistics.md explains the method and how well it k
 
 from __future__ import annotations
 
-from memmlp.tables.statistics.paired_differences import Effects, equivalence_p, paired_effects, seed_effects
+from memmlp.tables.statistics.paired_differences import (
+    EffectEstimates,
+    equivalence_p,
+    paired_effects,
+    seed_effects,
+)
 from memmlp.tables.statistics.power import detectable, seeds_needed
 from memmlp.tables.statistics.robust import (
     interquartile_mean,
@@ -19,7 +24,7 @@ from memmlp.tables.statistics.robust import (
 from memmlp.tables.statistics.verdicts import Verdict, holm, looks, sequential, spending, verdict
 
 __all__ = [
-    "Effects",
+    "EffectEstimates",
     "Verdict",
     "detectable",
     "equivalence_p",

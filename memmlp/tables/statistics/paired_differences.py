@@ -11,7 +11,7 @@ from memmlp.tables.statistics.crossed import Groups, error
 LEVEL = 0.05
 
 
-class Effects(NamedTuple):
+class EffectEstimates(NamedTuple):
     """The effects of K comparisons.
 
     Attributes:
@@ -30,7 +30,7 @@ class Effects(NamedTuple):
     conditional: str
 
 
-def paired_effects(differences: np.ndarray, groups: Groups = None) -> Effects:
+def paired_effects(differences: np.ndarray, groups: Groups = None) -> EffectEstimates:
     """Return the effects of differences (K, S, C) over seeds and clips, whose groups are `groups` (C,).
 
     Interval and p-value agree: 0 is outside the interval exactly if p is below 0.05.
@@ -39,10 +39,10 @@ def paired_effects(differences: np.ndarray, groups: Groups = None) -> Effects:
     nothing = np.full_like(mean, np.nan)
     half = nothing if known.conditional == "seeds and clips" else known.half(LEVEL)
     p = nothing if known.conditional else known.level(np.abs(mean))
-    return Effects(mean, mean - half, mean + half, p, known.conditional)
+    return EffectEstimates(mean, mean - half, mean + half, p, known.conditional)
 
 
-def seed_effects(differences: np.ndarray) -> Effects:
+def seed_effects(differences: np.ndarray) -> EffectEstimates:
     """Return the effects of differences (K, S) in something that each seed has once, such as a time."""
     alone = differences[:, :, None]
     effects, several = paired_effects(alone), differences.shape[1] > 1

@@ -41,7 +41,7 @@ def grid() -> list[GridRow]:
     return [cell for cell in cells if cell.groups[-1] > 0]
 
 
-class Counts(NamedTuple):
+class SimulatedOutcomes(NamedTuple):
     """Outcomes in simulated tables whose true differences are all zero.
 
     Attributes:
@@ -58,7 +58,7 @@ class Counts(NamedTuple):
     found: np.ndarray
 
 
-def count(sample: Simulated, shares: Shares) -> Counts:
+def count(sample: Simulated, shares: Shares) -> SimulatedOutcomes:
     """Count the outcomes in one sample with effects in these shares.
 
     All nulls are true, so Holm gives a table a star exactly if its first step does.
@@ -69,7 +69,7 @@ def count(sample: Simulated, shares: Shares) -> Counts:
         in_looks |= np.abs(mean) > known.half(level / TABLE)
     half = known.half(LEVEL / TABLE)
     covered = np.abs(mean) <= known.half(LEVEL)
-    return Counts(covered, _any(np.abs(mean) > half), _any(in_looks), half - mean)
+    return SimulatedOutcomes(covered, _any(np.abs(mean) > half), _any(in_looks), half - mean)
 
 
 def spent(sample: Simulated) -> Iterator[tuple[int, float]]:
@@ -82,7 +82,7 @@ def _any(claims: np.ndarray) -> np.ndarray:
     return np.any(claims.reshape(-1, TABLE), axis=1)
 
 
-def summary(counts: Sequence[Counts]) -> dict[str, float]:
+def summary(counts: Sequence[SimulatedOutcomes]) -> dict[str, float]:
     """Return the rates over all samples, and the power.
 
     Power is the share of comparisons that find the effect which an oracle, who knows the variances, finds in
@@ -157,7 +157,7 @@ def simulate(cell: GridRow, tables: int, seed: int) -> dict[str, Any]:
     rng = np.random.default_rng([seed, *cell])
     size = max(1, CHUNK // (TABLE * cell.seeds * cell.clips))
     every = choices(cell)
-    counts: dict[str, list[Counts]] = {name: [] for name in every}
+    counts: dict[str, list[SimulatedOutcomes]] = {name: [] for name in every}
     campaigns: list[Campaign] = []
     for start in range(0, tables, size):
         sample = Simulated(rng, cell, TABLE * min(size, tables - start))

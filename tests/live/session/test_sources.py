@@ -98,7 +98,7 @@ def test_the_truth_of_each_round_is_that_of_the_first(clip: TrackedClip, hz: flo
     played = source(clip, hz, Clock())
     for turn in range(1, 200):
         for step in (0, 1, played.count - 1):
-            truth = played.truth(turn * played.round + step / hz)
+            truth = played.truth(turn * played.round_seconds + step / hz)
             np.testing.assert_allclose(truth, clip.truth(step / hz), atol=1e-6)
 
 

@@ -5,9 +5,9 @@ import { pathToFileURL } from 'node:url';
 
 const [page, runtime, wasm, model, job] = process.argv.slice(2);
 const load = path => import(pathToFileURL(path).href);
-const [{ Session }, { Stream }, ort] = await Promise.all([load(`${page}/session.js`), load(`${page}/stream.js`), load(runtime)]);
+const [{ OnnxStream }, { Stream }, ort] = await Promise.all([load(`${page}/onnx_stream.js`), load(`${page}/stream.js`), load(runtime)]);
 Object.assign(ort.env.wasm, { numThreads: 1, wasmBinary: readFileSync(wasm) });
-const session = await Session.open(ort, new Uint8Array(readFileSync(model)));
+const session = await OnnxStream.open(ort, new Uint8Array(readFileSync(model)));
 const { body, parts } = JSON.parse(readFileSync(job));
 const answers = [];
 for (const { calibrate, height, samples } of parts) {

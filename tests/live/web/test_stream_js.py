@@ -135,7 +135,7 @@ def answers(site: Made, node: str, tmp_path_factory: pytest.TempPathFactory) -> 
     page = folder / "page"
     page.mkdir()
     (page / "package.json").write_text('{"type": "module"}')
-    for name in ("session.js", "stream.js", "trackers.js", "rotations.js", "ort/wasm.js"):
+    for name in ("onnx_stream.js", "stream.js", "trackers.js", "rotations.js", "ort/wasm.js"):
         (page / Path(name).name).write_bytes((site.folder / name).read_bytes())
     job = folder / "job.json"
     job.write_text(json.dumps({"body": entry["body"], "parts": [*PARTS.values(), *REFUSED.values()]}))

@@ -15,7 +15,7 @@ from memmlp.motion.network_coordinates import Heading, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines import manikin
 from memmlp.networks.baselines.limb_solver import BASES, ENDS, MIDDLES
-from memmlp.networks.baselines.manikin import KEPT, PLACED, Parts, Truth
+from memmlp.networks.baselines.manikin import KEPT, PLACED, PredictedParts, Truth
 from memmlp.networks.streaming import has_stream, streaming
 
 TRUTH = torch.stack([tiny.clip(7, seed) for seed in (1, 2)]).double()
@@ -43,7 +43,7 @@ def posed_globally(motion: torch.Tensor) -> torch.Tensor:
 def test_the_true_parts_make_the_true_trunk_hands_and_ankles():
     """And the head and wrists have their trackers' rotations; elbows and knees may reach a limit of twist."""
     normalizer = Normalizer.raw(World(), tiny.REST).double()
-    rotation = Parts.of(outputs(), normalizer).posed(SPARSE, normalizer)
+    rotation = PredictedParts.of(outputs(), normalizer).posed(SPARSE, normalizer)
     motion = normalizer.posed(rotation, SPARSE)
     made, true = (part[..., POSITION].unflatten(-1, (22, 3)) for part in (motion, MOTION))
     trunk = [0, 1, 2, 3, 6, 9, 12, 13, 14, 15, 16, 17]

@@ -14,7 +14,7 @@ from report.ui.conftest import SEEDS, begun, made, run_of
 from report.ui.test_replay import motion
 
 from memmlp.cli.seed_rounds import look
-from memmlp.evaluation.units import UNITS
+from memmlp.evaluation.metric_facts import UNITS
 from memmlp.report.ui.one_file import ReportedSweep, page_text, query, rounded
 from memmlp.report.ui.routes import Answers
 from memmlp.report.ui.server import RunsServer

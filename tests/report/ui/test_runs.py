@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from own_package import registers_kept
 
-from memmlp.evaluation.units import HIGHER, UNITS
+from memmlp.evaluation.metric_facts import HIGHER, UNITS
 from memmlp.report.ui.runs import by_earlier_recipes, differing, partners, sets, shared, units
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.identity import evaluation_id_of, evaluation_recipes, evaluation_settings

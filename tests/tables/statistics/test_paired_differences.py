@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from memmlp.tables.statistics import (
-    Effects,
+    EffectEstimates,
     detectable,
     equivalence_p,
     paired_effects,
@@ -170,7 +170,7 @@ def test_unequal_groups_keep_the_promises():
 sizes = st.tuples(st.integers(2, 4), st.integers(2, 6), st.integers(0, 1000))
 
 
-def assert_same(one: Effects, other: Effects) -> None:
+def assert_same(one: EffectEstimates, other: EffectEstimates) -> None:
     for a, b in zip(one[:4], other[:4], strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-9)
 
@@ -187,7 +187,7 @@ def test_order_and_names_do_not_matter(size: tuple[int, int, int]):
     assert_same(effects, paired_effects(d, np.array(["z", "a", "m"])[labels]))
     assert_same(paired_effects(d), paired_effects(d, np.arange(clips)))
     alone = [paired_effects(one[None], labels) for one in d]
-    assert_same(effects, Effects(*(np.concatenate([e[i] for e in alone]) for i in range(4)), ""))
+    assert_same(effects, EffectEstimates(*(np.concatenate([e[i] for e in alone]) for i in range(4)), ""))
 
 
 @settings(max_examples=30)
@@ -196,8 +196,8 @@ def test_units_and_signs_do_not_matter(size: tuple[int, int, int], scale: float)
     seeds, clips, number = size
     d = np.random.default_rng(number).normal(0.5, 1, (3, seeds, clips))
     e, scaled, turned = paired_effects(d), paired_effects(scale * d), paired_effects(-d)
-    assert_same(scaled, Effects(scale * e.mean, scale * e.low, scale * e.high, e.p, ""))
-    assert_same(turned, Effects(-e.mean, -e.high, -e.low, e.p, ""))
+    assert_same(scaled, EffectEstimates(scale * e.mean, scale * e.low, scale * e.high, e.p, ""))
+    assert_same(turned, EffectEstimates(-e.mean, -e.high, -e.low, e.p, ""))
     np.testing.assert_allclose(detectable(scale * d, 5), scale * detectable(d, 5))
 
 

@@ -53,7 +53,7 @@ class MeanMemory(FeatureMemory):
         codes: VQVAE | None = None,
     ):
         super().__init__(layers, width, fusion, hidden=hidden, frames=frames, depth=depth)
-        self.shift, self.length = 0, frames - 1
+        self.shift, self.past_frames = 0, frames - 1
 
     def feature(self) -> nn.Module:
         """Make the module that computes a block's memory feature."""

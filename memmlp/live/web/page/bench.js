@@ -1,7 +1,7 @@
 // Times every network of the site in this browser, and gives the measurement as rows for Table 17.
 
 import { h, replace, say } from './dom.js';
-import { Remote } from './remote.js';
+import { WorkerProxy } from './worker_proxy.js';
 import { median, percentile, ratio, ROUNDS } from './timing.js';
 
 const STEPS = [500, 1000, 2500];
@@ -105,7 +105,7 @@ class Bench {
 
   // Time everything on a backend. What does not run there has its reason in its row.
   async backend(backend, each) {
-    const remote = (this.remote = new Remote());
+    const remote = (this.remote = new WorkerProxy());
     const plan = [];
     const open = async (key, entry, part) => {
       this.note.textContent = `${backend}: loading ${key}`;

@@ -3,7 +3,7 @@
 import { h, replace, select } from './dom.js';
 import { fetched } from './fetched.js';
 import { History } from './history.js';
-import { Remote } from './remote.js';
+import { WorkerProxy } from './worker_proxy.js';
 import { Stage } from './stage.js';
 import { Stream } from './stream.js';
 
@@ -77,7 +77,7 @@ class Play {
   async begin() {
     const round = ++this.round;
     this.remote?.close();
-    this.remote = new Remote();
+    this.remote = new WorkerProxy();
     this.history.frames = [];
     this.history.resume();
     this.dropped = 0;

@@ -2,8 +2,8 @@
 
 import { h, replace, select } from './dom.js';
 import { kindsOf, trackersOf, usualOffsets } from './headset.js';
-import { Mirror } from './mirror.js';
-import { Remote } from './remote.js';
+import { WornScene } from './worn_scene.js';
+import { WorkerProxy } from './worker_proxy.js';
 import { heading, Stream } from './stream.js';
 import { median, percentile } from './timing.js';
 
@@ -33,7 +33,7 @@ class Wear {
       h('button', { type: 'button', class: 'primary', id: mode, disabled: true, onclick: () => this.enter(mode) }, name));
     this.layout();
     try {
-      this.mirror = new Mirror(this.canvas, site);
+      this.mirror = new WornScene(this.canvas, site);
     } catch (error) {
       this.trouble.textContent = `This browser draws no WebGL: ${error.message}`;
       return;
@@ -75,7 +75,7 @@ class Wear {
 
   // Load the network, and ask the browser what it can enter.
   async ready() {
-    const remote = (this.remote = (this.remote?.close(), new Remote()));
+    const remote = (this.remote = (this.remote?.close(), new WorkerProxy()));
     try {
       await remote.open('wear', this.network.play);
     } catch (error) {

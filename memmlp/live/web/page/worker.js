@@ -1,7 +1,7 @@
 // Runs networks beside the page, which goes on drawing: opens graphs, computes poses, times steps.
 
 import { fetched } from './fetched.js';
-import { Session } from './session.js';
+import { OnnxStream } from './onnx_stream.js';
 import { Stream } from './stream.js';
 import { clockStep, interleaved } from './timing.js';
 import { drawn } from './weights.js';
@@ -23,7 +23,7 @@ function load(backend) {
 const calls = {
   async open(key, { file, weights }, backend) {
     const [{ ort }, model] = await Promise.all([load(backend), fetched(file)]);
-    sessions.set(key, await Session.open(ort, model, { weights: drawn(weights), backend }));
+    sessions.set(key, await OnnxStream.open(ort, model, { weights: drawn(weights), backend }));
   },
 
   pose: (key, frame) => sessions.get(key).pose(frame),

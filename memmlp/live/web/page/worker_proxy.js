@@ -1,6 +1,6 @@
 // The worker as an object: its calls by name, each of which resolves to the worker's answer.
 
-export class Remote {
+export class WorkerProxy {
   constructor() {
     this.worker = new Worker('worker.js', { type: 'module' });
     this.waiting = new Map();

@@ -95,7 +95,7 @@ def show_in_trackers(plan: Plan, folder: Path, table: Table) -> None:
         build_tracking(OmegaConf.create(dict(plan.tasks[0].config))).sweep(folder)
 
 
-def whole() -> bool:
+def mlflow_has_page() -> bool:
     """Return whether MLflow is installed with its page, which mlflow-skinny lacks."""
     try:
         metadata.version("mlflow")
@@ -113,6 +113,6 @@ def mlflow(port: int, outputs: Path) -> None:
 
     store = MLflow(None, outputs).place
     program = shutil.which("mlflow")
-    if program is None or not whole():
+    if program is None or not mlflow_has_page():
         raise InputError("mlflow: its page is not installed; pip install 'memmlp[mlflow]'")
     os.execv(program, [program, "ui", "--backend-store-uri", store, "--port", str(port)])

@@ -8,7 +8,7 @@ import pytest
 from conftest import Memmlp, one_line
 from fake_tracker import FakeTracker, Server, a_run
 
-from memmlp.cli import show_in_trackers
+from memmlp.cli import track
 from memmlp.common.files import write_json
 
 
@@ -16,7 +16,7 @@ from memmlp.common.files import write_json
 def server(monkeypatch: pytest.MonkeyPatch) -> Server:
     """What is shown, by a tracker in memory."""
     tracker = FakeTracker()
-    monkeypatch.setattr(show_in_trackers, "_trackers", lambda *_: [tracker])
+    monkeypatch.setattr(track, "_trackers", lambda *_: [tracker])
     return tracker.server
 
 
@@ -46,8 +46,6 @@ def test_a_tracker_that_there_is_not_is_refused(memmlp: Memmlp):
 
 
 def test_the_trackers_of_a_command_line(tmp_path: Path):
-    found = show_in_trackers._trackers(
-        ["wandb", "mlflow", "tensorboard", "wandb"], "http://x", "mine", tmp_path
-    )
+    found = track._trackers(["wandb", "mlflow", "tensorboard", "wandb"], "http://x", "mine", tmp_path)
     assert [one.name for one in found] == ["wandb", "mlflow", "tensorboard"]
     assert found[1].place == "http://x"

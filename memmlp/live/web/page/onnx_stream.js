@@ -5,13 +5,13 @@
 const STATE = 'state.';
 const NEXT = '.next';
 
-export class Session {
+export class OnnxStream {
   // model: the ONNX file's bytes; weights: the bytes of the file that holds weights outside of it, if any;
   // backend: wasm or webgpu.
   static async open(ort, model, { weights = null, backend = 'wasm' } = {}) {
     const options = { executionProviders: [backend], graphOptimizationLevel: 'all', logSeverityLevel: 3 };
     if (weights) options.externalData = [{ path: 'weights', data: weights }];
-    return new Session(ort, await ort.InferenceSession.create(model, options));
+    return new OnnxStream(ort, await ort.InferenceSession.create(model, options));
   }
 
   constructor(ort, session) {

@@ -14,7 +14,7 @@ def core_share(run: Measured) -> float | None:
     return min((run.costs[name] for name in CORE_SHARES if name in run.costs), default=None)
 
 
-def timed_alone(runs: Mapping[int, Measured]) -> Mapping[int, Measured]:
+def undisturbed(runs: Mapping[int, Measured]) -> Mapping[int, Measured]:
     """Return the runs whose thread had a core while it was timed; all of them if none is known to have.
 
     A time does not depend on the seed, so that one undisturbed measurement says more than a mean with others.
@@ -25,4 +25,4 @@ def timed_alone(runs: Mapping[int, Measured]) -> Mapping[int, Measured]:
 
 def measured_for(metric: str, runs: Mapping[int, Measured]) -> Mapping[int, Measured]:
     """Return the runs whose values of a metric count: of a time the undisturbed ones, else every run."""
-    return timed_alone(runs) if metric in TIMES else runs
+    return undisturbed(runs) if metric in TIMES else runs

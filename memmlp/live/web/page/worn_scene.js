@@ -10,7 +10,7 @@ const SKIN = 0x27a9e1;
 const PANEL = [1024, 256]; // pixels of the words
 const FACE = ['#14191f', '#e3e8ee'];
 
-export class Mirror {
+export class WornScene {
   // joints: names of the joints; limbs: how they are shown (site.json).
   constructor(canvas, { limbs, joints }) {
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true });
