@@ -78,7 +78,7 @@ class Chromium:
             answer = self._next()
             wrong = answer.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded")
             if wrong and answer.get("sessionId") == session and STALL not in str(answer):
-                errors.append(json.dumps(answer["params"])[:500])
+                errors.append(json.dumps(answer["params"]))
             if answer.get("id") == self.count:
                 assert "error" not in answer, answer
                 return answer["result"]
@@ -92,10 +92,13 @@ class Chromium:
         return json.loads(line)
 
     def end(self) -> None:
-        """Kill it."""
-        self.process.kill()
-        self.process.wait()
+        """End it: it goes when its pipe is closed, whatever starts it."""
         os.close(self.write), os.close(self.read)
+        try:
+            self.process.wait(60)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait(60)
         self.litter.cleanup()
 
 
