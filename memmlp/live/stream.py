@@ -158,7 +158,7 @@ class Stream:
         self._output = ROTATION_FORMATS[rotations]
         self._trackers = TrackerFrames(self.network.skeleton, self.network.fps)
         self._features = Features()
-        self._sparse = self.network.sparse[0]
+        self._sparse = self.network.sparse[0]  # the network's inputs, in place: written before each step
         self._last: Pose | None = None
 
     @property

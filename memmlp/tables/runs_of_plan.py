@@ -1,4 +1,8 @@
-"""What a table gets from the runs of a planned sweep: results, states, and older runs."""
+"""What a table gets from the runs of a planned sweep: results, states, and older runs.
+
+A table never trains. It knows from the plan which identity the run of each arm and seed has, and reads the
+folder outputs/runs/<id>/, whichever command made it.
+"""
 
 from __future__ import annotations
 
