@@ -74,7 +74,7 @@ def test_a_sweep_trains_what_is_upstream_first():
             return type("Prepared", (), {"digest": "d"})
 
     for task, own in zip(tasks[1:], (refined.unrefined, refined), strict=True):
-        object.__setattr__(own, "data", Data())
+        object.__setattr__(own, "motion", Data())
         check_identity(own, task)
 
 

@@ -81,7 +81,7 @@ def test_a_training_says_on_a_terminal_what_is_odd_about_its_data(capsys, monkey
     manifest = SimpleNamespace(clips=(), split={}, skipped=(), unusual={"a": "Z is not up"})
     prepared = SimpleNamespace(manifest=manifest, cache="cache", digest="0")
     experiment = SimpleNamespace(
-        data=SimpleNamespace(prepare=lambda: prepared), config={"data": {"split": {}}}
+        motion=SimpleNamespace(prepare=lambda: prepared), config={"data": {"split": {}}}
     )
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
     with telling(), pytest.raises(AttributeError, match="outputs"):  # it comes no further than to the run
@@ -297,7 +297,7 @@ def test_a_failure_of_the_work_is_kept_with_the_run_and_an_interruption_is_not(
 ):
     run = Run.of(tmp_path, "0" * 16)
     run.begin("memmlp", {}, data="d", upstream=None)
-    experiment: Any = SimpleNamespace(tracking=Tracking((), tmp_path), stages=(), outputs=tmp_path)
+    experiment: Any = SimpleNamespace(tracking=Tracking((), tmp_path), stage_ids=(), outputs=tmp_path)
     with pytest.raises(type(error)), recording_outcome(experiment, run):
         raise error
     assert (run.failure is None) == (failure is None)
@@ -308,7 +308,7 @@ def test_work_that_ended_well_is_no_death(tmp_path: Path):
     """Else the tenth evaluation of a trained run would count as the tenth process that died on it."""
     run = Run.of(tmp_path, "0" * 16)
     run.begin("memmlp", {}, data="d", upstream=None)
-    experiment: Any = SimpleNamespace(tracking=Tracking((), tmp_path), stages=(), outputs=tmp_path)
+    experiment: Any = SimpleNamespace(tracking=Tracking((), tmp_path), stage_ids=(), outputs=tmp_path)
 
     def evaluate(error: BaseException | None = None) -> None:
         with recording_outcome(experiment, run):

@@ -121,5 +121,5 @@ def test_a_refiner_stands_behind_it_and_a_sweep_trains_all_in_order():
         def prepare(self):
             return type("Prepared", (), {"digest": "d"})
 
-    object.__setattr__(refined, "data", Data())
+    object.__setattr__(refined, "motion", Data())
     check_identity(refined, tasks[-1])
