@@ -165,7 +165,7 @@ def _line(error: Exception, arguments: Sequence[str]) -> str:
     """Return the error of a command line in one line."""
     if isinstance(error, click.Abort):
         command = COMMANDS.get(arguments[0]) if arguments else None
-        resumed = "; the same command goes on where it was left" if command and command.resumes else ""
+        resumed = "; the same command goes on from the last checkpoint" if command and command.resumes else ""
         return f"interrupted{resumed}"
     if isinstance(error, click.UsageError):
         path = error.ctx.command_path if error.ctx else "memmlp"

@@ -270,9 +270,7 @@ def train_run(
 ) -> None:
     """Train the network of a run, and mark the run as done."""
     steps = experiment.training.optim.steps
-    onward = ", on from its checkpoint" if run.checkpoint.exists() else ""
-    say = remark if onward else tell  # a progress bar does not tell why it begins in the middle
-    say(f"network: train it for {steps} steps{onward} (run {run.id})")
+    tell(f"network: train it for {steps} steps (run {run.id})")
     begin(experiment, run, experiment.identity(data.digest), experiment.config, upstream)
     if files := computed_imports(run.manifest.get("plugins") or {}):
         remark(f"plugins: edits are not seen of what is imported by computed names ({files})")

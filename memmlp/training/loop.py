@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from memmlp.common import distributed
 from memmlp.common.errors import InputError, TrainingDiverged
-from memmlp.common.progress import Count, counting, during
+from memmlp.common.progress import Count, counting, during, remark
 from memmlp.motion.dataset import MotionDataset
 from memmlp.networks import checkpoint, layers
 from memmlp.runs.run import Run
@@ -103,6 +103,8 @@ def train(
     average = optim.average(task.module, optimiser)
     start, spent = resume(task, optimiser, average, run)
     begun = time.monotonic() - spent
+    if start and distributed.first():  # a progress bar does not tell why it begins in the middle
+        remark(f"{description}: on from step {start} of {optim.steps}, the last checkpoint")
     distributed.align(task.module)
     with counting(description, optim.steps, start, shown=distributed.first(), unit="steps") as count:
         for step in range(start, optim.steps):

@@ -42,7 +42,7 @@ def test_a_request_to_end_is_a_ctrl_c(monkeypatch: pytest.MonkeyPatch, capsys: p
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 130
-    assert "interrupted; the same command goes on where it was left" in capsys.readouterr().err
+    assert "interrupted; the same command goes on from the last checkpoint" in capsys.readouterr().err
     assert signal.getsignal(signal.SIGTERM) == before
     seen: list[object] = []
     monkeypatch.setattr(

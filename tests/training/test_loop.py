@@ -81,7 +81,7 @@ def test_a_resumed_run_is_the_same_run(make, tmp_path):
     assert [m.values for m in whole.metrics()] == [m.values for m in broken.metrics()]
 
 
-def test_the_seconds_of_a_killed_training_are_those_of_all_its_steps(monkeypatch, tmp_path):
+def test_a_killed_training_says_from_where_it_goes_on_and_counts_all_its_seconds(monkeypatch, tmp_path):
     """A step takes a second here. It is killed in its eighth step, of which its checkpoint has five."""
     clock, run = iter(range(1000)), Run(tmp_path)
     now = mock.Mock(monotonic=lambda: now.seconds, seconds=0)
@@ -100,9 +100,13 @@ def test_the_seconds_of_a_killed_training_are_those_of_all_its_steps(monkeypatch
         made.step = timed
         return made
 
-    with pytest.raises(Kill):
-        train(task(7), OPTIM, run, 0, "killed")
-    train(task(None), OPTIM, run, 0, "again")
+    said: list[str] = []
+    with progress.telling(said.append):
+        with pytest.raises(Kill):
+            train(task(7), OPTIM, run, 0, "killed")
+        assert not said
+        train(task(None), OPTIM, run, 0, "again")
+    assert said == [f"again: on from step 5 of {OPTIM.steps}, the last checkpoint"]
     assert run.manifest["seconds"] == {"train": OPTIM.steps - 1}
 
 
