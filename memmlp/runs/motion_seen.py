@@ -9,7 +9,7 @@ LITTLE = 30 * MINUTE  # `profile=small` draws 23 times as many
 
 
 def frames_seen(run: Run) -> float:
-    """Return how many frames a run's network saw in training, with repetitions; 0 if that is unknown.
+    """Return how many frames a run's network saw in all training steps together; 0 if that is unknown.
 
     For a refiner, this includes the frames that the network before it saw, and the pieces of its own
     training.
@@ -33,4 +33,4 @@ def hardly_trained(frames: float) -> str:
     if not 0 < frames < LITTLE:
         return ""
     minutes = f"{frames / MINUTE:.2g} minutes of motion"
-    return f"hardly trained, on {minutes} with repetitions, so that errors say nothing of the network"
+    return f"hardly trained (its steps saw {minutes} in all), so that errors say nothing of the network"

@@ -50,7 +50,7 @@ def test_a_figure(memmlp: Memmlp, finished: Run, clips: list[str], tmp_path: Pat
     ran = memmlp("render", finished.id, "--out", str(out), "--frames", "2", "--label", "ours")
     error = rows(finished)[0]["rotation"]["MPJPE"]
     assert (ran.code, ran.out) == (0, f"{out}: {clips[0]} (stream, rotation), ours {error:.1f} cm\n")
-    assert f"run {finished.id}: hardly trained, on " in ran.err
+    assert f"run {finished.id}: hardly trained (its steps saw " in ran.err
     with Image.open(out) as image:
         assert image.size[0] < 700
 
@@ -207,7 +207,7 @@ def test_ctrl_c_ends_it_and_leaves_nothing(
         assert {"joints", "truth", "held", "ms"} <= set(next(frames))
     code, out, err = watched.interrupt()
     assert (code, out) == (0, "")
-    assert err.startswith(f"run {finished.id[:8]}: hardly trained, on ")
+    assert err.startswith(f"run {finished.id[:8]}: hardly trained (its steps saw ")
     assert err.count("\n") == 1
     with pytest.raises(ProcessLookupError):
         os.kill(watched.process.pid, 0)

@@ -40,7 +40,7 @@ def clip(home: Path, run: str) -> str:
 def test_a_test_clip_is_written_in_every_format(home: Path, run: str, clip: str):
     for name in ("a.bvh", "a.glb", "deep/a.npz"):
         said = command_line.run(home, "predict", run, clip, "--out", name)
-        assert f"run {run}: hardly trained, on " in said
+        assert f"run {run}: hardly trained (its steps saw " in said
         assert said.startswith(f"run {run}: rotation, stream mode\n1 clip, ")
         assert (home / name).stat().st_size > 10_000
     with contextlib.chdir(home):

@@ -152,7 +152,10 @@ def test_diff(memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch, wi
 def test_diff_says_that_a_network_hardly_saw_motion(memmlp: Memmlp, outputs: Path):
     little = {"model": {"frames": 41}, "optim": {"steps": 20, "batch": 8}}
     Run.of(outputs, "d" * 16).begin("memmlp", little, data="d" * 64, upstream=None)
-    assert "run dddddddd: hardly trained, on 1.8 minutes of motion" in memmlp("runs", "diff", "a", "d").out
+    assert (
+        "run dddddddd: hardly trained (its steps saw 1.8 minutes of motion"
+        in memmlp("runs", "diff", "a", "d").out
+    )
 
 
 def test_list_names_the_networks_that_hardly_saw_motion(memmlp: Memmlp, outputs: Path):

@@ -32,7 +32,7 @@ def test_a_site_to_play_and_wear(home: Path):
     (network,) = about["networks"]
     assert network["run"] == run
     assert network["graphs"] == []
-    assert network["remark"].startswith("hardly trained, on")
+    assert network["remark"].startswith("hardly trained (its steps saw")
     assert f"run {run}: {network['remark']}" in said
     assert "base" not in about
     assert about["backends"] == ["wasm"]

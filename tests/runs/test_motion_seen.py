@@ -31,5 +31,5 @@ def test_what_is_not_known_is_0(tmp_path: Path, lacking: str):
 
 def test_half_an_hour_is_enough_and_nothing_is_said_of_what_is_not_known():
     assert hardly_trained(LITTLE) == hardly_trained(0) == ""
-    assert hardly_trained(LITTLE - 1).startswith("hardly trained, on 30 minutes of motion with repetitions")
-    assert hardly_trained(9000).startswith("hardly trained, on 2.5 minutes of motion")
+    assert hardly_trained(LITTLE - 1).startswith("hardly trained (its steps saw 30 minutes of motion in all)")
+    assert hardly_trained(9000).startswith("hardly trained (its steps saw 2.5 minutes of motion")

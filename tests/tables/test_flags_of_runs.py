@@ -151,7 +151,7 @@ def test_networks_that_hardly_saw_motion_are_told(sweep: Sweep, tmp_path: Path):
         table = table_of(replace(sweep, seeds=(0,)), lambda arm, seed: runs[arm.label])
         return [flag for flag in table.flags if "hardly" in flag]
 
-    said = "hardly trained, on 0.49 minutes of motion with repetitions, so that "
+    said = "hardly trained (its steps saw 0.49 minutes of motion in all), so that "
     said += "errors say nothing of the network"
     assert flags() == []
     assert flags("no | memory") == [f"{said}: 'no | memory'"]

@@ -25,7 +25,7 @@ def test_facts_of_a_finished_run(outputs: Path):
     assert found["metrics"]["latency.median_ms"] == pytest.approx(0.64)
     assert (found["tags"], found["note"]) == (["good", "7"], "<b>look</b>")
     assert found["recent"][-1][0] == 2000
-    assert found["remark"].startswith("hardly trained, on 6.1 minutes of motion")
+    assert found["remark"].startswith("hardly trained (its steps saw 6.1 minutes of motion")
 
 
 def test_who_saw_enough_motion_has_no_remark(outputs: Path):

@@ -129,7 +129,7 @@ def test_a_run_s_page_and_its_replay(browser: Browser, server: RunsServer, home:
     browser.value("document.querySelector('.pieces button').click()")
     browser.wait("Number(document.documentElement.dataset.replayed.split(' ')[1]) >= 300")
     assert "memory.name" in browser.value("document.querySelector('.config').textContent")
-    assert "Its network: hardly trained, on 6.1" in browser.value(
+    assert "Its network: hardly trained (its steps saw 6.1" in browser.value(
         "document.querySelector('.warning').textContent"
     )
     assert browser.value("document.querySelectorAll('.meter').length") == 12
