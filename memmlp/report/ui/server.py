@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import socket
 import threading
 import time
 import urllib.parse
@@ -188,7 +189,6 @@ class RunsServer(ThreadingHTTPServer):
 
     daemon_threads = True
     block_on_close = False
-    allow_reuse_address = True
 
     def __init__(
         self, answers: Answers, port: int, host: str = LOCAL[0], token: str | None = None, every: float = 1.0
@@ -204,7 +204,11 @@ class RunsServer(ThreadingHTTPServer):
             raise InputError(f"--host {host} --port {port}: {reason}; {allowed}") from None
 
     def server_bind(self) -> None:
-        """Bind to the address, without asking a name server for the host's name."""
+        """Bind to the address, without asking a name server for the host's name.
+
+        Connections of a page that was left open do not keep a server of before in the way.
+        """
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.socket.bind(self.server_address)
         self.server_address = name, port, *_ = self.socket.getsockname()
         self.server_name, self.server_port = name, port

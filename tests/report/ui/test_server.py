@@ -156,6 +156,15 @@ def test_a_link_on_another_page_may_open_the_page_alone(server: RunsServer):
     assert get(server, "/api/runs", **elsewhere).code == 403
 
 
+def test_it_starts_again_where_a_page_was_left_open(outputs: Path):
+    with RunsServer(Answers(outputs), 0) as before:
+        page = http.client.HTTPConnection("127.0.0.1", before.server_port)
+        page.request("GET", "/", headers={"Host": f"127.0.0.1:{before.server_port}"})
+        assert page.getresponse().read()
+    with RunsServer(Answers(outputs), before.server_port):
+        page.close()
+
+
 def test_another_address_needs_the_token(outputs: Path):
     with RunsServer(Answers(outputs), 0, "0.0.0.0", TOKEN) as server:
         for path in ("/", "/api/runs", "/style.css", "/events", "/?token=wrong", "/api/runs?token="):
