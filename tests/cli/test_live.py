@@ -71,6 +71,17 @@ def step(step_files) -> Path:
     return step_files("no_memory")
 
 
+@pytest.mark.parametrize("option", ["--osc", "--vmc", "--vrchat"])
+def test_python_osc_is_asked_for_where_an_option_needs_it_alone(
+    memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch, step: Path, option: str
+):
+    monkeypatch.setitem(sys.modules, "pythonosc", None)
+    line = ["live", str(step), "--no-browser", "--udp", "9001", "--token", "a token of many letters"]
+    assert one_line(memmlp(*line), "--token: goes with --host")  # the last thing that is looked at
+    needing = ["--osc", "9001"] if option == "--osc" else ["--udp", "9001", option, "127.0.0.1"]
+    assert one_line(memmlp(*line[:3], *needing), f"{option}: needs python-osc")
+
+
 def test_a_clip_of_a_file_is_on_the_network_s_body(step: Path, clip: Path, tmp_path: Path):
     """As in `memmlp predict`: trackers of another body would be those of another person than it learned."""
     model = onnx.load(step)

@@ -7,7 +7,9 @@ import os
 import signal
 import sys
 from pathlib import Path
+from unittest import mock
 
+import click
 import pytest
 from conftest import Memmlp, one_line
 from omegaconf import DictConfig
@@ -50,6 +52,17 @@ def test_a_request_to_end_is_a_ctrl_c(monkeypatch: pytest.MonkeyPatch, capsys: p
     )
     main(["train", "profile=tiny"])
     assert seen == [before]
+
+
+def test_an_answer_that_is_broken_off_is_a_ctrl_c(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """What click raises where somebody presses Ctrl-C at a question."""
+    monkeypatch.setattr("memmlp.runs.lookup.list_runs", mock.Mock(side_effect=click.Abort))
+    with pytest.raises(SystemExit) as ended:
+        main(["runs", "list"])
+    assert ended.value.code == 130
+    assert capsys.readouterr().err == "memmlp: interrupted\n"
 
 
 def test_only_what_is_resumed_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
@@ -366,6 +367,14 @@ def test_a_folder_hides_no_option_of_another_one(memmlp: Memmlp, tmp_path: Path)
         (tmp_path / name / "experiment" / "own.yaml").write_text(EXTRA.format(width))
     both = ["hydra.searchpath=['file://a', b]", "experiment=own", "optim.lr=-1"]
     assert one_line(memmlp("train", *both), "b/experiment/own.yaml", "a/experiment/own.yaml is used")
+
+
+def test_help_lists_the_groups_and_the_config(memmlp: Memmlp):
+    said = memmlp("train", "--help", "memory=gru").out
+    groups, config = said.split("== Config ==")
+    assert re.search(r"^memory: .*\bgru\b", groups, re.MULTILINE)
+    assert "search" not in re.findall(r"^(\w+): ", groups, re.MULTILINE)
+    assert "name: gru" in config
 
 
 def test_an_experiment_does_not_replace_another_one_in_silence(memmlp: Memmlp):

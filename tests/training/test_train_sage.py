@@ -104,6 +104,17 @@ def test_a_step_changes_the_part_and_nothing_else(kind):
     assert all(tensors[name].data_ptr() in own for name in changed)
 
 
+@torch.no_grad()
+def test_the_upper_half_is_validated_on_what_it_samples():
+    """Not on one step of denoising, whose error depends on the noise that was drawn."""
+    net, codes = parts("upper_diffusion")
+    rotation, encoded = sage_part_losses.seen(net, FRAMES)
+    error = net.upper_latent(encoded) - sage_part_losses.latents(codes, rotation, encoded)
+    expected = nn.functional.smooth_l1_loss(error, torch.zeros_like(error))
+    assert torch.equal(sage_part_losses.upper_losses(net, codes, FRAMES, False)["latent"], expected)
+    assert not torch.equal(sage_part_losses.upper_losses(net, codes, FRAMES, True)["latent"], expected)
+
+
 def test_the_lower_half_is_given_what_the_upper_one_samples():
     """Never the true latents, which there are none of at inference."""
     net, codes = parts("lower_diffusion")

@@ -1,12 +1,13 @@
 """Clips of the same frames: in one part, and one group."""
 
 from collections import Counter
+from unittest import mock
 
 import pytest
 
 from memmlp.motion.preparing.duplicates import assign, one_part_each, tied
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
-from memmlp.motion.preparing.splits import MixedSplit, SeededSplit
+from memmlp.motion.preparing.splits import Assignment, MixedSplit, SeededSplit
 
 CONTENTS = {"a": "x", "b": "y", "c": "x", "d": "x", "e": "y", "f": "z", "g": STILL, "h": STILL}
 
@@ -32,6 +33,17 @@ def test_groups_with_copies_are_one():
     assert tied(clips(), groups) == {
         "a": "a", "b": "a", "c": "a", "d": "a", "e": "a", "f": "f", "g": "a", "h": "h",
     }  # fmt: skip
+
+
+def test_a_published_list_is_kept_although_copies_join_its_groups():
+    """A copy on the other side is left out; nothing is drawn anew."""
+    given = Assignment(dict.fromkeys(CONTENTS, "train") | {"c": "test"}, {name: name for name in CONTENTS})
+    split = mock.Mock(listed={"CMU": 8}, assign=mock.Mock(return_value=given))
+    parts, groups, gave_way = assign(split, clips())
+    assert parts == given.parts | {"a": None, "d": None}
+    assert gave_way == {"a": "c", "d": "c"}
+    assert groups["d"] == "a"
+    assert split.assign.call_count == 1
 
 
 @pytest.mark.parametrize("source", ["", "cmu/"])
