@@ -225,7 +225,6 @@ class LiveServer(ThreadingHTTPServer):
 
     daemon_threads = True
     block_on_close = False
-    allow_reuse_address = True
 
     def __init__(
         self,

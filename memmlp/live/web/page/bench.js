@@ -11,7 +11,7 @@ const YARDSTICK = 'yardstick';
 export function bench(page, site) {
   const view = new Bench(page, site);
   view.describe();
-  const hidden = () => { if (document.hidden && view.remote) view.stop('Stopped: browsers slow down a page that is not in front.'); };
+  const hidden = () => { if (document.hidden && view.proxy) view.stop('Stopped: browsers slow down a page that is not in front.'); };
   document.addEventListener('visibilitychange', hidden);
   return () => {
     document.removeEventListener('visibilitychange', hidden);
@@ -27,7 +27,7 @@ function items(site) {
 
 class Bench {
   constructor(page, site) {
-    Object.assign(this, { page, site, items: items(site), results: new Map(), failures: new Map(), remote: null, clock: 0 });
+    Object.assign(this, { page, site, items: items(site), results: new Map(), failures: new Map(), proxy: null, clock: 0 });
     this.device = h('input', { type: 'text', id: 'device', maxLength: 60, placeholder: 'such as Quest 3', autocomplete: 'off' });
     this.steps = h('select', { id: 'steps' }, STEPS.map(count => h('option', { value: count }, `${count} steps`)));
     this.gpu = h('input', { type: 'checkbox', id: 'webgpu', disabled: true });
@@ -74,11 +74,11 @@ class Bench {
     document.documentElement.dataset.bench = 'ready';
   }
 
-  toggle() { return this.remote ? this.stop('Stopped.') : this.measure(); }
+  toggle() { return this.proxy ? this.stop('Stopped.') : this.measure(); }
 
   stop(words) {
-    this.remote?.close();
-    this.remote = null;
+    this.proxy?.close();
+    this.proxy = null;
     this.start.textContent = 'Start';
     this.bar.hidden = true;
     if (words) this.note.textContent = words;
@@ -105,12 +105,12 @@ class Bench {
 
   // Time everything on a backend. What does not run there has its reason in its row.
   async backend(backend, each) {
-    const remote = (this.remote = new WorkerProxy());
+    const proxy = (this.proxy = new WorkerProxy());
     const plan = [];
     const open = async (key, entry, part) => {
       this.note.textContent = `${backend}: loading ${key}`;
       try {
-        await remote.open(key, entry, backend);
+        await proxy.open(key, entry, backend);
         plan.push({ key, ...part });
       } catch (error) {
         if (error.message === 'stopped') throw error;
@@ -124,10 +124,10 @@ class Bench {
       if (item.whole) await open(`${item.key} whole`, item.whole, { kind: 'whole', body, fps });
     }
     this.note.textContent = `${backend}: ${each * ROUNDS} steps of ${this.items.length} graphs, alone and as a whole pose`;
-    const { times, clock } = await remote.call('time', [plan, each], share => { this.bar.value = share; });
+    const { times, clock } = await proxy.call('time', [plan, each], share => { this.bar.value = share; });
     this.clock = Math.max(clock, this.clock);
     this.tell(times, backend, each);
-    remote.close();
+    proxy.close();
     this.rows();
   }
 

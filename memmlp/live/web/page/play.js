@@ -76,8 +76,8 @@ class Play {
   // Load network and clip, and play from the start.
   async begin() {
     const round = ++this.round;
-    this.remote?.close();
-    this.remote = new WorkerProxy();
+    this.proxy?.close();
+    this.proxy = new WorkerProxy();
     this.history.frames = [];
     this.history.resume();
     this.dropped = 0;
@@ -85,7 +85,7 @@ class Play {
     if (!this.clip) return this.tell('This network has no test clip on this site.');
     this.tell('Loading the network.');
     try {
-      const [content] = await Promise.all([fetched(this.clip.file), this.remote.open('play', this.network.play)]);
+      const [content] = await Promise.all([fetched(this.clip.file), this.proxy.open('play', this.network.play)]);
       const clip = new Clip(content.buffer);
       this.tell('');
       this.stage ??= this.drawn();
@@ -113,7 +113,7 @@ class Play {
   // Feed the clip to the stream at 60 Hz, over and over. What is due while a step is worked on is dropped.
   async rounds(clip, round) {
     const { body, fps } = this.network;
-    const stream = new Stream({ fps, body, run: frame => this.remote.call('pose', ['play', frame]) });
+    const stream = new Stream({ fps, body, run: frame => this.proxy.call('pose', ['play', frame]) });
     for (;;) {
       stream.reset();
       const began = performance.now();
@@ -171,6 +171,6 @@ class Play {
 
   leave() {
     this.round++;
-    this.remote?.close();
+    this.proxy?.close();
   }
 }

@@ -75,15 +75,15 @@ class Wear {
 
   // Load the network, and ask the browser what it can enter.
   async ready() {
-    const remote = (this.remote = (this.remote?.close(), new WorkerProxy()));
+    const proxy = (this.proxy = (this.proxy?.close(), new WorkerProxy()));
     try {
-      await remote.open('wear', this.network.play);
+      await proxy.open('wear', this.network.play);
     } catch (error) {
-      if (remote === this.remote) this.trouble.textContent = `The network did not load: ${error.message}`;
+      if (proxy === this.proxy) this.trouble.textContent = `The network did not load: ${error.message}`;
       return;
     }
     const can = await Promise.all(Object.keys(MODES).map(mode => navigator.xr?.isSessionSupported(mode).catch(() => false) ?? false));
-    if (remote !== this.remote) return;
+    if (proxy !== this.proxy) return;
     this.buttons.forEach((button, i) => { button.disabled = !can[i]; });
     const why = !window.isSecureContext ? 'This address is not secure: a headset may be entered at https or localhost alone.'
       : !navigator.xr ? 'This browser has no WebXR. Open this page in a headset’s browser.'
@@ -112,7 +112,7 @@ class Wear {
     this.worn = {
       session, network: this.network, tall, kinds: [null, null], placed: false, calibrated: false, due: null, waiting: 0, frames: 0, dropped: 0, skipped: 0, last: null, passed: [], times: [],
       tape: this.record.checked ? [] : null,
-      stream: new Stream({ fps, body, offsets: usualOffsets([null, null]), scale: body.height / tall, run: frame => this.remote.call('pose', ['wear', frame]) }),
+      stream: new Stream({ fps, body, offsets: usualOffsets([null, null]), scale: body.height / tall, run: frame => this.proxy.call('pose', ['wear', frame]) }),
     };
     this.seen.hidden = false;
     this.mirror.through(mode === 'immersive-ar');
@@ -253,7 +253,7 @@ class Wear {
 
   leave() {
     this.worn?.session.end();
-    this.remote?.close();
+    this.proxy?.close();
     this.mirror?.dispose();
   }
 }

@@ -6,7 +6,7 @@ import { Stream } from './stream.js';
 import { clockStep, interleaved } from './timing.js';
 import { drawn } from './weights.js';
 
-const sessions = new Map();
+const onnxStreams = new Map();
 let runtime = null;
 
 // ONNX Runtime for a backend, "wasm" or "webgpu", on one thread; its SIMD is part of the build.
@@ -23,14 +23,14 @@ function load(backend) {
 const calls = {
   async open(key, { file, weights }, backend) {
     const [{ ort }, model] = await Promise.all([load(backend), fetched(file)]);
-    sessions.set(key, await OnnxStream.open(ort, model, { weights: drawn(weights), backend }));
+    onnxStreams.set(key, await OnnxStream.open(ort, model, { weights: drawn(weights), backend }));
   },
 
-  pose: (key, frame) => sessions.get(key).pose(frame),
+  pose: (key, frame) => onnxStreams.get(key).pose(frame),
 
   // plan: [{ key, kind, body, fps }] of open graphs; kind: step, whole (from trackers to joints) or plain (no state).
   async time(plan, each, id) {
-    const steps = Object.fromEntries(plan.map(part => [part.key, stepper[part.kind](sessions.get(part.key), part)]));
+    const steps = Object.fromEntries(plan.map(part => [part.key, stepper[part.kind](onnxStreams.get(part.key), part)]));
     const times = await interleaved(steps, { each, told: share => postMessage({ id, share }) });
     for (const part of plan) await check(steps[part.key], part.key);
     return { times, clock: clockStep() };
@@ -38,18 +38,18 @@ const calls = {
 };
 
 const stepper = {
-  step(session) {
+  step(onnxStream) {
     const sparse = Float32Array.from({ length: 54 }, (_, i) => Math.sin(12.9898 * (i + 1)));
-    return () => session.step({ sparse });
+    return () => onnxStream.step({ sparse });
   },
-  plain(session) {
-    const inputs = Object.fromEntries(Object.entries(session.inputs).map(([name, tensor]) => [name, tensor.data.map(() => 1)]));
-    return () => session.step(inputs);
+  plain(onnxStream) {
+    const inputs = Object.fromEntries(Object.entries(onnxStream.inputs).map(([name, tensor]) => [name, tensor.data.map(() => 1)]));
+    return () => onnxStream.step(inputs);
   },
   // A sample of a person who sways, resampled, held and with the devices' offsets, to joints.
-  whole(session, { body, fps }) {
+  whole(onnxStream, { body, fps }) {
     const offsets = { positions: [[0, -0.07, 0.09], [0, 0, 0], [0, 0, 0]], rotations: Array(3).fill([0, 0, 0, 1]) };
-    const stream = new Stream({ fps, body, offsets, run: frame => session.pose(frame) });
+    const stream = new Stream({ fps, body, offsets, run: frame => onnxStream.pose(frame) });
     let count = 0;
     return () => {
       const angle = 0.4 * Math.sin(count++ / 20);
