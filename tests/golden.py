@@ -52,10 +52,10 @@ from memmlp.training.losses import (
     HandFK,
     HandPosition,
     Loss,
+    LossOfNetwork,
     Manual,
     MotionLoss,
     NoHand,
-    OwnLoss,
     RPMLoss,
     TermsLoss,
     Uncertainty,
@@ -133,11 +133,11 @@ def _used(model: MotionModel, clip: Tensor) -> Numbers:
 def sampler() -> Numbers:
     """Draws by frames and by clips."""
     found = {}
-    for weighting in ("frames", "clips"):
-        draws = WindowSampler(frames(), batch=32, window=50, seed=1, weighting=weighting)
+    for drawn_by in ("frames", "clips"):
+        draws = WindowSampler(frames(), batch=32, window=50, seed=1, drawn_by=drawn_by)
         for step in range(2):
             for name, values in zip(("clip", "end"), draws.draw(step), strict=True):
-                found |= summary(f"{weighting} {name} {step}", values)
+                found |= summary(f"{drawn_by} {name} {step}", values)
     return found
 
 
@@ -292,7 +292,7 @@ CASES: dict[str, Callable[[], Numbers]] = {
     },
     "loss.rpm": lambda: loss(RPMLoss),
     "loss.own": lambda: {
-        "total": float(OwnLoss()(*(torch.ones(1, 1, n) for n in (198, 198, 54)), tiny.normalizer())[0])
+        "total": float(LossOfNetwork()(*(torch.ones(1, 1, n) for n in (198, 198, 54)), tiny.normalizer())[0])
     },
     "loss.terms": lambda: {
         f"{error} {name}": value

@@ -31,7 +31,7 @@ from memmlp.networks.predictor_slot import Predictor, TwoBranch
 from memmlp.networks.recurrent_poser import RecurrentPoser
 from memmlp.networks.refiner import Refined
 from memmlp.networks.vqvae import VQVAE
-from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, Loss, OwnLoss, RPMLoss, TermsLoss
+from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, Loss, LossOfNetwork, RPMLoss, TermsLoss
 
 SIZES = {"hidden": 16, "frames": 7}
 DEPTH = 4
@@ -110,26 +110,28 @@ BASELINES: dict[str, Callable[..., MotionModel]] = {
     ),
     "bodiffusion": partial(
         BoDiffusion, frames=7, width=48, depth=2, heads=3, diffusion_steps=50, sampling_steps=3, noise_seed=0,
-        noise=1.0, bound=1.0, offline=False,
+        noise_weight=1.0, bound_weight=1.0, offline=False,
     ),
     "avatar_poser": partial(AvatarPoser, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1),
     "ego_poser": partial(EgoPoser, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1),
     "hmd_poser": partial(
-        HMDPoser, frames=7, width=16, depth=2, layers=1, heads=4, feedforward=32, dropout=0.1, shape=0.1
+        HMDPoser, frames=7, width=16, depth=2, encoder_layers=1, heads=4, feedforward=32, dropout=0.1,
+        shape_weight=0.1,
     ),
-    "vae_hmd": partial(VAEHMD, frames=7, width=16, depth=2, latent=6, dropout=0.2, divergence=0.01),
+    "vae_hmd": partial(VAEHMD, frames=7, width=16, depth=2, latent=6, dropout=0.2, divergence_weight=0.01),
     "avatar_jlm": partial(
-        AvatarJLM, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, coarse=1.0
+        AvatarJLM, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, coarse_weight=1.0
     ),
     "rpm": partial(
         RPM, frames=9, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, context=3, horizon=4
     ),
     "manikin_s": partial(
-        ManikinS, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.0, parts=1.0, turned=True
+        ManikinS, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.0, parts_weight=1.0,
+        turned=True,
     ),
     "manikin_l": partial(
-        ManikinL, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, coarse=1.0, parts=1.0,
-        turned=True, offline=False,
+        ManikinL, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, coarse_weight=1.0,
+        parts_weight=1.0, turned=True, offline=False,
     ),
     "sage": partial(
         SAGENet, frames=8, width=16, depth=1, heads=2, code_width=16, code_depth=1, code_heads=2, dropout=0.1,
@@ -141,7 +143,7 @@ WINDOWLESS = ["hmd_poser", "vae_hmd", "rpm"]
 BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
     "agrol_mlp": AGRoLLoss,
     "agrol_diffusion": AGRoLLoss,
-    "bodiffusion": OwnLoss,
+    "bodiffusion": LossOfNetwork,
     "avatar_poser": AvatarPoserLoss,
     "ego_poser": partial(TermsLoss, orientation=0.02, rotation=1.0, position=1.0),
     "hmd_poser": partial(

@@ -123,7 +123,7 @@ def build_upstream(cfg: DictConfig, config: dict[str, Any]) -> tuple[UpstreamTra
         return tuple(built(cfg.upstream).trainings(config, training))
     if cfg.memory is None or not memory_class(cfg).uses_codes:
         return ()
-    codes = {"frame": config["frame"], "vqvae": config["vqvae"]}
+    codes = {"normalizer": config["normalizer"], "vqvae": config["vqvae"]}
     codes |= {"data": {"mirror": True}} if cfg.data.mirror else {}
     optim = partial(build_vqvae_optim, cfg)
     return (VQVAETraining(codes, seed=cfg.vqvae.seed, optim=optim, mirror=cfg.data.mirror),)
@@ -131,7 +131,7 @@ def build_upstream(cfg: DictConfig, config: dict[str, Any]) -> tuple[UpstreamTra
 
 def build_training(cfg: DictConfig, metrics: dict[str, UserMetric]) -> NetworkTraining | RefinerTraining:
     """Build the training of a checked config's network, or of the refiner behind it."""
-    common = {"seed": cfg.seed, "optim": built(cfg.optim), "weighting": cfg.data.weighting}
+    common = {"seed": cfg.seed, "optim": built(cfg.optim), "drawn_by": cfg.data.drawn_by}
     common |= {"shares": shares(cfg.data), "mirror": cfg.data.mirror, "metrics": metrics}
     if cfg.refiner is not None:
         refiner = built(cfg.refiner)
@@ -159,21 +159,21 @@ def build_architecture(cfg: DictConfig) -> Architecture:
     network = build_unrefined_architecture(cfg)
     if cfg.refiner is None:
         return network
-    frame = {name: getattr(network, name) for name in ("coordinates", "normalize", "vqvae")}
-    return RefinedArchitecture(**frame, network=network, refiner=built(cfg.refiner))
+    common = {name: getattr(network, name) for name in ("coordinates", "normalize", "vqvae")}
+    return RefinedArchitecture(**common, network=network, refiner=built(cfg.refiner))
 
 
 def build_unrefined_architecture(cfg: DictConfig) -> Architecture:
     """Build the architecture of a checked config's network, without a refiner."""
-    frame = {"coordinates": build_coordinates(cfg.frame.coordinates), "normalize": cfg.frame.normalize}
     vqvae = partial(VQVAE, **{name: cfg.vqvae[name] for name in VQVAE_SETTINGS})
+    coordinates = build_coordinates(cfg.normalizer.coordinates)
+    common = {"coordinates": coordinates, "normalize": cfg.normalizer.z_scores, "vqvae": vqvae}
     if "_target_" in cfg.model:
         family = PlainArchitecture if cfg.upstream is None else PartedArchitecture
-        return family(**frame, vqvae=vqvae, network=built(cfg.model))
+        return family(**common, network=built(cfg.model))
     memory, kind = built(cfg.memory), memory_class(cfg)
     return MemMLPArchitecture(
-        **frame,
-        vqvae=vqvae,
+        **common,
         frames=cfg.model.frames,
         hidden=cfg.model.width,
         depth=cfg.model.depth,
@@ -187,11 +187,10 @@ def build_coordinates(name: str) -> Coordinates:
     """Build the coordinates with that name, or those of a custom class with that path."""
     if name in COORDINATES:
         return COORDINATES[name]()
-    found = located(name, "frame.coordinates")
+    found = located(name, "normalizer.coordinates")
     if not (isinstance(found, type) and issubclass(found, Coordinates)):
-        raise InputError(
-            f"frame.coordinates={name}: allowed is a class that extends {Coordinates.__module__}.Coordinates"
-        )
+        allowed = f"a class that extends {Coordinates.__module__}.Coordinates"
+        raise InputError(f"normalizer.coordinates={name}: allowed is {allowed}")
     return found()
 
 

@@ -20,6 +20,7 @@ from omegaconf.errors import (
 )
 
 from memmlp.config.schema import unknown_key
+from memmlp.runs.former_keys import present_key, present_option
 
 SOURCES = "data.sources"
 WORDS = {int: "an integer", float: "a number", bool: "true or false", str: "text", NoneType: "null"}
@@ -31,6 +32,8 @@ def explain(error: Exception, overrides: Sequence[str]) -> str:
         return f"{error.override}: cannot be read; allowed is KEY=VALUE, +KEY=VALUE or ~KEY"
     if isinstance(error, MissingConfigException):
         return _missing_option(error)
+    if isinstance(error, ConfigCompositionException) and (said := _former_group(overrides)):
+        return said
     if isinstance(error, RecursionError):
         said = (
             "a defaults list leads back to itself; allowed is '- NAME' for another option of the same group"
@@ -54,7 +57,18 @@ def _missing_option(error: MissingConfigException) -> str:
         return _first_line(error)
     near = difflib.get_close_matches(option, error.options, n=1)
     hint = f"did you mean {near[0]}? " if near else ""
+    if (now := present_option(group, option)) is not None:
+        hint = f"it is now {now}; "
     return f"{group}={option}: no such option; {hint}allowed are {', '.join(error.options)}"
+
+
+def _former_group(overrides: Sequence[str]) -> str | None:
+    """Answer an override that names a group by a former name; None if there is none."""
+    for word in overrides:
+        group = re.split("[.=@]", word.lstrip("+~"))[0]
+        if (now := present_key(group, ())) is not None:
+            return f"{word}: no such group; it is now {now}"
+    return None
 
 
 def _offender(error: Exception) -> str | None:

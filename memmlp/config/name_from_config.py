@@ -69,7 +69,7 @@ def _differences(config: Mapping[str, Any]) -> Iterator[str]:
 
 def _keys(config: Mapping[str, Any], default: Mapping[str, Any], foreign: list[str]) -> Iterator[str]:
     """Yield words for the keys whose values differ from the default; a custom component has no default."""
-    own, usual = flatten(config), {"data.weighting": "frames"} | flatten(default)
+    own, usual = flatten(config), {"data.drawn_by": "frames"} | flatten(default)
     for key in dict.fromkeys(
         [*training_config(config), *training_config(default)]
     ):  # either may count it where it is set

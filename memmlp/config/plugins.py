@@ -206,7 +206,7 @@ def foreign(config: Mapping[str, Any]) -> list[str]:
     """Return the paths of classes and functions outside memmlp that a config names."""
     flat = flatten(config)
     paths = [str(value) for key, value in flat.items() if key.rsplit(".", 1)[-1] == "_target_"]
-    coordinates = str(flat.get("frame.coordinates", ""))
+    coordinates = str(flat.get("normalizer.coordinates", ""))
     paths += [coordinates] if "." in coordinates else []
     return [path for path in dict.fromkeys(paths) if not path.startswith("memmlp.")]
 

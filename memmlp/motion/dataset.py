@@ -16,7 +16,7 @@ from memmlp.motion.preparing.manifest import Manifest
 from memmlp.motion.preparing.several_folders import source_of
 from memmlp.motion.preparing.splits import PARTS
 
-WEIGHTINGS = ("frames", "clips")
+DRAWN_BY = ("frames", "clips")
 SHARE_STEPS = 2**52  # how finely sources' shares are kept
 
 
@@ -115,13 +115,13 @@ class WindowSampler:
         batch: number of windows per draw.
         window: number of frames per window.
         seed: seed of the draws.
-        weighting: "frames" if every window of the part is equally likely (reading 23), "clips" if every clip
+        drawn_by: "frames" if every window of the part is equally likely (reading 23), "clips" if every clip
             is equally likely.
         shares: how often a window is drawn from each source, relative to the others; within a source,
-            `weighting` decides. None draws from all clips alike.
+            `drawn_by` decides. None draws from all clips alike.
 
     Raises:
-        InputError: for another weighting.
+        InputError: for another `drawn_by`.
     """
 
     def __init__(
@@ -130,16 +130,16 @@ class WindowSampler:
         batch: int,
         window: int,
         seed: int,
-        weighting: str = "frames",
+        drawn_by: str = "frames",
         shares: Mapping[str, float] | None = None,
     ):
-        if weighting not in WEIGHTINGS:
-            raise InputError(f"data.weighting: {weighting!r}; allowed: {', '.join(WEIGHTINGS)}")
+        if drawn_by not in DRAWN_BY:
+            raise InputError(f"data.drawn_by: {drawn_by!r}; allowed: {', '.join(DRAWN_BY)}")
         self.batch, self.seed, self.device = batch, seed, dataset.frames.device
         lengths = dataset.lengths.cpu().numpy()
         self.first_end = np.minimum(window, lengths) - 1
         self.windows = np.maximum(lengths - window + 1, 1)
-        weights = self.windows if weighting == "frames" else np.ones_like(self.windows)
+        weights = self.windows if drawn_by == "frames" else np.ones_like(self.windows)
         self.weights = _shared(weights, dataset.sources, shares) if shares else weights
         self.bounds = np.cumsum(self.weights)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -45,12 +46,22 @@ def module_tensors(prefix: str, module: nn.Module) -> dict[str, Tensor]:
 def load_module(prefix: str, module: nn.Module, tensors: dict[str, Tensor]) -> None:
     """Load into a module those of the tensors that `module_tensors` named with this prefix."""
     own = {name.removeprefix(f"{prefix}."): t for name, t in tensors.items() if name.startswith(f"{prefix}.")}
-    module.load_state_dict({_current(name): tensor for name, tensor in own.items()})
+    known = module.state_dict().keys()
+    module.load_state_dict({_current(name, known): tensor for name, tensor in own.items()})
 
 
-def _current(name: str) -> str:
-    """Return the name that a tensor has in this version; version 0.1 called the normalizer `frame`."""
-    return re.sub(r"(^|\.)frame\.(rest|mean|std)$", r"\1normalizer.\2", name)
+WEIGHTS = {"rotation": "all_rotations", "position": "branch_position", "velocity": "lower_body_velocity"}
+"""The present names of terms of Mem-MLP's loss, by those that they had up to version 0.2."""
+
+
+def _current(name: str, known: Collection[str]) -> str:
+    """Return the name that a tensor has in this version.
+
+    Version 0.1 called the normalizer `frame`; the learned weights of Mem-MLP's loss have the terms' names.
+    """
+    name = re.sub(r"(^|\.)frame\.(rest|mean|std)$", r"\1normalizer.\2", name)
+    above, _, term = name.rpartition(".")
+    return name if name in known or term not in WEIGHTS else f"{above}.{WEIGHTS[term]}"
 
 
 def optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:

@@ -127,7 +127,7 @@ OUTPUTS: dict[str, type[RotationOutput]] = {
 def mean_pose(normalizer: Normalizer) -> Tensor:
     """Return the global rotations (132,), 6D, of the mean pose in the network's coordinates.
 
-    They are zeros where the normalizer has no mean (`frame.normalize=false`).
+    They are zeros where the normalizer has no mean (`normalizer.z_scores=false`).
     """
     local = sixd_to_matrix(normalizer.mean[SPARSE_DIM:][ROTATION].unflatten(-1, (N_JOINTS, 6)))
     rotations, _ = forward_kinematics(local, torch.zeros_like(normalizer.rest[0]), normalizer.rest)

@@ -19,6 +19,7 @@ from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, plain
+from memmlp.runs.former_keys import with_present_keys
 from memmlp.sweep.definition import Sweep
 from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.measured_run import Errors, Measured, Origin
@@ -267,8 +268,8 @@ def load_kept(path: Path) -> Kept:
             label: {int(seed): measured[name] for seed, name in seeds.items()}
             for label, seeds in content["cells"].items()
         }
-        arms = {label: tuple(words) for label, words in content["arms"].items()}
-        words, flags = tuple(content["overrides"]), tuple(content.get("flags", ()))
+        arms = {label: with_present_keys(words) for label, words in content["arms"].items()}
+        words, flags = with_present_keys(content["overrides"]), tuple(content.get("flags", ()))
         predicted = content.get("predicted_flops", {})
         return Kept(content["sweep"], words, cells, arms, content["rounds"], flags, predicted)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

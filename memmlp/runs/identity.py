@@ -20,6 +20,7 @@ from typing import Any
 
 from memmlp.common.files import plain
 from memmlp.common.plugin import METRICS
+from memmlp.runs.former_keys import former_option, with_former_names
 from memmlp.runs.recipe_versions import recipes
 
 NEUTRAL = (
@@ -39,9 +40,6 @@ NEUTRAL = (
 )
 """Config keys that change no result of any stage."""
 
-FORMER = ("tracker",)
-"""Neutral keys that runs of version 0.1 have: today's `tracking`."""
-
 PATHS = ("_target_", "_partial_")
 """Where a component's class lies; the `name` of one of this package says what it is."""
 
@@ -59,7 +57,7 @@ ID = re.compile(r"[0-9a-f]{16}")
 DATA_PATH = re.compile(r"data\.(root|body|split\.folder|sources\..+\.root)")
 """The keys that say where data lies."""
 
-DRAWS = re.compile(r"data\.(weighting|mirror|split\.train_fraction|sources\..+\.weight)")
+DRAWS = re.compile(r"data\.(drawn_by|mirror|split\.train_fraction|sources\..+\.weight)")
 """The keys of the data that change what is trained on alone, not what is validated and tested."""
 
 SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term", "refiner", "upstream", "optim")
@@ -215,9 +213,9 @@ def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
     yield from ("features", "sampler", "training")
     if (config.get("data") or {}).get("mirror"):
         yield "mirror"
-    if coordinates := config.get("frame", {}).get("coordinates"):
+    if coordinates := config.get("normalizer", {}).get("coordinates"):
         yield f"coordinates.{coordinates}"
-    names = {slot: option_in_slot(config, slot) for slot in SLOTS}
+    names = {slot: former_option(slot, option_in_slot(config, slot)) for slot in SLOTS}
     yield from (f"{slot}.{name}" for slot, name in names.items() if name and name != UNNAMED.get(slot))
     if (config.get("loss") or {}).get("weighting") == "learned":
         yield "weighting.learned"
@@ -247,7 +245,7 @@ def option_in_slot(config: Mapping[str, Any], slot: str) -> str | None:
 def training_config(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the config values that can change a training's result, by dotted key; null counts as no key."""
     later = (*EVALUATION, *DEPLOYMENT, *(() if _rolls_out(config) else INFERENCE))
-    out = (*NEUTRAL, *FORMER, *later, *_unused(config))
+    out = (*NEUTRAL, *later, *_unused(config))
     flat = {key: _canonical(value) for key, value in flatten(config).items() if value is not None}
     counting = {key: flat[key] for key in flat if not _below(key, out) and not _is_path(key, flat)}
     inert = {key: value for key, value in _inert(config).items() if key in counting}
@@ -263,11 +261,13 @@ def _draws(config: Mapping[str, Any]) -> dict[str, Any]:
     weights = {name: _canonical(source.get("weight")) for name, source in sources}
     shares = {"data.sources": weights} if any(weights.values()) else {}
     mirror = {"data.mirror": True} if data.get("mirror") else {}
-    return {"data.weighting": data.get("weighting", "frames"), **shares, **mirror}
+    return {"data.drawn_by": data.get("drawn_by", "frames"), **shares, **mirror}
 
 
 def _training(kind: str, config: Mapping[str, Any], data: str, upstream: str | None) -> dict[str, Any]:
-    return {"kind": kind, "config": training_config(config), "data": data, "upstream": upstream}
+    """Return what a training's identity is the digest of, but for recipes; keys have their former names."""
+    named = with_former_names(training_config(config))
+    return {"kind": kind, "config": named, "data": data, "upstream": upstream}
 
 
 def changes_training(key: str, config: Mapping[str, Any]) -> bool:
@@ -359,7 +359,7 @@ def _inert(config: Mapping[str, Any]) -> dict[str, float]:
         return {}
     inert = {"loss.hand": 0.1} if option_in_slot(config, "hand") == "off" else {}
     if option_in_slot(config, "predictor") in ("rotation_only", "rotation_only_memory"):
-        inert |= {"loss.position": 0.5, "loss.velocity": 0.1}
+        inert |= {"loss.branch_position": 0.5, "loss.lower_body_velocity": 0.1}
     return inert
 
 

@@ -33,6 +33,7 @@ from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.environment import changed, changes, code_digests, environment, host
 from memmlp.runs.evaluation_file import intact
 from memmlp.runs.evaluations_as_configured import EvaluationsAsConfigured
+from memmlp.runs.former_keys import with_present_names
 from memmlp.runs.identity import (
     NETWORK,
     belongs,
@@ -357,7 +358,7 @@ class Run:
 
     @property
     def config(self) -> dict[str, Any]:
-        """The resolved config; empty before the run began.
+        """The resolved config, with the names that its keys have today; empty before the run began.
 
         Raises:
             InputError: if the file is damaged.
@@ -368,7 +369,7 @@ class Run:
             found = None
         if not isinstance(found, dict):
             raise InputError(f"{self.config_path}: cannot be read; remove the run's folder to do it again")
-        return found
+        return with_present_names(found)
 
     @property
     def results(self) -> dict[str, Any]:

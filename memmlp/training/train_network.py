@@ -39,7 +39,7 @@ class NetworkTraining:
         loss: makes the loss, given the network's branches.
         rollout: makes the history that the network is trained on.
         optim: steps, learning rates and intervals.
-        weighting: how training windows are drawn, "frames" or "clips" (see WindowSampler).
+        drawn_by: how training windows are drawn, "frames" or "clips" (see WindowSampler).
         shares: the share of windows drawn from each source (see WindowSampler).
         metrics: custom metrics, measured at validations.
         mirror: whether half of the training windows are mirrored (see MirroredDataset).
@@ -49,7 +49,7 @@ class NetworkTraining:
     loss: Callable[[frozenset[str]], Loss]
     rollout: Rollout
     optim: Optim
-    weighting: str
+    drawn_by: str
     shares: Mapping[str, float] | None = None
     metrics: UserMetrics = field(default_factory=dict)
     mirror: bool = False
@@ -104,7 +104,7 @@ class NetworkTraining:
             self.optim,
             self.seed,
             validate=lambda network: modes.quick_stream(network, pieces, self.metrics),
-            weighting=self.weighting,
+            drawn_by=self.drawn_by,
             shares=self.shares,
         )
 
@@ -121,12 +121,12 @@ class MotionTask:
         optim: Optim,
         seed: int,
         validate: Callable[[MotionModel], dict[str, float]],
-        weighting: str = "frames",
+        drawn_by: str = "frames",
         shares: Mapping[str, float] | None = None,
     ):
         self.model, self.loss, self.rollout, self.dataset = model, loss, rollout, dataset
         self.module: nn.Module = nn.ModuleDict({"model": model, "loss": loss, "rollout": rollout})
-        self.sampler = WindowSampler(dataset, optim.batch, model.frames, seed, weighting, shares)
+        self.sampler = WindowSampler(dataset, optim.batch, model.frames, seed, drawn_by, shares)
         self.learn = torch.compile(model.learn) if optim.compile else model.learn
         self._validate = validate
 

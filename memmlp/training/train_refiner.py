@@ -57,7 +57,7 @@ class RefinerTraining:
         seed: seed of the weights, pieces and batches.
         refiner: says how many pieces are drawn, and how long they are.
         optim: steps, learning rates and intervals; a batch consists of pieces.
-        weighting: how pieces are drawn, "frames" or "clips" (see WindowSampler).
+        drawn_by: how pieces are drawn, "frames" or "clips" (see WindowSampler).
         shares: the share of pieces drawn from each source (see WindowSampler).
         mirror: whether half of the pieces are mirrored (see MirroredDataset).
         metrics: custom metrics, measured at validations.
@@ -66,7 +66,7 @@ class RefinerTraining:
     seed: int
     refiner: SAGERefiner
     optim: Optim
-    weighting: str
+    drawn_by: str
     shares: Mapping[str, float] | None = None
     mirror: bool = False
     metrics: UserMetrics = field(default_factory=dict)
@@ -117,7 +117,7 @@ class RefinerTraining:
     def drawn(self, dataset: MotionDataset) -> tuple[Tensor, Tensor]:
         """Draw the pieces: frames (P, n, 252), and the indices (P,) of the clips that they come from."""
         pieces = WindowSampler(
-            dataset, self.refiner.pieces, self.refiner.frames, self.seed, self.weighting, self.shares
+            dataset, self.refiner.pieces, self.refiner.frames, self.seed, self.drawn_by, self.shares
         )
         clips, end = pieces.draw(0)
         return dataset.segments(clips, end, self.refiner.frames), clips

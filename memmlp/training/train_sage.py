@@ -107,7 +107,7 @@ def of_whole(name: str, whole: Optim, part: Optim) -> tuple[str, ...]:
 def acting(kind: str, config: Mapping[str, Any]) -> dict[str, Any]:
     """Return those keys of a network's config that determine the result of training one of its parts."""
     upstream = {key: config["upstream"][key] for key in ("name", "_target_", kind)}
-    own = {key: config[key] for key in ("profile", "data", "frame", "seed")}
+    own = {key: config[key] for key in ("profile", "data", "normalizer", "seed")}
     own |= {"loss": config["loss"]} if kind == "decoder" else {}
     return {
         **own,
@@ -211,7 +211,7 @@ class Windows:
         self, network: NetworkTraining, dataset: MotionDataset, validation: MotionDataset, frames: int
     ):
         self.dataset = MirroredDataset(dataset) if network.mirror else dataset
-        draws = network.optim.batch, frames, network.seed, network.weighting, network.shares
+        draws = network.optim.batch, frames, network.seed, network.drawn_by, network.shares
         self.frames, self.sampler = frames, WindowSampler(self.dataset, *draws)
         drawn = WindowSampler(validation, VALIDATION_WINDOWS, frames, seed=0).draw(0)
         self.validation = validation.segments(*drawn, frames)

@@ -27,7 +27,7 @@ from memmlp.training.optim import Optim
 class VQVAETraining:
     """How a VQ-VAE is trained.
 
-    All frames of the training part are equally likely, whatever `data.weighting` and the weights of sources
+    All frames of the training part are equally likely, whatever `data.drawn_by` and the weights of sources
     are, as an epoch has each once (reading 5). So networks that draw windows otherwise share their VQ-VAE.
 
     Attributes:

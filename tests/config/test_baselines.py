@@ -126,12 +126,14 @@ def test_published_work():
 
 def test_baselines_see_what_their_authors_give_them():
     """World coordinates, and z-scores of the diffusion model and of RPM alone; what is asked for wins."""
-    features = {name: tuple(composed([f"model={name}"]).frame.values()) for name in NAMES}
+    features = {name: tuple(composed([f"model={name}"]).normalizer.values()) for name in NAMES}
     scored = dict.fromkeys(("agrol_diffusion", "rpm"), ("world", True))
     assert features == dict.fromkeys(NAMES, ("world", False)) | scored
-    asked = composed(["model=agrol_mlp", "frame.coordinates=heading", "frame.normalize=true"]).frame
+    asked = composed(
+        ["model=agrol_mlp", "normalizer.coordinates=heading", "normalizer.z_scores=true"]
+    ).normalizer
     assert tuple(asked.values()) == ("heading", True)
-    assert tuple(composed([]).frame.values()) == ("heading", True)
+    assert tuple(composed([]).normalizer.values()) == ("heading", True)
 
 
 def identity(*overrides: str) -> str:
@@ -176,8 +178,8 @@ REFUSED = [
     (["model=agrol_mlp", "loss.error=cube"], "loss.error=cube"),
     (["model=avatar_poser", "loss.anchor=foot"], "loss.anchor=foot"),
     (
-        ["model=ego_poser", "frame.normalize=true"],
-        "frame.normalize=true: EgoPoser takes the head's place off the hands'",
+        ["model=ego_poser", "normalizer.z_scores=true"],
+        "normalizer.z_scores=true: EgoPoser takes the head's place off the hands'",
     ),
     (["model=rpm", "model.frames=19"], "model.context + model.horizon = 20"),
     (["model=manikin_l", "model.offline=true"], "allowed is evaluation.modes=[window] with export.graph=off"),
@@ -185,14 +187,14 @@ REFUSED = [
         [*OFFLINE, "refiner=sage"],
         "refiner: corrects a stream",
     ),
-    (["model=bodiffusion", "model.noise=0"], "model.noise=0"),
+    (["model=bodiffusion", "model.noise_weight=0"], "model.noise_weight=0"),
     (["model=sage", "upstream=null"], "upstream=null"),
     (["upstream=sage"], "allowed with this model is upstream=null"),
     (["model=sage", "model.frames=21"], "model.frames=21: allowed for SAGENet is an even number"),
     (["model=sage", "model.code_heads=3"], "model.code_heads=3"),
     (["model=sage", "model.code_width=21", "model.code_heads=1"], "model.code_width=21"),
     (["model=sage", "upstream.decoder.drop=0"], "upstream.decoder.drop=0"),
-    (["model=avatar_poser", "loss=own"], "loss=own: AvatarPoser"),
+    (["model=avatar_poser", "loss=of_network"], "loss=of_network: AvatarPoser"),
     (["loss=terms"], "loss=terms is of rotations alone"),
     (["model=agrol_mlp", "loss=terms", "loss.jerk=-1"], "loss.jerk=-1"),
     (["model=agrol_mlp", "loss=terms", "loss.jerks=1"], "loss.jerks"),

@@ -58,8 +58,11 @@ TRAINED: dict[str, tuple[list[str], list[list[str]]]] = {
     ),
     "loss": (SMALL, [["loss=uncertainty"], ["loss=manual"]]),
     "hand": (SMALL, [["hand=position"], ["hand=fk"], ["hand=off"]]),
-    "frame.coordinates": (SMALL, [[f"frame.coordinates={n}"] for n in ("heading", "head_relative", "world")]),
-    "frame.normalize": (SMALL, [["frame.normalize=true"], ["frame.normalize=false"]]),
+    "normalizer.coordinates": (
+        SMALL,
+        [[f"normalizer.coordinates={n}"] for n in ("heading", "head_relative", "world")],
+    ),
+    "normalizer.z_scores": (SMALL, [["normalizer.z_scores=true"], ["normalizer.z_scores=false"]]),
     "evaluation.ik": (SMALL, [["evaluation.ik=off"], ["evaluation.ik=lbfgs"], ["evaluation.ik=arms"]]),
     "evaluation.modes": (SMALL, [[f"evaluation.modes=[{n}]"] for n in ("window,stream", "stream", "window")]),
     "history": (
@@ -202,14 +205,14 @@ def test_the_same_network_again_is_no_different():
     assert torch.equal(streamed(base), streamed(again))
 
 
-SHORT = "frame.coordinates=head_relative"  # whose graphs are two thirds of those with a heading
+SHORT = "normalizer.coordinates=head_relative"  # whose graphs are two thirds of those with a heading
 EXPORTED = [
     ["memory=no_codes", "memory.fusion=plain", SHORT],
     ["memory=vq_joint", "memory.blend=sampled", SHORT],
     ["memory=lstm", "predictor=two_branch_memory", SHORT],
     ["memory=gru", "predictor=rotation_only_memory", "hand=fk", SHORT],
-    ["memory=none", "frame.coordinates=world", "predictor=rotation_only", "hand=off"],
-    ["memory=vq", "memory.shift=frame", "memory.history=latest", "frame.coordinates=heading"],
+    ["memory=none", "normalizer.coordinates=world", "predictor=rotation_only", "hand=off"],
+    ["memory=vq", "memory.shift=frame", "memory.history=latest", "normalizer.coordinates=heading"],
 ]  # every value that makes another graph; the other axes have the same graph with other numbers
 
 
@@ -247,7 +250,7 @@ GROUPS: dict[str, list[str]] = {
     "rollout": ["teacher_forcing", "own_predictions", "streams"],
     "loss": ["uncertainty", "manual"],
     "hand": ["position", "fk", "off"],
-    "frame.coordinates": ["heading", "head_relative", "world"],
+    "normalizer.coordinates": ["heading", "head_relative", "world"],
     "evaluation.ik": ["off", "lbfgs", "arms"],
     "vqvae.codebook": ["ema", "gradient"],
     "tracking": ["mlflow", "none", "tensorboard", "wandb", "all"],

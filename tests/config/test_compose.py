@@ -43,7 +43,7 @@ def needed(tmp_path: Path) -> dict[str, list[str]]:
         "predictor=rotation_only": ["hand=fk"],
         "loss=agrol": ["model=agrol_mlp"],
         "loss=avatar_poser": ["model=avatar_poser"],
-        "loss=own": ["model=bodiffusion"],
+        "loss=of_network": ["model=bodiffusion"],
         "loss=rpm": ["model=rpm"],
         "upstream=sage": ["model=sage"],
         **{f"loss={name}": ["model=agrol_mlp"] for name in OF_TERMS},
@@ -85,20 +85,20 @@ def test_a_group_may_differ_from_its_profile():
 def test_the_most_literal_reading():
     cfg = composed(["experiment=paper"])
     assert (cfg.model.width, cfg.model.depth, cfg.model.frames) == (512, 8, 41)
-    assert (cfg.frame.coordinates, cfg.frame.normalize) == ("world", False)
+    assert (cfg.normalizer.coordinates, cfg.normalizer.z_scores) == ("world", False)
     assert (cfg.memory.shift, cfg.memory.history, cfg.memory.fusion) == ("frame", "latest", "residual")
     assert cfg.rollout._target_.endswith("TeacherForcing")
     assert (cfg.optim.steps, cfg.optim.batch, cfg.optim.drop_at) == (300_000, 256, 0.75)
     assert (cfg.vqvae.epochs, cfg.vqvae.steps, cfg.vqvae.codebook) == (100, None, "gradient")
-    assert (cfg.data.weighting, cfg.evaluation.ik) == ("clips", "lbfgs")
-    assert (composed([]).data.weighting, composed([]).evaluation.ik) == ("frames", "off")
+    assert (cfg.data.drawn_by, cfg.evaluation.ik) == ("clips", "lbfgs")
+    assert (composed([]).data.drawn_by, composed([]).evaluation.ik) == ("frames", "off")
 
 
 @pytest.mark.parametrize("experiment", ["profile=paper", "experiment=paper"])
 def test_the_literal_reading_leaves_other_networks_their_coordinates(experiment: str):
     def seen(model: str) -> tuple[str, bool]:
-        frame = composed([experiment, f"model={model}"]).frame
-        return frame.coordinates, frame.normalize
+        features = composed([experiment, f"model={model}"]).normalizer
+        return features.coordinates, features.z_scores
 
     assert seen("agrol_diffusion") == ("world", True)
     assert seen("recurrent_poser") == ("heading", True)
@@ -231,10 +231,10 @@ BAD = [
     (["vqvae.epochs=3"], ["vqvae.epochs=3.0, vqvae.steps=2000", "one of them", "null"]),
     (["vqvae.steps=null"], ["vqvae.epochs=None, vqvae.steps=None", "one of them"]),
     (["vqvae.steps=null", "vqvae.epochs=0"], ["vqvae.epochs=0", "above 0"]),
-    (["data.weighting=even"], ["data.weighting=even", "frames or clips"]),
+    (["data.drawn_by=even"], ["data.drawn_by=even", "frames or clips"]),
     (["vqvae.codebook=random"], ["vqvae.codebook=random", "ema or gradient"]),
     (["vqvae.decay=1"], ["vqvae.decay=1", "below 1"]),
-    (["frame.coordinates=polar"], ["frame.coordinates=polar", "head_relative or world"]),
+    (["normalizer.coordinates=polar"], ["normalizer.coordinates=polar", "head_relative or world"]),
     (["data.synth.minutes=0"], ["data.synth.minutes=0", "above 0"]),
     (["paths.outputs="], ["paths.outputs=", "not empty"]),
     (["memory._target_=os.system"], ["memory._target_=os.system", "memmlp.networks.memory.CodeMemory"]),

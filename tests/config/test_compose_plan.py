@@ -76,8 +76,8 @@ def test_nothing_undoes_what_an_arms_experiment_sets_by_another_one(tmp_path: Pa
         ),
         (
             "arms: {a: [], b: [experiment=paper]}",
-            ["data.weighting=frames"],
-            "sets data.weighting, and",
+            ["data.drawn_by=frames"],
+            "sets data.drawn_by, and",
         ),
         (
             "base: [experiment=paper]\narms: {a: [], b: [experiment=no_memory]}",

@@ -31,8 +31,8 @@ def name(*words: str) -> str:
     ("model=bodiffusion optim.ema=null", "model=bodiffusion · optim.ema=null · seed 0"),
     ("profile=paper optim.lr=0.01", "profile=paper · optim.lr=0.01 · seed 0"),
     ("profile.width=64", "profile.width=64 · seed 0"),
-    ("data.weighting=clips device=cpu threads=1 tracking=none evaluation.modes=[window]",
-     "data.weighting=clips · seed 0"),
+    ("data.drawn_by=clips device=cpu threads=1 tracking=none evaluation.modes=[window]",
+     "data.drawn_by=clips · seed 0"),
 ])  # fmt: skip
 def test_what_differs(words: str, expected: str):
     assert name(*words.split()) == expected
@@ -46,7 +46,7 @@ def test_many_differences_are_counted():
 
 def test_a_vqvae_and_a_component_of_ones_own():
     whole = config()
-    codes = {"frame": whole["frame"], "vqvae": whole["vqvae"] | {"codes": 9, "seed": 4}}
+    codes = {"normalizer": whole["normalizer"], "vqvae": whole["vqvae"] | {"codes": 9, "seed": 4}}
     assert readable_name("vqvae", codes) == "VQ-VAE · vqvae.codes=9 · seed 4"
     mine = whole | {"memory": {"name": "mine", "_target_": "mine.Memory", "knob": 3}}
     assert readable_name("memmlp", mine) == "memory=mine · seed 0"

@@ -239,7 +239,7 @@ def test_coordinates_of_ones_own(folder: Path):
     write(
         folder, {"mine.py": "from memmlp.motion.network_coordinates import World\nclass Floor(World): pass\n"}
     )
-    experiment = build_experiment(composed(["frame.coordinates=mine.Floor"]))
+    experiment = build_experiment(composed(["normalizer.coordinates=mine.Floor"]))
     assert type(experiment.architecture.coordinates).__name__ == "Floor"
     assert experiment.config["plugins"] == ["mine"]
     assert experiment.identity("d").id != build_experiment(composed([])).identity("d").id
@@ -250,7 +250,7 @@ def test_coordinates_of_ones_own(folder: Path):
         ("sideways", "allowed is"),
     ):
         with pytest.raises(InputError, match=line):
-            build_experiment(composed([f"frame.coordinates={word}"]))
+            build_experiment(composed([f"normalizer.coordinates={word}"]))
 
 
 WALKS = """

@@ -31,5 +31,5 @@ def test_the_sampler_draws_every_window_alike_and_the_step_is_its_position(frame
     again = WindowSampler(frames, batch=200, window=6, seed=0)
     assert all(torch.equal(a, b) for a, b in zip(sampler.draw(7), again.draw(7), strict=True))
     assert not torch.equal(sampler.draw(7)[1], WindowSampler(frames, 200, 6, seed=1).draw(7)[1])
-    clips = WindowSampler(frames, batch=3000, window=6, seed=0, weighting="clips").draw(0)[0]
+    clips = WindowSampler(frames, batch=3000, window=6, seed=0, drawn_by="clips").draw(0)[0]
     assert torch.bincount(clips).min() > 800

@@ -68,8 +68,8 @@ def test_a_mirrored_dataset_has_each_clip_twice_and_its_frames_once():
         assert torch.equal(segment, mirrored(expected) if index > 1 else expected)
 
 
-@pytest.mark.parametrize("weighting", ["frames", "clips"])
-def test_half_of_the_windows_are_mirrored(weighting):
+@pytest.mark.parametrize("drawn_by", ["frames", "clips"])
+def test_half_of_the_windows_are_mirrored(drawn_by):
     both = MirroredDataset(tiny.frames((30, 20)))
-    clips, _ = WindowSampler(both, 4000, 7, 0, weighting).draw(0)
+    clips, _ = WindowSampler(both, 4000, 7, 0, drawn_by).draw(0)
     assert float((clips >= 2).float().mean()) == pytest.approx(0.5, abs=0.03)

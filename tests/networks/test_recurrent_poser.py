@@ -208,7 +208,7 @@ def test_the_file_is_the_network_and_its_cells_become_int8(tmp_path):
 @pytest.mark.parametrize("weighting", ["fixed", "learned"])
 def test_it_sees_the_world_as_the_head_looks_and_weighs_the_terms_of_its_loss(weighting):
     cfg = composed(["model=recurrent_poser", "profile=tiny", f"loss.weighting={weighting}"])
-    assert (cfg.frame.coordinates, cfg.frame.normalize) == ("heading", True)
+    assert (cfg.normalizer.coordinates, cfg.normalizer.z_scores) == ("heading", True)
     assert (cfg.memory, cfg.predictor, cfg.hand) == (None, None, None)
     loss = build_experiment(cfg).training.loss(frozenset({"rotation"}))
     begun = {name: value for name, value in cfg.loss.items() if name in loss.weighting.weights()}

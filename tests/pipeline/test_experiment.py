@@ -37,11 +37,11 @@ BASE = [
 
 CHANGES: dict[str, str] = {
     "seed": "1", "device": "cpu", "threads": "2", "force": "true", "save_predictions": "elsewhere",
-    "data.name": "other", "data.min_frames": "13", "data.strict": "true", "data.weighting": "clips",
+    "data.name": "other", "data.min_frames": "13", "data.strict": "true", "data.drawn_by": "clips",
     "data.mirror": "true", "data.split.test": "0.3", "data.split.val": "0.3",
     "data.split.train_fraction": "0.5",
     "data.split.seed": "1", "data.split.groups": "['[a-d]1']", "data.split.groups_file": "groups.csv",
-    "frame.coordinates": "world", "frame.normalize": "false",
+    "normalizer.coordinates": "world", "normalizer.z_scores": "false",
     "model.frames": "6", "model.width": "12", "model.depth": "3",
     "memory.layers": "[2,4]", "memory.width": "5", "memory.shift": "window", "memory.history": "latest",
     "memory.fusion": "plain", "memory.blend": "1",

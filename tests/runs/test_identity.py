@@ -123,7 +123,7 @@ def test_flatten_keeps_lists_and_empty_mappings():
 
 def test_keys_that_older_runs_lack_count_only_where_they_change_something():
     """Fixed weights and windows without a mirror are what runs have from before there were such keys."""
-    terms = {**CONFIG, "loss": {"name": "terms", "rotation": 1.0}, "data": {"weighting": "frames"}}
+    terms = {**CONFIG, "loss": {"name": "terms", "rotation": 1.0}, "data": {"drawn_by": "frames"}}
 
     def of(**changes: dict) -> str:
         config = {**terms, **{group: {**terms[group], **keys} for group, keys in changes.items()}}
@@ -144,7 +144,7 @@ def test_keys_that_older_runs_lack_count_only_where_they_change_something():
 
 def test_weights_of_terms_that_are_not_there_do_not_count():
     """They count as their defaults, so that runs with these keep their ids."""
-    weights = {"rotation": 1.0, "position": 0.5, "velocity": 0.1, "hand": 0.1}
+    weights = {"all_rotations": 1.0, "branch_position": 0.5, "lower_body_velocity": 0.1, "hand": 0.1}
 
     def of(term: str, predictor: str = "two_branch", **others: float) -> str:
         loss = {"name": "manual", **weights, **others}
@@ -153,9 +153,9 @@ def test_weights_of_terms_that_are_not_there_do_not_count():
 
     assert of("off", hand=9.0) == of("off") == "87063d950dc5b521"
     assert of("fk", hand=9.0) != of("fk")
-    assert of("off", position=9.0) != of("off")
+    assert of("off", branch_position=9.0) != of("off")
     alone = "rotation_only"
-    assert of("off", alone, position=9.0, velocity=9.0, hand=9.0) == of("off", alone)
-    assert of("off", alone, rotation=9.0) != of("off", alone)
+    assert of("off", alone, branch_position=9.0, lower_body_velocity=9.0, hand=9.0) == of("off", alone)
+    assert of("off", alone, all_rotations=9.0) != of("off", alone)
     config = {**CONFIG, "hand": {"name": "off"}, "loss": {"name": "manual", **weights}}
-    assert [changes_training(f"loss.{name}", config) for name in ("hand", "position")] == [False, True]
+    assert [changes_training(f"loss.{name}", config) for name in ("hand", "branch_position")] == [False, True]

@@ -164,7 +164,7 @@ def test_the_decomposition_changes_one_ingredient_a_step():
             changed[label] = {key.split(".")[0] for key in keys}
             changed[label] |= {"branch"} if arm.branch != arms[control].branch else set()
     assert changed == {
-        "+ features": {"frame"},
+        "+ features": {"normalizer"},
         "+ Mem-MLP's backbone": {"model", "memory", "predictor", "hand"},
         "+ Eqs. 1-2": {"loss"},
         "+ learned weights": {"loss"},
@@ -190,7 +190,7 @@ def _trained(config: dict[str, object]) -> dict[str, object]:
 
 def test_the_backbone_is_agrols_mlp_of_ten_blocks():
     """Without memory and with one head, it computes the same function of the same weights."""
-    small = ["model.frames=41", "profile=tiny", "frame.coordinates=world", "frame.normalize=false"]
+    small = ["model.frames=41", "profile=tiny", "normalizer.coordinates=world", "normalizer.z_scores=false"]
     mem = untrained([*small, "memory=none", "predictor=rotation_only", "hand=off", "loss=agrol"])
     agrol = untrained([*small, "model=agrol_mlp", "model.depth=10"])
     names = [name for name in mem.state_dict() if not name.startswith("normalizer.")]

@@ -24,20 +24,20 @@ from memmlp.training.train_network import MotionTask
 from memmlp.training.train_vqvae import perplexity
 
 
-def test_the_weighting_of_the_data_decides_which_clips_a_step_sees():
+def test_drawn_by_decides_which_clips_a_step_sees():
     """Clips of 60, 45 and 80 frames have 54, 39 and 74 windows of 7, so by windows the last is drawn most."""
     drawn = {}
-    for weighting in ("frames", "clips"):
-        experiment = build_experiment(composed([f"data.weighting={weighting}"]))
+    for drawn_by in ("frames", "clips"):
+        experiment = build_experiment(composed([f"data.drawn_by={drawn_by}"]))
         task = motion_task()
         task = MotionTask(
             task.model, task.loss, TeacherForcing(), task.dataset, replace(OPTIM, batch=3000), 0,
-            task.validate, experiment.training.weighting,
+            task.validate, experiment.training.drawn_by,
         )  # fmt: skip
-        drawn[weighting] = torch.bincount(task.sampler.draw(0)[0], minlength=3) / 3000
+        drawn[drawn_by] = torch.bincount(task.sampler.draw(0)[0], minlength=3) / 3000
     expected = {"frames": torch.tensor([54, 39, 74]) / 167, "clips": torch.ones(3) / 3}
-    for weighting, shares in expected.items():
-        torch.testing.assert_close(drawn[weighting], shares, atol=0.03, rtol=0)
+    for drawn_by, shares in expected.items():
+        torch.testing.assert_close(drawn[drawn_by], shares, atol=0.03, rtol=0)
     assert torch.equal(motion_task().sampler.draw(3)[1], WindowSampler(tiny.frames(), 4, 7, 0).draw(3)[1])
 
 

@@ -84,19 +84,19 @@ def test_no_memory_needs_no_passes():
     assert calls == []
 
 
-@pytest.mark.parametrize(("shift", "weighting"), [("frame", "frames"), ("window", "clips")])
-def test_streams_see_every_window_as_often_as_the_sampler_draws_it(shift: str, weighting: str):
+@pytest.mark.parametrize(("shift", "drawn_by"), [("frame", "frames"), ("window", "clips")])
+def test_streams_see_every_window_as_often_as_the_sampler_draws_it(shift: str, drawn_by: str):
     """Long clips and short ones, one shorter than a stride, their beginnings like their ends."""
     lengths = (9, 40, 120, 331)
     frames, model, rollout = tiny.frames(lengths), tiny.model(shift=shift), PersistentStreams(400)
     rollout.begin(model)
-    sampler = WindowSampler(frames, 400, model.frames, seed=0, weighting=weighting)
+    sampler = WindowSampler(frames, 400, model.frames, seed=0, drawn_by=drawn_by)
     seen = torch.zeros(4, 331)
     for step in range(300):
         rollout.draw(model, frames, sampler, step)
         seen.index_put_((rollout.clip, rollout.end), torch.ones(400), accumulate=True)
     windows = [length - model.frames + 1 for length in lengths]
-    wanted = [number / sum(windows) if weighting == "frames" else 1 / 4 for number in windows]
+    wanted = [number / sum(windows) if drawn_by == "frames" else 1 / 4 for number in windows]
     assert (seen.sum(1) / seen.sum()).tolist() == pytest.approx(wanted, abs=0.04)
     thirds = [float(part.mean()) for part in seen[3, model.frames - 1 :].tensor_split(3)]
     assert thirds == pytest.approx([sum(thirds) / 3] * 3, rel=0.12)

@@ -28,13 +28,14 @@ from memmlp.config.schema.network import (
 from memmlp.config.schema.training import (
     AGRoLLossConfig,
     BaselineLossConfig,
+    LossOfNetworkConfig,
     NoHandConfig,
-    OwnLossConfig,
     OwnPredictionsConfig,
     StreamsConfig,
     TeacherForcingConfig,
     TermsLossConfig,
 )
+from memmlp.runs.former_keys import present_key
 from memmlp.runs.identity import SLOTS
 
 WITHOUT_STREAM = ("naive", "off")
@@ -95,6 +96,8 @@ def unknown_key(name: str, keys: Sequence[str]) -> str:
     own = re.split(r"[./@]", name)[-1]
     near = difflib.get_close_matches(own, keys, n=1)
     hint = f"did you mean {near[0]}? " if near else ""
+    if (now := present_key(name.replace("@", "."), keys)) is not None:
+        hint = f"it is now {now}; "
     fixed = ("name",) if "_target_" in keys else ()  # tells which option of a slot it is
     listed = ", ".join(word for word in keys if not word.startswith("_") and word not in fixed) or "none"
     return f"{name}: no such key; {hint}allowed here: {listed}"
@@ -204,8 +207,8 @@ def _check_baseline(cfg: DictConfig) -> None:
     for group in ("memory", "predictor", "hand", "term"):
         if cfg[group] is not None:
             raise InputError(f"{group}: {name} has none; allowed is a command line without {group}=...")
-    if _is(cfg.loss, OwnLossConfig) and not _is(cfg.model, BoDiffusionConfig):
-        raise InputError(f"loss=own: {name} has none that it could be trained with; allowed is another")
+    if _is(cfg.loss, LossOfNetworkConfig) and not _is(cfg.model, BoDiffusionConfig):
+        raise InputError(f"loss=of_network: {name} has none to be trained with; allowed is another loss")
     if not _is(cfg.loss, BaselineLossConfig):
         raise InputError(f"loss: weights of Mem-MLP's terms, which {name} has not; allowed is its own loss")
     carries = _is(cfg.model, RecurrentPoserConfig) and _is(cfg.rollout, StreamsConfig)
@@ -241,18 +244,18 @@ def _check_baseline(cfg: DictConfig) -> None:
         )
     if cfg.model.get("offline") and cfg.refiner is not None:
         raise InputError("refiner: corrects a stream, which model.offline=true is not; allowed is null")
-    if _is(cfg.model, EgoPoserConfig) and cfg.frame.normalize and cfg.frame.coordinates == "world":
+    if _is(cfg.model, EgoPoserConfig) and cfg.normalizer.z_scores and cfg.normalizer.coordinates == "world":
         raise InputError(
-            "frame.normalize=true: EgoPoser takes the head's place off the hands', which is no sense of "
-            "z-scores in the world; allowed is frame.normalize=false, or frame.coordinates=heading"
+            "normalizer.z_scores=true: EgoPoser takes the head's place off the hands', which is no sense of "
+            "z-scores in the world; allowed is normalizer.z_scores=false, or normalizer.coordinates=heading"
         )
     steps = cfg.model.get("diffusion_steps", 1)
     if cfg.model.get("sampling_steps", 1) > steps:
         raise InputError(
             f"model.sampling_steps={cfg.model.sampling_steps}: allowed is up to model.diffusion_steps={steps}"
         )
-    if _is(cfg.loss, OwnLossConfig) and not cfg.model.noise:
-        raise InputError("model.noise=0: allowed with loss=own is a weight above 0, or another loss")
+    if _is(cfg.loss, LossOfNetworkConfig) and not cfg.model.noise_weight:
+        raise InputError("model.noise_weight=0: allowed with loss=of_network is above 0, or another loss")
 
 
 def _check_foreign_loss(cfg: DictConfig, predictor: str) -> None:

@@ -27,7 +27,6 @@ from memmlp.config.schema.network import (
     BoDiffusionConfig,
     CodeMemoryConfig,
     EgoPoserConfig,
-    FrameConfig,
     GRUMemoryConfig,
     HMDPoserConfig,
     JointCodeMemoryConfig,
@@ -38,6 +37,7 @@ from memmlp.config.schema.network import (
     ModelConfig,
     NoCodesMemoryConfig,
     NoMemoryConfig,
+    NormalizerConfig,
     PredictorConfig,
     RecurrentPoserConfig,
     RefinerConfig,
@@ -80,11 +80,11 @@ from memmlp.config.schema.training import (
     HandFKConfig,
     HandPositionConfig,
     LossConfig,
+    LossOfNetworkConfig,
     ManualConfig,
     MuonConfig,
     NoHandConfig,
     OptimConfig,
-    OwnLossConfig,
     OwnPredictionsConfig,
     RolloutConfig,
     RPMLossConfig,
@@ -141,17 +141,17 @@ class ProfileConfig:
     evaluation_batch: int = at_least(1)
     latency_steps: int = at_least(1)
     coordinates: str = standing("heading", OneOfOrPath(("heading", "head_relative", "world")))
-    normalize: bool = standing(True)
+    z_scores: bool = standing(True)
     memory_shift: str = one_of("frame", "window")
     memory_history: str = one_of("first", "latest")
     ik: str = one_of("off", "lbfgs", "arms")
     agrol_frames: int = at_least(2)
-    avatar_poser_frames: int = at_least(2)
+    baseline_frames: int = at_least(2)
     avatar_poser_width: int = at_least(1)
     avatar_poser_feedforward: int = at_least(1)
     ego_poser_frames: Optional[int] = optional(Within(2))
     hmd_poser_width: Optional[int] = optional(Within(4))
-    hmd_poser_layers: Optional[int] = optional(Within(1))
+    hmd_poser_encoder_layers: Optional[int] = optional(Within(1))
     hmd_poser_feedforward: Optional[int] = optional(Within(1))
     vae_hmd_width: Optional[int] = optional(Within(1))
     avatar_jlm_width: Optional[int] = optional(Within(4))
@@ -256,7 +256,7 @@ class Config:
     paths: PathsConfig = field(default_factory=PathsConfig)
     profile: ProfileConfig = field(default_factory=ProfileConfig)
     data: DataConfig = field(default_factory=DataConfig)
-    frame: FrameConfig = field(default_factory=FrameConfig)
+    normalizer: NormalizerConfig = field(default_factory=NormalizerConfig)
     model: AnyModelConfig = field(default_factory=AnyModelConfig)
     memory: Optional[MemoryConfig] = None
     predictor: Optional[PredictorConfig] = None
@@ -280,7 +280,7 @@ SCHEMAS: dict[str, type] = {
     "data_seeded": SeededDataConfig,
     "data_lists": ListDataConfig,
     "data_subsets": SubsetDataConfig,
-    "frame": FrameConfig,
+    "normalizer": NormalizerConfig,
     "model": ModelConfig,
     "model_agrol_mlp": AGRoLMLPConfig,
     "model_agrol_diffusion": AGRoLDiffusionConfig,
@@ -314,7 +314,7 @@ SCHEMAS: dict[str, type] = {
     "loss_manual": ManualConfig,
     "loss_agrol": AGRoLLossConfig,
     "loss_avatar_poser": AvatarPoserLossConfig,
-    "loss_own": OwnLossConfig,
+    "loss_of_network": LossOfNetworkConfig,
     "loss_rpm": RPMLossConfig,
     "loss_terms": TermsLossConfig,
     "hand_position": HandPositionConfig,
@@ -337,7 +337,7 @@ SCHEMAS: dict[str, type] = {
 GROUPS = {
     "paths": PathsConfig,
     "profile": ProfileConfig,
-    "frame": FrameConfig,
+    "normalizer": NormalizerConfig,
     "model": ModelConfig,
     "memory": MemoryConfig,
     "vqvae": VQVAEConfig,

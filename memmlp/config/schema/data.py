@@ -81,7 +81,7 @@ class DataConfig:
     min_frames: int = at_least(2)
     strict: bool = key()
     interpolation: str = standing("lines", OneOf(("splines", "lines")))
-    weighting: str = one_of("frames", "clips")
+    drawn_by: str = one_of("frames", "clips")
     mirror: bool = standing(False)
 
 

@@ -30,11 +30,11 @@ from memmlp.config.schema.rules import (
 
 
 @dataclass
-class FrameConfig:
+class NormalizerConfig:
     """The space in which the network sees the motion (conf/frame)."""
 
     coordinates: str = key(OneOfOrPath(("heading", "head_relative", "world")))
-    normalize: bool = key()
+    z_scores: bool = key()
 
 
 @dataclass
@@ -97,8 +97,8 @@ class BoDiffusionConfig(AGRoLDiffusionConfig):
     name: str = called("bodiffusion")
     _target_: str = target("memmlp.networks.baselines.bodiffusion.BoDiffusion")
     heads: int = at_least(1)
-    noise: float = at_least(0)
-    bound: float = positive()
+    noise_weight: float = at_least(0)
+    bound_weight: float = positive()
     offline: bool = key()
 
 
@@ -122,8 +122,8 @@ class HMDPoserConfig(AvatarPoserConfig):
     name: str = called("hmd_poser")
     _target_: str = target("memmlp.networks.baselines.hmd_poser.HMDPoser")
     width: int = at_least(4)
-    layers: int = at_least(1)
-    shape: float = at_least(0)
+    encoder_layers: int = at_least(1)
+    shape_weight: float = at_least(0)
 
 
 @dataclass
@@ -132,7 +132,7 @@ class VAEHMDConfig(LayeredConfig):
     _target_: str = target("memmlp.networks.baselines.vae_hmd.VAEHMD")
     latent: int = at_least(1)
     dropout: float = fraction()
-    divergence: float = at_least(0)
+    divergence_weight: float = at_least(0)
 
 
 @dataclass
@@ -149,7 +149,7 @@ class AvatarJLMConfig(AvatarPoserConfig):
     name: str = called("avatar_jlm")
     _target_: str = target("memmlp.networks.baselines.avatar_jlm.AvatarJLM")
     width: int = at_least(4)
-    coarse: float = at_least(0)
+    coarse_weight: float = at_least(0)
 
 
 @dataclass
@@ -184,7 +184,7 @@ class SAGEConfig(LayeredConfig):
 class ManikinSConfig(AvatarPoserConfig):
     name: str = called("manikin_s")
     _target_: str = target("memmlp.networks.baselines.manikin.ManikinS")
-    parts: float = at_least(0)
+    parts_weight: float = at_least(0)
     turned: bool = key()
 
 
@@ -192,7 +192,7 @@ class ManikinSConfig(AvatarPoserConfig):
 class ManikinLConfig(AvatarJLMConfig):
     name: str = called("manikin_l")
     _target_: str = target("memmlp.networks.baselines.manikin.ManikinL")
-    parts: float = at_least(0)
+    parts_weight: float = at_least(0)
     turned: bool = key()
     offline: bool = key()
 

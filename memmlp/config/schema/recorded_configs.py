@@ -10,10 +10,8 @@ from omegaconf import DictConfig, OmegaConf
 from memmlp.config.schema.checks import WITHOUT_STREAM
 from memmlp.config.schema.config import DATA, GROUPS, SCHEMAS, Config, TrackerConfig
 from memmlp.config.schema.data import SynthDataConfig
+from memmlp.runs.former_keys import with_present_names
 from memmlp.runs.identity import option_in_slot
-
-RENAMED = {"tracker": "tracking"}
-"""The present names of groups that runs of version 0.1 recorded under other names."""
 
 
 def restored(config: Mapping[str, Any]) -> DictConfig:
@@ -24,7 +22,7 @@ def restored(config: Mapping[str, Any]) -> DictConfig:
             wrong kind may also raise TypeError or ValueError.)
     """
     cfg = OmegaConf.structured(Config)
-    for group, content in ((RENAMED.get(name, name), content) for name, content in config.items()):
+    for group, content in with_present_names(config).items():
         cfg[group] = _restored(group, content) if isinstance(content, Mapping) else content
     if cfg.export.graph in WITHOUT_STREAM:
         cfg.export.precision = "fp32"  # until version 0.2 another was allowed, and no file was made of it

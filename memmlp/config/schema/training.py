@@ -74,10 +74,10 @@ class UncertaintyConfig(LossConfig):
 class ManualConfig(LossConfig):
     name: str = called("manual")
     _target_: str = target("memmlp.training.losses.Manual")
-    rotation: float = at_least(0)
+    all_rotations: float = at_least(0)
     rotation_velocity: float = at_least(0)
-    position: float = at_least(0)
-    velocity: float = at_least(0)
+    branch_position: float = at_least(0)
+    lower_body_velocity: float = at_least(0)
     hand: float = at_least(0)
 
 
@@ -107,18 +107,18 @@ class AvatarPoserLossConfig(BaselineLossConfig):
 class RPMLossConfig(BaselineLossConfig):
     name: str = called("rpm")
     _target_: str = target("memmlp.training.losses.RPMLoss")
-    rotation: float = at_least(0)
+    all_rotations: float = at_least(0)
     rotation_velocity: float = at_least(0)
-    position: float = at_least(0)
+    world_position: float = at_least(0)
     velocity: float = at_least(0)
 
 
 @dataclass
-class OwnLossConfig(BaselineLossConfig):
+class LossOfNetworkConfig(BaselineLossConfig):
     """No loss besides the network's own, for networks that define a loss on their outputs (BoDiffusion)."""
 
-    name: str = called("own")
-    _target_: str = target("memmlp.training.losses.OwnLoss")
+    name: str = called("of_network")
+    _target_: str = target("memmlp.training.losses.LossOfNetwork")
 
 
 @dataclass

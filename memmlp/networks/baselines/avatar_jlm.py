@@ -71,7 +71,7 @@ class AvatarJLM(WholeWindow):
         heads: number of attention heads; it divides d.
         feedforward: width of the encoders' hidden layers.
         dropout: dropout rate of the encoders, while training.
-        coarse: weight of the loss of the coarse pose's joints.
+        coarse_weight: weight of the loss of the coarse pose's joints.
 
     Attributes:
         outputs: how many numbers are read from the tokens of a frame.
@@ -89,10 +89,10 @@ class AvatarJLM(WholeWindow):
         heads: int,
         feedforward: int,
         dropout: float,
-        coarse: float,
+        coarse_weight: float,
     ):
         super().__init__(normalizer, frames)
-        self.coarse_weight, hidden = coarse, 2 * width
+        self.coarse_weight, hidden = coarse_weight, 2 * width
         self.embedding = nn.Linear(N_JOINTS * JOINT_DIM, hidden)
         self.coarse = nn.Sequential(
             nn.Linear(hidden, hidden), nn.LeakyReLU(0.1), nn.Linear(hidden, ROTATION.stop)

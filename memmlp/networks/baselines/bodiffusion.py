@@ -81,8 +81,8 @@ class BoDiffusion(WholeWindow):
         diffusion_steps: number of steps of the training's noise schedule.
         sampling_steps: number of denoiser calls at inference.
         noise_seed: seed of the noise of samples.
-        noise: weight of the loss of the predicted noise.
-        bound: weight of the variational bound, from which the variances learn.
+        noise_weight: weight of the loss of the predicted noise.
+        bound_weight: weight of the variational bound, from which the variances learn.
         offline: whether window mode denoises the windows of a clip together, as published.
     """
 
@@ -99,12 +99,12 @@ class BoDiffusion(WholeWindow):
         diffusion_steps: int,
         sampling_steps: int,
         noise_seed: int,
-        noise: float,
-        bound: float,
+        noise_weight: float,
+        bound_weight: float,
         offline: bool,
     ):
         super().__init__(normalizer, frames)
-        self.noise_weight, self.bound_weight = noise, bound
+        self.noise_weight, self.bound_weight = noise_weight, bound_weight
         self.noise_seed, self.offline = noise_seed, offline
         self.diffusion = AncestralDiffusion(diffusion_steps, sampling_steps)
         self.time = TimeEmbedding(width, SINES)

@@ -172,12 +172,12 @@ class HMDPoser(WindowlessModel):
         frames: T, the frames of a training window.
         width: d, the width of a token.
         depth: number of blocks.
-        layers: number of encoder layers of a block.
+        encoder_layers: number of encoder layers of a block.
         heads: number of attention heads; it divides d.
         feedforward: width of the encoders' hidden layers.
         dropout: dropout rate of the encoders, while training.
-        shape: weight of the loss that keeps the predicted shape the same in a window; 0 leaves out the head
-            for the shape, which no prediction needs.
+        shape_weight: weight of the loss that keeps the predicted shape the same in a window; 0 leaves out the
+            head for the shape, which no prediction needs.
     """
 
     def __init__(
@@ -187,14 +187,14 @@ class HMDPoser(WindowlessModel):
         frames: int,
         width: int,
         depth: int,
-        layers: int,
+        encoder_layers: int,
         heads: int,
         feedforward: int,
         dropout: float,
-        shape: float,
+        shape_weight: float,
     ):
         super().__init__(normalizer, frames)
-        self.width, self.depth, self.shape_weight = width, depth, shape
+        self.width, self.depth, self.shape_weight = width, depth, shape_weight
         tracked, turns = ((6, 6, 3, 3), shares(width)), 15 * width // 32
         self.trackers = nn.ModuleList(TokenEmbedding(*tracked) for _ in TRACKED)
         self.hands = nn.ModuleList(TokenEmbedding(*tracked) for _ in range(HANDS))
@@ -202,10 +202,10 @@ class HMDPoser(WindowlessModel):
         self.others = nn.ModuleList(TokenEmbedding(*unseen) for _ in range(OTHERS))
         self.norm = nn.LayerNorm(width, eps=1e-6)
         self.blocks = nn.ModuleList(
-            TimeAndTokenBlock(width, layers, heads, feedforward, dropout) for _ in range(depth)
+            TimeAndTokenBlock(width, encoder_layers, heads, feedforward, dropout) for _ in range(depth)
         )
         self.pose = self._head(ROTATION.stop)
-        self.shape = self._head(SHAPE) if shape else None
+        self.shape = self._head(SHAPE) if shape_weight else None
 
     def _head(self, size: int) -> nn.Module:
         return nn.Sequential(

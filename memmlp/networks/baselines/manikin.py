@@ -163,11 +163,11 @@ class Manikin(MotionModel):
     it. The network's own losses, as its authors have them, compare the predicted parts themselves.
 
     Attributes:
-        parts: weight of all losses of the parts.
+        parts_weight: weight of all losses of the parts.
         turned: whether training windows are turned by headings drawn at random.
     """
 
-    parts: float
+    parts_weight: float
     turned: bool
 
     def predicted(self, encoded: Tensor) -> Tensor:
@@ -211,7 +211,7 @@ class Manikin(MotionModel):
         )
         with in_float32(made.device):
             parts = self.losses_of_parts(made.to(true.dtype), Truth(motion[:, -made.shape[1] :]))
-        return {name: self.parts * term for name, term in parts.items()}
+        return {name: self.parts_weight * term for name, term in parts.items()}
 
 
 class ManikinS(Manikin, AvatarPoser):
@@ -227,7 +227,7 @@ class ManikinS(Manikin, AvatarPoser):
         heads: number of attention heads; it divides d.
         feedforward: width of the feed-forward's hidden layers.
         dropout: dropout rate in the encoder, while training.
-        parts: weight of the losses of what the limbs are solved from.
+        parts_weight: weight of the losses of what the limbs are solved from.
         turned: whether training windows are turned by headings drawn at random.
     """
 
@@ -243,7 +243,7 @@ class ManikinS(Manikin, AvatarPoser):
         heads: int,
         feedforward: int,
         dropout: float,
-        parts: float,
+        parts_weight: float,
         turned: bool,
     ):
         super().__init__(
@@ -255,7 +255,7 @@ class ManikinS(Manikin, AvatarPoser):
             feedforward=feedforward,
             dropout=dropout,
         )
-        self.parts, self.turned = parts, turned
+        self.parts_weight, self.turned = parts_weight, turned
         self.swivel, self.places = head(width, SWIVELS), head(width, PLACES)
         for added in (self.swivel, self.places):
             draw_weights(added)
@@ -311,8 +311,8 @@ class ManikinL(Manikin, AvatarJLM):
         heads: number of attention heads; it divides d.
         feedforward: width of the encoders' hidden layers.
         dropout: dropout rate of the encoders, while training.
-        coarse: weight of the loss of the coarse pose's joints.
-        parts: weight of the losses of what the limbs are solved from.
+        coarse_weight: weight of the loss of the coarse pose's joints.
+        parts_weight: weight of the losses of what the limbs are solved from.
         turned: whether training windows are turned by headings drawn at random.
         offline: whether it is used as MANIKIN-LN.
     """
@@ -329,8 +329,8 @@ class ManikinL(Manikin, AvatarJLM):
         heads: int,
         feedforward: int,
         dropout: float,
-        coarse: float,
-        parts: float,
+        coarse_weight: float,
+        parts_weight: float,
         turned: bool,
         offline: bool,
     ):
@@ -342,9 +342,9 @@ class ManikinL(Manikin, AvatarJLM):
             heads=heads,
             feedforward=feedforward,
             dropout=dropout,
-            coarse=coarse,
+            coarse_weight=coarse_weight,
         )
-        self.parts, self.turned, self.offline = parts, turned, offline
+        self.parts_weight, self.turned, self.offline = parts_weight, turned, offline
 
     @property
     def streams(self) -> bool:

@@ -20,7 +20,7 @@ class StillPose(WindowlessModel):
     """A learned pose, which the coordinates alone turn and carry along: by default with the head.
 
     It has 132 parameters: the joints' local rotations, at first those of the normalizer's mean, or none where
-    it has no mean (`frame.normalize=false`).
+    it has no mean (`normalizer.z_scores=false`).
 
     Args:
         normalizer: converts between the world and network space.

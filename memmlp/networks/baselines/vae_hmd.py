@@ -99,7 +99,7 @@ class VAEHMD(WindowlessModel):
         depth: number of residual blocks of each part.
         latent: z, the number of the latent's components.
         dropout: dropout rate of the blocks, while training.
-        divergence: weight of the KL divergence.
+        divergence_weight: weight of the KL divergence.
     """
 
     def __init__(
@@ -111,10 +111,10 @@ class VAEHMD(WindowlessModel):
         depth: int,
         latent: int,
         dropout: float,
-        divergence: float,
+        divergence_weight: float,
     ):
         super().__init__(normalizer, frames)
-        self.divergence = divergence
+        self.divergence_weight = divergence_weight
         self.encoder = Perceptron(TRACKERS, 2 * latent, width, depth, dropout)
         self.decoder = Perceptron(latent, ROTATION.stop, width, depth, dropout)
         self.pose_encoder = Perceptron(MOTION_DIM, 2 * latent, width, depth, dropout)
@@ -153,4 +153,4 @@ class VAEHMD(WindowlessModel):
         frozen = {name: weight.detach() for name, weight in self.decoder.named_parameters()}
         live, still = self.decoder(sample), functional_call(self.decoder, frozen, (sample,))
         motion = self.normalizer.posed(posed * live + (1 - posed) * still, sparse)
-        return Learned(motion, state, {"divergence": self.divergence * divergence(latent)})
+        return Learned(motion, state, {"divergence": self.divergence_weight * divergence(latent)})

@@ -15,6 +15,7 @@ import yaml
 from memmlp.common.files import plain, read_json
 from memmlp.runs.deployment_folder import as_deployed
 from memmlp.runs.evaluation_file import combined_by, of_one_solver, preference, with_solvers
+from memmlp.runs.former_keys import with_present_names
 from memmlp.runs.identity import (
     DEPLOYMENT,
     EVALUATION,
@@ -162,6 +163,7 @@ def _group(text: str) -> tuple[dict[str, Any], dict[str, Any]]:
     found = yaml.load(text, Loader)  # a safe loader
     if not isinstance(found, dict):
         raise TypeError("no config")
+    found = with_present_names(found)
     return found, {key: value for key, value in plain(flatten(found)).items() if _shown(key)}
 
 

@@ -3,7 +3,7 @@
 from memmlp.training.losses.baseline_losses import (
     AGRoLLoss,
     AvatarPoserLoss,
-    OwnLoss,
+    LossOfNetwork,
     RPMLoss,
     SAGERefinerLoss,
 )
@@ -28,10 +28,10 @@ __all__ = [
     "HandPosition",
     "LearnedWeights",
     "Loss",
+    "LossOfNetwork",
     "Manual",
     "MotionLoss",
     "NoHand",
-    "OwnLoss",
     "RPMLoss",
     "SAGERefinerLoss",
     "Term",

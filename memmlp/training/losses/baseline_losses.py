@@ -1,4 +1,4 @@
-"""Losses of baselines as in their released codes, and OwnLoss for networks that bring their own losses."""
+"""Losses of baselines as in their released codes, and the empty one of networks that bring their own."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ class AGRoLLoss(Loss):
     def __init__(self, error: str = "norm"):
         super().__init__()
         self.error = ERRORS[error]
-        self.weighting = Fixed({"rotation": 1.0})
+        self.weighting = Fixed({"all_rotations": 1.0})
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         """Return the one term, from motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
         origin = normalizer.origin(sparse)
         error = normalizer.encode_motion(motion, origin) - normalizer.encode_motion(truth, origin)
-        return {"rotation": self.error(error[..., ROTATION])}
+        return {"all_rotations": self.error(error[..., ROTATION])}
 
 
 def from_pelvis(positions: Tensor) -> Tensor:
@@ -109,22 +109,22 @@ class RPMLoss(Loss):
     kinematics with the head on its tracker, metres in the world.
 
     Args:
-        rotation: weight of the 6D rotations' error.
+        all_rotations: weight of the 6D rotations' error.
         rotation_velocity: weight of their differences between frames.
-        position: weight of the positions' error.
+        world_position: weight of the positions' error.
         velocity: weight of their differences between frames.
     """
 
     def __init__(
         self,
-        rotation: float = 1.0,
+        all_rotations: float = 1.0,
         rotation_velocity: float = 1.0,
-        position: float = 1.0,
+        world_position: float = 1.0,
         velocity: float = 1.0,
     ):
         super().__init__()
-        weights = {"rotation": rotation, "rotation_velocity": rotation_velocity}
-        self.weighting = Fixed({**weights, "position": position, "velocity": velocity})
+        weights = {"all_rotations": all_rotations, "rotation_velocity": rotation_velocity}
+        self.weighting = Fixed({**weights, "world_position": world_position, "velocity": velocity})
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         """Return each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
@@ -133,9 +133,9 @@ class RPMLoss(Loss):
         rotations, pair = error[..., ROTATION], Comparison(motion, truth, sparse, normalizer)
         positions = (pair.positions - pair.true_positions).flatten(-2)
         return {
-            "rotation": joint_sums(rotations),
+            "all_rotations": joint_sums(rotations),
             "rotation_velocity": joint_sums_of_steps(rotations),
-            "position": joint_sums(positions),
+            "world_position": joint_sums(positions),
             "velocity": joint_sums_of_steps(positions),
         }
 
@@ -150,7 +150,7 @@ class SAGERefinerLoss(Loss):
 
     def __init__(self) -> None:
         super().__init__()
-        weights = {"rotation": 0.01, "rotation_velocity": 60.0, "rotation_velocity_3": 20.0}
+        weights = {"all_rotations": 0.01, "rotation_velocity": 60.0, "rotation_velocity_3": 20.0}
         self.weighting = Fixed({**weights, "position": 0.01, "trackers": 0.01, "jerk": 0.03})
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
@@ -158,7 +158,7 @@ class SAGERefinerLoss(Loss):
         error, pair = (motion - truth)[..., ROTATION], Comparison(motion, truth, sparse, normalizer)
         tracked = [HEAD, *HANDS]
         return {
-            "rotation": _smooth(error),
+            "all_rotations": _smooth(error),
             "rotation_velocity": _smooth(error.diff(dim=1)),
             "rotation_velocity_3": _smooth(error[:, ::3].diff(dim=1)),
             "position": (pair.made.posed[1] - from_pelvis(pair.true_positions)).norm(dim=-1).mean(),
@@ -172,7 +172,7 @@ def _smooth(error: Tensor) -> Tensor:
     return F.smooth_l1_loss(error, error.new_zeros(()).expand_as(error))
 
 
-class OwnLoss(Loss):
+class LossOfNetwork(Loss):
     """No loss of the motion: a network trains with its own losses alone (`Learned.losses`)."""
 
     def __init__(self) -> None:

@@ -57,18 +57,18 @@ class Manual(Fixed):
 
     def __init__(
         self,
-        rotation: float = 1.0,
+        all_rotations: float = 1.0,
         rotation_velocity: float = 30.0,
-        position: float = 0.5,
-        velocity: float = 0.1,
+        branch_position: float = 0.5,
+        lower_body_velocity: float = 0.1,
         hand: float = 0.1,
     ):
         super().__init__(
             {
-                "rotation": rotation,
+                "all_rotations": all_rotations,
                 "rotation_velocity": rotation_velocity,
-                "position": position,
-                "velocity": velocity,
+                "branch_position": branch_position,
+                "lower_body_velocity": lower_body_velocity,
                 "hand": hand,
             }
         )

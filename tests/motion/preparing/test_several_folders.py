@@ -78,14 +78,14 @@ def test_errors_name_the_source(home):
         prepare(mixed(home, a="none", b="two"), home / "cache")
 
 
-@pytest.mark.parametrize("weighting", ["frames", "clips"])
-def test_shares_say_how_often_a_window_is_of_each_source(home, weighting):
+@pytest.mark.parametrize("drawn_by", ["frames", "clips"])
+def test_shares_say_how_often_a_window_is_of_each_source(home, drawn_by):
     prepare(mixed(home, a="one", b="two"), home / "cache")
     dataset = MotionDataset.open(home / "cache", "train")
     sources = np.array(dataset.sources)
 
     def drawn(shares):
-        sampler = WindowSampler(dataset, 4000, 41, 0, weighting, shares)
+        sampler = WindowSampler(dataset, 4000, 41, 0, drawn_by, shares)
         return np.bincount(sampler.draw(0)[0].numpy(), minlength=len(dataset)) / 4000
 
     even = drawn(None)

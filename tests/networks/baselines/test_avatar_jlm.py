@@ -74,7 +74,7 @@ class Always(torch.nn.Module):
 @torch.no_grad()
 def test_the_coarse_poses_loss_is_of_joints_relative_to_the_head():
     """With the true rotations as the coarse pose it is nothing."""
-    model = tiny.baseline("avatar_jlm", coarse=2.0).double()
+    model = tiny.baseline("avatar_jlm", coarse_weight=2.0).double()
     truth = TRUTH.double()
     true = model.normalizer.encode(truth)[..., SPARSE_DIM:][..., ROTATION]
     coarse = model.coarse

@@ -86,7 +86,7 @@ KNOBS = [
     ("vae_hmd", {"depth": 1}), ("vae_hmd", {"latent": 5}), ("vae_hmd", {"width": 12}),
     ("rpm", {"context": 2}), ("rpm", {"horizon": 3}), ("rpm", {"feedforward": 16}), ("rpm", {"heads": 2}),
     ("avatar_jlm", {"frames": 6}), ("avatar_jlm", {"depth": 1}), ("avatar_jlm", {"feedforward": 16}),
-    ("hmd_poser", {"layers": 2}), ("hmd_poser", {"depth": 1}), ("hmd_poser", {"heads": 2}),
+    ("hmd_poser", {"encoder_layers": 2}), ("hmd_poser", {"depth": 1}), ("hmd_poser", {"heads": 2}),
 ]  # fmt: skip
 
 

@@ -56,7 +56,7 @@ def test_each_joint_gets_a_mixture_of_the_inputs_thirds():
 def test_the_denoiser_learns_from_the_noised_truth_of_the_window():
     """The training call's losses are of the noise that was mixed in; they have weights."""
     found = []
-    for weights in ({}, {"noise": 0.5, "bound": 3.0}):
+    for weights in ({}, {"noise_weight": 0.5, "bound_weight": 3.0}):
         model, seen = tiny.baseline("bodiffusion", **weights), []
         denoise = model.denoise
         model.denoise = lambda *args, denoise=denoise, seen=seen: (seen.append(args), denoise(*args))[1]

@@ -70,7 +70,7 @@ def test_the_state_of_the_published_network_is_8192_numbers():
 
 
 def test_the_shape_is_trained_to_be_the_same_within_a_window():
-    model = tiny.baseline("hmd_poser", shape=0.5)
+    model = tiny.baseline("hmd_poser", shape_weight=0.5)
     truth = torch.stack([tiny.clip(7, seed) for seed in (1, 2)])
     motion, _, losses = model.learn(truth[..., :SPARSE_DIM], model.initial_state(2), truth)
     torch.testing.assert_close(motion, model.advance(truth[..., :SPARSE_DIM], model.initial_state(2))[0])
@@ -78,7 +78,7 @@ def test_the_shape_is_trained_to_be_the_same_within_a_window():
     shapes = model.shape(features).detach().numpy()
     expected = 0.5 * np.abs(shapes - shapes.mean(1, keepdims=True)).mean()
     assert float(losses["shape"].detach()) == pytest.approx(expected, rel=1e-4)
-    plain = tiny.baseline("hmd_poser", shape=0)
+    plain = tiny.baseline("hmd_poser", shape_weight=0)
     assert plain.learn(truth[..., :SPARSE_DIM], plain.initial_state(2), truth).losses == {}
     assert model.count_parameters() - plain.count_parameters() == 8 * 16 * 16 + 16 + 16 * 16 + 16
 

@@ -181,7 +181,7 @@ def test_training_is_on_windows_turned_by_any_heading_and_the_motion_is_turned_b
 def test_the_losses_of_the_parts_have_a_weight(name):
     found = []
     for weight in (1.0, 0.5):
-        model = tiny.baseline(name, parts=weight, turned=False)
+        model = tiny.baseline(name, parts_weight=weight, turned=False)
         losses = model.learn(SPARSE.float(), model.initial_state(2), TRUTH.float()).losses
         found.append({key: float(term.detach()) for key, term in losses.items()})
     parts = found[0].keys() - {"coarse"}

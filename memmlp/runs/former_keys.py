@@ -1,0 +1,139 @@
+"""Config keys that had other names in earlier versions: `RENAMED` has them all, and what follows from it.
+
+A run keeps what it recorded, so its config is read with the names of today (`with_present_names`). Identities
+are digests of the former names (`with_former_names`), so that a new name moves no run. What a user types by a
+former name is answered with its present one (`present_key`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+
+class Renamed(NamedTuple):
+    """A key, or a whole group, that has another name today.
+
+    Attributes:
+        now: its dotted name.
+        former: its dotted name up to version 0.2; the group is that of `now`, unless the group was renamed.
+        option: the option GROUP=NAME of which alone the key is; None for a key of every option.
+    """
+
+    now: str
+    former: str
+    option: str | None = None
+
+
+GROUPS = {"normalizer": "frame", "tracking": "tracker"}
+"""The former names of groups, by their present ones. `tracker` was a group of version 0.1."""
+
+RENAMED = (
+    Renamed("normalizer.z_scores", "frame.normalize"),
+    Renamed("data.drawn_by", "data.weighting"),
+    Renamed("loss.all_rotations", "loss.rotation", "loss=manual"),
+    Renamed("loss.branch_position", "loss.position", "loss=manual"),
+    Renamed("loss.lower_body_velocity", "loss.velocity", "loss=manual"),
+    Renamed("loss.all_rotations", "loss.rotation", "loss=rpm"),
+    Renamed("loss.world_position", "loss.position", "loss=rpm"),
+    Renamed("model.noise_weight", "model.noise", "model=bodiffusion"),
+    Renamed("model.bound_weight", "model.bound", "model=bodiffusion"),
+    Renamed("model.divergence_weight", "model.divergence", "model=vae_hmd"),
+    Renamed("model.shape_weight", "model.shape", "model=hmd_poser"),
+    Renamed("model.encoder_layers", "model.layers", "model=hmd_poser"),
+    Renamed("model.coarse_weight", "model.coarse", "model=avatar_jlm"),
+    Renamed("model.coarse_weight", "model.coarse", "model=manikin_l"),
+    Renamed("model.parts_weight", "model.parts", "model=manikin_s"),
+    Renamed("model.parts_weight", "model.parts", "model=manikin_l"),
+    Renamed("profile.z_scores", "profile.normalize"),
+    Renamed("profile.baseline_frames", "profile.avatar_poser_frames"),
+    Renamed("profile.hmd_poser_encoder_layers", "profile.hmd_poser_layers"),
+)
+
+OPTIONS = {("loss", "of_network"): "own"}
+"""The former names of options, by their groups and present names."""
+
+
+def with_present_names(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a recorded config, or some of its groups, with the names that keys and options have today."""
+    present = {former: now for now, former in GROUPS.items()}
+    tree = {present.get(group, group): content for group, content in config.items()}
+    for one in RENAMED:
+        group, _, key = one.now.partition(".")
+        content, former = tree.get(group), one.former.partition(".")[2]
+        if isinstance(content, Mapping) and former in content and _has(content, one.option):
+            tree[group] = {key if name == former else name: value for name, value in content.items()}
+    for (group, now), former in OPTIONS.items():
+        content = tree.get(group)
+        if isinstance(content, Mapping) and content.get("name") == former:
+            tree[group] = {**content, "name": now}
+    return tree
+
+
+def _has(content: Mapping[str, Any], option: str | None) -> bool:
+    """Return whether a group's content is that of an option GROUP=NAME; None stands for any."""
+    return option is None or option.partition("=")[2] == content.get("name")
+
+
+def with_former_names(flat: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a flat config by their former dotted keys, under which identities count them."""
+    options = {(f"{group}.name", now): former for (group, now), former in OPTIONS.items()}
+    return {
+        _former_key(key, flat): options.get((key, value), value) if isinstance(value, str) else value
+        for key, value in flat.items()
+    }
+
+
+def _former_key(key: str, flat: Mapping[str, Any]) -> str:
+    group, dot, rest = key.partition(".")
+    option = f"{group}={flat.get(f'{group}.name')}"
+    named = (one.former for one in RENAMED if key == one.now and one.option in (None, option))
+    return next(named, GROUPS.get(group, group) + dot + rest)
+
+
+def former_option(group: str, name: str | None) -> str | None:
+    """Return the name under which an option of a group counts in identities."""
+    return OPTIONS.get((group, name or ""), name)
+
+
+def with_present_keys(overrides: Sequence[str]) -> tuple[str, ...]:
+    """Return recorded overrides KEY=VALUE with the names of today."""
+    return tuple(_present_override(word, overrides) for word in overrides)
+
+
+def _present_override(word: str, overrides: Sequence[str]) -> str:
+    key, equals, value = word.partition("=")
+    for one in RENAMED:
+        if key == one.former and (one.option is None or one.option in overrides):
+            return f"{one.now}{equals}{value}"
+    if (now := present_option(key, value)) is not None:
+        return f"{key}={now}"
+    group, dot, rest = key.partition(".")
+    named = {former: now for now, former in GROUPS.items()}
+    return f"{named.get(group, group)}{dot}{rest}{equals}{value}"
+
+
+def present_key(key: str, allowed: Sequence[str]) -> str | None:
+    """Return the present name of a dotted key that its group does not have; None if it never had it.
+
+    Args:
+        key: the key, as a user gave it.
+        allowed: the keys that its group has, or the groups for a group itself.
+    """
+    group, dot, rest = key.partition(".")
+    named = next((now for now, former in GROUPS.items() if former == group), None)
+    if not dot:
+        return named
+    found = (one.now.split(".") for one in RENAMED if one.former in (key, _formerly(group, rest)))
+    now = next((name for _, name in found if name in allowed), rest if named else None)
+    return None if now is None else f"{named or group}.{now}"
+
+
+def _formerly(group: str, key: str) -> str:
+    """Return a key's dotted name with its group's former name."""
+    return f"{GROUPS.get(group, group)}.{key}"
+
+
+def present_option(group: str, former: str) -> str | None:
+    """Return the present name of an option that its group does not have; None if it never had it."""
+    return next((now for (slot, now), name in OPTIONS.items() if (slot, name) == (group, former)), None)

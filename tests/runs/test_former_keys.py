@@ -1,0 +1,124 @@
+"""Keys that had other names: old records are read with today's, ids are made of theirs, users are told."""
+
+from __future__ import annotations
+
+import pytest
+
+from memmlp.common.errors import InputError
+from memmlp.config.compose import composed
+from memmlp.config.schema.config import SCHEMAS
+from memmlp.runs.former_keys import (
+    GROUPS,
+    OPTIONS,
+    RENAMED,
+    present_key,
+    with_former_names,
+    with_present_keys,
+    with_present_names,
+)
+from memmlp.runs.identity import flatten, run_id
+
+FORMER = {
+    "seed": 0,
+    "frame": {"coordinates": "heading", "normalize": True},
+    "loss": {"name": "manual", "rotation": 2.0, "rotation_velocity": 30.0, "position": 0.5, "velocity": 0.1},
+    "model": {"name": "hmd_poser", "layers": 3, "shape": 0.1},
+    "data": {"weighting": "clips", "mirror": False},
+}
+NOW = {
+    "seed": 0,
+    "normalizer": {"coordinates": "heading", "z_scores": True},
+    "loss": {
+        "name": "manual", "all_rotations": 2.0, "rotation_velocity": 30.0, "branch_position": 0.5,
+        "lower_body_velocity": 0.1,
+    },
+    "model": {"name": "hmd_poser", "encoder_layers": 3, "shape_weight": 0.1},
+    "data": {"drawn_by": "clips", "mirror": False},
+}  # fmt: skip
+
+
+def test_a_recorded_config_is_read_with_the_names_of_today():
+    assert with_present_names(FORMER) == NOW
+    assert with_present_names(NOW) == NOW
+    assert with_present_names({}) == {}
+
+
+def test_names_come_and_go():
+    assert with_former_names(flatten(NOW)) == flatten(FORMER)
+
+
+@pytest.mark.parametrize("name", ["terms", "avatar_poser", "mine"])
+def test_the_same_word_of_another_option_stays(name: str):
+    loss = {"name": name, "rotation": 1.0, "position": 2.0, "velocity": 3.0}
+    assert with_present_names({"loss": loss}) == {"loss": loss}
+    assert with_former_names(flatten({"loss": loss})) == flatten({"loss": loss})
+
+
+def test_an_option_has_its_present_name():
+    assert with_present_names({"loss": {"name": "own"}}) == {"loss": {"name": "of_network"}}
+    assert with_former_names({"loss.name": "of_network"}) == {"loss.name": "own"}
+    assert with_present_keys(["loss=own"]) == ("loss=of_network",)
+
+
+def test_an_id_is_that_of_the_former_names():
+    """What version 0.2 made of this config, computed with its code (commit ae007ecb)."""
+    made = run_id("memmlp", NOW | {"data": {"drawn_by": "clips"}}, data="d", upstream=None)
+    assert made == "30bd7460c64ebd85"
+
+
+@pytest.mark.parametrize("one", RENAMED, ids=lambda one: f"{one.former} of {one.option}")
+def test_every_renamed_key_is_one_of_the_config_and_its_former_name_is_none(one):
+    group, _, key = one.now.partition(".")
+    option = one.option.partition("=")[2] if one.option else {"data": "synth"}.get(group)
+    schema = SCHEMAS.get(f"{group}_{option}") or SCHEMAS[group]
+    fields = schema.__dataclass_fields__
+    assert key in fields
+    assert one.former.partition(".")[2] not in fields
+
+
+def test_every_renamed_group_and_option_is_there():
+    fields = SCHEMAS["config"].__dataclass_fields__
+    assert fields.keys() >= GROUPS.keys()
+    assert fields.keys().isdisjoint(GROUPS.values())
+    assert {f"{group}_{now}" for group, now in OPTIONS} <= SCHEMAS.keys()
+
+
+def test_recorded_overrides_have_the_names_of_today():
+    words = [
+        "model=bodiffusion",
+        "model.noise=0.5",
+        "frame.normalize=false",
+        "frame=default",
+        "loss.rotation=1",
+    ]
+    assert with_present_keys(words) == (
+        "model=bodiffusion", "model.noise_weight=0.5", "normalizer.z_scores=false", "normalizer=default",
+        "loss.rotation=1",
+    )  # fmt: skip
+    assert with_present_keys(["loss=manual", "loss.velocity=1"])[1] == "loss.lower_body_velocity=1"
+    assert with_present_keys(["model=sage", "model.noise=1"])[1] == "model.noise=1"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["frame.coordinates=world"], "it is now normalizer"),
+        (["frame=default"], "it is now normalizer"),
+        (["normalizer.normalize=false"], "normalizer.normalize: no such key; it is now normalizer.z_scores"),
+        (["loss=manual", "loss.rotation=2"], "loss.rotation: no such key; it is now loss.all_rotations"),
+        (["model=bodiffusion", "model.noise=2"], "model.noise: no such key; it is now model.noise_weight"),
+        (["data.weighting=clips"], "data.weighting: no such key; it is now data.drawn_by"),
+        (["loss=own"], "loss=own: no such option; it is now of_network"),
+    ],
+)
+def test_a_former_name_on_the_command_line_is_answered_with_todays(words: list[str], said: str):
+    with pytest.raises(InputError) as error:
+        composed(words)
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_key_that_never_was_has_no_present_name():
+    assert present_key("data.sources", ["drawn_by", "root"]) is None
+    assert present_key("loss.rotation", ["lr"]) is None
+    assert present_key("optim", ["loss"]) is None
