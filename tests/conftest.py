@@ -99,7 +99,7 @@ LONGEST = (
     "kills/test_sweep", "tables/test_seed_rounds", "networks/baselines/test_baselines", "deploy/test_export",
     "cli/test_tune", "live/web/test_page", "report/ui/test_page", "kills/test_command", "kills/test_training",
     "cli/test_train_distributed", "experiment_tracking/test_mlflow_server",
-    "experiment_tracking/test_mlflow_tracker", "live/session/test_live_page", "common/test_distributed",
+    "experiment_tracking/test_mlflow_logger", "live/session/test_live_page", "common/test_distributed",
     "cli/test_look",
 )  # fmt: skip
 

@@ -16,7 +16,7 @@ from memmlp.sweep.search.study import Study
 
 STEPS = 30
 SPACE = {
-    "all_rotations": {"low": 0.1, "high": 10.0, "log": True, "first": 1.0},
+    "rotation_all": {"low": 0.1, "high": 10.0, "log": True, "first": 1.0},
     "hand": {"low": 0.01, "high": 1.0, "log": True, "first": 0.1},
 }
 
@@ -48,7 +48,7 @@ def director(study: Study, folder: Path, composed: Callable = compose) -> Direct
 def error(config: Mapping[str, Any]) -> float:
     """Return a trial's error: lowest at weights of 2 and 0.2, and 0.3 higher with each further seed."""
     values = config["values"]
-    return 5 + abs(values["loss.all_rotations"] - 2) + abs(values["loss.hand"] - 0.2) + 0.3 * config["seed"]
+    return 5 + abs(values["loss.rotation_all"] - 2) + abs(values["loss.hand"] - 0.2) + 0.3 * config["seed"]
 
 
 def log(run: Run, step: int, value: float) -> None:

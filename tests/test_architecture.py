@@ -63,7 +63,7 @@ def test_layout_has_every_file_of_the_package():
 
 
 def test_rooms_that_make_no_numbers_are_there():
-    """A renamed room must not begin to count, so that a tracker's new code would flag finished runs."""
+    """A renamed room must not begin to count, so that a logger's new code would flag finished runs."""
     assert [room for room in NOT_NUMBERS if not (PACKAGE / room).exists()] == []
 
 

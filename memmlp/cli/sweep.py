@@ -202,7 +202,7 @@ def show_outcome(shown: ShownSweep, words: Sequence[str], chosen: Sweep, labels:
     """
     from memmlp.cli.seed_rounds import closing
     from memmlp.cli.table import SHOWN_MODES, on_screen, table_of_plan
-    from memmlp.cli.track import show_in_trackers
+    from memmlp.cli.track import show_in_loggers
     from memmlp.config import plugins
     from memmlp.config.compose_plan import orphans, sweep_folder
     from memmlp.tables.measured_run import load
@@ -212,7 +212,7 @@ def show_outcome(shown: ShownSweep, words: Sequence[str], chosen: Sweep, labels:
     failed = [task for task in plan.of_arms(labels).tasks if states[task.key] in ("failed", "blocked")]
     command = " ".join(["memmlp sweep", *words])
     found = table_of_plan(shown, SHOWN_MODES["both"], command, load)
-    show_in_trackers(plan, sweep_folder(chosen, plan.outputs), found.table)
+    show_in_loggers(plan, sweep_folder(chosen, plan.outputs), found.table)
     on_screen([found.table])
     for line in closing(rounds, chosen, found.runs) if rounds else ():
         click.echo(line)

@@ -15,7 +15,7 @@ from memmlp.cli.options import outputs_option
 from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
-    from memmlp.experiment_tracking.tracker import Tracker
+    from memmlp.experiment_tracking.run_logger import RunLogger
     from memmlp.sweep.plan import Plan
     from memmlp.tables.table import Table
 
@@ -29,7 +29,7 @@ def track() -> None:
 
 @track.command("sync")
 @click.option(
-    "--tracker",
+    "--logger",
     "names",
     multiple=True,
     type=click.Choice(TRACKERS),
@@ -44,7 +44,7 @@ def track() -> None:
 @click.option("--full", is_flag=True, help="Compare runs anew that were shown to their end before.")
 @outputs_option
 def sync(names: tuple[str, ...], uri: str | None, project: str, full: bool, outputs: Path) -> None:
-    """Bring trackers up to date with all runs and sweeps.
+    """Bring loggers up to date with all runs and sweeps.
 
     Afterwards they have exactly what the run folders have, each thing once; runs that are going on at present
     are left to the process that shows them. It may be repeated at any time.
@@ -57,25 +57,25 @@ def sync(names: tuple[str, ...], uri: str | None, project: str, full: bool, outp
     begun = [run for run in list_runs(outputs) if run.manifest]
     sweeps = sorted(path.parent for path in outputs.glob("sweeps/*/summary.json"))
     complaints: list[str] = []
-    for tracker in _trackers(names or ("mlflow",), uri, project, outputs):
-        found = fill_in(tracker, progress_bar(begun, tracker.name), outputs, complaints.append, full)
-        groups = sync_sweeps(tracker, sweeps, complaints.append)
+    for logger in _loggers(names or ("mlflow",), uri, project, outputs):
+        found = fill_in(logger, progress_bar(begun, logger.name), outputs, complaints.append, full)
+        groups = sync_sweeps(logger, sweeps, complaints.append)
         live = f", {found['live']} are going on" if found["live"] else ""
         runs = f"{found['shown'] + found['same']} runs ({found['shown']} of them now)"
-        click.echo(f"{runs} and {groups} sweeps are in {tracker.place}{live}")
+        click.echo(f"{runs} and {groups} sweeps are in {logger.place}{live}")
     for line in complaints:
         click.echo(f"memmlp: warning: {line}", err=True)
     if complaints:
         raise SystemExit(1)
 
 
-def _trackers(names: Sequence[str], uri: str | None, project: str, outputs: Path) -> list[Tracker]:
-    """Return the trackers with these names. Raises InputError if a package is missing."""
-    from memmlp.experiment_tracking.mlflow_tracker import MLflow
-    from memmlp.experiment_tracking.tensorboard_tracker import TensorBoard
-    from memmlp.experiment_tracking.wandb_tracker import WandB
+def _loggers(names: Sequence[str], uri: str | None, project: str, outputs: Path) -> list[RunLogger]:
+    """Return the loggers with these names. Raises InputError if a package is missing."""
+    from memmlp.experiment_tracking.mlflow_logger import MLflow
+    from memmlp.experiment_tracking.tensorboard_logger import TensorBoard
+    from memmlp.experiment_tracking.wandb_logger import WandB
 
-    every: dict[str, Tracker] = {
+    every: dict[str, RunLogger] = {
         "mlflow": MLflow(uri, outputs),
         "tensorboard": TensorBoard(outputs),
         "wandb": WandB(project, outputs),
@@ -83,8 +83,8 @@ def _trackers(names: Sequence[str], uri: str | None, project: str, outputs: Path
     return [every[name] for name in dict.fromkeys(names)]
 
 
-def show_in_trackers(plan: Plan, folder: Path, table: Table) -> None:
-    """Write the sweep's summary into its folder, and show it in the trackers that show its runs."""
+def show_in_loggers(plan: Plan, folder: Path, table: Table) -> None:
+    """Write the sweep's summary into its folder, and show it in the loggers that show its runs."""
     from omegaconf import OmegaConf
 
     from memmlp.config.build import build_tracking
@@ -109,7 +109,7 @@ def mlflow_has_page() -> bool:
 @outputs_option
 def mlflow(port: int, outputs: Path) -> None:
     """Open MLflow's page on the tracked runs (needs pip install 'memmlp[mlflow]')."""
-    from memmlp.experiment_tracking.mlflow_tracker import MLflow
+    from memmlp.experiment_tracking.mlflow_logger import MLflow
 
     store = MLflow(None, outputs).place
     program = shutil.which("mlflow")

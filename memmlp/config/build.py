@@ -149,7 +149,7 @@ def untrained(overrides: Sequence[str]) -> MotionModel:
 
 
 def build_tracking(cfg: DictConfig) -> Tracking:
-    """Build the tracking of a config, which shows runs in any number of trackers."""
+    """Build the tracking of a config, which shows runs in any number of loggers."""
     outputs = Path(cfg.paths.outputs)
     return Tracking(tuple(built(node, outputs=outputs) for node in cfg.tracking.values()), outputs)
 

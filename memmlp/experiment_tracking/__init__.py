@@ -1,4 +1,4 @@
-"""Trackers, which show runs elsewhere as they happen: MLflow, TensorBoard, W&B.
+"""Loggers, which show runs elsewhere as they happen: MLflow, TensorBoard, W&B.
 
 The run folder stays the record.
 """

@@ -1,8 +1,8 @@
-"""The process beside a run that shows it in trackers.
+"""The process beside a run that shows it in loggers.
 
 Lines on its standard input tell it which runs begin and end. It reads the content from the runs' own folders,
-so a run never waits for a tracker, and a slow tracker loses nothing. Each tracker has its own thread and
-bounded inbox. A tracker that fails is tried again after longer and longer pauses; `memmlp track sync` fills
+so a run never waits for a logger, and a slow logger loses nothing. Each logger has its own thread and
+bounded inbox. A logger that fails is tried again after longer and longer pauses; `memmlp track sync` fills
 in what it missed in the end.
 """
 
@@ -22,23 +22,23 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.experiment_tracking.logged_values import SYSTEM, SweepFacts
+from memmlp.experiment_tracking.run_logger import Busy, RunLogger, Session
 from memmlp.experiment_tracking.system import Machine, next_sample
-from memmlp.experiment_tracking.tracker import Busy, Session, Tracker
 from memmlp.runs.metrics_log import MetricsLog
 from memmlp.runs.run import Run
 
 PACE = 1.0  # seconds between looks at a run's log
 SLOWEST = 60.0  # seconds of the longest pause after failures
-GRACE = 30.0  # seconds in which a tracker may take the end of a run
+GRACE = 30.0  # seconds in which a logger may take the end of a run
 SAMPLE = 10.0  # seconds between measurements of the machine
-INBOX = 100  # events of runs that a tracker may be behind
+INBOX = 100  # events of runs that a logger may be behind
 
 Event = dict[str, str]
 Tell = Callable[[Event], None]
 
 
 class Followed:
-    """A run that one tracker shows, with the state of its failures.
+    """A run that one logger shows, with the state of its failures.
 
     Attributes:
         run: the run.
@@ -59,21 +59,21 @@ class Followed:
         self.next = now + (min(pause, 2 * PACE) if self.ended is not None else pause)
 
     def late(self, now: float) -> bool:
-        """Return whether the run ended so long ago that the tracker should give up on it."""
+        """Return whether the run ended so long ago that the logger should give up on it."""
         return self.ended is not None and now - self.ended > GRACE
 
 
 class Desk:
-    """The runs that one tracker shows, in a thread of its own.
+    """The runs that one logger shows, in a thread of its own.
 
     Args:
-        tracker: the tracker.
-        ledgers: the folder of notes about what the tracker has.
+        logger: the logger.
+        ledgers: the folder of notes about what the logger has.
         tell: gets a report of runs that were shown to their end, of failures and of dropped events.
     """
 
-    def __init__(self, tracker: Tracker, ledgers: Path, tell: Tell):
-        self.tracker, self.ledgers, self.tell = tracker, ledgers, tell
+    def __init__(self, logger: RunLogger, ledgers: Path, tell: Tell):
+        self.logger, self.ledgers, self.tell = logger, ledgers, tell
         self.inbox: queue.Queue[Event] = queue.Queue(INBOX)
         self.runs: dict[str, Followed] = {}
         self.dropped = 0
@@ -144,7 +144,7 @@ class Desk:
 
     def _show(self, one: Followed) -> None:
         if one.session is None:
-            one.session = Session(self.tracker, one.run, self.ledgers)
+            one.session = Session(self.logger, one.run, self.ledgers)
         if one.ended is None:
             one.session.step()
         else:
@@ -170,13 +170,13 @@ class Desk:
         try:
             facts = SweepFacts.read(folder)
             if facts is not None:
-                self.tracker.sweep(facts)
+                self.logger.sweep(facts)
             self._say("shown", str(folder), "")
         except Exception as error:
             self._say("missed", str(folder), reason_of(error))
 
     def _say(self, event: str, folder: str, reason: str) -> None:
-        self.tell({"event": event, "tracker": self.tracker.name, "folder": folder, "reason": reason})
+        self.tell({"event": event, "logger": self.logger.name, "folder": folder, "reason": reason})
 
 
 class MachineLog:
@@ -209,25 +209,25 @@ def reason_of(error: BaseException) -> str:
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
-def ledgers(outputs: Path, tracker: Tracker) -> Path:
-    """Return the folder of notes about what a tracker has of the runs in an outputs folder."""
-    place = hashlib.sha256(tracker.place.encode()).hexdigest()[:8]
-    return outputs / "tracking" / f"{tracker.name}-{place}"
+def ledgers(outputs: Path, logger: RunLogger) -> Path:
+    """Return the folder of notes about what a logger has of the runs in an outputs folder."""
+    place = hashlib.sha256(logger.place.encode()).hexdigest()[:8]
+    return outputs / "tracking" / f"{logger.name}-{place}"
 
 
 def follow(
-    trackers: Sequence[Tracker], outputs: Path, pid: int, told: queue.Queue[Event], tell: Tell
+    loggers: Sequence[RunLogger], outputs: Path, pid: int, told: queue.Queue[Event], tell: Tell
 ) -> None:
     """Follow runs until the event "stop" comes, and then finish showing them, for at most GRACE.
 
     Args:
-        trackers: where to show the runs.
+        loggers: where to show the runs.
         outputs: the outputs folder.
         pid: the process that works on the runs.
         told: the events.
         tell: gets reports of the outcome of events.
     """
-    desks = [Desk(tracker, ledgers(outputs, tracker), tell) for tracker in trackers]
+    desks = [Desk(logger, ledgers(outputs, logger), tell) for logger in loggers]
     sampler, sampled = MachineLog(pid), time.monotonic()
     for desk in desks:
         desk.thread.start()
@@ -248,17 +248,15 @@ def follow(
     for desk in desks:
         desk.thread.join(max(end - time.monotonic(), 0))
         if desk.dropped:
-            tell(
-                {"event": "dropped", "tracker": desk.tracker.name, "folder": "", "reason": str(desk.dropped)}
-            )
+            tell({"event": "dropped", "logger": desk.logger.name, "folder": "", "reason": str(desk.dropped)})
 
 
 def main() -> None:
-    """Read the trackers, then events from the standard input; write the outcomes to the standard output."""
+    """Read the loggers, then events from the standard input; write the outcomes to the standard output."""
     with contextlib.suppress(OSError):
         os.nice(10)  # a run goes before what shows it
     given: dict[str, Any] = pickle.load(sys.stdin.buffer)  # from the process that started this one
-    trackers, outputs = pickle.loads(given["trackers"]), Path(given["outputs"])
+    loggers, outputs = pickle.loads(given["loggers"]), Path(given["outputs"])
     out, lock = os.fdopen(os.dup(1), "w"), threading.Lock()
     os.dup2(2, 1)  # what packages print is not taken for an answer
 
@@ -275,8 +273,8 @@ def main() -> None:
         told.put({"event": "stop"})
 
     threading.Thread(target=listen, daemon=True).start()
-    follow(trackers, outputs, os.getppid(), told, tell)
-    os._exit(0)  # a thread that hangs in a tracker holds up nothing
+    follow(loggers, outputs, os.getppid(), told, tell)
+    os._exit(0)  # a thread that hangs in a logger holds up nothing
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO
 
 from memmlp.common.child_imports import child_imports
-from memmlp.experiment_tracking.tracker import Tracker
+from memmlp.experiment_tracking.run_logger import RunLogger
 from memmlp.runs.run import Run
 
 SHARE = 0.01  # of a run's time, for which its end may be waited for
@@ -25,14 +25,14 @@ MOST = 10.0  # seconds of that at most
 
 @dataclass(frozen=True)
 class Tracking:
-    """The trackers in which an experiment's runs are shown.
+    """The loggers in which an experiment's runs are shown.
 
     Attributes:
-        trackers: the trackers.
+        loggers: the loggers.
         outputs: the outputs folder.
     """
 
-    trackers: tuple[Tracker, ...]
+    loggers: tuple[RunLogger, ...]
     outputs: Path
 
     @contextlib.contextmanager
@@ -65,15 +65,15 @@ class Feed:
 
     def __init__(self, tracking: Tracking):
         self.dropped = 0
-        self.names = [tracker.name for tracker in tracking.trackers]
+        self.names = [logger.name for logger in tracking.loggers]
         self.answers: dict[tuple[str, str], str] = {}
         self.answered = threading.Condition()
-        self.process = self._start(tracking) if tracking.trackers else None
+        self.process = self._start(tracking) if tracking.loggers else None
 
     def _start(self, tracking: Tracking) -> subprocess.Popen[bytes] | None:
         environment = os.environ | child_imports() | {"OMP_NUM_THREADS": "1"}
         given = {
-            "trackers": pickle.dumps(tracking.trackers),
+            "loggers": pickle.dumps(tracking.loggers),
             "outputs": str(tracking.outputs.absolute()),
         }
         try:
@@ -119,7 +119,7 @@ class Feed:
             warn(f"the {event} of {folder.name} is not shown: its follower does not listen")
 
     def wait(self, folder: Path, seconds: float) -> bool:
-        """Wait, at most `seconds`, until all trackers have shown or missed a run's end; return whether so."""
+        """Wait, at most `seconds`, until all loggers have shown or missed a run's end; return whether so."""
         wanted = [(str(folder.absolute()), name) for name in self.names]
         with self.answered:
             return self.answered.wait_for(
@@ -144,15 +144,15 @@ class Feed:
             self.answered.notify_all()
 
     def _take(self, answer: dict[str, str]) -> None:
-        tracker, what = answer["tracker"], Path(answer["folder"]).name
+        logger, what = answer["logger"], Path(answer["folder"]).name
         if answer["event"] in ("shown", "missed"):
-            self.answers[answer["folder"], tracker] = answer["event"]
+            self.answers[answer["folder"], logger] = answer["event"]
         if answer["event"] == "trouble":
-            warn(f"{what} is not shown by {tracker} at present: {answer['reason']}")
+            warn(f"{what} is not shown by {logger} at present: {answer['reason']}")
         elif answer["event"] == "missed":
-            warn(f"{tracker} lacks {what}: {answer['reason']}; memmlp track sync fills it in")
+            warn(f"{logger} lacks {what}: {answer['reason']}; memmlp track sync fills it in")
         elif answer["event"] == "dropped":
-            warn(f"{tracker} was too slow for {answer['reason']} events; memmlp track sync fills them in")
+            warn(f"{logger} was too slow for {answer['reason']} events; memmlp track sync fills them in")
 
 
 _FEEDS: dict[Tracking, Feed] = {}
@@ -160,9 +160,9 @@ _FEEDS: dict[Tracking, Feed] = {}
 
 
 def feed_of(tracking: Tracking) -> Feed:
-    """Return this process' feed for these trackers; a new one if its process has died."""
+    """Return this process' feed for these loggers; a new one if its process has died."""
     feed = _FEEDS.get(tracking)
-    if feed is not None and tracking.trackers and not feed.alive:
+    if feed is not None and tracking.loggers and not feed.alive:
         feed.close()
         feed = None
     if feed is None:

@@ -1,4 +1,4 @@
-"""What trackers show: facts and points, all read from the folders of runs and sweeps."""
+"""What loggers show: facts and points, all read from the folders of runs and sweeps."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def final(facts: RunFacts, step: int) -> list[CurvePoint]:
 
 
 def fingerprint(run: Run, facts: RunFacts) -> str:
-    """Return a digest of everything that a tracker shows of the run."""
+    """Return a digest of everything that a logger shows of the run."""
     logs = [file_digest(path) for path in (run.metrics_path, run.folder / SYSTEM) if path.exists()]
     files = [file_digest(path) for path in facts.files]
     text = json.dumps(plain([asdict(facts), logs, files]), sort_keys=True, default=str)

@@ -50,8 +50,11 @@ def load_module(prefix: str, module: nn.Module, tensors: dict[str, Tensor]) -> N
     module.load_state_dict({_current(name, known): tensor for name, tensor in own.items()})
 
 
-WEIGHTS = {"rotation": "all_rotations", "position": "branch_position", "velocity": "lower_body_velocity"}
-"""The present names of terms of Mem-MLP's loss, by those that they had up to version 0.2."""
+WEIGHTS = {"rotation": "rotation_all", "position": "position_branch", "velocity": "velocity_lower_body"}
+"""The present names of terms of Mem-MLP's loss, by those that they had up to version 0.2.
+
+They sort alike: torch keeps the learned weights by their names, and the optimiser's state by their order.
+"""
 
 
 def _current(name: str, known: Collection[str]) -> str:

@@ -67,7 +67,7 @@ class Experiment:
         evaluation: how the network is evaluated.
         deployment: how the network is exported and timed; None where it is not deployed.
         predictions: folder for predictions of the test clips; None to write none.
-        tracking: shows the runs in experiment trackers.
+        tracking: shows the runs in run loggers, such as MLflow.
         called: makes a readable name for a run from the word for its kind and its config.
         unrefined: the experiment of the network that is refined; None without a refiner.
     """

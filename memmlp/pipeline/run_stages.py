@@ -242,7 +242,7 @@ def train_upstream(
 
 @contextlib.contextmanager
 def recording_outcome(experiment: Experiment, run: Run, again: bool = False) -> Iterator[None]:
-    """Follow work on a run in the trackers, and record in the run's folder how it ended.
+    """Follow work on a run in the loggers, and record in the run's folder how it ended.
 
     Only failures of the work itself are recorded. Bad input, interruptions, a full disk, a closed output
     pipe, and the loss of the run to another process are not.

@@ -359,7 +359,7 @@ def _inert(config: Mapping[str, Any]) -> dict[str, float]:
         return {}
     inert = {"loss.hand": 0.1} if option_in_slot(config, "hand") == "off" else {}
     if option_in_slot(config, "predictor") in ("rotation_only", "rotation_only_memory"):
-        inert |= {"loss.branch_position": 0.5, "loss.lower_body_velocity": 0.1}
+        inert |= {"loss.position_branch": 0.5, "loss.velocity_lower_body": 0.1}
     return inert
 
 

@@ -1,4 +1,4 @@
-"""A run's readable name, which is the same in lists, on the page and in trackers."""
+"""A run's readable name, which is the same in lists, on the page and in loggers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`memmlp track sync` and `memmlp mlflow`, and training with trackers, as a person types them."""
+"""`memmlp track sync` and `memmlp mlflow`, and training with loggers, as a person types them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from conftest import Memmlp, one_line
-from fake_tracker import FakeTracker, Server, a_run
+from fake_logger import FakeLogger, Server, a_run
 
 from memmlp.cli import track
 from memmlp.common.files import write_json
@@ -14,10 +14,10 @@ from memmlp.common.files import write_json
 
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch) -> Server:
-    """What is shown, by a tracker in memory."""
-    tracker = FakeTracker()
-    monkeypatch.setattr(track, "_trackers", lambda *_: [tracker])
-    return tracker.server
+    """What is shown, by a logger in memory."""
+    logger = FakeLogger()
+    monkeypatch.setattr(track, "_loggers", lambda *_: [logger])
+    return logger.server
 
 
 def test_sync_shows_runs_and_sweeps_and_then_nothing_more(memmlp: Memmlp, tmp_path: Path, server: Server):
@@ -41,11 +41,11 @@ def test_what_could_not_be_shown_is_a_line_each(memmlp: Memmlp, tmp_path: Path, 
     assert ran.err == f"memmlp: warning: run {'0' * 16} is not shown by fake: connection refused\n"
 
 
-def test_a_tracker_that_there_is_not_is_refused(memmlp: Memmlp):
-    assert one_line(memmlp("track", "sync", "--tracker", "paper"), "paper", "mlflow", "tensorboard", "wandb")
+def test_a_logger_that_there_is_not_is_refused(memmlp: Memmlp):
+    assert one_line(memmlp("track", "sync", "--logger", "paper"), "paper", "mlflow", "tensorboard", "wandb")
 
 
-def test_the_trackers_of_a_command_line(tmp_path: Path):
-    found = track._trackers(["wandb", "mlflow", "tensorboard", "wandb"], "http://x", "mine", tmp_path)
+def test_the_loggers_of_a_command_line(tmp_path: Path):
+    found = track._loggers(["wandb", "mlflow", "tensorboard", "wandb"], "http://x", "mine", tmp_path)
     assert [one.name for one in found] == ["wandb", "mlflow", "tensorboard"]
     assert found[1].place == "http://x"

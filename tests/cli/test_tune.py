@@ -105,8 +105,8 @@ def test_a_second_owner_is_refused(home: Path):
         ("search.seeds=0", "search.seeds=0: allowed is a whole number"),
         ("search=losses", "losses"),
         (
-            "search.space.loss.all_rotations.low=-1",
-            "search.space.loss.all_rotations.low=-1: allowed with log is above 0",
+            "search.space.loss.rotation_all.low=-1",
+            "search.space.loss.rotation_all.low=-1: allowed with log is above 0",
         ),
         ("+search.space.optim.lrr={low: 0.1, high: 1.0}", "optim.lrr"),
         (
@@ -114,7 +114,7 @@ def test_a_second_owner_is_refused(home: Path):
             "search.space: optim.batch=-4: allowed is at least 1",
         ),
         ("optim.lr=-1", "memmlp: optim.lr=-1"),
-        ("loss.all_rotations=5", "loss.all_rotations=5: is searched"),
+        ("loss.rotation_all=5", "loss.rotation_all=5: is searched"),
         (
             "+search.space.memory.blend={low: 0.0, high: 1.0}",
             "search.space: memory.blend: changes no training",

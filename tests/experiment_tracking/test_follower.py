@@ -1,4 +1,4 @@
-"""Trackers that are down, slow or late: nothing is shown twice, nothing is lost, everything is told."""
+"""Loggers that are down, slow or late: nothing is shown twice, nothing is lost, everything is told."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_tracker import FakeTracker, Server, a_run, losses
+from fake_logger import FakeLogger, Server, a_run, losses
 
 from memmlp.common.files import write_json
 from memmlp.experiment_tracking import follower
 from memmlp.experiment_tracking.follower import Desk, MachineLog, follow
 from memmlp.experiment_tracking.logged_values import SYSTEM
-from memmlp.experiment_tracking.tracker import Session
+from memmlp.experiment_tracking.run_logger import Session
 from memmlp.runs.metrics_log import MetricsLog
 from memmlp.runs.run import Run
 
@@ -25,9 +25,9 @@ class At:
 
     def __init__(self, folder: Path, server: Server | None = None):
         self.said: list[dict[str, str]] = []
-        self.tracker = FakeTracker(server)
-        self.server = self.tracker.server
-        self.desk = Desk(self.tracker, folder / "ledgers", self.said.append)
+        self.logger = FakeLogger(server)
+        self.server = self.logger.server
+        self.desk = Desk(self.logger, folder / "ledgers", self.said.append)
 
     def take(self, event: str, run: Run) -> None:
         self.desk.take({"event": event, "folder": str(run.folder)})
@@ -112,7 +112,7 @@ def test_pauses_grow_while_a_server_is_down(at: At, tmp_path: Path):
     assert pauses == [2, 4, 8, 16, 32, 60, 60, 60]
 
 
-def test_a_tracker_that_stays_down_is_given_up_with_a_reason(at: At, tmp_path: Path):
+def test_a_logger_that_stays_down_is_given_up_with_a_reason(at: At, tmp_path: Path):
     run = a_run(tmp_path)
     at.server.down = True
     at.take("begin", run)
@@ -131,7 +131,7 @@ def test_a_tracker_that_stays_down_is_given_up_with_a_reason(at: At, tmp_path: P
 
 def test_a_run_that_another_process_shows_is_waited_for(at: At, tmp_path: Path):
     run = a_run(tmp_path)
-    other = Session(FakeTracker(), run, tmp_path / "ledgers")
+    other = Session(FakeLogger(), run, tmp_path / "ledgers")
     at.take("begin", run)
     at.desk.look(NOW)
     assert at.server.status == {}
@@ -185,14 +185,14 @@ def told(*events: dict[str, str]) -> queue.Queue[Any]:
 def test_a_process_that_is_gone_ends_what_it_began(tmp_path: Path):
     run, server, said = a_run(tmp_path), Server(), []
     follow(
-        [FakeTracker(server)], tmp_path, 0, told({"event": "begin", "folder": str(run.folder)}), said.append
+        [FakeLogger(server)], tmp_path, 0, told({"event": "begin", "folder": str(run.folder)}), said.append
     )
     assert (server.status, server.values[run.id]) == ({run.id: "killed"}, losses(3))
     assert [one["event"] for one in said] == ["shown"]
 
 
-class Hung(FakeTracker):
-    """A tracker that never comes back from a run's beginning."""
+class Hung(FakeLogger):
+    """A logger that never comes back from a run's beginning."""
 
     name = "hung"
 
@@ -206,13 +206,13 @@ class Hung(FakeTracker):
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_tracker_that_hangs_holds_up_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_logger_that_hangs_holds_up_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(follower, "GRACE", 0.2)
     run, said, hung = a_run(tmp_path), [], Hung()
     events = [{"event": word, "folder": str(run.folder)} for word in ("begin", "end")]
-    follow([hung, FakeTracker()], tmp_path, 0, told(*events), said.append)
+    follow([hung, FakeLogger()], tmp_path, 0, told(*events), said.append)
     hung.gate.put(None)
-    assert [(one["event"], one["tracker"]) for one in said] == [("shown", "fake")]
+    assert [(one["event"], one["logger"]) for one in said] == [("shown", "fake")]
 
 
 @pytest.mark.usefixtures("quick")

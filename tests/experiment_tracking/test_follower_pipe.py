@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import processes
 import pytest
-from fake_tracker import FileTracker, a_run
+from fake_logger import FileLogger, a_run
 
 from memmlp.experiment_tracking import follower_pipe
 from memmlp.experiment_tracking.follower_pipe import Tracking, feed_of
@@ -34,7 +34,7 @@ def _closed() -> Iterator[None]:
     follower_pipe._FEEDS.clear()
 
 
-def test_without_trackers_there_is_no_process_and_no_file(tmp_path: Path):
+def test_without_loggers_there_is_no_process_and_no_file(tmp_path: Path):
     tracking, run = Tracking((), tmp_path), a_run(tmp_path)
     with tracking.following(run):
         pass
@@ -45,7 +45,7 @@ def test_without_trackers_there_is_no_process_and_no_file(tmp_path: Path):
 
 @pytest.mark.slow
 def test_runs_are_followed_by_one_process_to_their_ends(tmp_path: Path):
-    tracking = Tracking((FileTracker(tmp_path / "shown"),), tmp_path)
+    tracking = Tracking((FileLogger(tmp_path / "shown"),), tmp_path)
     first, second = a_run(tmp_path, "0" * 16), a_run(tmp_path, "1" * 16)
     with tracking.following(first):
         first.finish([])
@@ -67,13 +67,13 @@ def test_runs_are_followed_by_one_process_to_their_ends(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_a_tracker_that_hangs_costs_a_share_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_logger_that_hangs_costs_a_share_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     waited: list[float] = []
     monkeypatch.setattr(follower_pipe.Feed, "wait", lambda self, folder, seconds: waited.append(seconds))
     # The clock of this file alone: another thread that looks at the time takes none of its readings.
     clock = SimpleNamespace(monotonic=iter([0.0, 50.0, 1000.0, 90_000.0]).__next__)
     monkeypatch.setattr(follower_pipe, "time", clock)
-    tracking, run = Tracking((FileTracker(tmp_path / "shown", hangs=True),), tmp_path), a_run(tmp_path)
+    tracking, run = Tracking((FileLogger(tmp_path / "shown", hangs=True),), tmp_path), a_run(tmp_path)
     for _ in range(2):
         with tracking.following(run):
             run.log(9, {"loss": 1.0})
@@ -84,7 +84,7 @@ def test_a_tracker_that_hangs_costs_a_share_of_the_run(tmp_path: Path, monkeypat
 def test_a_follower_that_is_killed_harms_nothing_and_is_replaced(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    tracking, run = Tracking((FileTracker(tmp_path / "shown"),), tmp_path), a_run(tmp_path)
+    tracking, run = Tracking((FileLogger(tmp_path / "shown"),), tmp_path), a_run(tmp_path)
     with tracking.following(run):
         followed = feed_of(tracking)
         assert followed.process is not None
@@ -102,7 +102,7 @@ def test_a_follower_that_is_killed_harms_nothing_and_is_replaced(
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="no SIGSTOP here")
 def test_a_follower_that_does_not_read_drops_events_and_blocks_nobody(tmp_path: Path):
-    tracking = Tracking((FileTracker(tmp_path / "shown"),), tmp_path)
+    tracking = Tracking((FileLogger(tmp_path / "shown"),), tmp_path)
     followed = feed_of(tracking)
     assert followed.process is not None
     os.kill(followed.process.pid, signal.SIGSTOP)
@@ -116,7 +116,7 @@ def test_a_process_that_cannot_be_started_is_a_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setattr(sys, "executable", str(tmp_path / "no-python"))
-    tracking, run = Tracking((FileTracker(tmp_path / "shown"),), tmp_path), a_run(tmp_path)
+    tracking, run = Tracking((FileLogger(tmp_path / "shown"),), tmp_path), a_run(tmp_path)
     with tracking.following(run):
         pass
     err = capsys.readouterr().err
@@ -127,10 +127,10 @@ def test_a_process_that_cannot_be_started_is_a_line(
 KILLED = """
 import sys, os, signal
 from pathlib import Path
-from fake_tracker import FileTracker, a_run
+from fake_logger import FileLogger, a_run
 from memmlp.experiment_tracking.follower_pipe import Tracking
 outputs = Path(sys.argv[1])
-with Tracking((FileTracker(outputs / "shown"),), outputs).following(a_run(outputs)):
+with Tracking((FileLogger(outputs / "shown"),), outputs).following(a_run(outputs)):
     os.kill(os.getpid(), signal.SIGKILL)
 """
 

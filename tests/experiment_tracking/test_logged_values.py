@@ -1,11 +1,11 @@
-"""What trackers are shown follows from the folders alone."""
+"""What loggers are shown follows from the folders alone."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
-from fake_tracker import a_run, an_outdated_evaluation
+from fake_logger import a_run, an_outdated_evaluation
 
 from memmlp.common.files import write_json
 from memmlp.experiment_tracking.logged_values import SYSTEM, SweepFacts, Tail, facts_of, final, fingerprint

@@ -12,11 +12,11 @@ from typing import Any
 
 import pytest
 from command_line import run as command
-from fake_tracker import a_run, losses
+from fake_logger import a_run, losses
 from processes import until
 
 from memmlp.experiment_tracking.follower_pipe import Tracking, feed_of
-from memmlp.experiment_tracking.mlflow_tracker import MLflow, quiet
+from memmlp.experiment_tracking.mlflow_logger import MLflow, quiet
 from memmlp.runs.run import Run
 
 pytestmark = pytest.mark.slow

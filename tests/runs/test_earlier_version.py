@@ -1,7 +1,7 @@
 """Runs that version 0.1 wrote: found under the ids of today, evaluated, and shown in tables.
 
-A run of today is given the names that 0.1 wrote: the config group `tracker`, other paths of classes, `frame`
-for the normalizer's tensors, and the yardstick's times under "reference".
+A run of today is given the names that 0.1 wrote: the config groups `tracker` and `frame` and former names of
+keys, other paths of classes, `frame` for the normalizer's tensors, and the yardstick's times as "reference".
 """
 
 from __future__ import annotations
@@ -26,7 +26,13 @@ from memmlp.runs.run import Run
 from memmlp.tables.measured_run import load
 
 TRACKER = {"name": "none", "_target_": "memmlp.runs.tracking.NoTracker"}
-"""The group of 0.1, which had a single tracker."""
+"""The group of 0.1, which had a single logger."""
+
+FORMER = {
+    "normalizer": "frame", "z_scores": "normalize", "drawn_by": "weighting",
+    "baseline_frames": "avatar_poser_frames",
+}  # fmt: skip
+"""The former names of some groups and keys."""
 
 
 @pytest.fixture
@@ -40,7 +46,14 @@ def earlier(home: Path) -> tuple[Path, Run]:
 
 def _as_it_was(run: Run) -> None:
     """Give a run's files the names of version 0.1."""
-    config = {key: value for key, value in run.config.items() if key != "tracking"} | {"tracker": TRACKER}
+    config: dict[str, Any] = {
+        FORMER.get(group, group): {FORMER.get(key, key): value for key, value in content.items()}
+        if isinstance(content, dict)
+        else content
+        for group, content in run.config.items()
+        if group != "tracking"
+    }
+    config["tracker"] = TRACKER
     run.config_path.write_text(yaml.safe_dump(_mapped(config, _earlier_class), sort_keys=False))
     for path in (run.model, run.checkpoint):
         _rename_tensors(path)
@@ -89,8 +102,11 @@ def test_its_files_have_the_names_that_0_1_wrote(earlier):
         names = set(file.keys())
     assert {name for name in names if "normalizer" in name} == set()
     assert any(name.endswith("frame.rest") for name in names)
-    assert "tracker" in run.config
-    assert "tracking" not in run.config
+    assert {"tracking", "normalizer"} <= run.config.keys()
+    written = yaml.safe_load(run.config_path.read_text())
+    assert {"tracker", "frame"} <= written.keys()
+    assert written.keys().isdisjoint({"tracking", "normalizer"})
+    assert (written["data"]["weighting"], run.config["data"]["drawn_by"]) == ("frames", "frames")
     assert "yardstick" not in next(run.deployments.glob("*/latency.json")).read_text()
 
 

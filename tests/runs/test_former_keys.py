@@ -29,8 +29,8 @@ NOW = {
     "seed": 0,
     "normalizer": {"coordinates": "heading", "z_scores": True},
     "loss": {
-        "name": "manual", "all_rotations": 2.0, "rotation_velocity": 30.0, "branch_position": 0.5,
-        "lower_body_velocity": 0.1,
+        "name": "manual", "rotation_all": 2.0, "rotation_velocity": 30.0, "position_branch": 0.5,
+        "velocity_lower_body": 0.1,
     },
     "model": {"name": "hmd_poser", "encoder_layers": 3, "shape_weight": 0.1},
     "data": {"drawn_by": "clips", "mirror": False},
@@ -95,7 +95,7 @@ def test_recorded_overrides_have_the_names_of_today():
         "model=bodiffusion", "model.noise_weight=0.5", "normalizer.z_scores=false", "normalizer=default",
         "loss.rotation=1",
     )  # fmt: skip
-    assert with_present_keys(["loss=manual", "loss.velocity=1"])[1] == "loss.lower_body_velocity=1"
+    assert with_present_keys(["loss=manual", "loss.velocity=1"])[1] == "loss.velocity_lower_body=1"
     assert with_present_keys(["model=sage", "model.noise=1"])[1] == "model.noise=1"
 
 
@@ -105,7 +105,7 @@ def test_recorded_overrides_have_the_names_of_today():
         (["frame.coordinates=world"], "it is now normalizer"),
         (["frame=default"], "it is now normalizer"),
         (["normalizer.normalize=false"], "normalizer.normalize: no such key; it is now normalizer.z_scores"),
-        (["loss=manual", "loss.rotation=2"], "loss.rotation: no such key; it is now loss.all_rotations"),
+        (["loss=manual", "loss.rotation=2"], "loss.rotation: no such key; it is now loss.rotation_all"),
         (["model=bodiffusion", "model.noise=2"], "model.noise: no such key; it is now model.noise_weight"),
         (["data.weighting=clips"], "data.weighting: no such key; it is now data.drawn_by"),
         (["loss=own"], "loss=own: no such option; it is now of_network"),

@@ -144,7 +144,7 @@ def test_keys_that_older_runs_lack_count_only_where_they_change_something():
 
 def test_weights_of_terms_that_are_not_there_do_not_count():
     """They count as their defaults, so that runs with these keep their ids."""
-    weights = {"all_rotations": 1.0, "branch_position": 0.5, "lower_body_velocity": 0.1, "hand": 0.1}
+    weights = {"rotation_all": 1.0, "position_branch": 0.5, "velocity_lower_body": 0.1, "hand": 0.1}
 
     def of(term: str, predictor: str = "two_branch", **others: float) -> str:
         loss = {"name": "manual", **weights, **others}
@@ -153,9 +153,9 @@ def test_weights_of_terms_that_are_not_there_do_not_count():
 
     assert of("off", hand=9.0) == of("off") == "87063d950dc5b521"
     assert of("fk", hand=9.0) != of("fk")
-    assert of("off", branch_position=9.0) != of("off")
+    assert of("off", position_branch=9.0) != of("off")
     alone = "rotation_only"
-    assert of("off", alone, branch_position=9.0, lower_body_velocity=9.0, hand=9.0) == of("off", alone)
-    assert of("off", alone, all_rotations=9.0) != of("off", alone)
+    assert of("off", alone, position_branch=9.0, velocity_lower_body=9.0, hand=9.0) == of("off", alone)
+    assert of("off", alone, rotation_all=9.0) != of("off", alone)
     config = {**CONFIG, "hand": {"name": "off"}, "loss": {"name": "manual", **weights}}
-    assert [changes_training(f"loss.{name}", config) for name in ("hand", "branch_position")] == [False, True]
+    assert [changes_training(f"loss.{name}", config) for name in ("hand", "position_branch")] == [False, True]

@@ -24,7 +24,7 @@ def test_agrols_loss_is_that_of_its_code_or_of_its_paper(error):
     norms = [np.sqrt((scaled[b, t, 6 * j : 6 * j + 6] ** 2).sum()) for b, t, j in np.ndindex(2, 3, 22)]
     expected = {"norm": np.mean(norms), "square": np.mean(scaled**2)}
     assert float(loss) == pytest.approx(expected[error], rel=1e-4)
-    assert set(terms) == {"all_rotations"}
+    assert set(terms) == {"rotation_all"}
     assert float(AGRoLLoss()(motion, truth, SPARSE[:, :3].expand(2, -1, -1), normalizer)[0]) == pytest.approx(
         expected["norm"], rel=1e-4
     )
@@ -76,7 +76,7 @@ def test_rpms_loss_has_l1_norms_of_joints_and_counts_the_last_frames_step_as_rig
     scaled = (motion - truth)[..., ROTATION].numpy() / normalizer.std[SPARSE_DIM:][ROTATION].numpy()
     expected = {}
     for names, error in (
-        (("all_rotations", "rotation_velocity"), scaled.reshape(2, 3, 22, 6)),
+        (("rotation_all", "rotation_velocity"), scaled.reshape(2, 3, 22, 6)),
         (("world_position", "velocity"), made - true),
     ):
         steps = [np.abs(error[:, t + 1] - error[:, t]).sum(-1) for t in range(2)] + [np.zeros((2, 22))]
@@ -84,7 +84,7 @@ def test_rpms_loss_has_l1_norms_of_joints_and_counts_the_last_frames_step_as_rig
     loss, terms = RPMLoss()(motion, truth, sparse, normalizer)
     assert {name: float(term) for name, term in terms.items()} == pytest.approx(expected, rel=1e-4)
     assert float(loss) == pytest.approx(sum(expected.values()), rel=1e-4)
-    weighed, _ = RPMLoss(all_rotations=0.0, rotation_velocity=2.0, world_position=3.0, velocity=0.0)(
+    weighed, _ = RPMLoss(rotation_all=0.0, rotation_velocity=2.0, world_position=3.0, velocity=0.0)(
         motion, truth, sparse, normalizer
     )
     whole = 2 * expected["rotation_velocity"] + 3 * expected["world_position"]
@@ -104,7 +104,7 @@ def test_the_refiners_loss_is_mostly_of_how_rotations_move():
     rooted = made[0] - made[0][:, :1]
     jerks = [rooted[t + 3] - 3 * rooted[t + 2] + 3 * rooted[t + 1] - rooted[t] for t in range(6)]
     expected = {
-        "all_rotations": smooth(error),
+        "rotation_all": smooth(error),
         "rotation_velocity": smooth(error[1:] - error[:-1]),
         "rotation_velocity_3": smooth(error[3::3] - error[:-3:3]),
         "position": np.linalg.norm(rooted - (true[0] - true[0][:, :1]), axis=-1).mean(),

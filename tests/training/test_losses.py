@@ -25,24 +25,22 @@ def terms(hand=None, branches=BOTH):
 def test_terms_are_the_papers_equations():
     """Eqs. 1-4, summed over joints and components, mean over time and batch."""
     truth, batch, time = TRUTH[..., SPARSE_DIM:], 2, 9
-    names = ["all_rotations", "rotation_velocity", "branch_position", "lower_body_velocity", "hand"]
+    names = ["rotation_all", "rotation_velocity", "position_branch", "velocity_lower_body", "hand"]
     expected = dict.fromkeys(names, 0.0)
     for b in range(batch):
         for t in range(time):
             error = MOTION[b, t] - truth[b, t]
             for joint in range(22):
                 position = error[132 + 3 * joint : 135 + 3 * joint].abs().sum().item()
-                expected["all_rotations"] += (
-                    error[6 * joint : 6 * joint + 6].abs().sum().item() / time / batch
-                )
-                expected["branch_position"] += position / time / batch
+                expected["rotation_all"] += error[6 * joint : 6 * joint + 6].abs().sum().item() / time / batch
+                expected["position_branch"] += position / time / batch
                 expected["hand"] += position / time / batch if joint in (20, 21) else 0
             if t + 1 < time:
                 step = (truth[b, t + 1] - truth[b, t]) - (MOTION[b, t + 1] - MOTION[b, t])
                 expected["rotation_velocity"] += step[:132].abs().sum().item() / (time - 1) / batch
                 for joint in LOWER:
                     part = step[132 + 3 * joint : 135 + 3 * joint]
-                    expected["lower_body_velocity"] += part.abs().sum().item() / (time - 1) / batch
+                    expected["velocity_lower_body"] += part.abs().sum().item() / (time - 1) / batch
     assert {name: float(term) for name, term in terms().items()} == pytest.approx(expected, rel=1e-4)
 
 
@@ -58,12 +56,12 @@ def test_hand_by_forward_kinematics_is_of_the_rotation_branch():
 def test_hand_off_and_rotation_only_leave_terms_out():
     assert "hand" not in terms(NoHand())
     rotation = frozenset({"rotation"})
-    assert set(terms(HandPosition(), rotation)) == {"all_rotations", "rotation_velocity"}
-    assert set(terms(HandFK(), rotation)) == {"all_rotations", "rotation_velocity", "hand"}
+    assert set(terms(HandPosition(), rotation)) == {"rotation_all", "rotation_velocity"}
+    assert set(terms(HandFK(), rotation)) == {"rotation_all", "rotation_velocity", "hand"}
 
 
 def test_manual_weights_are_the_papers_and_each_counts():
-    names = ("all_rotations", "rotation_velocity", "branch_position", "lower_body_velocity", "hand")
+    names = ("rotation_all", "rotation_velocity", "position_branch", "velocity_lower_body", "hand")
     ones = {name: torch.tensor(1.0) for name in names}
     assert float(Manual()(ones)) == pytest.approx(1 + 30 + 0.5 + 0.1 + 0.1)
     for name in names:
@@ -73,15 +71,15 @@ def test_manual_weights_are_the_papers_and_each_counts():
 def test_uncertainty_settles_where_the_weight_is_one_over_the_loss():
     """The minimum of e^-s L + s is s = ln L."""
     weighting = Uncertainty(lr=0.05)
-    weighting.build(["all_rotations", "branch_position"])
+    weighting.build(["rotation_all", "position_branch"])
     optimiser = torch.optim.Adam(weighting.parameter_groups())
     assert optimiser.param_groups[0]["lr"] == 0.05
     for _ in range(400):
         optimiser.zero_grad()
-        weighting({"all_rotations": torch.tensor(4.0), "branch_position": torch.tensor(0.1)}).backward()
+        weighting({"rotation_all": torch.tensor(4.0), "position_branch": torch.tensor(0.1)}).backward()
         optimiser.step()
-    assert weighting.weights() == pytest.approx({"all_rotations": 1 / 4, "branch_position": 10}, rel=1e-2)
-    assert weighting.s["all_rotations"].item() == pytest.approx(math.log(4), rel=1e-2)
+    assert weighting.weights() == pytest.approx({"rotation_all": 1 / 4, "position_branch": 10}, rel=1e-2)
+    assert weighting.s["rotation_all"].item() == pytest.approx(math.log(4), rel=1e-2)
 
 
 def test_a_loss_without_terms_is_none():
@@ -91,19 +89,19 @@ def test_a_loss_without_terms_is_none():
 
 def test_a_custom_term_has_its_own_weight_also_under_the_name_of_a_term_that_is_not_there():
     weighting = Manual()
-    weighting.build(["all_rotations", "hand"], {"hand": 7.0})
-    terms = {"all_rotations": torch.tensor(1.0), "hand": torch.tensor(1.0)}
+    weighting.build(["rotation_all", "hand"], {"hand": 7.0})
+    terms = {"rotation_all": torch.tensor(1.0), "hand": torch.tensor(1.0)}
     assert float(weighting(terms)) == pytest.approx(1 + 7)
 
 
 def test_a_term_that_is_0_keeps_its_weight():
     """The regulariser alone would make the weight of a term without an error grow for ever."""
     weighting = Uncertainty(lr=0.05)
-    weighting.build(["branch_position", "penetration"])
+    weighting.build(["position_branch", "penetration"])
     optimiser = torch.optim.AdamW(weighting.parameter_groups())
     for _ in range(50):
         optimiser.zero_grad()
-        weighting({"branch_position": torch.tensor(0.3), "penetration": torch.tensor(0.0)}).backward()
+        weighting({"position_branch": torch.tensor(0.3), "penetration": torch.tensor(0.0)}).backward()
         optimiser.step()
     assert weighting.weights()["penetration"] == 1
-    assert weighting.weights()["branch_position"] > 1.5
+    assert weighting.weights()["position_branch"] > 1.5

@@ -1,4 +1,4 @@
-"""`memmlp bench tracking`: how much slower a training is while trackers show it."""
+"""`memmlp bench tracking`: how much slower a training is while loggers show it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from memmlp.runs.run import Run
 @click.option("--uri", help="MLflow's store, such as a dead or slow server.  [default: a sqlite file]")
 @click.argument("overrides", nargs=-1)
 def tracking(blocks: int, steps: int, uri: str | None, overrides: tuple[str, ...]) -> None:
-    """Time a training that is shown in trackers, by pieces.
+    """Time a training that is shown in loggers, by pieces.
 
     In every other piece the process that shows it is stopped, so that the ratio of neighbours tells what it
     costs, whatever else the machine does. OVERRIDES are those of `memmlp train`; the default is profile=small

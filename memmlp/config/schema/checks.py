@@ -130,7 +130,7 @@ def _check_names(cfg: DictConfig) -> None:
             raise InputError(f"{slot}.name={node.name}: allowed for {path} is a name of its own")
     for name, node in cfg.tracking.items():
         if node.name != name:
-            raise InputError(f"tracking.{name}.name={node.name}: allowed is {name}, the tracker's key")
+            raise InputError(f"tracking.{name}.name={node.name}: allowed is {name}, the logger's key")
 
 
 def _check_combinations(cfg: DictConfig) -> None:

@@ -216,30 +216,30 @@ class ExportConfig:
 
 
 @dataclass
-class TrackerConfig:
-    """Where runs are shown beside their folders (conf/tracking), by the name of the tracker."""
+class LoggerConfig:
+    """Where runs are shown beside their folders (conf/tracking), by the name of the logger."""
 
     name: str = key(Text())
     _target_: str = MISSING
 
 
 @dataclass
-class MLflowConfig(TrackerConfig):
+class MLflowConfig(LoggerConfig):
     name: str = called("mlflow")
-    _target_: str = target("memmlp.experiment_tracking.mlflow_tracker.MLflow")
+    _target_: str = target("memmlp.experiment_tracking.mlflow_logger.MLflow")
     uri: Optional[str] = key()
 
 
 @dataclass
-class TensorBoardConfig(TrackerConfig):
+class TensorBoardConfig(LoggerConfig):
     name: str = called("tensorboard")
-    _target_: str = target("memmlp.experiment_tracking.tensorboard_tracker.TensorBoard")
+    _target_: str = target("memmlp.experiment_tracking.tensorboard_logger.TensorBoard")
 
 
 @dataclass
-class WandBConfig(TrackerConfig):
+class WandBConfig(LoggerConfig):
     name: str = called("wandb")
-    _target_: str = target("memmlp.experiment_tracking.wandb_tracker.WandB")
+    _target_: str = target("memmlp.experiment_tracking.wandb_logger.WandB")
     project: str = key(Text())
 
 
@@ -270,7 +270,7 @@ class Config:
     optim: OptimConfig = field(default_factory=OptimConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     export: ExportConfig = field(default_factory=ExportConfig)
-    tracking: dict[str, TrackerConfig] = field(default_factory=dict)
+    tracking: dict[str, LoggerConfig] = field(default_factory=dict)
 
 
 SCHEMAS: dict[str, type] = {
@@ -368,7 +368,7 @@ def add_schema(option: str, schema: type) -> None:
     Raises:
         ValueError: where there is one of that name, or it does not extend the schema of its slot.
     """
-    slots = {**GROUPS, "tracking": TrackerConfig, "data": DataConfig}
+    slots = {**GROUPS, "tracking": LoggerConfig, "data": DataConfig}
     slot = slots.get(option.partition("_")[0])
     if slot is None or option in SCHEMAS:
         raise ValueError(f"'{option}': allowed is GROUP_OPTION with a new option of {', '.join(slots)}")

@@ -8,7 +8,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from memmlp.config.schema.checks import WITHOUT_STREAM
-from memmlp.config.schema.config import DATA, GROUPS, SCHEMAS, Config, TrackerConfig
+from memmlp.config.schema.config import DATA, GROUPS, SCHEMAS, Config, LoggerConfig
 from memmlp.config.schema.data import SynthDataConfig
 from memmlp.runs.former_keys import with_present_names
 from memmlp.runs.identity import option_in_slot
@@ -35,7 +35,7 @@ def _restored(group: str, content: Mapping[str, Any]) -> Any:
     A component that is not part of this package keeps the path of its class.
     """
     if group == "tracking":
-        return _trackers(content)
+        return _loggers(content)
     option = SCHEMAS.get(f"{group}_{option_in_slot({group: content}, group)}")
     ours = option is None or option.__module__.startswith("memmlp.")
     if group == "data" and ours:
@@ -44,15 +44,15 @@ def _restored(group: str, content: Mapping[str, Any]) -> Any:
     return OmegaConf.merge(OmegaConf.structured(option or GROUPS[group]), _content(option, content))
 
 
-def _trackers(content: Mapping[str, Any]) -> Any:
-    """Return the trackers as typed configs. Up to version 0.2 the group was itself the single tracker."""
+def _loggers(content: Mapping[str, Any]) -> Any:
+    """Return the loggers as typed configs. Up to version 0.2 the group was itself the single logger."""
     every = {str(content["name"]): content} if "name" in content else content
-    return {name: _restored_tracker(name, node) for name, node in every.items() if name != "none"}
+    return {name: _restored_logger(name, node) for name, node in every.items() if name != "none"}
 
 
-def _restored_tracker(name: str, content: Mapping[str, Any]) -> Any:
+def _restored_logger(name: str, content: Mapping[str, Any]) -> Any:
     option = SCHEMAS.get(f"tracking_{name}")
-    return OmegaConf.merge(OmegaConf.structured(option or TrackerConfig), _content(option, content))
+    return OmegaConf.merge(OmegaConf.structured(option or LoggerConfig), _content(option, content))
 
 
 def _content(option: type | None, content: Mapping[str, Any]) -> dict[str, Any]:

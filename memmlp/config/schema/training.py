@@ -74,10 +74,10 @@ class UncertaintyConfig(LossConfig):
 class ManualConfig(LossConfig):
     name: str = called("manual")
     _target_: str = target("memmlp.training.losses.Manual")
-    all_rotations: float = at_least(0)
+    rotation_all: float = at_least(0)
     rotation_velocity: float = at_least(0)
-    branch_position: float = at_least(0)
-    lower_body_velocity: float = at_least(0)
+    position_branch: float = at_least(0)
+    velocity_lower_body: float = at_least(0)
     hand: float = at_least(0)
 
 
@@ -107,7 +107,7 @@ class AvatarPoserLossConfig(BaselineLossConfig):
 class RPMLossConfig(BaselineLossConfig):
     name: str = called("rpm")
     _target_: str = target("memmlp.training.losses.RPMLoss")
-    all_rotations: float = at_least(0)
+    rotation_all: float = at_least(0)
     rotation_velocity: float = at_least(0)
     world_position: float = at_least(0)
     velocity: float = at_least(0)

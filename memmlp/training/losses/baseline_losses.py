@@ -37,13 +37,13 @@ class AGRoLLoss(Loss):
     def __init__(self, error: str = "norm"):
         super().__init__()
         self.error = ERRORS[error]
-        self.weighting = Fixed({"all_rotations": 1.0})
+        self.weighting = Fixed({"rotation_all": 1.0})
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         """Return the one term, from motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
         origin = normalizer.origin(sparse)
         error = normalizer.encode_motion(motion, origin) - normalizer.encode_motion(truth, origin)
-        return {"all_rotations": self.error(error[..., ROTATION])}
+        return {"rotation_all": self.error(error[..., ROTATION])}
 
 
 def from_pelvis(positions: Tensor) -> Tensor:
@@ -109,7 +109,7 @@ class RPMLoss(Loss):
     kinematics with the head on its tracker, metres in the world.
 
     Args:
-        all_rotations: weight of the 6D rotations' error.
+        rotation_all: weight of the 6D rotations' error.
         rotation_velocity: weight of their differences between frames.
         world_position: weight of the positions' error.
         velocity: weight of their differences between frames.
@@ -117,13 +117,13 @@ class RPMLoss(Loss):
 
     def __init__(
         self,
-        all_rotations: float = 1.0,
+        rotation_all: float = 1.0,
         rotation_velocity: float = 1.0,
         world_position: float = 1.0,
         velocity: float = 1.0,
     ):
         super().__init__()
-        weights = {"all_rotations": all_rotations, "rotation_velocity": rotation_velocity}
+        weights = {"rotation_all": rotation_all, "rotation_velocity": rotation_velocity}
         self.weighting = Fixed({**weights, "world_position": world_position, "velocity": velocity})
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
@@ -133,7 +133,7 @@ class RPMLoss(Loss):
         rotations, pair = error[..., ROTATION], Comparison(motion, truth, sparse, normalizer)
         positions = (pair.positions - pair.true_positions).flatten(-2)
         return {
-            "all_rotations": joint_sums(rotations),
+            "rotation_all": joint_sums(rotations),
             "rotation_velocity": joint_sums_of_steps(rotations),
             "world_position": joint_sums(positions),
             "velocity": joint_sums_of_steps(positions),
@@ -150,7 +150,7 @@ class SAGERefinerLoss(Loss):
 
     def __init__(self) -> None:
         super().__init__()
-        weights = {"all_rotations": 0.01, "rotation_velocity": 60.0, "rotation_velocity_3": 20.0}
+        weights = {"rotation_all": 0.01, "rotation_velocity": 60.0, "rotation_velocity_3": 20.0}
         self.weighting = Fixed({**weights, "position": 0.01, "trackers": 0.01, "jerk": 0.03})
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
@@ -158,7 +158,7 @@ class SAGERefinerLoss(Loss):
         error, pair = (motion - truth)[..., ROTATION], Comparison(motion, truth, sparse, normalizer)
         tracked = [HEAD, *HANDS]
         return {
-            "all_rotations": _smooth(error),
+            "rotation_all": _smooth(error),
             "rotation_velocity": _smooth(error.diff(dim=1)),
             "rotation_velocity_3": _smooth(error[:, ::3].diff(dim=1)),
             "position": (pair.made.posed[1] - from_pelvis(pair.true_positions)).norm(dim=-1).mean(),

@@ -57,18 +57,18 @@ class Manual(Fixed):
 
     def __init__(
         self,
-        all_rotations: float = 1.0,
+        rotation_all: float = 1.0,
         rotation_velocity: float = 30.0,
-        branch_position: float = 0.5,
-        lower_body_velocity: float = 0.1,
+        position_branch: float = 0.5,
+        velocity_lower_body: float = 0.1,
         hand: float = 0.1,
     ):
         super().__init__(
             {
-                "all_rotations": all_rotations,
+                "rotation_all": rotation_all,
                 "rotation_velocity": rotation_velocity,
-                "branch_position": branch_position,
-                "lower_body_velocity": lower_body_velocity,
+                "position_branch": position_branch,
+                "velocity_lower_body": velocity_lower_body,
                 "hand": hand,
             }
         )

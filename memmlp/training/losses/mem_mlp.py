@@ -83,14 +83,14 @@ class Term:
 def rotation_terms(motion: Tensor, truth: Tensor) -> Terms:
     """Return Eqs. 1 and 2, from motion and truth (B, T, 198)."""
     error = (motion - truth)[..., ROTATION]
-    return {"all_rotations": l1(error), "rotation_velocity": l1(error.diff(dim=1))}
+    return {"rotation_all": l1(error), "rotation_velocity": l1(error.diff(dim=1))}
 
 
 def position_terms(motion: Tensor, truth: Tensor) -> Terms:
     """Return Eqs. 3 and 4 (Eq. 4 on the lower body alone), from motion and truth (B, T, 198)."""
     error = joints(motion) - joints(truth)
     steps = error[:, :, list(LOWER)].diff(dim=1)
-    return {"branch_position": l1(error), "lower_body_velocity": l1(steps)}
+    return {"position_branch": l1(error), "velocity_lower_body": l1(steps)}
 
 
 class MotionLoss(Loss):

@@ -35,7 +35,7 @@ def test_a_search_has_the_trials_it_wants_and_the_papers_first(tmp_path: Path):
     study = open_study(tmp_path)
     to_the_end(study, tmp_path)
     assert [trial.state for trial in study.trials] == [TrialState.COMPLETE] * 6
-    assert study.trials[0].params == {"loss.all_rotations": 1.0, "loss.hand": 0.1}
+    assert study.trials[0].params == {"loss.rotation_all": 1.0, "loss.hand": 0.1}
     assert len({run for trial in study.trials for run in trial.user_attrs["runs"]}) == 6
     for trial in study.trials:
         assert trial.value == pytest.approx(error({"values": trial.params, "seed": 0}))
@@ -99,7 +99,7 @@ def test_a_director_killed_while_it_asks_loses_and_repeats_nothing(
     to_the_end(study, tmp_path)
     assert [trial.number for trial in study.trials] == list(range(6))
     assert all(trial.state == TrialState.COMPLETE for trial in study.trials)
-    assert all(set(trial.params) == {"loss.all_rotations", "loss.hand"} for trial in study.trials)
+    assert all(set(trial.params) == {"loss.rotation_all", "loss.hand"} for trial in study.trials)
     assert len({tuple(trial.params.values()) for trial in study.trials}) == 6
 
 

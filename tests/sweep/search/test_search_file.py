@@ -12,7 +12,7 @@ from memmlp.sweep.search.search_file import Range, parse_search
 GOOD: dict[str, Any] = {
     "name": "mine",
     "base": ["loss=manual"],
-    "space": {"loss": {"all_rotations": {"low": 0.1, "high": 10.0, "log": True, "first": 1.0}}},
+    "space": {"loss": {"rotation_all": {"low": 0.1, "high": 10.0, "log": True, "first": 1.0}}},
     "objectives": ["MPJPE"],
     "n_trials": 3,
     "seeds": 1,
@@ -110,7 +110,7 @@ def test_an_objective_that_is_not_validated_is_named():
         ({"sampler": "gp"}, "search.sampler=gp: allowed is tpe or random or grid"),
         (
             {"sampler": "grid"},
-            "search.space.loss.all_rotations: with search.sampler=grid allowed are choices alone",
+            "search.space.loss.rotation_all: with search.sampler=grid allowed are choices alone",
         ),
         (
             {"sampler": "grid", "space": space(choices=[1, 2], first=1)},

@@ -43,7 +43,7 @@ def test_the_seed_changes_what_is_proposed_and_the_sampler_too(tmp_path: Path):
 
 
 def test_a_grid_has_each_combination_once_in_order_however_often_it_is_stopped(tmp_path: Path):
-    space = {"loss": {"all_rotations": {"choices": [1.0, 2.0]}, "hand": {"choices": [0.1, 0.2, 0.3]}}}
+    space = {"loss": {"rotation_all": {"choices": [1.0, 2.0]}, "hand": {"choices": [0.1, 0.2, 0.3]}}}
     grid = {"sampler": "grid", "space": space, "n_trials": 6, "startup": None, "prune_after": None}
     for _ in range(3):
         one = director(open_study(tmp_path, **grid), tmp_path)
@@ -51,7 +51,7 @@ def test_a_grid_has_each_combination_once_in_order_however_often_it_is_stopped(t
     study = open_study(tmp_path, **grid)
     to_the_end(study, tmp_path, capacity=1)
     every = [
-        {"loss.all_rotations": one, "loss.hand": other} for one in (1.0, 2.0) for other in (0.1, 0.2, 0.3)
+        {"loss.rotation_all": one, "loss.hand": other} for one in (1.0, 2.0) for other in (0.1, 0.2, 0.3)
     ]
     assert [trial.params for trial in study.trials] == every
 

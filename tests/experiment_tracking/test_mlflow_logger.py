@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_tracker import an_outdated_evaluation
+from fake_logger import an_outdated_evaluation
 from processes import finished
 
 from memmlp.common.files import write_json
 from memmlp.experiment_tracking.logged_values import SweepFacts
-from memmlp.experiment_tracking.mlflow_tracker import MLflow, allowed, quiet
+from memmlp.experiment_tracking.mlflow_logger import MLflow, allowed, quiet
+from memmlp.experiment_tracking.run_logger import Session
 from memmlp.experiment_tracking.sync import sync
-from memmlp.experiment_tracking.tracker import Session
 from memmlp.runs.notes import add_tags, remove_tags, set_note
 from memmlp.runs.run import Run
 
@@ -238,8 +238,8 @@ from pathlib import Path
 from mlflow import MlflowClient
 from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
 from memmlp.runs.run import Run
-from memmlp.experiment_tracking.mlflow_tracker import MLflow
-from memmlp.experiment_tracking.tracker import Session
+from memmlp.experiment_tracking.mlflow_logger import MLflow
+from memmlp.experiment_tracking.run_logger import Session
 outputs, begun = Path(sys.argv[1]), []
 for name in sys.argv[2:]:
     if not (process := os.fork()):

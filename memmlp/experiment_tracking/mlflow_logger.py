@@ -1,4 +1,4 @@
-"""The tracker that shows runs in MLflow: one MLflow run for each run folder, identified by a tag."""
+"""The logger that shows runs in MLflow: one MLflow run for each run folder, identified by a tag."""
 
 from __future__ import annotations
 
@@ -118,12 +118,12 @@ class ShownInMLflow:
     """A run as shown in MLflow.
 
     Attributes:
-        tracker: the tracker.
+        logger: the logger.
         mlflow_id: MLflow's own id of the run.
         known: keys and steps of the values that MLflow has.
     """
 
-    tracker: MLflow
+    logger: MLflow
     mlflow_id: str
     known: set[tuple[str, int]]
 
@@ -137,7 +137,7 @@ class ShownInMLflow:
             for place, point in new.items()
             if place not in self.known
         ]
-        with self.tracker._client() as client:
+        with self.logger._client() as client:
             for part in _chunks(metrics, METRICS):
                 client.log_batch(self.mlflow_id, metrics=part)
                 self.known.update((metric.key, metric.step) for metric in part)
@@ -145,7 +145,7 @@ class ShownInMLflow:
     def end(self, facts: RunFacts, results: Sequence[CurvePoint]) -> None:
         """Send results and files, and end MLflow's run with the run's own status."""
         self.log(results)
-        with self.tracker._client() as client:
+        with self.logger._client() as client:
             describe(client, client.get_run(self.mlflow_id), facts)
             for path in facts.files:
                 client.log_artifact(self.mlflow_id, str(path))
@@ -156,13 +156,13 @@ class ShownInMLflow:
         """Do nothing: MLflow keeps no run open."""
 
 
-def experiment_id(client: MlflowClient, tracker: MLflow) -> str:
+def experiment_id(client: MlflowClient, logger: MLflow) -> str:
     """Return the id of MLflow's experiment; it is created if it does not exist."""
     experiment = client.get_experiment_by_name(EXPERIMENT)
     if experiment is not None:
         return experiment.experiment_id
-    local = tracker.place.startswith("sqlite:")
-    place = (tracker.outputs.absolute() / "mlflow-artifacts").as_uri() if local else None
+    local = logger.place.startswith("sqlite:")
+    place = (logger.outputs.absolute() / "mlflow-artifacts").as_uri() if local else None
     return client.create_experiment(EXPERIMENT, artifact_location=place)
 
 

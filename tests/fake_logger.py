@@ -1,4 +1,4 @@
-"""Trackers for tests: one in memory that can be down, one that writes a file or hangs in another process."""
+"""Loggers for tests: one in memory that can be down, one that writes a file or hangs in another process."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class Server:
             raise ConnectionError("connection refused")
 
 
-class FakeTracker:
-    """A tracker in memory."""
+class FakeLogger:
+    """A logger in memory."""
 
     name = "fake"
     place = "memory"
@@ -86,7 +86,7 @@ class FakeShown:
 
 
 @dataclass(frozen=True)
-class FileTracker:
+class FileLogger:
     """Writes lines into a file, from whatever process; with `hangs` it never comes back from a beginning."""
 
     path: Path
@@ -103,7 +103,7 @@ class FileTracker:
         """Whether the file speaks of the run."""
         return self.path.exists() and run_id in self.path.read_text()
 
-    def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> FileTracker:
+    def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> FileLogger:
         """Write that it begins."""
         if self.hangs:
             threading.Event().wait()
@@ -143,7 +143,7 @@ def a_run(outputs: Path, name: str = "0" * 16, steps: int = 3, **config: object)
 
 
 def losses(steps: int) -> list[tuple[str, int, float]]:
-    """What a tracker has of a run's steps."""
+    """What a logger has of a run's steps."""
     return [("train/loss", step, 1 / step) for step in range(1, steps + 1)]
 
 

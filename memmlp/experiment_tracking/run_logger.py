@@ -1,4 +1,4 @@
-"""The tracking slot: the interface of trackers, and a run as one tracker shows it."""
+"""The tracking slot: the interface of loggers, and a run as one logger shows it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from memmlp.runs.run import Run
 
 
 class Shown(Protocol):
-    """A run that a tracker is showing."""
+    """A run that a logger is showing."""
 
     def log(self, points: Sequence[CurvePoint]) -> None:
         """Show further values of the curves."""
@@ -35,8 +35,8 @@ class Shown(Protocol):
         """Release the run, whether or not it ended."""
 
 
-class Tracker(Protocol):
-    """The slot's interface. Every method may block and may raise, since no run ever waits for a tracker.
+class RunLogger(Protocol):
+    """The slot's interface. Every method may block and may raise, since no run ever waits for a logger.
 
     An implementation must be picklable, since it works in a separate process.
 
@@ -48,36 +48,36 @@ class Tracker(Protocol):
 
     @property
     def place(self) -> str:
-        """Where the tracker shows runs: an address or a folder."""
+        """Where the logger shows runs: an address or a folder."""
 
     def has(self, run_id: str) -> bool:
-        """Return whether the tracker shows a run with that id."""
+        """Return whether the logger shows a run with that id."""
 
     def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> Shown:
-        """Show a run with exactly these facts and points, replacing whatever the tracker had of it."""
+        """Show a run with exactly these facts and points, replacing whatever the logger had of it."""
 
     def sweep(self, facts: SweepFacts) -> None:
         """Show a sweep as a group that contains its runs; a second call changes nothing."""
 
 
 class Busy(Exception):
-    """Raised when another process is showing the run in that tracker."""
+    """Raised when another process is showing the run in that logger."""
 
 
 class Session:
-    """The work of showing one run in one tracker, from the run's beginning to its end.
+    """The work of showing one run in one logger, from the run's beginning to its end.
 
     Args:
-        tracker: the tracker.
+        logger: the logger.
         run: the run, which has begun.
-        ledgers: the folder of notes about what trackers have.
+        ledgers: the folder of notes about what loggers have.
 
     Raises:
-        Busy: if another process is showing the run in that tracker.
+        Busy: if another process is showing the run in that logger.
     """
 
-    def __init__(self, tracker: Tracker, run: Run, ledgers: Path):
-        self.tracker, self.run = tracker, run
+    def __init__(self, logger: RunLogger, run: Run, ledgers: Path):
+        self.logger, self.run = logger, run
         ledgers.mkdir(parents=True, exist_ok=True)
         self.ledger = ledgers / f"{run.id}.json"
         self.lock = FileLock(ledgers / f"{run.id}.lock")
@@ -98,7 +98,7 @@ class Session:
                 self.shown.log(points)
 
     def end(self) -> None:
-        """Show the run's final state from its folder, and note that this tracker has it."""
+        """Show the run's final state from its folder, and note that this logger has it."""
         if not self.run.manifest_path.exists():
             return  # it never began
         with self._trying():
@@ -108,16 +108,16 @@ class Session:
             assert self.shown is not None
             while points := self.tail.read():
                 self.shown.log(points)
-            if self.tail.repeated:  # trackers can't take back what the run logged before it was resumed
+            if self.tail.repeated:  # loggers can't take back what the run logged before it was resumed
                 self._begin(facts)
             mark = fingerprint(self.run, facts)
             self.shown.end(facts, final(facts, self.run.step))
             write_json(self.ledger, {"shown": mark})
 
     def up_to_date(self) -> bool:
-        """Return whether the tracker has everything of the run already."""
+        """Return whether the logger has everything of the run already."""
         kept = read_json(self.ledger).get("shown")
-        return kept == fingerprint(self.run, facts_of(self.run)) and self.tracker.has(self.run.id)
+        return kept == fingerprint(self.run, facts_of(self.run)) and self.logger.has(self.run.id)
 
     def leave(self) -> None:
         """Release the run."""
@@ -134,7 +134,7 @@ class Session:
             shown, self.shown = self.shown, None
             shown.leave()
         self.tail, self.results = Tail(self.run), facts.results
-        self.shown = self.tracker.begin(facts, self.tail.history())
+        self.shown = self.logger.begin(facts, self.tail.history())
 
     def _outdated(self, facts: RunFacts) -> bool:
         """Return whether a result was measured again since the run began to be shown, with another value."""
@@ -142,7 +142,7 @@ class Session:
 
     @contextlib.contextmanager
     def _trying(self) -> Iterator[None]:
-        """Start anew after a failure, since it is unknown how much the tracker received."""
+        """Start anew after a failure, since it is unknown how much the logger received."""
         try:
             yield
         except BaseException:

@@ -1,30 +1,30 @@
-"""A run as one tracker is shown it."""
+"""A run as one logger is shown it."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from fake_tracker import FakeTracker, a_run
+from fake_logger import FakeLogger, a_run
 
 from memmlp.common.files import write_json
-from memmlp.experiment_tracking.tracker import Session
+from memmlp.experiment_tracking.run_logger import Session
 
 
 def test_a_result_that_is_measured_again_replaces_what_is_shown(tmp_path: Path):
-    """Trackers can't take values back, so that the run is shown anew; new results need none of that."""
-    tracker, run = FakeTracker(), a_run(tmp_path)
+    """Loggers can't take values back, so that the run is shown anew; new results need none of that."""
+    logger, run = FakeLogger(), a_run(tmp_path)
     run.finish([])
 
     def measured(before: dict[str, float], after: dict[str, float]) -> int:
-        tracker.server.begun = 0
+        logger.server.begun = 0
         write_json(run.results_path, before)
-        session = Session(tracker, run, tmp_path / "ledgers")
+        session = Session(logger, run, tmp_path / "ledgers")
         session.step()
         write_json(run.results_path, after)
         session.end()
         assert session.up_to_date()
         session.leave()
-        return tracker.server.begun
+        return logger.server.begun
 
     assert measured({"a": 6.5}, {"a": 6.5}) == 1
     assert measured({"a": 6.5}, {"a": 6.5, "b": 1.0}) == 1
@@ -34,8 +34,8 @@ def test_a_result_that_is_measured_again_replaces_what_is_shown(tmp_path: Path):
 
 def test_steps_that_a_resumed_run_repeats_are_shown_once(tmp_path: Path):
     """With the values of the weights that count, which the last line of a step has."""
-    tracker, run = FakeTracker(), a_run(tmp_path, steps=3)
-    session = Session(tracker, run, tmp_path / "ledgers")
+    logger, run = FakeLogger(), a_run(tmp_path, steps=3)
+    session = Session(logger, run, tmp_path / "ledgers")
     session.step()
     for step in (2, 3, 4):
         run.log(step, {"loss": 9.0})
@@ -43,6 +43,6 @@ def test_steps_that_a_resumed_run_repeats_are_shown_once(tmp_path: Path):
     run.finish([])
     session.end()
     values = [("train/loss", 1, 1.0), *(("train/loss", step, 9.0) for step in (2, 3, 4))]
-    assert tracker.server.values[run.id] == values
+    assert logger.server.values[run.id] == values
     assert session.up_to_date()
     session.leave()

@@ -6,12 +6,12 @@ import struct
 from pathlib import Path
 
 import pytest
-from fake_tracker import a_run, an_outdated_evaluation
+from fake_logger import a_run, an_outdated_evaluation
 
 from memmlp.experiment_tracking.logged_values import SweepFacts
+from memmlp.experiment_tracking.run_logger import Session
 from memmlp.experiment_tracking.sync import sync
-from memmlp.experiment_tracking.tensorboard_tracker import TensorBoard, file_name
-from memmlp.experiment_tracking.tracker import Session
+from memmlp.experiment_tracking.tensorboard_logger import TensorBoard, file_name
 from memmlp.runs.notes import set_note
 from memmlp.runs.run import Run
 
@@ -35,49 +35,49 @@ def events(folder: Path) -> list[tuple[str, int, float | str]]:
     return found
 
 
-def curve(tracker: TensorBoard) -> list[tuple[int, float]]:
-    (folder,) = Path(tracker.place).iterdir()
+def curve(logger: TensorBoard) -> list[tuple[int, float]]:
+    (folder,) = Path(logger.place).iterdir()
     return [(step, value) for tag, step, value in events(folder) if tag == "train/loss"]
 
 
 def test_a_curve_grows_and_is_written_once(tmp_path: Path):
-    tracker, run = TensorBoard(tmp_path), a_run(tmp_path, steps=2)
+    logger, run = TensorBoard(tmp_path), a_run(tmp_path, steps=2)
     run.write_manifest({"name": "memory=gru · seed 1"})
-    session = Session(tracker, run, tmp_path / "ledgers")
+    session = Session(logger, run, tmp_path / "ledgers")
     session.step()
-    assert curve(tracker) == [(1, 1.0), (2, 0.5)]
+    assert curve(logger) == [(1, 1.0), (2, 0.5)]
     run.log(3, {"loss": 0.25})
     session.step()
-    assert curve(tracker) == [(1, 1.0), (2, 0.5), (3, 0.25)]
+    assert curve(logger) == [(1, 1.0), (2, 0.5), (3, 0.25)]
     session.leave()
-    sync(tracker, [run], tmp_path, print)
-    assert curve(tracker) == [(1, 1.0), (2, 0.5), (3, 0.25)]
-    assert sync(tracker, [run], tmp_path, print) == {"same": 1}
-    assert [path.name for path in Path(tracker.place).iterdir()] == ["memory=gru · seed 1 · 00000000"]
+    sync(logger, [run], tmp_path, print)
+    assert curve(logger) == [(1, 1.0), (2, 0.5), (3, 0.25)]
+    assert sync(logger, [run], tmp_path, print) == {"same": 1}
+    assert [path.name for path in Path(logger.place).iterdir()] == ["memory=gru · seed 1 · 00000000"]
 
 
 def test_runs_with_long_names_have_a_folder_each(tmp_path: Path):
     """Names of seeds differ at their end alone, which is behind what there is room for."""
-    tracker = TensorBoard(tmp_path)
+    logger = TensorBoard(tmp_path)
     runs = [a_run(tmp_path, 16 * digit) for digit in "12"]
     for seed, run in enumerate(runs):
         run.write_manifest({"name": f"{'optim.weight_decay=0.05 · ' * 5}seed {seed}"})
     for _ in range(2):
-        sync(tracker, runs, tmp_path, print)
-        folders = [path.name for path in Path(tracker.place).iterdir()]
+        sync(logger, runs, tmp_path, print)
+        folders = [path.name for path in Path(logger.place).iterdir()]
         assert sorted(name[-11:] for name in folders) == [f" · {run.id[:8]}" for run in runs]
         assert {len(name) for name in folders} == {120}
-    assert sync(tracker, runs, tmp_path, print) == {"same": 2}
-    assert all(tracker.has(run.id) for run in runs)
+    assert sync(logger, runs, tmp_path, print) == {"same": 2}
+    assert all(logger.has(run.id) for run in runs)
 
 
 def test_it_tells_how_a_run_ended_and_what_people_said(tmp_path: Path):
-    tracker, run = TensorBoard(tmp_path), a_run(tmp_path)
+    logger, run = TensorBoard(tmp_path), a_run(tmp_path)
     run.fail("loss is nan")
     set_note(run, "a note")
     an_outdated_evaluation(run)
-    sync(tracker, [run], tmp_path, print)
-    (folder,) = Path(tracker.place).iterdir()
+    sync(logger, [run], tmp_path, print)
+    (folder,) = Path(logger.place).iterdir()
     texts = {tag.split("/")[0]: text for tag, _, text in events(folder) if isinstance(text, str)}
     assert (texts["status"], texts["reason"], texts["note"]) == ("failed", "loss is nan", "a note")
     assert "| seed | 0 |" in texts["config"]
@@ -85,22 +85,22 @@ def test_it_tells_how_a_run_ended_and_what_people_said(tmp_path: Path):
 
 
 def test_a_run_that_is_gone_from_it_is_shown_again(tmp_path: Path):
-    tracker, run = TensorBoard(tmp_path), a_run(tmp_path)
-    sync(tracker, [run], tmp_path, print)
-    assert tracker.has(run.id)
-    assert not tracker.has(Run.of(tmp_path, "1" * 16).id)
+    logger, run = TensorBoard(tmp_path), a_run(tmp_path)
+    sync(logger, [run], tmp_path, print)
+    assert logger.has(run.id)
+    assert not logger.has(Run.of(tmp_path, "1" * 16).id)
 
 
 def test_a_sweep_is_its_table_verdicts_and_aggregates(tmp_path: Path):
-    tracker = TensorBoard(tmp_path)
+    logger = TensorBoard(tmp_path)
     (tmp_path / "table.md").write_text("| a table |")
     facts = SweepFacts(
         "mine", tmp_path, "done", {}, {"a/stream/MPJPE": 6.5}, {"a/stream/MPJPE": "holds"},
         (tmp_path / "table.md",),
     )  # fmt: skip
     for _ in range(2):
-        tracker.sweep(facts)
-    found = {tag.split("/text")[0]: value for tag, _, value in events(Path(tracker.place) / "sweep mine")}
+        logger.sweep(facts)
+    found = {tag.split("/text")[0]: value for tag, _, value in events(Path(logger.place) / "sweep mine")}
     assert (found["status"], found["table"]) == ("done", "| a table |")
     assert "| a/stream/MPJPE | holds |" in str(found["verdicts"])
     assert found["a/stream/MPJPE"] == 6.5

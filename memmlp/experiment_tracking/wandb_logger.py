@@ -1,4 +1,4 @@
-"""The tracker that writes W&B's offline runs, with W&B's own client; `wandb sync` uploads them."""
+"""The logger that writes W&B's offline runs, with W&B's own client; `wandb sync` uploads them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tracker that writes TensorBoard's event files; it needs tensorboardX, not TensorBoard."""
+"""The logger that writes TensorBoard's event files; it needs tensorboardX, not TensorBoard."""
 
 from __future__ import annotations
 
