@@ -21,7 +21,7 @@ INTERRUPTIBLE = "import signal; signal.signal(signal.SIGINT, signal.default_int_
 MAIN = [sys.executable, "-c", f"{INTERRUPTIBLE}; from memmlp.cli.main import main; main()"]
 SIZES = ["profile.depth=2", "profile.memory_layers=[2]"]
 SMALL = [*SIZES, "data.synth.minutes=0.1"]  # smaller than profile=tiny
-FEW = ["tracking=none", "threads=1", "optim.steps=6", "vqvae.steps=6"]
+FEW = ["loggers=none", "threads=1", "optim.steps=6", "vqvae.steps=6"]
 TINY = ["profile=tiny", *SIZES, "data.synth.minutes=0.2", *FEW]
 BRIEF = ["profile=tiny", *SMALL, *FEW]  # half as much motion, where no two runs' weights are compared
 

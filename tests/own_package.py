@@ -17,7 +17,7 @@ from memmlp.runs.recipe_versions import RECIPES
 
 EXAMPLE = Path(__file__).parent.parent / "docs/examples/feet"
 PACKAGE = "memmlp_feet"
-TINY = ["profile=tiny", *SMALL, "tracking=none", "threads=1", "optim.validate_every=20"]
+TINY = ["profile=tiny", *SMALL, "loggers=none", "threads=1", "optim.validate_every=20"]
 KILLED = [*TINY, "optim.steps=40", "optim.checkpoint_every=5"]
 """Words of a run that takes long enough to be killed at a checkpoint."""
 REGISTERS = (METRICS, SCHEMAS, SMALLEST, UNITS, RECIPES, HIGHER, plugins._active, plugins._folders)

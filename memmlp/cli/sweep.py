@@ -200,9 +200,9 @@ def show_outcome(shown: ShownSweep, words: Sequence[str], chosen: Sweep, labels:
 
     Exits with 1 if something failed that the arms with these labels need.
     """
+    from memmlp.cli.loggers import show_in_loggers
     from memmlp.cli.seed_rounds import closing
     from memmlp.cli.table import SHOWN_MODES, on_screen, table_of_plan
-    from memmlp.cli.track import show_in_loggers
     from memmlp.config import plugins
     from memmlp.config.compose_plan import orphans, sweep_folder
     from memmlp.tables.measured_run import load

@@ -27,7 +27,7 @@ from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import IK, LBFGS, Arms, NoIK
 from memmlp.evaluation.metrics import UserMetric
-from memmlp.experiment_tracking.follower_pipe import Tracking
+from memmlp.experiment_tracking.follower_pipe import Loggers
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.network_coordinates import Coordinates, Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
@@ -93,7 +93,7 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
         ),
         deployment=build_deployment(cfg),
         predictions=Path(cfg.save_predictions) if cfg.save_predictions else None,
-        tracking=build_tracking(cfg),
+        loggers=build_loggers(cfg),
         called=readable_name,
         unrefined=unrefined,
     )
@@ -148,10 +148,10 @@ def untrained(overrides: Sequence[str]) -> MotionModel:
     return architecture.build(normalizer, codes).eval()
 
 
-def build_tracking(cfg: DictConfig) -> Tracking:
-    """Build the tracking of a config, which shows runs in any number of loggers."""
+def build_loggers(cfg: DictConfig) -> Loggers:
+    """Build the loggers of a config, in which its runs are shown."""
     outputs = Path(cfg.paths.outputs)
-    return Tracking(tuple(built(node, outputs=outputs) for node in cfg.tracking.values()), outputs)
+    return Loggers(tuple(built(node, outputs=outputs) for node in cfg.loggers.values()), outputs)
 
 
 def build_architecture(cfg: DictConfig) -> Architecture:

@@ -21,7 +21,7 @@ from memmlp.tables.measured_run import Measured
 from memmlp.training.train_network import NetworkTraining
 from memmlp.training.training_flops import training_flops
 
-ELSEWHERE = ("seed", "data", "paths", "profile", "tracking", "evaluation", "export", "device", "threads")
+ELSEWHERE = ("seed", "data", "paths", "profile", "loggers", "evaluation", "export", "device", "threads")
 """Groups and keys on which a training's number of operations does not depend."""
 
 

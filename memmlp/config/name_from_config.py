@@ -110,7 +110,7 @@ def _default(overrides: tuple[str, ...]) -> dict[str, Any]:
             cfg = compose("train", list(overrides))
     finally:
         GlobalHydra.instance().hydra = before
-    groups = {str(key): cfg[key] for key in cfg if key not in ("data", "paths", "tracking")}
+    groups = {str(key): cfg[key] for key in cfg if key not in ("data", "paths", "loggers")}
     return {
         key: OmegaConf.to_container(group, resolve=True) if OmegaConf.is_config(group) else group
         for key, group in groups.items()

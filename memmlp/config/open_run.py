@@ -23,7 +23,7 @@ from memmlp.runs.identity import DEPLOYMENT, EVALUATION, INFERENCE, training_con
 from memmlp.runs.lookup import find_run
 from memmlp.runs.run import Run
 
-ACTING = (*EVALUATION, *DEPLOYMENT, "data", "paths", "plugins", "tracking")
+ACTING = (*EVALUATION, *DEPLOYMENT, "data", "paths", "plugins", "loggers")
 """The groups whose keys have an effect on a finished run; so have the keys of INFERENCE."""
 
 

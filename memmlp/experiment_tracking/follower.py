@@ -2,7 +2,7 @@
 
 Lines on its standard input tell it which runs begin and end. It reads the content from the runs' own folders,
 so a run never waits for a logger, and a slow logger loses nothing. Each logger has its own thread and
-bounded inbox. A logger that fails is tried again after longer and longer pauses; `memmlp track sync` fills
+bounded inbox. A logger that fails is tried again after longer and longer pauses; `memmlp loggers sync` fills
 in what it missed in the end.
 """
 

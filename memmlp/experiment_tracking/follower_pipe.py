@@ -24,7 +24,7 @@ MOST = 10.0  # seconds of that at most
 
 
 @dataclass(frozen=True)
-class Tracking:
+class Loggers:
     """The loggers in which an experiment's runs are shown.
 
     Attributes:
@@ -63,14 +63,14 @@ class Feed:
         dropped: how many events were dropped, because the process is gone or its pipe is full.
     """
 
-    def __init__(self, tracking: Tracking):
+    def __init__(self, tracking: Loggers):
         self.dropped = 0
         self.names = [logger.name for logger in tracking.loggers]
         self.answers: dict[tuple[str, str], str] = {}
         self.answered = threading.Condition()
         self.process = self._start(tracking) if tracking.loggers else None
 
-    def _start(self, tracking: Tracking) -> subprocess.Popen[bytes] | None:
+    def _start(self, tracking: Loggers) -> subprocess.Popen[bytes] | None:
         environment = os.environ | child_imports() | {"OMP_NUM_THREADS": "1"}
         given = {
             "loggers": pickle.dumps(tracking.loggers),
@@ -150,16 +150,16 @@ class Feed:
         if answer["event"] == "trouble":
             warn(f"{what} is not shown by {logger} at present: {answer['reason']}")
         elif answer["event"] == "missed":
-            warn(f"{logger} lacks {what}: {answer['reason']}; memmlp track sync fills it in")
+            warn(f"{logger} lacks {what}: {answer['reason']}; memmlp loggers sync fills it in")
         elif answer["event"] == "dropped":
-            warn(f"{logger} was too slow for {answer['reason']} events; memmlp track sync fills them in")
+            warn(f"{logger} was too slow for {answer['reason']} events; memmlp loggers sync fills them in")
 
 
-_FEEDS: dict[Tracking, Feed] = {}
+_FEEDS: dict[Loggers, Feed] = {}
 """The feeds of this process; the processes behind them end with it."""
 
 
-def feed_of(tracking: Tracking) -> Feed:
+def feed_of(tracking: Loggers) -> Feed:
     """Return this process' feed for these loggers; a new one if its process has died."""
     feed = _FEEDS.get(tracking)
     if feed is not None and tracking.loggers and not feed.alive:

@@ -11,7 +11,7 @@ import torch
 
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.evaluation import Evaluation
-from memmlp.experiment_tracking.follower_pipe import Tracking
+from memmlp.experiment_tracking.follower_pipe import Loggers
 from memmlp.motion.motion_source import MotionSource, Prepared
 from memmlp.networks.architectures import VQVAE_SETTINGS, Architecture
 from memmlp.runs.identity import NETWORK, Identity, deployment_id, evaluation_id
@@ -67,7 +67,7 @@ class Experiment:
         evaluation: how the network is evaluated.
         deployment: how the network is exported and timed; None where it is not deployed.
         predictions: folder for predictions of the test clips; None to write none.
-        tracking: shows the runs in run loggers, such as MLflow.
+        loggers: show the runs elsewhere, such as in MLflow.
         called: makes a readable name for a run from the word for its kind and its config.
         unrefined: the experiment of the network that is refined; None without a refiner.
     """
@@ -83,7 +83,7 @@ class Experiment:
     evaluation: Evaluation
     deployment: Deployment | None
     predictions: Path | None
-    tracking: Tracking
+    loggers: Loggers
     called: Callable[[str, Mapping[str, Any]], str] = unnamed
     unrefined: Experiment | None = None
 

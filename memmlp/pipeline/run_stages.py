@@ -22,7 +22,7 @@ from memmlp.common.files import write_json
 from memmlp.common.progress import remark, tell
 from memmlp.evaluation.evaluation import picture
 from memmlp.evaluation.predictions import save_predictions
-from memmlp.experiment_tracking.follower_pipe import Tracking
+from memmlp.experiment_tracking.follower_pipe import Loggers
 from memmlp.live.pose_latency import measure_pose
 from memmlp.motion.motion_source import Prepared
 from memmlp.pipeline.data_remarks import (
@@ -249,8 +249,8 @@ def recording_outcome(experiment: Experiment, run: Run, again: bool = False) -> 
     """
     missing = again or not run.done or not all(map(run.has, experiment.stage_ids))
     missing = missing or bool(unmeasured(experiment, run))
-    tracking = experiment.tracking if missing else Tracking((), experiment.outputs)
-    with tracking.following(run):
+    loggers = experiment.loggers if missing else Loggers((), experiment.outputs)
+    with loggers.following(run):
         try:
             yield
         except (LeaseLost, BrokenPipeError):

@@ -25,8 +25,8 @@ class Renamed(NamedTuple):
     option: str | None = None
 
 
-GROUPS = {"normalizer": "frame", "tracking": "tracker"}
-"""The former names of groups, by their present ones. `tracker` was a group of version 0.1."""
+GROUPS = {"frame": "normalizer", "tracker": "loggers", "tracking": "loggers"}
+"""The present names of groups, by their former ones. `tracker` was a group of version 0.1."""
 
 RENAMED = (
     Renamed("normalizer.z_scores", "frame.normalize"),
@@ -56,8 +56,7 @@ OPTIONS = {("loss", "of_network"): "own"}
 
 def with_present_names(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return a recorded config, or some of its groups, with the names that keys and options have today."""
-    present = {former: now for now, former in GROUPS.items()}
-    tree = {present.get(group, group): content for group, content in config.items()}
+    tree = {GROUPS.get(group, group): content for group, content in config.items()}
     for one in RENAMED:
         group, _, key = one.now.partition(".")
         content, former = tree.get(group), one.former.partition(".")[2]
@@ -88,7 +87,11 @@ def _former_key(key: str, flat: Mapping[str, Any]) -> str:
     group, dot, rest = key.partition(".")
     option = f"{group}={flat.get(f'{group}.name')}"
     named = (one.former for one in RENAMED if key == one.now and one.option in (None, option))
-    return next(named, GROUPS.get(group, group) + dot + rest)
+    return next(named, _former_group(group) + dot + rest)
+
+
+def _former_group(group: str) -> str:
+    return next((former for former, now in GROUPS.items() if now == group), group)
 
 
 def former_option(group: str, name: str | None) -> str | None:
@@ -109,8 +112,7 @@ def _present_override(word: str, overrides: Sequence[str]) -> str:
     if (now := present_option(key, value)) is not None:
         return f"{key}={now}"
     group, dot, rest = key.partition(".")
-    named = {former: now for now, former in GROUPS.items()}
-    return f"{named.get(group, group)}{dot}{rest}{equals}{value}"
+    return f"{GROUPS.get(group, group)}{dot}{rest}{equals}{value}"
 
 
 def present_key(key: str, allowed: Sequence[str]) -> str | None:
@@ -121,17 +123,12 @@ def present_key(key: str, allowed: Sequence[str]) -> str | None:
         allowed: the keys that its group has, or the groups for a group itself.
     """
     group, dot, rest = key.partition(".")
-    named = next((now for now, former in GROUPS.items() if former == group), None)
+    named = GROUPS.get(group)
     if not dot:
         return named
-    found = (one.now.split(".") for one in RENAMED if one.former in (key, _formerly(group, rest)))
+    found = (one.now.split(".") for one in RENAMED if one.former in (key, f"{_former_group(group)}.{rest}"))
     now = next((name for _, name in found if name in allowed), rest if named else None)
     return None if now is None else f"{named or group}.{now}"
-
-
-def _formerly(group: str, key: str) -> str:
-    """Return a key's dotted name with its group's former name."""
-    return f"{GROUPS.get(group, group)}.{key}"
 
 
 def present_option(group: str, former: str) -> str | None:

@@ -27,7 +27,7 @@ NEUTRAL = (
     "data",  # its digest stands for it: frames, clips, split and rest pose; but see `_draws`
     "profile",  # sizes, read by the groups that use them
     "paths",
-    "tracking",
+    "loggers",
     "device",  # recorded, and flagged where runs that are compared differ in it
     "threads",
     "force",

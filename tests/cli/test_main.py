@@ -299,7 +299,7 @@ def test_hydras_environment_is_left_as_it_was(memmlp: Memmlp, jobs: list[DictCon
         ("memmlp train memory=n", {"memory=no_codes", "memory=none"}),
         ("memmlp train memory=none optim.preci", {"optim.precision="}),
         ("memmlp train memory=none memory.wid", set()),
-        ("memmlp tr", {"train", "track"}),
+        ("memmlp tr", {"train"}),
         ("memmlp ", set(COMMANDS)),
         ("memmlp runs sh", set()),
     ],

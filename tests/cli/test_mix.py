@@ -14,7 +14,7 @@ from memmlp.motion.clip import Clip
 from memmlp.motion.formats.npz import write_clip
 from memmlp.runs.lookup import list_runs
 
-TINY = ["profile=tiny", "tracking=none", "threads=1", "optim.steps=6", "memory=none", "export.graph=off"]
+TINY = ["profile=tiny", "loggers=none", "threads=1", "optim.steps=6", "memory=none", "export.graph=off"]
 
 
 @pytest.fixture

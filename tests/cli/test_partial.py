@@ -19,7 +19,7 @@ from memmlp.runs.lookup import list_runs
 
 TINY = [
     "profile=tiny",
-    "tracking=none",
+    "loggers=none",
     "threads=1",
     "optim.steps=6",
     "memory=none",

@@ -66,7 +66,7 @@ def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Runs:
     found = Runs(tmp_path / "outputs")
     monkeypatch.setattr("memmlp.config.compose_plan.kept_or_new_plan", found.planned)
     monkeypatch.setattr("memmlp.cli.sweep.run_workers", found.work)
-    monkeypatch.setattr("memmlp.cli.track.show_in_loggers", lambda *_: None)
+    monkeypatch.setattr("memmlp.cli.loggers.show_in_loggers", lambda *_: None)
     return found
 
 

@@ -26,7 +26,7 @@ from memmlp.pipeline.run_stages import make_upstream_runs
 from memmlp.runs.run import Run
 
 TINY = [
-    "profile=tiny", "data.synth.minutes=0.1", "tracking=none", "threads=1", "optim.steps=2", "vqvae.steps=2",
+    "profile=tiny", "data.synth.minutes=0.1", "loggers=none", "threads=1", "optim.steps=2", "vqvae.steps=2",
     "optim.batch=4", "model.width=8", "memory.width=4", "vqvae.width=8", "evaluation.ik_iterations=2",
 ]  # fmt: skip
 SMALL = [
@@ -253,7 +253,7 @@ GROUPS: dict[str, list[str]] = {
     "normalizer.coordinates": ["heading", "head_relative", "world"],
     "evaluation.ik": ["off", "lbfgs", "arms"],
     "vqvae.codebook": ["ema", "gradient"],
-    "tracking": ["mlflow", "none", "tensorboard", "wandb", "all"],
+    "loggers": ["mlflow", "none", "tensorboard", "wandb", "all"],
 }
 OPTIONS = [f"{group}={option}" for group, options in GROUPS.items() for option in options]
 PAIRS = [(a, b) for a, b in combinations(OPTIONS, 2) if a.split("=")[0] != b.split("=")[0]]
@@ -354,7 +354,7 @@ def test_a_joint_vqvae_is_part_of_the_runs_identity_and_its_own_stage_is_not():
 
     base = identity()
     assert all(identity(change) != base for change in ("vqvae.codes=32", "vqvae.encoder_depth=2"))
-    assert all(identity(change) == base for change in ("vqvae.steps=7", "vqvae.lr=0.5", "tracking=none"))
+    assert all(identity(change) == base for change in ("vqvae.steps=7", "vqvae.lr=0.5", "loggers=none"))
     assert experiment_of().upstream_identities("data") == []
 
 

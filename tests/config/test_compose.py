@@ -403,8 +403,8 @@ def test_a_config_without_the_schema_is_refused(memmlp: Memmlp, tmp_path: Path):
     [
         ["model.width=8", "seed=3"],
         ["profile=tiny", "memory=gru", "experiment=no_memory", "optim.steps=4"],
-        ["model=avatar_poser", "loss.position=2", "~tracking"],
-        ["profile.width=16", "data.split.groups=[a,b]", "paths.outputs=elsewhere", "tracking=none"],
+        ["model=avatar_poser", "loss.position=2", "~loggers"],
+        ["profile.width=16", "data.split.groups=[a,b]", "paths.outputs=elsewhere", "loggers=none"],
     ],
 )
 def test_a_job_is_composed_as_hydra_composes_it(overrides):

@@ -31,7 +31,7 @@ def name(*words: str) -> str:
     ("model=bodiffusion optim.ema=null", "model=bodiffusion · optim.ema=null · seed 0"),
     ("profile=paper optim.lr=0.01", "profile=paper · optim.lr=0.01 · seed 0"),
     ("profile.width=64", "profile.width=64 · seed 0"),
-    ("data.drawn_by=clips device=cpu threads=1 tracking=none evaluation.modes=[window]",
+    ("data.drawn_by=clips device=cpu threads=1 loggers=none evaluation.modes=[window]",
      "data.drawn_by=clips · seed 0"),
 ])  # fmt: skip
 def test_what_differs(words: str, expected: str):

@@ -15,7 +15,7 @@ import pytest
 from fake_logger import FileLogger, a_run
 
 from memmlp.experiment_tracking import follower_pipe
-from memmlp.experiment_tracking.follower_pipe import Tracking, feed_of
+from memmlp.experiment_tracking.follower_pipe import Loggers, feed_of
 from memmlp.runs.run import Run
 
 PATIENCE = 300.0  # seconds; nothing comes near
@@ -35,24 +35,24 @@ def _closed() -> Iterator[None]:
 
 
 def test_without_loggers_there_is_no_process_and_no_file(tmp_path: Path):
-    tracking, run = Tracking((), tmp_path), a_run(tmp_path)
-    with tracking.following(run):
+    loggers, run = Loggers((), tmp_path), a_run(tmp_path)
+    with loggers.following(run):
         pass
-    tracking.sweep(tmp_path)
-    assert feed_of(tracking).process is None
+    loggers.sweep(tmp_path)
+    assert feed_of(loggers).process is None
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
 
 
 @pytest.mark.slow
 def test_runs_are_followed_by_one_process_to_their_ends(tmp_path: Path):
-    tracking = Tracking((FileLogger(tmp_path / "shown"),), tmp_path)
+    loggers = Loggers((FileLogger(tmp_path / "shown"),), tmp_path)
     first, second = a_run(tmp_path, "0" * 16), a_run(tmp_path, "1" * 16)
-    with tracking.following(first):
+    with loggers.following(first):
         first.finish([])
     second.fail("why")
-    with contextlib.suppress(KeyError), tracking.following(second):
+    with contextlib.suppress(KeyError), loggers.following(second):
         raise KeyError
-    followed = feed_of(tracking)
+    followed = feed_of(loggers)
     for run in (first, second):
         assert followed.wait(run.folder, PATIENCE)
     lines = (tmp_path / "shown").read_text().splitlines()
@@ -73,9 +73,9 @@ def test_a_logger_that_hangs_costs_a_share_of_the_run(tmp_path: Path, monkeypatc
     # The clock of this file alone: another thread that looks at the time takes none of its readings.
     clock = SimpleNamespace(monotonic=iter([0.0, 50.0, 1000.0, 90_000.0]).__next__)
     monkeypatch.setattr(follower_pipe, "time", clock)
-    tracking, run = Tracking((FileLogger(tmp_path / "shown", hangs=True),), tmp_path), a_run(tmp_path)
+    loggers, run = Loggers((FileLogger(tmp_path / "shown", hangs=True),), tmp_path), a_run(tmp_path)
     for _ in range(2):
-        with tracking.following(run):
+        with loggers.following(run):
             run.log(9, {"loss": 1.0})
     assert waited == [0.5, follower_pipe.MOST]
 
@@ -84,26 +84,26 @@ def test_a_logger_that_hangs_costs_a_share_of_the_run(tmp_path: Path, monkeypatc
 def test_a_follower_that_is_killed_harms_nothing_and_is_replaced(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    tracking, run = Tracking((FileLogger(tmp_path / "shown"),), tmp_path), a_run(tmp_path)
-    with tracking.following(run):
-        followed = feed_of(tracking)
+    loggers, run = Loggers((FileLogger(tmp_path / "shown"),), tmp_path), a_run(tmp_path)
+    with loggers.following(run):
+        followed = feed_of(loggers)
         assert followed.process is not None
         followed.process.kill()
         followed.process.wait()
         run.finish([])
     assert followed.dropped == 1
     assert "is not shown" in capsys.readouterr().err
-    with tracking.following(run):
-        assert feed_of(tracking) is not followed
-    assert feed_of(tracking).wait(run.folder, PATIENCE)
+    with loggers.following(run):
+        assert feed_of(loggers) is not followed
+    assert feed_of(loggers).wait(run.folder, PATIENCE)
     assert (tmp_path / "shown").read_text().splitlines()[-1] == f"end {run.id} done"
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="no SIGSTOP here")
 def test_a_follower_that_does_not_read_drops_events_and_blocks_nobody(tmp_path: Path):
-    tracking = Tracking((FileLogger(tmp_path / "shown"),), tmp_path)
-    followed = feed_of(tracking)
+    loggers = Loggers((FileLogger(tmp_path / "shown"),), tmp_path)
+    followed = feed_of(loggers)
     assert followed.process is not None
     os.kill(followed.process.pid, signal.SIGSTOP)
     for _ in range(10_000):
@@ -116,8 +116,8 @@ def test_a_process_that_cannot_be_started_is_a_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setattr(sys, "executable", str(tmp_path / "no-python"))
-    tracking, run = Tracking((FileLogger(tmp_path / "shown"),), tmp_path), a_run(tmp_path)
-    with tracking.following(run):
+    loggers, run = Loggers((FileLogger(tmp_path / "shown"),), tmp_path), a_run(tmp_path)
+    with loggers.following(run):
         pass
     err = capsys.readouterr().err
     assert err.startswith("memmlp: warning: runs are not shown by file: ")
@@ -128,9 +128,9 @@ KILLED = """
 import sys, os, signal
 from pathlib import Path
 from fake_logger import FileLogger, a_run
-from memmlp.experiment_tracking.follower_pipe import Tracking
+from memmlp.experiment_tracking.follower_pipe import Loggers
 outputs = Path(sys.argv[1])
-with Tracking((FileLogger(outputs / "shown"),), outputs).following(a_run(outputs)):
+with Loggers((FileLogger(outputs / "shown"),), outputs).following(a_run(outputs)):
     os.kill(os.getpid(), signal.SIGKILL)
 """
 

@@ -15,7 +15,7 @@ from command_line import run as command
 from fake_logger import a_run, losses
 from processes import until
 
-from memmlp.experiment_tracking.follower_pipe import Tracking, feed_of
+from memmlp.experiment_tracking.follower_pipe import Loggers, feed_of
 from memmlp.experiment_tracking.mlflow_logger import MLflow, quiet
 from memmlp.runs.run import Run
 
@@ -102,17 +102,17 @@ def test_a_server_that_is_killed_and_restarted_has_everything_once(
     server: Server, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ):
     outputs = tmp_path / "outputs"
-    tracking = Tracking((MLflow(server.url, outputs),), outputs)
+    loggers = Loggers((MLflow(server.url, outputs),), outputs)
     server.start()
     run = a_run(outputs, "0" * 16)
-    with tracking.following(run):
+    with loggers.following(run):
         until(lambda: server.values(run) == losses(3), "the curve while it goes on")
         server.kill()
         run.log(4, {"loss": 1 / 4})
         until(lambda: "is not shown by mlflow at present" in capfd.readouterr().err, "the warning")
         server.start()
         until(lambda: server.values(run) == losses(4), "what was missed")
-        feed = feed_of(tracking)
+        feed = feed_of(loggers)
         assert feed.process is not None
         feed.process.kill()  # who would show the rest
         feed.process.wait()
@@ -123,7 +123,7 @@ def test_a_server_that_is_killed_and_restarted_has_everything_once(
     other.fail("loss is nan")
     assert server.values(run) == losses(4)
 
-    words = ["track", "sync", "--uri", server.url, "--outputs", str(outputs)]
+    words = ["loggers", "sync", "--uri", server.url, "--outputs", str(outputs)]
     for more, now in (([], 2), ([], 0), (["--full"], 2)):
         assert f"2 runs ({now} of them now)" in command(tmp_path, *words, *more)
         assert (server.values(run), server.values(other)) == (losses(5), losses(3))

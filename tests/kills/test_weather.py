@@ -116,7 +116,7 @@ def test_a_disk_that_is_full_at_any_write(plan: Plan, tmp_path: Path, monkeypatc
 @pytest.mark.parametrize("words", [["train"], ["sweep", "14", "executor=debug"], ["tune"]])
 def test_outputs_that_are_read_only(memmlp: Memmlp, tmp_path: Path, monkeypatch, words: list[str]):
     Disk(monkeypatch, tmp_path, errno.EROFS, 0)
-    ran = memmlp(*words, "profile=tiny", "tracking=none")
+    ran = memmlp(*words, "profile=tiny", "loggers=none")
     assert one_line(ran, "Read-only file system", "outputs"), ran.err
     assert not (tmp_path / "outputs").exists()
 

@@ -19,7 +19,7 @@ from memmlp.config.compose import composed
 from memmlp.config.schema import restored
 from memmlp.deploy.deployment import GRAPHS
 from memmlp.evaluation import modes as evaluation
-from memmlp.experiment_tracking.follower_pipe import Tracking
+from memmlp.experiment_tracking.follower_pipe import Loggers
 from memmlp.motion.dataset import MotionDataset
 from memmlp.pipeline.experiment import Experiment
 from memmlp.pipeline.run_stages import make_upstream_runs
@@ -29,7 +29,7 @@ from memmlp.runs.run import Run
 BASE = [
     "profile=tiny", "data=mocap", "data.root=clips", "data.split.groups=[]", "memory.shift=frame",
     "data.min_frames=12",
-    "tracking=all", "threads=1", "optim.steps=4", "vqvae.steps=3",
+    "loggers=all", "threads=1", "optim.steps=4", "vqvae.steps=3",
     "optim.batch=4", "model.width=8", "model.frames=5", "model.depth=4", "memory.layers=[2]", "vqvae.width=8",
     "memory.width=4", "predictor.depth=1", "optim.checkpoint_every=9", "optim.validate_every=9",
     "evaluation.ik=lbfgs", "evaluation.ik_iterations=2", "optim.schedule=step", "optim.drop_at=0.5",
@@ -60,7 +60,7 @@ CHANGES: dict[str, str] = {
     "evaluation.ik_iterations": "3",
     "export.graph": "naive", "export.precision": "int8", "export.opset": "15", "export.latency_steps": "250",
     "export.alone": "true",
-    "tracking.mlflow.uri": "sqlite:///other.db", "tracking.wandb.project": "other",
+    "loggers.mlflow.uri": "sqlite:///other.db", "loggers.wandb.project": "other",
 }  # fmt: skip
 
 UNTRIED = {
@@ -87,8 +87,8 @@ LAST_DIGITS = {
 """Keys that are asked for less than exactness, and why."""
 NOWHERE = {
     "force", "save_predictions", "data.name", "data.strict", "optim.checkpoint_every", "optim.log_every",
-    "optim.validate_every", "evaluation.modes", "evaluation.batch", "tracking.mlflow.uri",
-    "tracking.wandb.project",
+    "optim.validate_every", "evaluation.modes", "evaluation.batch", "loggers.mlflow.uri",
+    "loggers.wandb.project",
 }  # fmt: skip
 """Keys that change no result; what they do has tests of its own."""
 TOGETHER = sorted(NOWHERE - {"evaluation.modes"})  # which leaves a mode out
@@ -141,7 +141,7 @@ def outcome(folder: Path, overrides: list[str]) -> Outcome:
     experiment = replace(build_experiment(composed([*BASE, *overrides])), outputs=folder)
     data = experiment.motion.prepare()
     identity = experiment.identity(data.digest)
-    codes = make_upstream_runs(replace(experiment, tracking=Tracking((), folder)), data).model
+    codes = make_upstream_runs(replace(experiment, loggers=Loggers((), folder)), data).model
     run = Run(folder / "run")
     run.folder.mkdir(parents=True)
     model = experiment.training.train(experiment.architecture, data, codes, run, experiment.device)

@@ -9,7 +9,7 @@ from memmlp.runs.lookup import list_runs
 SHORT = [
     "profile=tiny",
     "data.synth.minutes=0.05",
-    "tracking=none",
+    "loggers=none",
     "threads=1",
     "optim.steps=2",
     "export.graph=off",

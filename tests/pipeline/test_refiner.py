@@ -17,7 +17,7 @@ from memmlp.pipeline.run_in_processes import run_in_processes
 from memmlp.runs.lookup import list_runs
 
 SHORT = [
-    "profile=tiny", "data.synth.minutes=0.05", "tracking=none", "threads=1", "optim.steps=2",
+    "profile=tiny", "data.synth.minutes=0.05", "loggers=none", "threads=1", "optim.steps=2",
     "export.graph=off", "model=vae_hmd",
 ]  # fmt: skip
 

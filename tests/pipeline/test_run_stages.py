@@ -25,7 +25,7 @@ from memmlp.common.progress import telling
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.config.package_data import packaged
-from memmlp.experiment_tracking.follower_pipe import Tracking
+from memmlp.experiment_tracking.follower_pipe import Loggers
 from memmlp.live.stream import Stream
 from memmlp.motion.dataset import MotionDataset
 from memmlp.pipeline import run_stages
@@ -297,7 +297,7 @@ def test_a_failure_of_the_work_is_kept_with_the_run_and_an_interruption_is_not(
 ):
     run = Run.of(tmp_path, "0" * 16)
     run.begin("memmlp", {}, data="d", upstream=None)
-    experiment: Any = SimpleNamespace(tracking=Tracking((), tmp_path), stage_ids=(), outputs=tmp_path)
+    experiment: Any = SimpleNamespace(loggers=Loggers((), tmp_path), stage_ids=(), outputs=tmp_path)
     with pytest.raises(type(error)), recording_outcome(experiment, run):
         raise error
     assert (run.failure is None) == (failure is None)
@@ -308,7 +308,7 @@ def test_work_that_ended_well_is_no_death(tmp_path: Path):
     """Else the tenth evaluation of a trained run would count as the tenth process that died on it."""
     run = Run.of(tmp_path, "0" * 16)
     run.begin("memmlp", {}, data="d", upstream=None)
-    experiment: Any = SimpleNamespace(tracking=Tracking((), tmp_path), stage_ids=(), outputs=tmp_path)
+    experiment: Any = SimpleNamespace(loggers=Loggers((), tmp_path), stage_ids=(), outputs=tmp_path)
 
     def evaluate(error: BaseException | None = None) -> None:
         with recording_outcome(experiment, run):

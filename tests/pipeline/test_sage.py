@@ -20,7 +20,7 @@ from memmlp.runs.lookup import check_trained, list_runs
 from memmlp.training.train_sage import PARTS
 
 SHORT = [
-    "model=sage", "profile=tiny", "data.synth.minutes=0.05", "tracking=none", "threads=1", "export.graph=off",
+    "model=sage", "profile=tiny", "data.synth.minutes=0.05", "loggers=none", "threads=1", "export.graph=off",
     "optim.steps=2", *(f"upstream.{part}.steps=2" for part in PARTS), "model.sampling_steps=1",
 ]  # fmt: skip
 

@@ -51,7 +51,7 @@ def _as_it_was(run: Run) -> None:
         if isinstance(content, dict)
         else content
         for group, content in run.config.items()
-        if group != "tracking"
+        if group != "loggers"
     }
     config["tracker"] = TRACKER
     run.config_path.write_text(yaml.safe_dump(_mapped(config, _earlier_class), sort_keys=False))
@@ -102,10 +102,10 @@ def test_its_files_have_the_names_that_0_1_wrote(earlier):
         names = set(file.keys())
     assert {name for name in names if "normalizer" in name} == set()
     assert any(name.endswith("frame.rest") for name in names)
-    assert {"tracking", "normalizer"} <= run.config.keys()
+    assert {"loggers", "normalizer"} <= run.config.keys()
     written = yaml.safe_load(run.config_path.read_text())
     assert {"tracker", "frame"} <= written.keys()
-    assert written.keys().isdisjoint({"tracking", "normalizer"})
+    assert written.keys().isdisjoint({"loggers", "normalizer"})
     assert (written["data"]["weighting"], run.config["data"]["drawn_by"]) == ("frames", "frames")
     assert "yardstick" not in next(run.deployments.glob("*/latency.json")).read_text()
 

@@ -222,15 +222,15 @@ def test_an_arm_of_the_decomposition_trains(arm: Arm):
 
 
 TERMS = {
-    "AGRoL-MLP-41": ["rotation"],
-    "+ features": ["rotation"],
-    "+ Mem-MLP's backbone": ["rotation"],
-    "+ Eqs. 1-2": ["rotation", "rotation_velocity"],
-    "+ learned weights": ["rotation", "rotation_velocity"],
-    "less second branch": ["rotation", "rotation_velocity"],
-    "+ second branch": ["rotation", "rotation_velocity", "position", "velocity"],
-    "less hand term": ["rotation", "rotation_velocity", "position", "velocity"],
-    "rest": ["rotation", "rotation_velocity", "position", "velocity", "hand"],
+    "AGRoL-MLP-41": ["rotation_all"],
+    "+ features": ["rotation_all"],
+    "+ Mem-MLP's backbone": ["rotation_all"],
+    "+ Eqs. 1-2": ["rotation_all", "rotation_velocity"],
+    "+ learned weights": ["rotation_all", "rotation_velocity"],
+    "less second branch": ["rotation_all", "rotation_velocity"],
+    "+ second branch": ["rotation_all", "rotation_velocity", "position_branch", "velocity_lower_body"],
+    "less hand term": ["rotation_all", "rotation_velocity", "position_branch", "velocity_lower_body"],
+    "rest": ["rotation_all", "rotation_velocity", "position_branch", "velocity_lower_body", "hand"],
 }
 
 

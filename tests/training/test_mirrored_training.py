@@ -18,7 +18,7 @@ from memmlp.runs.run import Run
 
 DATA = SimpleNamespace(manifest=SimpleNamespace(rest=builtin_rest_joints()), open=lambda split: tiny.frames())
 SHORT = [
-    "profile=tiny", "tracking=none", "optim.steps=2", "optim.batch=4", "vqvae.steps=2",
+    "profile=tiny", "loggers=none", "optim.steps=2", "optim.batch=4", "vqvae.steps=2",
 ]  # fmt: skip
 
 

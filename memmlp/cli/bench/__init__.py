@@ -7,11 +7,11 @@ import click
 from memmlp.cli.bench.chaos import chaos, chaos_tune
 from memmlp.cli.bench.latency import latency
 from memmlp.cli.bench.live_frame import live_frame
+from memmlp.cli.bench.loggers import loggers
 from memmlp.cli.bench.prepare_data import prepare
 from memmlp.cli.bench.soak import soak
 from memmlp.cli.bench.stream_evaluation import stream
 from memmlp.cli.bench.time_to_error import train
-from memmlp.cli.bench.tracking_overhead import tracking
 from memmlp.cli.bench.ui_page import ui
 from memmlp.cli.bench.verdict_simulation import verdicts
 
@@ -22,6 +22,6 @@ def bench() -> None:
 
 
 for command in (
-    prepare, stream, train, latency, live_frame, soak, tracking, chaos, chaos_tune, verdicts, ui,
+    prepare, stream, train, latency, live_frame, soak, loggers, chaos, chaos_tune, verdicts, ui,
 ):  # fmt: skip
     bench.add_command(command)

@@ -29,7 +29,7 @@ from memmlp.runs.identity import NETWORK
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
 
-OVERRIDES = ["profile=tiny", "data.synth.minutes=1", "tracking=none", "threads=1"]
+OVERRIDES = ["profile=tiny", "data.synth.minutes=1", "loggers=none", "threads=1"]
 PAUSES = (0.5, 3.0)  # seconds between kills of a sweep's processes
 LONG_PAUSES = (3.0, 9.0)  # of a search's, whose one controller has to start again in between
 

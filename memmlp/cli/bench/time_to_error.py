@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 ERRORS = ("MPJRE", "MPJPE", "MPJVE", "Jitter")
 ARMS = ("today", "recipe")
-BASE = ("profile=small", "device=cpu", "tracking=none")
+BASE = ("profile=small", "device=cpu", "loggers=none")
 WARM_UP = 3  # steps of each that are taken before any is timed
 
 

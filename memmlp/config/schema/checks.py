@@ -128,9 +128,9 @@ def _check_names(cfg: DictConfig) -> None:
         ours = schema is not None and schema.__module__.startswith("memmlp.")
         if path and ours and not path.startswith("memmlp."):
             raise InputError(f"{slot}.name={node.name}: allowed for {path} is a name of its own")
-    for name, node in cfg.tracking.items():
+    for name, node in cfg.loggers.items():
         if node.name != name:
-            raise InputError(f"tracking.{name}.name={node.name}: allowed is {name}, the logger's key")
+            raise InputError(f"loggers.{name}.name={node.name}: allowed is {name}, the logger's key")
 
 
 def _check_combinations(cfg: DictConfig) -> None:

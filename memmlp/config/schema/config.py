@@ -217,7 +217,7 @@ class ExportConfig:
 
 @dataclass
 class LoggerConfig:
-    """Where runs are shown beside their folders (conf/tracking), by the name of the logger."""
+    """Where runs are shown beside their folders (conf/loggers), by the name of the logger."""
 
     name: str = key(Text())
     _target_: str = MISSING
@@ -270,7 +270,7 @@ class Config:
     optim: OptimConfig = field(default_factory=OptimConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     export: ExportConfig = field(default_factory=ExportConfig)
-    tracking: dict[str, LoggerConfig] = field(default_factory=dict)
+    loggers: dict[str, LoggerConfig] = field(default_factory=dict)
 
 
 SCHEMAS: dict[str, type] = {
@@ -328,9 +328,9 @@ SCHEMAS: dict[str, type] = {
     "optim_schedule_free": ScheduleFreeConfig,
     "evaluation": EvaluationConfig,
     "export": ExportConfig,
-    "tracking_mlflow": MLflowConfig,
-    "tracking_tensorboard": TensorBoardConfig,
-    "tracking_wandb": WandBConfig,
+    "loggers_mlflow": MLflowConfig,
+    "loggers_tensorboard": TensorBoardConfig,
+    "loggers_wandb": WandBConfig,
 }
 
 
@@ -368,7 +368,7 @@ def add_schema(option: str, schema: type) -> None:
     Raises:
         ValueError: where there is one of that name, or it does not extend the schema of its slot.
     """
-    slots = {**GROUPS, "tracking": LoggerConfig, "data": DataConfig}
+    slots = {**GROUPS, "loggers": LoggerConfig, "data": DataConfig}
     slot = slots.get(option.partition("_")[0])
     if slot is None or option in SCHEMAS:
         raise ValueError(f"'{option}': allowed is GROUP_OPTION with a new option of {', '.join(slots)}")

@@ -34,7 +34,7 @@ def _restored(group: str, content: Mapping[str, Any]) -> Any:
 
     A component that is not part of this package keeps the path of its class.
     """
-    if group == "tracking":
+    if group == "loggers":
         return _loggers(content)
     option = SCHEMAS.get(f"{group}_{option_in_slot({group: content}, group)}")
     ours = option is None or option.__module__.startswith("memmlp.")
@@ -51,7 +51,7 @@ def _loggers(content: Mapping[str, Any]) -> Any:
 
 
 def _restored_logger(name: str, content: Mapping[str, Any]) -> Any:
-    option = SCHEMAS.get(f"tracking_{name}")
+    option = SCHEMAS.get(f"loggers_{name}")
     return OmegaConf.merge(OmegaConf.structured(option or LoggerConfig), _content(option, content))
 
 

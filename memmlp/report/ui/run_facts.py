@@ -29,7 +29,7 @@ from memmlp.runs.motion_seen import frames_seen, hardly_trained
 from memmlp.runs.run import Run, latency_name
 from memmlp.runs.shown_name import run_name
 
-HIDDEN = ("paths", "tracking", "tracker", "force", "hydra", "save_predictions")
+HIDDEN = ("paths", "loggers", "force", "hydra", "save_predictions")
 """Config groups that are not shown with a run."""
 
 ACTING = {*EVALUATION, *DEPLOYMENT, *(key.split(".")[0] for key in INFERENCE)}

@@ -1,4 +1,4 @@
-"""`memmlp bench tracking`: how much slower a training is while loggers show it."""
+"""`memmlp bench loggers`: how much slower a training is while loggers show it."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ import click
 from memmlp.runs.run import Run
 
 
-@click.command("tracking")
+@click.command("loggers")
 @click.option("--blocks", default=40, show_default=True, help="How many pieces of the training are timed.")
 @click.option("--steps", default=25, show_default=True, help="Length of a piece, training steps.")
 @click.option("--uri", help="MLflow's store, such as a dead or slow server.  [default: a sqlite file]")
 @click.argument("overrides", nargs=-1)
-def tracking(blocks: int, steps: int, uri: str | None, overrides: tuple[str, ...]) -> None:
+def loggers(blocks: int, steps: int, uri: str | None, overrides: tuple[str, ...]) -> None:
     """Time a training that is shown in loggers, by pieces.
 
     In every other piece the process that shows it is stopped, so that the ratio of neighbours tells what it
     costs, whatever else the machine does. OVERRIDES are those of `memmlp train`; the default is profile=small
-    memory=no_codes and tracking=mlflow. It is all done in a temporary folder.
+    memory=no_codes and loggers=mlflow. It is all done in a temporary folder.
     """
     import tempfile
 
@@ -34,15 +34,15 @@ def tracking(blocks: int, steps: int, uri: str | None, overrides: tuple[str, ...
     from memmlp.experiment_tracking.follower_pipe import feed_of
     from memmlp.pipeline.run_stages import train_run
 
-    address = [f"tracking.mlflow.uri={uri}"] if uri else []
+    address = [f"loggers.mlflow.uri={uri}"] if uri else []
     length = [f"optim.steps={(blocks + 3) * steps}", f"optim.log_every={steps}"]  # two pieces warm up
     with tempfile.TemporaryDirectory() as folder:
         words = ["profile=small", "memory=no_codes", f"paths.outputs={folder}", *length, *address, *overrides]
         experiment = build_experiment(composed(words))
-        feed = feed_of(experiment.tracking)
+        feed = feed_of(experiment.loggers)
         follower = feed.process
         run = PiecewiseRun(Path(folder) / "runs" / ("0" * 16), follower.pid if follower else None)
-        with experiment.tracking.following(run):
+        with experiment.loggers.following(run):
             train_run(experiment, run, experiment.motion.prepare(), None)
         feed.close()
         if follower is not None:

@@ -1,4 +1,4 @@
-"""`memmlp track` and `memmlp mlflow`: run folders shown in MLflow, TensorBoard and W&B."""
+"""`memmlp loggers` and `memmlp mlflow`: run folders shown in MLflow, TensorBoard and W&B."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ if TYPE_CHECKING:
     from memmlp.sweep.plan import Plan
     from memmlp.tables.table import Table
 
-TRACKERS = ("mlflow", "tensorboard", "wandb")
+LOGGERS = ("mlflow", "tensorboard", "wandb")
 
 
-@click.group("track")
-def track() -> None:
+@click.group("loggers")
+def loggers() -> None:
     """Fill in what MLflow, TensorBoard or W&B lack of runs."""
 
 
-@track.command("sync")
+@loggers.command("sync")
 @click.option(
     "--logger",
     "names",
     multiple=True,
-    type=click.Choice(TRACKERS),
+    type=click.Choice(LOGGERS),
     help="Which to bring up to date; may be repeated.  [default: mlflow]",
 )
 @click.option(
@@ -87,12 +87,12 @@ def show_in_loggers(plan: Plan, folder: Path, table: Table) -> None:
     """Write the sweep's summary into its folder, and show it in the loggers that show its runs."""
     from omegaconf import OmegaConf
 
-    from memmlp.config.build import build_tracking
+    from memmlp.config.build import build_loggers
     from memmlp.tables.sweep_summary import write_summary
 
     write_summary(plan, table, folder)
     if plan.tasks:
-        build_tracking(OmegaConf.create(dict(plan.tasks[0].config))).sweep(folder)
+        build_loggers(OmegaConf.create(dict(plan.tasks[0].config))).sweep(folder)
 
 
 def mlflow_has_page() -> bool:

@@ -1,4 +1,4 @@
-"""`memmlp track sync` and `memmlp mlflow`, and training with loggers, as a person types them."""
+"""`memmlp loggers sync` and `memmlp mlflow`, and training with loggers, as a person types them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from conftest import Memmlp, one_line
 from fake_logger import FakeLogger, Server, a_run
 
-from memmlp.cli import track
+from memmlp.cli import loggers
 from memmlp.common.files import write_json
 
 
@@ -16,7 +16,7 @@ from memmlp.common.files import write_json
 def server(monkeypatch: pytest.MonkeyPatch) -> Server:
     """What is shown, by a logger in memory."""
     logger = FakeLogger()
-    monkeypatch.setattr(track, "_loggers", lambda *_: [logger])
+    monkeypatch.setattr(loggers, "_loggers", lambda *_: [logger])
     return logger.server
 
 
@@ -27,25 +27,25 @@ def test_sync_shows_runs_and_sweeps_and_then_nothing_more(memmlp: Memmlp, tmp_pa
     names = {"name": "mine", "status": "done", "labels": {}, "aggregates": {}, "verdicts": {}}
     (outputs / "sweeps" / "mine").mkdir(parents=True)
     write_json(outputs / "sweeps" / "mine" / "summary.json", names)
-    assert memmlp("track", "sync").out == "2 runs (2 of them now) and 1 sweeps are in memory\n"
-    assert memmlp("track", "sync").out == "2 runs (0 of them now) and 1 sweeps are in memory\n"
-    assert memmlp("track", "sync", "--full").out == "2 runs (2 of them now) and 1 sweeps are in memory\n"
+    assert memmlp("loggers", "sync").out == "2 runs (2 of them now) and 1 sweeps are in memory\n"
+    assert memmlp("loggers", "sync").out == "2 runs (0 of them now) and 1 sweeps are in memory\n"
+    assert memmlp("loggers", "sync", "--full").out == "2 runs (2 of them now) and 1 sweeps are in memory\n"
     assert server.status == {"0" * 16: "done", "1" * 16: "failed"}
 
 
 def test_what_could_not_be_shown_is_a_line_each(memmlp: Memmlp, tmp_path: Path, server: Server):
     a_run(tmp_path / "outputs")
     server.down = True
-    ran = memmlp("track", "sync")
+    ran = memmlp("loggers", "sync")
     assert ran.code == 1
     assert ran.err == f"memmlp: warning: run {'0' * 16} is not shown by fake: connection refused\n"
 
 
 def test_a_logger_that_there_is_not_is_refused(memmlp: Memmlp):
-    assert one_line(memmlp("track", "sync", "--logger", "paper"), "paper", "mlflow", "tensorboard", "wandb")
+    assert one_line(memmlp("loggers", "sync", "--logger", "paper"), "paper", "mlflow", "tensorboard", "wandb")
 
 
 def test_the_loggers_of_a_command_line(tmp_path: Path):
-    found = track._loggers(["wandb", "mlflow", "tensorboard", "wandb"], "http://x", "mine", tmp_path)
+    found = loggers._loggers(["wandb", "mlflow", "tensorboard", "wandb"], "http://x", "mine", tmp_path)
     assert [one.name for one in found] == ["wandb", "mlflow", "tensorboard"]
     assert found[1].place == "http://x"
