@@ -38,7 +38,7 @@ def test_page_names_files_that_exist():
 
 
 def test_page_names_parts_of_modules_that_exist():
-    """Such as `tracker_frames.GAP` and `tables.statistics`; keys of the config have the same form."""
+    """Such as `tracker_resampling.GAP` and `tables.statistics`; keys of the config have the same form."""
     parts: dict[str, set[str]] = defaultdict(set)
     for path in [*PACKAGE.rglob("*.py"), *(path for path in PACKAGE.rglob("*") if path.is_dir())]:
         parts[path.parent.name].add(path.stem)

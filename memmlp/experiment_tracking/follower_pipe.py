@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from memmlp.common.child_imports import child_imports
+from memmlp.common.child_process_imports import child_imports
 from memmlp.experiment_tracking.run_logger import RunLogger
 from memmlp.runs.run import Run
 

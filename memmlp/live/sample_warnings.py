@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from memmlp.live.tracker_frames import GAP, Lost
+from memmlp.live.tracker_resampling import GAP, Lost
 
 JUMPS, STILL = 5, 30  # samples in a row
 COARSE = 1e-3  # seconds between neighbouring times

@@ -18,7 +18,15 @@ from memmlp.live.exported import ExportedNetwork
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
 from memmlp.live.sample_warnings import OddSamples, SampleWarning
 from memmlp.live.spaces import SpaceName, space_of
-from memmlp.live.tracker_frames import TRACKERS, UPRIGHT, Features, Lost, TrackerFrames, heading_of, t_pose
+from memmlp.live.tracker_resampling import (
+    TRACKERS,
+    UPRIGHT,
+    Features,
+    Lost,
+    TrackerFrames,
+    heading_of,
+    t_pose,
+)
 from memmlp.live.wearer import wearer
 from memmlp.runs.run import Run
 
@@ -111,7 +119,7 @@ class Stream:
 
     A tracker's rotation is that of SMPL's joint (head, wrists): the turn from a T-pose, see
     `memmlp.live.spaces`. Devices that are worn in other orientations or places differ from the joints by
-    constant offsets, which `calibrate` finds or `offsets` gives. `memmlp.live.tracker_frames` says what
+    constant offsets, which `calibrate` finds or `offsets` gives. `memmlp.live.tracker_resampling` says what
     happens at other rates than 60 Hz, to lost trackers and after gaps.
 
     Args:

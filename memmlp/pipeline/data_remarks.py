@@ -8,10 +8,10 @@ from typing import Any
 from memmlp.motion.body import FPS
 from memmlp.motion.clip import LINES, Skipped
 from memmlp.motion.motion_source import Prepared
-from memmlp.motion.preparing.amass import absent_subsets
-from memmlp.motion.preparing.divided_clips import divided_remark
+from memmlp.motion.preparing.amass_names import absent_subsets
 from memmlp.motion.preparing.groups import unfitting
 from memmlp.motion.preparing.manifest import ClipRecord, Manifest
+from memmlp.motion.preparing.split_leaks import divided_remark
 from memmlp.pipeline.experiment import Experiment
 
 SLOW = 0.99  # of the network's rate, below which a recording lacks frames: 59.94 Hz is as good as 60

@@ -9,7 +9,6 @@ import pytest
 import tiny
 import torch
 
-from memmlp.common import core_share
 from memmlp.deploy import latency
 from memmlp.deploy.export import export, save
 from memmlp.deploy.onnx_stream import OnnxStream

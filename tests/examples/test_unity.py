@@ -25,7 +25,7 @@ from memmlp.deploy.onnx_stream import open_session
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream
-from memmlp.live.tracker_frames import GAP
+from memmlp.live.tracker_resampling import GAP
 from memmlp.motion.body import PARENTS, builtin_rest_joints
 
 pytestmark = pytest.mark.slow

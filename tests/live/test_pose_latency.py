@@ -2,7 +2,6 @@
 
 import pytest
 
-from memmlp.common import core_share
 from memmlp.live.pose_latency import alternate, measure_pose, time_poses_in_turn
 from memmlp.live.stream import Stream
 

@@ -12,7 +12,7 @@ import pytest
 import memmlp
 from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.sample_warnings import JUMPS, STILL, OddSamples
-from memmlp.live.tracker_frames import UPRIGHT
+from memmlp.live.tracker_resampling import UPRIGHT
 
 STANDING = np.array([[0, 0, 1.57], [0.7, 0, 1.4], [-0.7, 0, 1.4]])
 ALL, NO_HANDS = (False, False, False), (False, True, True)

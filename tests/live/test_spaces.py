@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from memmlp.common.errors import InputError
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix
 from memmlp.live.spaces import SPACES, space_of
-from memmlp.live.tracker_frames import UPRIGHT
+from memmlp.live.tracker_resampling import UPRIGHT
 
 numbers = st.floats(-10, 10)
 points = st.tuples(numbers, numbers, numbers).map(np.array)

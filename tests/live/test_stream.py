@@ -28,7 +28,7 @@ from memmlp.live.sample_warnings import SampleWarning
 from memmlp.live.soak import TrackedMotion, repetitions, soak
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Offsets, Stream
-from memmlp.live.tracker_frames import t_pose
+from memmlp.live.tracker_resampling import t_pose
 from memmlp.motion.body import HEAD, N_JOINTS, SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading
 from memmlp.motion.synthetic import synthesize_clip

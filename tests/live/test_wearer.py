@@ -14,7 +14,7 @@ from memmlp.live.rotations import BodyTree
 from memmlp.live.sample_warnings import SampleWarning
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Offsets, Stream
-from memmlp.live.tracker_frames import t_pose
+from memmlp.live.tracker_resampling import t_pose
 from memmlp.live.wearer import stature, wearer
 from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
 

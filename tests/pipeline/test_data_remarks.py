@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from memmlp.motion.clip import Skipped
-from memmlp.motion.preparing.amass import S2_TEST, S2_TRAIN
+from memmlp.motion.preparing.amass_names import S2_TEST, S2_TRAIN
 from memmlp.pipeline import data_remarks
 
 

@@ -78,7 +78,7 @@ def _synthetic() -> MotionDataset:
 
 def _motion(clips: MotionDataset) -> TrackedMotion:
     """Join all clips into one motion of trackers and true joints."""
-    from memmlp.live.full_graph import trackers_of
+    from memmlp.live.full_scope_graph import trackers_of
     from memmlp.live.soak import TrackedMotion
     from memmlp.motion.body import N_JOINTS, POSITION, SPARSE_DIM
 

@@ -13,9 +13,9 @@ from rich.table import Table
 from memmlp.common.errors import one_line
 from memmlp.motion.body import FPS
 from memmlp.motion.clip import INTERPOLATED
-from memmlp.motion.preparing.divided_clips import divided_remark
 from memmlp.motion.preparing.groups import unfitting
 from memmlp.motion.preparing.several_folders import source_of
+from memmlp.motion.preparing.split_leaks import divided_remark
 
 if TYPE_CHECKING:
     from pathlib import Path

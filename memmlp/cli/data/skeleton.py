@@ -24,8 +24,8 @@ def guess(file: Path, out: Path | None) -> None:
     Prints the map with comments that say what is guessed and what is in doubt, imports the file with it, and
     says what is wrong then. Exits with 1 where the file can't be imported so.
     """
-    from memmlp.motion.importing.guess import as_yaml, check, write_map
-    from memmlp.motion.importing.guess import guess as propose
+    from memmlp.motion.importing.guessed_map import as_yaml, check, write_map
+    from memmlp.motion.importing.guessed_map import guess as propose
     from memmlp.motion.importing.importable_files import read_recording
 
     recording = read_recording(file)

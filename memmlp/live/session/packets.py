@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.live.tracker_frames import TRACKERS
+from memmlp.live.tracker_resampling import TRACKERS
 
 POSE = 7  # numbers of a pose
 PREFIX = "/memmlp/"

@@ -18,7 +18,7 @@ from memmlp.common.progress import remark
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
 from memmlp.live.session.packets import Packet, Parse, QuaternionPoses
 from memmlp.live.spaces import Space, SpaceName
-from memmlp.live.tracker_frames import TrackerSample, between
+from memmlp.live.tracker_resampling import TrackerSample, between
 from memmlp.motion.body import (
     FPS,
     MOTION_DIM,

@@ -16,7 +16,7 @@ from torch import Tensor
 from memmlp.common.progress import tell
 from memmlp.deploy.deployment import lower
 from memmlp.deploy.export import export
-from memmlp.live.full_graph import export_full
+from memmlp.live.full_scope_graph import export_full
 from memmlp.live.rotations import BodyTree
 from memmlp.live.spaces import SPACES
 from memmlp.live.wearer import stature

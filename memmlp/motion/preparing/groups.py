@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.motion.preparing.amass import unpacked
+from memmlp.motion.preparing.amass_names import unpacked
 
 COLUMNS = ("clip", "group")
 KEY = "data.split.groups_file"

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from memmlp.common.errors import InputError
-from memmlp.motion.preparing.amass import clip_key, subset
+from memmlp.motion.preparing.amass_names import clip_key, subset
 
 PHASES = ("train", "test")  # the parts for which there are published lists
 

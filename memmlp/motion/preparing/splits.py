@@ -2,7 +2,7 @@
 
 A clip's name is its path below the data root without suffix, `/`-separated. Clips that belong together
 (`Grouping`) are never divided (`memmlp.motion.preparing.grouped_split`). Entries of lists and names of
-subsets match AMASS' clips from any release (`memmlp.motion.preparing.amass`), and patterns of groups don't
+subsets match AMASS' clips from any release (`memmlp.motion.preparing.amass_names`), and patterns of groups don't
 see an archive's folder above that of a subset.
 """
 
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from memmlp.common.errors import InputError
-from memmlp.motion.preparing.amass import subset, unpacked
+from memmlp.motion.preparing.amass_names import subset, unpacked
 from memmlp.motion.preparing.grouped_split import Grouped, check_fractions, rank
 from memmlp.motion.preparing.published_lists import PHASES, check_once, entries_of_clips, read_lists
 

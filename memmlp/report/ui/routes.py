@@ -14,7 +14,7 @@ from memmlp.report.ui.replay import Predict, Replays, body
 from memmlp.report.ui.runs import Rows
 from memmlp.report.ui.searches import Searches
 from memmlp.report.ui.sweeps import Sweeps
-from memmlp.report.ui.users_of_run import uses_by_run
+from memmlp.report.ui.uses_of_run import uses_by_run
 from memmlp.runs.identity import ID
 from memmlp.sweep.definition import MODES
 

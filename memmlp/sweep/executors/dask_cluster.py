@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from memmlp.common.child_imports import child_imports
+from memmlp.common.child_process_imports import child_imports
 from memmlp.common.errors import InputError
 from memmlp.sweep.executors.executor import Work
 from memmlp.sweep.executors.gpus import VISIBLE

@@ -14,7 +14,7 @@ from memmlp.live.calibration_file import read_calibration
 from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.session.wearer_fitting import COUNTDOWN, Fitting, read_order
 from memmlp.live.stream import Stream
-from memmlp.live.tracker_frames import t_pose
+from memmlp.live.tracker_resampling import t_pose
 
 pytestmark = pytest.mark.slow
 

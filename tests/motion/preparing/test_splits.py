@@ -5,7 +5,7 @@ from collections import Counter
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.motion.preparing.amass import S2_TEST, S2_TRAIN
+from memmlp.motion.preparing.amass_names import S2_TEST, S2_TRAIN
 from memmlp.motion.preparing.splits import ListSplit, SeededSplit, SubsetSplit
 
 NAMES = [f"salsa/{n:02}" for n in range(1, 31)] + [f"martial/{n:02}" for n in range(1, 11)]

@@ -1,4 +1,4 @@
-// From samples of three trackers, each at its own time, to frames at the network's rate: memmlp.live.tracker_frames, rule by rule.
+// From samples of three trackers, each at its own time, to frames at the network's rate: memmlp.live.tracker_resampling, rule by rule.
 //
 // A sample is { time, positions, rotations }: seconds, and of head, left and right wrist the position (metres, OpenXR's
 // axes: Y up, -Z forward) and the rotation (a quaternion, the identity for a person in T-pose who looks along -Z).

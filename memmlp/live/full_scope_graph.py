@@ -10,7 +10,7 @@ the head on its tracker; `joints` (1, 22, 3), metres, the network's own position
 the same names with the suffix `.next`.
 
 All inputs and outputs are in the chosen frame of reference (memmlp.live.spaces). Lost trackers, other rates
-and gaps (memmlp.live.tracker_frames) are left to the caller: NaN in is NaN out.
+and gaps (memmlp.live.tracker_resampling) are left to the caller: NaN in is NaN out.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from memmlp.motion.preparing.divided_clips import divided_remark
+from memmlp.motion.preparing.split_leaks import divided_remark
 
 
 def manifest_of(parts: Sequence[tuple[str, str]], split: dict[str, Any], tied: Sequence[str] = ()) -> Any:

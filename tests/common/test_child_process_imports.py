@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import memmlp
-from memmlp.common.child_imports import child_imports, children_import_the_same
+from memmlp.common.child_process_imports import child_imports, children_import_the_same
 
 FILE = "import memmlp; print(memmlp.__file__)"
 

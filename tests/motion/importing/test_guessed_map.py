@@ -11,7 +11,7 @@ from bvh_samples import refuse, write
 from skeleton_families import FAMILIES, anonymous, family, in_order, renamed, walking
 
 from memmlp.motion.formats.bvh import Bvh, read_bvh
-from memmlp.motion.importing.guess import as_yaml, check, guess, write_map
+from memmlp.motion.importing.guessed_map import as_yaml, check, guess, write_map
 from memmlp.motion.importing.skeleton_map import find_skeleton, load_skeleton
 
 

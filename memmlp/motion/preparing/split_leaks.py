@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 
-from memmlp.motion.preparing.amass import divided_subjects
+from memmlp.motion.preparing.amass_names import divided_subjects
 from memmlp.motion.preparing.groups import untied
 from memmlp.motion.preparing.manifest import Manifest
 

@@ -2,8 +2,6 @@
 
 import pytest
 
-from memmlp.common import core_share
-
 
 def test_a_share_by_clocks_of_the_tests_own(monkeypatch: pytest.MonkeyPatch):
     clocks = {"perf_counter": 100.0, "thread_time": 3.0}

@@ -3,7 +3,7 @@
 import pytest
 
 from memmlp.config.compose import composed
-from memmlp.motion.preparing.amass import PEOPLE, divided_subjects
+from memmlp.motion.preparing.amass_names import PEOPLE, divided_subjects
 from memmlp.motion.preparing.groups import Grouping
 
 ONE = [

@@ -18,7 +18,7 @@ from memmlp.common.errors import InputError
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.opsets import OPSETS, converted
 from memmlp.deploy.parity import ROUNDING, TOLERANCE
-from memmlp.live.full_graph import export_full, full_parity, full_tolerated, quaternions, trackers_of
+from memmlp.live.full_scope_graph import export_full, full_parity, full_tolerated, quaternions, trackers_of
 from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream

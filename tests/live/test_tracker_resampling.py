@@ -8,7 +8,7 @@ import tiny
 import wearer
 
 from memmlp.live.rotations import BodyTree
-from memmlp.live.tracker_frames import (
+from memmlp.live.tracker_resampling import (
     NOBODY,
     Features,
     Hold,
