@@ -113,7 +113,7 @@ def network(model: MotionModel) -> Numbers:
     torch.manual_seed(7)
     model.train()
     past, new = clip[:, : model.past_frames], clip[:, model.past_frames : model.past_frames + model.frames]
-    motion, _, terms = model.learn(new[..., :SPARSE_DIM], model.true_state(past), new)
+    motion, _, terms = model.training_call(new[..., :SPARSE_DIM], model.true_state(past), new)
     (motion.square().mean() + sum(terms.values(), torch.zeros(()))).backward()
     slopes = torch.cat([p.grad.flatten() for p in model.parameters() if p.grad is not None])
     found = summary("learned", motion) | summary("slopes", slopes)
@@ -144,7 +144,7 @@ def sampler() -> Numbers:
 def mirror() -> Numbers:
     """Windows of mirrored clips."""
     clips, ends = torch.tensor([3, 1, 5]), torch.tensor([20, 30, 44])
-    return summary("frames", MirroredDataset(frames()).segments(clips, ends, 9))
+    return summary("frames", MirroredDataset(frames()).stretches(clips, ends, 9))
 
 
 def schedule(name: str) -> Numbers:
@@ -162,7 +162,7 @@ def rollout(make: Callable[[], Rollout]) -> Numbers:
         seed_step(0, step)
         call = slot.draw(model, split, draws, step)
         slot.keep(model.advance(call.sparse, call.state)[1])
-        found |= summary(f"sparse {step}", call.sparse) | summary(f"truth {step}", call.truth)
+        found |= summary(f"sparse {step}", call.sparse) | summary(f"truth {step}", call.true_frames)
         found |= summary(f"history {step}", call.state["motion"])
     return found
 

@@ -15,7 +15,7 @@ from memmlp.motion.network_coordinates import World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.sage_parts import LATENT, ProductQuantiser
 from memmlp.networks.memory import State
-from memmlp.networks.motion_model import Learned, MotionModel
+from memmlp.networks.motion_model import MotionModel, TrainingOutputs
 from memmlp.networks.refiner import SAGERefiner
 from memmlp.networks.vqvae import VQVAE
 from memmlp.training.loop import seed_step, train_step
@@ -75,8 +75,8 @@ class Line(MotionModel):
         inputs, kept = self.taken_in(sparse, state)
         return self.map(inputs[:, -(newest or self.frames) :]), kept
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
-        return Learned(*self.advance(sparse, state), {"own": self.map.bias.square().sum()})
+    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
+        return TrainingOutputs(*self.advance(sparse, state), {"own": self.map.bias.square().sum()})
 
 
 class Squares(Loss):
@@ -124,7 +124,7 @@ def parts() -> Numbers:
 
     The codes are moved towards latents that are far from each other.
     """
-    optim = DroppingOptim(steps=3, batch=4, lr=1e-2, drops=(0.5,), drop=0.25)
+    optim = DroppingOptim(steps=3, batch=4, lr=1e-2, lr_drops_at=(0.5,), lr_drop=0.25)
     torch.manual_seed(4)
     quantiser = ProductQuantiser()
     for _ in range(3):

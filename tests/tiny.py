@@ -145,12 +145,14 @@ BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
     "agrol_diffusion": AGRoLLoss,
     "bodiffusion": LossOfNetwork,
     "avatar_poser": AvatarPoserLoss,
-    "ego_poser": partial(TermsLoss, orientation=0.02, rotation=1.0, position=1.0),
+    "ego_poser": partial(TermsLoss, orientation=0.02, rotation=1.0, position_from_pelvis=1.0),
     "hmd_poser": partial(
         TermsLoss, orientation=1.0, rotation=5.0, global_rotation=1.0, world_position=1.0, acceleration=0.5
     ),
-    "vae_hmd": partial(TermsLoss, "square", rotation=1.0, position=20.0, angle=0.1),
-    "avatar_jlm": partial(TermsLoss, rotation=2.0, position=5.0, velocity_3=16.0, contact=20.0, hand=5.0),
+    "vae_hmd": partial(TermsLoss, "square", rotation=1.0, position_from_pelvis=20.0, angle=0.1),
+    "avatar_jlm": partial(
+        TermsLoss, rotation=2.0, position_from_pelvis=5.0, velocity_3=16.0, contact=20.0, hand=5.0
+    ),
     "rpm": RPMLoss,
     "sage": partial(TermsLoss, "norm", orientation=0.02, rotation=1.0, world_position=5.0),
     "manikin_s": partial(TermsLoss, orientation=0.02),

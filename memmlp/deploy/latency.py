@@ -116,7 +116,7 @@ def in_turn(keys: Iterable[Key], rounds: int, time_round: Callable[[Key], np.nda
     return {key: InTurn(np.array(seconds[key]), np.array(shares[key])) for key in seconds}
 
 
-def profile(path: Path, steps: int = 100) -> list[tuple[str, str, float, float]]:
+def profiled(path: Path, steps: int = 100) -> list[tuple[str, str, float, float]]:
     """Measure where a step's time goes, by ONNX Runtime's own profile.
 
     The profile adds one or two microseconds to each operation.

@@ -76,7 +76,7 @@ class MotionDataset:
         """Return the number of clips."""
         return len(self.names)
 
-    def segments(self, clip: Tensor, end: Tensor, length: int) -> Tensor:
+    def stretches(self, clip: Tensor, end: Tensor, length: int) -> Tensor:
         """Return the `length` frames of each clip up to and including frame `end`.
 
         Before a clip's start its first frame repeats, as in the warm-up of a live stream.

@@ -54,9 +54,9 @@ class MirroredDataset(MotionDataset):
         starts, lengths = plain.starts.repeat(2), plain.lengths.repeat(2)
         super().__init__(plain.frames, starts, lengths, names, [*plain.groups] * 2, sources)
 
-    def segments(self, clip: Tensor, end: Tensor, length: int) -> Tensor:
+    def stretches(self, clip: Tensor, end: Tensor, length: int) -> Tensor:
         """Return frames (B, length, 252) that end with frame `end` of each clip; see MotionDataset."""
-        plain = super().segments(clip, end, length)
+        plain = super().stretches(clip, end, length)
         turned = (clip >= len(self) // 2).to(plain.device)
         return torch.where(turned[:, None, None], mirrored(plain), plain)
 

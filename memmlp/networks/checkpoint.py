@@ -50,8 +50,13 @@ def load_module(prefix: str, module: nn.Module, tensors: dict[str, Tensor]) -> N
     module.load_state_dict({_current(name, known): tensor for name, tensor in own.items()})
 
 
-WEIGHTS = {"rotation": "rotation_all", "position": "position_branch", "velocity": "velocity_lower_body"}
-"""The present names of terms of Mem-MLP's loss, by those that they had up to version 0.2.
+WEIGHTS = (
+    ("rotation", "rotation_all"),
+    ("position", "position_branch"),
+    ("position", "position_from_pelvis"),
+    ("velocity", "velocity_lower_body"),
+)
+"""Terms of losses by their names up to version 0.2 and the present ones, of Mem-MLP's and the library's.
 
 They sort alike: torch keeps the learned weights by their names, and the optimiser's state by their order.
 """
@@ -60,11 +65,12 @@ They sort alike: torch keeps the learned weights by their names, and the optimis
 def _current(name: str, known: Collection[str]) -> str:
     """Return the name that a tensor has in this version.
 
-    Version 0.1 called the normalizer `frame`; the learned weights of Mem-MLP's loss have the terms' names.
+    Version 0.1 called the normalizer `frame`; the learned weights of a loss have the terms' names.
     """
     name = re.sub(r"(^|\.)frame\.(rest|mean|std)$", r"\1normalizer.\2", name)
     above, _, term = name.rpartition(".")
-    return name if name in known or term not in WEIGHTS else f"{above}.{WEIGHTS[term]}"
+    renamed = (f"{above}.{now}" for former, now in WEIGHTS if former == term and name not in known)
+    return next((one for one in renamed if one in known), name)
 
 
 def optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import Memory, State
-from memmlp.networks.motion_model import Learned, MotionModel
+from memmlp.networks.motion_model import MotionModel, TrainingOutputs
 from memmlp.networks.predictor_slot import Predictor
 
 
@@ -90,7 +90,7 @@ class MemMLP(MotionModel):
         kept |= self.memory.remember(motion, past, state, new)
         return self.normalizer.decode_motion(motion[:, -wanted:], origin[:, -wanted:]), kept
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
+    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call; a memory whose VQ-VAE trains with the network adds losses of its own."""
         motion, kept = self.advance(sparse, state)
-        return Learned(motion, kept, self.memory.auxiliary_losses(truth, self.normalizer))
+        return TrainingOutputs(motion, kept, self.memory.auxiliary_losses(true_frames, self.normalizer))

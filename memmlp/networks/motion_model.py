@@ -12,7 +12,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import State
 
 
-class Learned(NamedTuple):
+class TrainingOutputs(NamedTuple):
     """What a training call returns.
 
     Attributes:
@@ -136,15 +136,15 @@ class MotionModel(nn.Module):
         """Map the world inputs (N, 54) of a clip, N >= T, to its world motion (N, 198); see `joint`."""
         raise NotImplementedError
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
+    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call; by default this is `advance`.
 
         Args:
             sparse: see `advance`.
             state: see `advance`.
-            truth: world frames [X | Theta] (B, T, 252) of the window.
+            true_frames: world frames [X | Theta] (B, T, 252) of the window.
         """
-        return Learned(*self.advance(sparse, state), {})
+        return TrainingOutputs(*self.advance(sparse, state), {})
 
     def count_parameters(self) -> int:
         """Count the trainable parameters; tables show this number in millions.

@@ -13,7 +13,7 @@ from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import State
-from memmlp.networks.motion_model import Learned
+from memmlp.networks.motion_model import TrainingOutputs
 from memmlp.networks.reaching_arms import reached, tracked
 from memmlp.networks.recurrent_cells import CELLS, RecurrentCell
 from memmlp.networks.windowless_model import WindowlessModel
@@ -247,11 +247,11 @@ class RecurrentPoser(WindowlessModel):
         made, kept = self.made(sparse, state, wanted)
         return self.posed(made.mean(0), sparse[:, sparse.shape[1] - wanted :]), kept
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
+    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call; it returns the motion of each member (members B, T, 198), one by one."""
         made, kept = self.made(sparse, state, sparse.shape[1])
         motion = self.output.learned(made, sparse.expand(len(made), -1, -1, -1), self.normalizer)
-        return Learned(motion.flatten(0, 1), kept, {})
+        return TrainingOutputs(motion.flatten(0, 1), kept, {})
 
     def step(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
         """Take in one frame of world inputs (B, 54), as `advance` does, in plain layers.

@@ -52,7 +52,7 @@ def figure_digest(found: Trends) -> str:
         ]
         for trend in found.trends
     ]
-    return digest([LOOK, numbers, found.predict, found.compute, found.against])
+    return digest([LOOK, numbers, found.predict, found.compute, found.along])
 
 
 def figure_is_of(path: Path, found: Trends) -> bool:
@@ -89,10 +89,10 @@ def scaling_figure(found: Trends) -> bytes:
 
 def _label(found: Trends) -> str:
     """Describe the figure's axis and its marks."""
-    name = found.against[0]
+    name = found.along[0]
     words = ["training compute of the control, FLOP" if name == COMPUTE else name]
-    if len(found.against) > 1:
-        words.append(f"hollow: less than the largest {' or '.join(found.against[1:])}")
+    if len(found.along) > 1:
+        words.append(f"hollow: less than the largest {' or '.join(found.along[1:])}")
     if _ahead(found):
         words.append(f"orange: {found.predict}, 95 % interval for one more cell there")
     return "; ".join(words)
@@ -101,14 +101,14 @@ def _label(found: Trends) -> str:
 def _ahead(found: Trends) -> float | None:
     """Return the compute for which effects are predicted, if it fits on the figure's axis."""
     ends = found.measured(COMPUTE)
-    if found.against[0] != COMPUTE or found.compute is None or ends is None:
+    if found.along[0] != COMPUTE or found.compute is None or ends is None:
         return None
     beyond, span = math.log10(found.compute / ends[1]), math.log10(ends[1] / ends[0])
     return found.compute if beyond <= WIDEST * span else None
 
 
 def _panel(axis: Axes, trend: Trend, found: Trends) -> None:
-    name, ahead = found.against[0], _ahead(found)
+    name, ahead = found.along[0], _ahead(found)
     axis.axhline(0, color=FAINT, zorder=0)
     axis.set_xscale("log")
     axis.xaxis.set_minor_formatter(NullFormatter())

@@ -17,11 +17,11 @@ NEAR = 0.5
 
 def scaling_section(found: Trends) -> str:
     """Return the section in Markdown: how to read it, the figure, a table of lines, what they predict."""
-    parts = [f"### Effects against {escaped(_listed(found.against))}: {escaped(found.title)}"]
+    parts = [f"### Effects against {escaped(_listed(found.along))}: {escaped(found.title)}"]
     parts.append("\n".join(f"- {line}" for line in _explained(found)))
     if any(trend.line for trend in found.trends):
         parts.append(f"![The effects of {escaped(found.name)} with their lines]({picture_name(found)})")
-        parts += [_table(found, name) for name in found.against if _has(found, name)]
+        parts += [_table(found, name) for name in found.along if _has(found, name)]
         parts.append("\n".join(f"- {line}" for line in [*_reach(found), *_readings(found)]))
     without = [trend for trend in found.trends if trend.line is None]
     words = dict.fromkeys(f"- '{escaped(trend.series)}': {escaped(trend.reason)}" for trend in without)
@@ -116,7 +116,7 @@ def _numbers(seeds: Sequence[int]) -> str:
 
 def _table(found: Trends, name: str) -> str:
     """Return the table of all slopes along one axis; that of the first axis has the effects' sizes, too."""
-    first = name == found.against[0]
+    first = name == found.along[0]
     ahead = found.compute if name == COMPUTE else None
     head = ["effect", "metric", "cells", f"tenfold {escaped(name)}", "verdict"]
     head += ["at the largest measured"] if first else []
@@ -178,7 +178,7 @@ def _reach(found: Trends) -> list[str]:
 
 def _held(found: Trends, where: str) -> list[str]:
     """Say which other values are kept at their largest measured one in the prediction."""
-    others = [name for name in found.against if name != COMPUTE and _has(found, name)]
+    others = [name for name in found.along if name != COMPUTE and _has(found, name)]
     words = [f"`{name}={ends[1]:g}`" for name in others if (ends := found.measured(name)) is not None]
     return [f"the prediction for {where} has {_listed(words)}, the largest measured"] if words else []
 
@@ -189,7 +189,7 @@ def _readings(found: Trends) -> list[str]:
     for series in found.series:
         own = [trend for trend in found.trends if trend.series == series and trend.line is not None]
         if own:
-            said = [_changes(own, name) for name in found.against if _has(found, name)]
+            said = [_changes(own, name) for name in found.along if _has(found, name)]
             lines.append(f"**{escaped(series)}**: {'; '.join([*said, *_signs(found, own)])}")
     return lines
 

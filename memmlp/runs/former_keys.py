@@ -28,6 +28,9 @@ class Renamed(NamedTuple):
 GROUPS = {"frame": "normalizer", "tracker": "loggers", "tracking": "loggers"}
 """The present names of groups, by their former ones. `tracker` was a group of version 0.1."""
 
+PARTS = ("upper_codes", "lower_codes", "upper_diffusion", "lower_diffusion", "decoder")
+"""The parts of SAGE-Net that are trained before it."""
+
 RENAMED = (
     Renamed("normalizer.z_scores", "frame.normalize"),
     Renamed("data.drawn_by", "data.weighting"),
@@ -45,6 +48,10 @@ RENAMED = (
     Renamed("model.coarse_weight", "model.coarse", "model=manikin_l"),
     Renamed("model.parts_weight", "model.parts", "model=manikin_s"),
     Renamed("model.parts_weight", "model.parts", "model=manikin_l"),
+    Renamed("loss.position_from_pelvis", "loss.position", "loss=terms"),
+    Renamed("optim.other_lr", "optim.rest_lr", "optim=muon"),
+    *(Renamed(f"upstream.{part}.lr_drops_at", f"upstream.{part}.drops") for part in PARTS),
+    *(Renamed(f"upstream.{part}.lr_drop", f"upstream.{part}.drop") for part in PARTS),
     Renamed("profile.z_scores", "profile.normalize"),
     Renamed("profile.baseline_frames", "profile.avatar_poser_frames"),
     Renamed("profile.hmd_poser_encoder_layers", "profile.hmd_poser_layers"),
@@ -58,15 +65,26 @@ def with_present_names(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return a recorded config, or some of its groups, with the names that keys and options have today."""
     tree = {GROUPS.get(group, group): content for group, content in config.items()}
     for one in RENAMED:
-        group, _, key = one.now.partition(".")
-        content, former = tree.get(group), one.former.partition(".")[2]
-        if isinstance(content, Mapping) and former in content and _has(content, one.option):
-            tree[group] = {key if name == former else name: value for name, value in content.items()}
+        group = one.now.partition(".")[0]
+        content = tree.get(group)
+        if isinstance(content, Mapping) and _has(content, one.option):
+            tree[group] = _with_name(content, one.former.split(".")[1:], one.now.rpartition(".")[2])
     for (group, now), former in OPTIONS.items():
         content = tree.get(group)
         if isinstance(content, Mapping) and content.get("name") == former:
             tree[group] = {**content, "name": now}
     return tree
+
+
+def _with_name(tree: Mapping[str, Any], path: Sequence[str], now: str) -> Mapping[str, Any]:
+    """Return a tree whose key at a path has another name; the same tree if there is no such key."""
+    name, *below = path
+    if name not in tree:
+        return tree
+    if below:
+        inner = tree[name]
+        return {**tree, name: _with_name(inner, below, now)} if isinstance(inner, Mapping) else tree
+    return {now if key == name else key: value for key, value in tree.items()}
 
 
 def _has(content: Mapping[str, Any], option: str | None) -> bool:
@@ -126,9 +144,9 @@ def present_key(key: str, allowed: Sequence[str]) -> str | None:
     named = GROUPS.get(group)
     if not dot:
         return named
-    found = (one.now.split(".") for one in RENAMED if one.former in (key, f"{_former_group(group)}.{rest}"))
-    now = next((name for _, name in found if name in allowed), rest if named else None)
-    return None if now is None else f"{named or group}.{now}"
+    found = (one.now for one in RENAMED if one.former in (key, f"{_former_group(group)}.{rest}"))
+    now = next((name for name in found if name.rpartition(".")[2] in allowed), None)
+    return now or (f"{named}.{rest}" if named else None)
 
 
 def present_option(group: str, former: str) -> str | None:

@@ -66,13 +66,13 @@ class Scale:
     """The axes against which a sweep's effects are shown, as lines through its cells.
 
     Attributes:
-        against: COMPUTE, or keys of the axes, whose values are numbers above 0. The first one is the figure's
+        along: COMPUTE, or keys of the axes, whose values are numbers above 0. The first one is the figure's
             axis; the others distinguish cells beside it.
         predict: overrides that replace the cells', at whose compute the effects are predicted; empty for no
             prediction.
     """
 
-    against: tuple[str, ...] = (COMPUTE,)
+    along: tuple[str, ...] = (COMPUTE,)
     predict: tuple[str, ...] = ()
 
 

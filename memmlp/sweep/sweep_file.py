@@ -15,7 +15,7 @@ arms:
   "4": {overrides: ['memory.layers=[4]'], branch: rotation, against: "2"}     # its own branch and control
 axes: {model.frames: [11, 21], seed: [0, 1, 2]}      # a grid, instead of arms or over each of them
 axes: [{optim.steps: [500, 2000]}, {model.frames: [11]}]           # or a list of grids: the cells of all
-scale: {against: [compute], predict: [profile=paper]}    # effects as lines through the cells
+scale: {along: [compute], predict: [profile=paper]}    # effects as lines through the cells
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ KEYS = (
     "arms", "axes", "scale",
 )  # fmt: skip
 ARM_KEYS = ("overrides", "branch", "against", "paper", "note")
-SCALE_KEYS = ("against", "predict")
+SCALE_KEYS = ("along", "predict")
 BASE = "base"  # the arm of a sweep that has only seeds
 
 
@@ -225,26 +225,26 @@ def _scale(value: Any, grids: Sequence[Mapping[str, Any]], arms: Sequence[Arm]) 
     value = _mapping(value or {}, "scale", SCALE_KEYS)
     if not any(arm.cell and arm.against for arm in arms):
         raise InputError("scale: allowed with axes, and arms that name their control with against")
-    against = _texts(value.get("against", [COMPUTE]), "scale.against")
-    if not against or len(set(against)) < len(against):
-        raise InputError("scale.against: allowed is a list of at least one, each once")
+    along = _texts(value.get("along", [COMPUTE]), "scale.along")
+    if not along or len(set(along)) < len(along):
+        raise InputError("scale.along: allowed is a list of at least one, each once")
     keys = [str(key) for grid in grids for key in grid]
-    for name in against:
+    for name in along:
         if name != COMPUTE and name not in keys:
             allowed = ", ".join(dict.fromkeys([COMPUTE, *keys]))
-            raise InputError(f"scale.against: '{name}' is no axis; allowed are {allowed}")
+            raise InputError(f"scale.along: '{name}' is no axis; allowed are {allowed}")
         _check_numbers(name, grids)
-    return Scale(tuple(against), tuple(_overrides(value.get("predict", []), "scale.predict")))
+    return Scale(tuple(along), tuple(_overrides(value.get("predict", []), "scale.predict")))
 
 
 def _check_numbers(name: str, grids: Sequence[Mapping[str, Any]]) -> None:
     """Raise InputError for an axis against which effects can't be shown: each cell needs a number above 0."""
     for place, grid in enumerate(grids) if name != COMPUTE else ():
         if name not in grid:
-            raise InputError(f"scale.against: axes[{place}] has no {name}; allowed is a key of every grid")
+            raise InputError(f"scale.along: axes[{place}] has no {name}; allowed is a key of every grid")
         for number in grid[name]:
             if not _positive(number):
-                raise InputError(f"scale.against: {name}={_word(number)}; allowed are numbers above 0")
+                raise InputError(f"scale.along: {name}={_word(number)}; allowed are numbers above 0")
 
 
 def _positive(number: Any) -> bool:

@@ -157,7 +157,7 @@ class Trends:
 
     Attributes:
         name, title: the sweep's name and title.
-        against: the axes against which they are shown; the first is a figure's axis.
+        along: the axes against which they are shown; the first is a figure's axis.
         trends: the effects, series by series and metric by metric.
         cells: how many cells were measured, counted for each arm.
         wanted: how many cells the sweep has.
@@ -170,7 +170,7 @@ class Trends:
 
     name: str
     title: str
-    against: tuple[str, ...]
+    along: tuple[str, ...]
     trends: tuple[Trend, ...]
     cells: int
     wanted: int
@@ -190,7 +190,7 @@ class Trends:
         return tuple(dict.fromkeys(trend.metric for trend in self.trends))
 
     def measured(self, name: str) -> tuple[float, float] | None:
-        """Return the least and the largest measured value of one of `against`; None if there are none."""
+        """Return the least and the largest measured value of one of `along`; None if there are none."""
         every = [
             point.values[name] for trend in self.trends for point in trend.points if name in point.values
         ]
@@ -219,7 +219,7 @@ def trends(
     return Trends(
         name=sweep.name,
         title=sweep.title,
-        against=sweep.scale.against,
+        along=sweep.scale.along,
         trends=tuple(_predicted(_judged(found), compute)),
         cells=sum(bool(runs.get(arm.label)) for arm in sweep.runnable()),
         wanted=len(sweep.runnable()),
@@ -245,8 +245,8 @@ def _trend(
     cells = _cells(sweep, runs, {arm.label: pairs.get(Key(arm.label, MODE, metric)) for arm, _ in own}, own)
     differences, groups, lost = _shared([cell.pair for cell in cells])
     values = [cell.values for cell in cells]
-    varied = tuple(name for name in sweep.scale.against if len({one.get(name) for one in values}) > 1)
-    reason, line = _reason(sweep.scale.against, values, varied, differences) or _diverged(cells), None
+    varied = tuple(name for name in sweep.scale.along if len({one.get(name) for one in values}) > 1)
+    reason, line = _reason(sweep.scale.along, values, varied, differences) or _diverged(cells), None
     if not reason:
         x = np.array([[1.0, *(math.log10(one[name]) for name in varied)] for one in values])
         line = fit(differences, x, groups)
@@ -304,13 +304,13 @@ def _values(sweep: Sweep, arm: Arm, control: RunsBySeed) -> dict[str, float]:
     """Return a cell's values for the scale's keys: numbers in its overrides, and its compute."""
     assert sweep.scale is not None
     words = dict(word.split("=", 1) for word in arm.cell)
-    found = {name: float(words[name]) for name in sweep.scale.against if name in words}
+    found = {name: float(words[name]) for name in sweep.scale.along if name in words}
     flops = [run.training["flops"] for run in control.values() if "flops" in run.training]
-    return found | ({COMPUTE: float(np.mean(flops))} if COMPUTE in sweep.scale.against and flops else {})
+    return found | ({COMPUTE: float(np.mean(flops))} if COMPUTE in sweep.scale.along and flops else {})
 
 
 def _reason(
-    against: Sequence[str],
+    along: Sequence[str],
     values: Sequence[Mapping[str, float]],
     varied: Sequence[str],
     differences: np.ndarray,
@@ -318,11 +318,11 @@ def _reason(
     """Say why there can be no line; empty if there may be one."""
     if not values:
         return "no cell is measured"
-    if any(name not in one for one in values for name in against):
+    if any(name not in one for one in values for name in along):
         return "the compute of some cells is not kept; memmlp results save counts it"
     if not differences.size:
         return "its cells share no test clip"
-    return "" if against[0] in varied else f"all cells have the same {against[0]}"
+    return "" if along[0] in varied else f"all cells have the same {along[0]}"
 
 
 def _diverged(cells: Sequence[_Cell]) -> str:

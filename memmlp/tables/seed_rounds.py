@@ -246,7 +246,7 @@ def outlook(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> dic
 
 
 @dataclass(frozen=True)
-class Standing:
+class ArmProgress:
     """An arm's progress through the rounds.
 
     Attributes:
@@ -263,7 +263,7 @@ class Standing:
     next: int | None
 
 
-def standings(rounds: Rounds, sweep: Sweep) -> list[Standing]:
+def standings(rounds: Rounds, sweep: Sweep) -> list[ArmProgress]:
     """Return each arm's progress through the rounds."""
     ahead = rounds.next_looks(sweep)
     found: dict[str, list[Verdict]] = {}
@@ -274,7 +274,7 @@ def standings(rounds: Rounds, sweep: Sweep) -> list[Standing]:
         verdicts = found.get(label, [])
         still = verdicts.count(Verdict.OPEN)
         following = rounds.looks[ahead[label]] if label in ahead else None
-        standing.append(Standing(label, len(verdicts) - still, still, seeds, following))
+        standing.append(ArmProgress(label, len(verdicts) - still, still, seeds, following))
     return standing
 
 

@@ -110,22 +110,22 @@ class Muon(Optim):
 
     Attributes:
         momentum: Muon's momentum, which is Nesterov momentum.
-        rest_lr: learning rate at the start for parameters that are not matrices, with the same schedule; None
-            for `lr`.
+        other_lr: learning rate at the start for parameters that are not matrices, with the same schedule;
+            None for `lr`.
         vectors: what optimises parameters of two dimensions of which one is 1, such as the biases (T, 1) of
             TimeMix: "adamw", or "muon", which took them for matrices before.
     """
 
     momentum: float = 0.95
-    rest_lr: float | None = None
+    other_lr: float | None = None
     vectors: str = "adamw"
 
     def at(self, lr: float | None) -> Self:
-        """Return these settings with another learning rate; `rest_lr` is scaled by the same factor."""
+        """Return these settings with another learning rate; `other_lr` is scaled by the same factor."""
         other = super().at(lr)
-        if lr is None or self.rest_lr is None:
+        if lr is None or self.other_lr is None:
             return other
-        return replace(other, rest_lr=self.rest_lr * lr / self.lr)
+        return replace(other, other_lr=self.other_lr * lr / self.lr)
 
     def check_installed(self) -> None:
         """Raise InputError if torch has no Muon."""
@@ -144,7 +144,7 @@ class Muon(Optim):
                 )
             )
         if rest:
-            lr = self.rest_lr or self.lr
+            lr = self.other_lr or self.lr
             parts.append(
                 torch.optim.AdamW(rest, lr, weight_decay=self.weight_decay, betas=self.betas, fused=True)
             )

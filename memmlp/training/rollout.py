@@ -19,18 +19,18 @@ from memmlp.networks.motion_model import MotionModel
 
 
 class TrainingCall(NamedTuple):
-    """The arguments of a training call: `model.learn(sparse, state, truth)` should return the true motion.
+    """The arguments of `MotionModel.training_call`, which should return the true motion.
 
     Attributes:
         sparse: world inputs (B, n, 54) of the new frames.
         state: the state before the new frames.
-        truth: world frames [X | Theta] (B, T, 252) of the window.
+        true_frames: world frames [X | Theta] (B, T, 252) of the window.
         clips: indices of the clips (B,) that the frames are from.
     """
 
     sparse: Tensor
     state: State
-    truth: Tensor
+    true_frames: Tensor
     clips: Tensor
 
 
@@ -62,7 +62,7 @@ class TeacherForcing(Rollout):
         """Draw the training call of a step."""
         clips, end = map(distributed.own_rows, sampler.draw(step))
         past, stride = model.past_frames, model.stride
-        segment = dataset.segments(clips, end, past + stride)
+        segment = dataset.stretches(clips, end, past + stride)
         state = model.true_state(segment[:, :past])
         return TrainingCall(segment[:, past:, :SPARSE_DIM], state, segment[:, -model.frames :], clips)
 
@@ -85,7 +85,7 @@ class OwnPredictions(Rollout):
         clips, end = map(distributed.own_rows, sampler.draw(step))
         past, stride = model.past_frames, model.stride
         passes = int(torch.randint(self.max_passes + 1, ())) if model.shift else 0
-        segment = dataset.segments(clips, end, past + stride * (passes + 1))
+        segment = dataset.stretches(clips, end, past + stride * (passes + 1))
         sparse = segment[..., :SPARSE_DIM]
         state = model.running_state(sparse[:, :past])
         model.eval()
@@ -147,7 +147,7 @@ class PersistentStreams(Rollout):
         self.lives[who] = True
         self.who, mine, going = who, distributed.own_rows(who), distributed.own_rows(going)
         past, stride = model.past_frames, model.stride
-        segment = dataset.segments(self.clip[mine], self.end[mine], past + stride)
+        segment = dataset.stretches(self.clip[mine], self.end[mine], past + stride)
         fresh = model.running_state(segment[:, :past, :SPARSE_DIM])
         state = {}
         for name, tensor in fresh.items():

@@ -127,7 +127,7 @@ class MotionTask:
         self.model, self.loss, self.rollout, self.dataset = model, loss, rollout, dataset
         self.module: nn.Module = nn.ModuleDict({"model": model, "loss": loss, "rollout": rollout})
         self.sampler = WindowSampler(dataset, optim.batch, model.frames, seed, drawn_by, shares)
-        self.learn = torch.compile(model.learn) if optim.compile else model.learn
+        self.training_call = torch.compile(model.training_call) if optim.compile else model.training_call
         self._validate = validate
 
     def parameter_groups(self) -> list[dict]:
@@ -139,10 +139,10 @@ class MotionTask:
         """Compute the loss of one training call."""
         with record_function(SAMPLING):
             call = self.rollout.draw(self.model, self.dataset, self.sampler, step)
-        motion, state, own = self.learn(call.sparse, call.state, call.truth)
+        motion, state, own = self.training_call(call.sparse, call.state, call.true_frames)
         self.rollout.keep(state)
-        times = len(motion) // len(call.truth)  # each of a network's members may have learned them
-        true = call.truth[:, -motion.shape[1] :].repeat(times, 1, 1)
+        times = len(motion) // len(call.true_frames)  # each of a network's members may have learned them
+        true = call.true_frames[:, -motion.shape[1] :].repeat(times, 1, 1)
         loss, terms = self.loss(motion, true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], self.model.normalizer)
         return StepResult(sum(own.values(), loss), terms | own, call.clips)
 

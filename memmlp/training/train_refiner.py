@@ -120,7 +120,7 @@ class RefinerTraining:
             dataset, self.refiner.pieces, self.refiner.frames, self.seed, self.drawn_by, self.shares
         )
         clips, end = pieces.draw(0)
-        return dataset.segments(clips, end, self.refiner.frames), clips
+        return dataset.stretches(clips, end, self.refiner.frames), clips
 
 
 class RefinerTask:

@@ -57,21 +57,21 @@ class DroppingOptim(Optim):
     """AdamW with a learning rate that falls at some steps.
 
     Attributes:
-        drops: fractions of the steps at which the learning rate falls.
-        drop: factor by which it is multiplied at each of them.
+        lr_drops_at: fractions of the steps at which the learning rate falls.
+        lr_drop: factor by which it is multiplied at each of them.
     """
 
-    drops: Sequence[float] = ()
-    drop: float = 1.0
+    lr_drops_at: Sequence[float] = ()
+    lr_drop: float = 1.0
 
     def factor(self, step: int) -> float:
         """Return the learning rate at a step as a fraction of the learning rate at the start."""
-        return self.drop ** sum(step >= at * self.steps for at in self.drops)
+        return self.lr_drop ** sum(step >= at * self.steps for at in self.lr_drops_at)
 
 
 @dataclass(frozen=True)
 class SAGEUpstream:
-    """The steps, batch, lr, drops and drop with which each part is trained."""
+    """The steps, batch, lr and its drops with which each part is trained."""
 
     upper_codes: Mapping[str, Any]
     lower_codes: Mapping[str, Any]
@@ -214,12 +214,12 @@ class Windows:
         draws = network.optim.batch, frames, network.seed, network.drawn_by, network.shares
         self.frames, self.sampler = frames, WindowSampler(self.dataset, *draws)
         drawn = WindowSampler(validation, VALIDATION_WINDOWS, frames, seed=0).draw(0)
-        self.validation = validation.segments(*drawn, frames)
+        self.validation = validation.stretches(*drawn, frames)
 
     def draw(self, step: int) -> tuple[Tensor, Tensor]:
         """Return the world frames (B, T, 252) of a step's windows, and the indices (B,) of their clips."""
         clips, end = map(distributed.own_rows, self.sampler.draw(step))
-        return self.dataset.segments(clips, end, self.frames), clips
+        return self.dataset.stretches(clips, end, self.frames), clips
 
 
 class PartTask:

@@ -100,7 +100,7 @@ class VQVAETask:
     def step(self, step: int) -> StepResult:
         """Compute the loss on a batch of single frames."""
         clips, end = map(distributed.own_rows, self.sampler.draw(step))
-        frames = self.normalizer.encode(self.dataset.segments(clips, end, 1))[:, 0]
+        frames = self.normalizer.encode(self.dataset.stretches(clips, end, 1))[:, 0]
         terms, indices = self.model.loss_terms(frames, self.normalizer)
         self.used = torch.bincount(distributed.whole(indices), minlength=len(self.used)).float()
         return StepResult(torch.stack(list(terms.values())).sum(), terms, clips)

@@ -193,7 +193,7 @@ REFUSED = [
     (["model=sage", "model.frames=21"], "model.frames=21: allowed for SAGENet is an even number"),
     (["model=sage", "model.code_heads=3"], "model.code_heads=3"),
     (["model=sage", "model.code_width=21", "model.code_heads=1"], "model.code_width=21"),
-    (["model=sage", "upstream.decoder.drop=0"], "upstream.decoder.drop=0"),
+    (["model=sage", "upstream.decoder.lr_drop=0"], "upstream.decoder.lr_drop=0"),
     (["model=avatar_poser", "loss=of_network"], "loss=of_network: AvatarPoser"),
     (["loss=terms"], "loss=terms is of rotations alone"),
     (["model=agrol_mlp", "loss=terms", "loss.jerk=-1"], "loss.jerk=-1"),

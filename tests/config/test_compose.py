@@ -212,7 +212,7 @@ BAD = [
     (["optim.schedule=linear"], ["optim.schedule=linear", "step or cosine"]),
     (["optim.warmup=-1"], ["optim.warmup=-1", "at least 0"]),
     (["optim.ema=1"], ["optim.ema=1", "above 0 and below 1"]),
-    (["optim=muon", "optim.rest_lr=0"], ["optim.rest_lr=0", "above 0"]),
+    (["optim=muon", "optim.other_lr=0"], ["optim.other_lr=0", "above 0"]),
     (["optim=schedule_free", "optim.schedule=step"], ["optim.schedule", "no such key"]),
     (["optim=sgd"], ["optim=sgd", "adamw, muon, schedule_free"]),
     (["optim.warmup=2001"], ["optim.warmup=2001", "at most optim.steps=2000"]),

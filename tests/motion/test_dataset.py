@@ -1,4 +1,4 @@
-"""Datasets: segments of windows, and which windows the sampler draws."""
+"""Datasets: stretches of windows, and which windows the sampler draws."""
 
 import pytest
 import torch
@@ -13,9 +13,9 @@ def frames() -> MotionDataset:
     return MotionDataset(numbers, torch.tensor([0, 5, 17]), lengths, ["a", "b", "c"])
 
 
-def test_segments_end_where_asked_and_repeat_the_first_frame(frames):
-    segments = frames.segments(torch.tensor([0, 1, 2]), torch.tensor([2, 11, 29]), 4)[..., 0]
-    assert segments.tolist() == [[0, 0, 1, 2], [13, 14, 15, 16], [43, 44, 45, 46]]
+def test_stretches_end_where_asked_and_repeat_the_first_frame(frames):
+    stretches = frames.stretches(torch.tensor([0, 1, 2]), torch.tensor([2, 11, 29]), 4)[..., 0]
+    assert stretches.tolist() == [[0, 0, 1, 2], [13, 14, 15, 16], [43, 44, 45, 46]]
 
 
 def test_the_sampler_draws_every_window_alike_and_the_step_is_its_position(frames):

@@ -62,7 +62,7 @@ def test_a_mirrored_dataset_has_each_clip_twice_and_its_frames_once():
     for index, clip in enumerate(both.clips()):
         expected = plain.clip(index % 2)
         assert torch.equal(clip, mirrored(expected) if index > 1 else expected)
-    drawn = both.segments(torch.arange(4), torch.full((4,), 9), 5)
+    drawn = both.stretches(torch.arange(4), torch.full((4,), 9), 5)
     for index, segment in enumerate(drawn):
         expected = plain.clip(index % 2)[5:10]
         assert torch.equal(segment, mirrored(expected) if index > 1 else expected)

@@ -9,6 +9,7 @@ import torch
 
 from memmlp.networks.checkpoint import WEIGHTS, load_module, module_tensors
 from memmlp.training.losses import LearnedWeights, Uncertainty
+from memmlp.training.losses.terms import TERMS
 
 FORMER = ("rotation", "rotation_velocity", "position", "velocity", "hand")
 NOW = ("rotation_all", "rotation_velocity", "position_branch", "velocity_lower_body", "hand")
@@ -32,18 +33,21 @@ def test_learned_weights_of_mem_mlps_terms_are_found_by_their_former_names():
     assert now.weights() == expected
 
 
-def test_learned_weights_are_in_the_order_of_their_former_names():
+@pytest.mark.parametrize("now", [NOW, tuple(TERMS)], ids=["Mem-MLP", "library"])
+def test_learned_weights_are_in_the_order_of_their_former_names(now: tuple[str, ...]):
     """An optimiser's state has no names, so that in another order it would be of other weights."""
-    former, now = list(weighting(FORMER).s), list(weighting(NOW).s)
-    assert [WEIGHTS.get(name, name) for name in former] == now
+    renamed = {present: former for former, present in WEIGHTS}
+    former = [renamed.get(name, name) for name in now]
+    assert [renamed.get(name, name) for name in weighting(now).s] == list(weighting(former).s)
 
 
-def test_weights_of_the_library_s_terms_keep_their_names():
+def test_weights_of_the_library_s_terms_are_found_by_their_former_names():
     """`rotation` is a term of the library, which has another meaning than Mem-MLP's of that name."""
     given = LearnedWeights({"rotation": 2.0, "position": 3.0, "velocity": 5.0})
-    loaded = LearnedWeights({"rotation": 1.0, "position": 1.0, "velocity": 1.0})
+    loaded = LearnedWeights({"rotation": 1.0, "position_from_pelvis": 1.0, "velocity": 1.0})
     load_module("loss", loaded, module_tensors("loss", given))
-    assert loaded.weights() == pytest.approx({"rotation": 2.0, "position": 3.0, "velocity": 5.0})
+    expected = {"rotation": 2.0, "position_from_pelvis": 3.0, "velocity": 5.0}
+    assert loaded.weights() == pytest.approx(expected)
 
 
 def test_the_normalizer_of_version_0_1_is_found():

@@ -68,8 +68,8 @@ def test_teacher_forcing_starts_the_hidden_state_from_the_input_before_the_windo
     sampler = WindowSampler(SPLIT, batch=5, window=7, seed=0)
     call = TeacherForcing().draw(model, SPLIT, sampler, 0)
     clips, end = sampler.draw(0)
-    assert torch.equal(call.sparse, SPLIT.segments(clips, end, 7)[..., :SPARSE_DIM])
-    before = SPLIT.segments(clips, end - 7, 1)
+    assert torch.equal(call.sparse, SPLIT.stretches(clips, end, 7)[..., :SPARSE_DIM])
+    before = SPLIT.stretches(clips, end - 7, 1)
     encoded = model.normalizer.encode(before)[:, 0, :SPARSE_DIM]
     layer = model.memory.recurrences[1]
     torch.testing.assert_close(call.state["hidden"][:, 1], layer.first(layer.norm(encoded)))

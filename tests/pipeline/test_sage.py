@@ -78,7 +78,7 @@ FIRST = {
     "upstream.upper_codes.steps": (3, 0), "upstream.upper_codes.drop": (0.5, 0),
     "upstream.lower_codes.lr": (0.1, 1),
     "model.width": (8, 2), "model.depth": (2, 2), "model.heads": (1, 2), "model.diffusion_steps": (99, 2),
-    "upstream.upper_diffusion.batch": (9, 2), "upstream.upper_diffusion.drops": ([0.1], 2),
+    "upstream.upper_diffusion.batch": (9, 2), "upstream.upper_diffusion.lr_drops_at": ([0.1], 2),
     "model.sampling_steps": (2, 3), "model.noise": (0.1, 3), "model.noise_seed": (1, 3),
     "upstream.lower_diffusion.steps": (3, 3),
     "loss.orientation": (1.0, 4), "upstream.decoder.lr": (0.1, 4),

@@ -107,7 +107,7 @@ def test_the_refiners_loss_is_mostly_of_how_rotations_move():
         "rotation_all": smooth(error),
         "rotation_velocity": smooth(error[1:] - error[:-1]),
         "rotation_velocity_3": smooth(error[3::3] - error[:-3:3]),
-        "position": np.linalg.norm(rooted - (true[0] - true[0][:, :1]), axis=-1).mean(),
+        "position_from_pelvis": np.linalg.norm(rooted - (true[0] - true[0][:, :1]), axis=-1).mean(),
         "trackers": smooth((made - true)[0][:, [15, 20, 21]]),
         "jerk": np.linalg.norm(jerks, axis=-1).mean(),
     }

@@ -44,7 +44,7 @@ def test_terms_of_positions(bodies):
     found, error = terms(), made - true
     rooted = (made - made[..., :1, :]) - (true - true[..., :1, :])
     expected = {
-        "position": np.abs(rooted).mean(),
+        "position_from_pelvis": np.abs(rooted).mean(),
         "world_position": np.abs(error).mean(),
         "hand": np.abs(error[..., [20, 21], :]).mean(),
         "velocity": np.abs(error[:, 1:] - error[:, :-1]).mean(),

@@ -85,7 +85,7 @@ def test_the_weights_that_are_validated_are_kept(name: str, averaged: bool, tmp_
 @pytest.mark.parametrize(
     ("name", "changes"),
     [
-        ("muon", {"momentum": 0.5}), ("muon", {"rest_lr": 1e-3}), ("muon", {"weight_decay": 0.5}),
+        ("muon", {"momentum": 0.5}), ("muon", {"other_lr": 1e-3}), ("muon", {"weight_decay": 0.5}),
         ("muon", {"lr": 2e-2}), ("schedule_free", {"lr": 2e-2}), ("schedule_free", {"warmup": 0}),
         ("schedule_free", {"weight_decay": 0.5}), ("ema", {"ema": 0.3}), ("ema", {"ema": None}),
         ("warmup", {"warmup": 0}),
@@ -107,7 +107,7 @@ def test_optimisers_are_not_the_same(tmp_path: Path):
 
 def test_muon_has_the_matrices_and_adamw_the_rest():
     matrix, row, cube = (torch.nn.Parameter(torch.rand(shape)) for shape in ((3, 4), (4,), (2, 3, 4)))
-    optimiser = replace(OPTIMS["muon"], rest_lr=0.5).build(
+    optimiser = replace(OPTIMS["muon"], other_lr=0.5).build(
         [{"params": [matrix, row]}, {"params": [cube], "lr": 0.1, "weight_decay": 0.0}]
     )
     muon, adamw = optimiser.parts
@@ -147,10 +147,10 @@ def test_at_another_rate_the_course_is_the_same():
     assert (other.lr, other.final_lr) == (1.0, pytest.approx(0.1))
     assert [other.factor(step) for step in range(10)] == pytest.approx([plain.factor(n) for n in range(10)])
     assert plain.at(None) == plain
-    muon = replace(OPTIMS["muon"], lr=8e-3, rest_lr=4e-3)
-    assert muon.at(1e-4).rest_lr == pytest.approx(5e-5)
+    muon = replace(OPTIMS["muon"], lr=8e-3, other_lr=4e-3)
+    assert muon.at(1e-4).other_lr == pytest.approx(5e-5)
     assert muon.at(None) == muon
-    assert replace(muon, rest_lr=None).at(1e-4).rest_lr is None
+    assert replace(muon, other_lr=None).at(1e-4).other_lr is None
 
 
 def test_a_library_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch):

@@ -23,7 +23,7 @@ from memmlp.training import sage_part_losses
 from memmlp.training.loop import train_step
 from memmlp.training.train_sage import PARTS, DroppingOptim
 
-OPTIM = DroppingOptim(steps=4, batch=4, lr=1e-2, drops=(0.5, 0.75), drop=0.2)
+OPTIM = DroppingOptim(steps=4, batch=4, lr=1e-2, lr_drops_at=(0.5, 0.75), lr_drop=0.2)
 FRAMES = torch.stack([tiny.clip(8, seed) for seed in (1, 2)])
 JOINTS = {"upper": UPPER, "lower": LOWER}
 
@@ -132,7 +132,7 @@ def test_the_lower_half_is_given_what_the_upper_one_samples():
 def test_the_whole_is_trained_through_both_samplers():
     net = tiny.baseline("sage")
     state = net.running_state(FRAMES[:, :-1, :SPARSE_DIM])
-    motion, *_ = net.learn(FRAMES[:, -1:, :SPARSE_DIM], state, FRAMES)
+    motion, *_ = net.training_call(FRAMES[:, -1:, :SPARSE_DIM], state, FRAMES)
     assert motion.shape[1] == 1
     motion[..., ROTATION].sum().backward()
     assert all(part.stem.weight.grad.any() for part in (net.upper, net.lower, net.decoder))

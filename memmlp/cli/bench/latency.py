@@ -269,13 +269,13 @@ def show_breakdown(path: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from memmlp.deploy.latency import profile
+    from memmlp.deploy.latency import profiled
 
     table = Table(title=f"{path.name.removesuffix('.onnx')}: microseconds a step", title_justify="left")
     table.add_column("operation")
     table.add_column("first input")
     for name in ("times", "us each", "us a step"):
         table.add_column(name, justify="right")
-    for kind, shape, times, each in profile(path)[:20]:
+    for kind, shape, times, each in profiled(path)[:20]:
         table.add_row(kind, shape, f"{times:.0f}", f"{each:.1f}", f"{times * each:.0f}")
     Console().print(table)

@@ -69,8 +69,8 @@ from memmlp.config.schema.rules import (
     one_of,
     optional,
     positive,
-    standing,
     target,
+    with_default,
 )
 from memmlp.config.schema.training import (
     AdamWConfig,
@@ -140,8 +140,8 @@ class ProfileConfig:
     code_lr: float = positive()
     evaluation_batch: int = at_least(1)
     latency_steps: int = at_least(1)
-    coordinates: str = standing("heading", OneOfOrPath(("heading", "head_relative", "world")))
-    z_scores: bool = standing(True)
+    coordinates: str = with_default("heading", OneOfOrPath(("heading", "head_relative", "world")))
+    z_scores: bool = with_default(True)
     memory_shift: str = one_of("frame", "window")
     memory_history: str = one_of("first", "latest")
     ik: str = one_of("off", "lbfgs", "arms")
@@ -211,8 +211,8 @@ class ExportConfig:
     latency_steps: int = at_least(1)
     graph: str = one_of("auto", "streaming", "naive", "off")
     precision: str = one_of(*ONNX_FILES)
-    alone: bool = standing(False)
-    opset: int = standing(18, Within(15, 26))  # memmlp.deploy.opsets.OPSETS, without importing onnx
+    alone: bool = with_default(False)
+    opset: int = with_default(18, Within(15, 26))  # memmlp.deploy.opsets.OPSETS, without importing onnx
 
 
 @dataclass

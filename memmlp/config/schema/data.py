@@ -19,8 +19,8 @@ from memmlp.config.schema.rules import (
     one_of,
     optional,
     positive,
-    standing,
     target,
+    with_default,
 )
 
 # OmegaConf reads the annotations at run time and knows Optional and Union, not `|`.
@@ -37,7 +37,7 @@ class SeededSplitConfig:
     seed: int = at_least(0)
     groups: list[str] = key(EachOf(empty=True))
     groups_file: Optional[str] = optional(Existing("file"))
-    train_fraction: float = standing(1.0, Within(0, 1))
+    train_fraction: float = with_default(1.0, Within(0, 1))
     per_group: Optional[int] = optional(Within(1))
 
 
@@ -50,7 +50,7 @@ class ListSplitConfig:
     seed: int = at_least(0)
     groups: list[str] = key(EachOf(empty=True))
     groups_file: Optional[str] = optional(Existing("file"))
-    train_fraction: float = standing(1.0, Within(0, 1))
+    train_fraction: float = with_default(1.0, Within(0, 1))
 
 
 @dataclass
@@ -63,7 +63,7 @@ class SubsetSplitConfig:
     seed: int = at_least(0)
     groups: list[str] = key(EachOf(empty=True))
     groups_file: Optional[str] = optional(Existing("file"))
-    train_fraction: float = standing(1.0, Within(0, 1))
+    train_fraction: float = with_default(1.0, Within(0, 1))
 
 
 @dataclass
@@ -80,9 +80,9 @@ class DataConfig:
     body: str = key(Existing("file", ("builtin",)))
     min_frames: int = at_least(2)
     strict: bool = key()
-    interpolation: str = standing("lines", OneOf(("splines", "lines")))
+    interpolation: str = with_default("lines", OneOf(("splines", "lines")))
     drawn_by: str = one_of("frames", "clips")
-    mirror: bool = standing(False)
+    mirror: bool = with_default(False)
 
 
 @dataclass

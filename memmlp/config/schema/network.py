@@ -1,4 +1,4 @@
-"""The schemas of what makes a network: conf/frame, conf/model, conf/predictor, conf/memory, conf/vqvae."""
+"""The schemas of what makes a network: normalizer, model, predictor, memory, vqvae, refiner, upstream."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from memmlp.config.schema.rules import (
     one_of,
     optional,
     positive,
-    standing,
     target,
+    with_default,
 )
 
 # OmegaConf reads the annotations at run time and knows Optional and Union, not `|`.
@@ -31,7 +31,7 @@ from memmlp.config.schema.rules import (
 
 @dataclass
 class NormalizerConfig:
-    """The space in which the network sees the motion (conf/frame)."""
+    """The space in which the network sees the motion (conf/normalizer)."""
 
     coordinates: str = key(OneOfOrPath(("heading", "head_relative", "world")))
     z_scores: bool = key()
@@ -141,7 +141,7 @@ class RPMConfig(AvatarPoserConfig):
     _target_: str = target("memmlp.networks.baselines.rpm.RPM")
     context: int = at_least(1)
     horizon: int = at_least(1)
-    own_dropout: bool = standing(True)
+    own_dropout: bool = with_default(True)
 
 
 @dataclass
@@ -159,7 +159,7 @@ class RecurrentPoserConfig(LayeredConfig):
     name: str = called("recurrent_poser")
     _target_: str = target("memmlp.networks.recurrent_poser.RecurrentPoser")
     cell: str = one_of("gru", "lstm", "mingru", "lru")
-    output: str = standing("local", OneOf(("local", "global", "reaching")))
+    output: str = with_default("local", OneOf(("local", "global", "reaching")))
     expansion: int = at_least(1)
     members: int = at_least(1)
 
@@ -316,7 +316,7 @@ class SAGERefinerConfig(RefinerConfig):
     frames: int = at_least(4)
     pieces: int = at_least(1)
     lr: Optional[float] = optional(Within(0, strict=True))
-    velocities: str = standing("joints", OneOf(("rotations", "joints")))
+    velocities: str = with_default("joints", OneOf(("rotations", "joints")))
 
 
 @dataclass
@@ -334,8 +334,8 @@ class PartConfig:
     steps: int = at_least(1)
     batch: int = at_least(1)
     lr: float = positive()
-    drops: list[float] = key(EachOf(Within(0, 1), empty=True))
-    drop: float = positive()
+    lr_drops_at: list[float] = key(EachOf(Within(0, 1), empty=True))
+    lr_drop: float = positive()
 
 
 @dataclass

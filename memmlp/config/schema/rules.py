@@ -176,7 +176,7 @@ def optional(rule: object = None) -> Any:
     return field(default=None, metadata={"rule": rule})
 
 
-def standing(value: object, rule: object = None) -> Any:
+def with_default(value: object, rule: object = None) -> Any:
     """Declare a key with a default, which is its value for runs recorded before the key existed."""
     return field(default=value, metadata={"rule": rule})
 

@@ -18,8 +18,8 @@ from memmlp.config.schema.rules import (
     one_of,
     optional,
     positive,
-    standing,
     target,
+    with_default,
 )
 
 # OmegaConf reads the annotations at run time and knows Optional and Union, not `|`.
@@ -128,15 +128,15 @@ class TermsLossConfig(BaselineLossConfig):
     name: str = called("terms")
     _target_: str = target("memmlp.training.losses.TermsLoss")
     error: str = one_of("absolute", "square", "norm", "smooth")
-    weighting: str = standing("fixed", OneOf(("fixed", "learned")))
-    lr: float = standing(1e-2, Within(0, strict=True))
+    weighting: str = with_default("fixed", OneOf(("fixed", "learned")))
+    lr: float = with_default(1e-2, Within(0, strict=True))
     orientation: Optional[float] = optional(Within(0))
     rotation: Optional[float] = optional(Within(0))
     global_rotation: Optional[float] = optional(Within(0))
     angle: Optional[float] = optional(Within(0))
     sixd_velocity: Optional[float] = optional(Within(0))
     turn: Optional[float] = optional(Within(0))
-    position: Optional[float] = optional(Within(0))
+    position_from_pelvis: Optional[float] = optional(Within(0))
     world_position: Optional[float] = optional(Within(0))
     hand: Optional[float] = optional(Within(0))
     velocity: Optional[float] = optional(Within(0))
@@ -198,7 +198,7 @@ class OptimConfig:
     batch: int = at_least(1)
     lr: float = positive()
     weight_decay: float = at_least(0)
-    warmup: int = standing(0, Within(0))
+    warmup: int = with_default(0, Within(0))
     clip_norm: float = at_least(0)
     precision: str = one_of("fp32", "bf16")
     compile: bool = key()
@@ -228,8 +228,8 @@ class MuonConfig(ScheduledConfig):
     name: str = called("muon")
     _target_: str = target("memmlp.training.optim.Muon")
     momentum: float = fraction()
-    rest_lr: Optional[float] = optional(Within(0, strict=True))
-    vectors: str = standing("muon", OneOf(("adamw", "muon")))
+    other_lr: Optional[float] = optional(Within(0, strict=True))
+    vectors: str = with_default("muon", OneOf(("adamw", "muon")))
 
 
 @dataclass

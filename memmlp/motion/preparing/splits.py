@@ -2,8 +2,8 @@
 
 A clip's name is its path below the data root without suffix, `/`-separated. Clips that belong together
 (`Grouping`) are never divided (`memmlp.motion.preparing.grouped_split`). Entries of lists and names of
-subsets match AMASS' clips from any release (`memmlp.motion.preparing.amass_names`), and patterns of groups don't
-see an archive's folder above that of a subset.
+subsets match AMASS' clips from any release (`memmlp.motion.preparing.amass_names`), and patterns of groups
+don't see an archive's folder above that of a subset.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.diffusion import Diffusion
 from memmlp.networks.layers import MLPBlock
 from memmlp.networks.memory import State
-from memmlp.networks.motion_model import Learned, MotionModel
+from memmlp.networks.motion_model import MotionModel, TrainingOutputs
 
 
 class WholeWindow(MotionModel):
@@ -174,7 +174,7 @@ class AGRoLDiffusion(WholeWindow):
         noise = self.noise.expand(len(encoded), -1, -1)
         return self.diffusion.sample(lambda noisy, time: self.denoise(noisy, time, encoded), noise)
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
+    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call: add noise to the truth (B, T, 252), and denoise it in one call.
 
         A diffusion time is drawn for each window.
@@ -182,11 +182,11 @@ class AGRoLDiffusion(WholeWindow):
         Args:
             sparse: world inputs (B, n, 54) of the newest frames.
             state: what the last call returned, or `initial_state`.
-            truth: world frames [X | Theta] (B, T, 252) of the window.
+            true_frames: world frames [X | Theta] (B, T, 252) of the window.
         """
         _, kept = self.taken_in(sparse, state)
-        window, frames = truth[..., :SPARSE_DIM], self.normalizer.encode(truth)
+        window, frames = true_frames[..., :SPARSE_DIM], self.normalizer.encode(true_frames)
         encoded, clean = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:][..., ROTATION]
-        time = distributed.drawn(self.diffusion.random_times, truth)
+        time = distributed.drawn(self.diffusion.random_times, true_frames)
         noisy = self.diffusion.noised(clean, time, distributed.drawn(torch.randn_like, clean))
-        return Learned(self.normalizer.posed(self.denoise(noisy, time, encoded), window), kept, {})
+        return TrainingOutputs(self.normalizer.posed(self.denoise(noisy, time, encoded), window), kept, {})

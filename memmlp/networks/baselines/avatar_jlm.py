@@ -25,7 +25,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.agrol import WholeWindow
 from memmlp.networks.baselines.transformer_encoder import EncoderLayer, draw_weights
 from memmlp.networks.memory import State
-from memmlp.networks.motion_model import Learned
+from memmlp.networks.motion_model import TrainingOutputs
 
 JOINT_DIM = 18  # features of a joint: rotation, angular velocity, position, velocity
 UNSEEN = 0.01  # stands in all features of joints without a tracker
@@ -167,17 +167,17 @@ class AvatarJLM(WholeWindow):
             h = self.renewed(h, first)
         return self.regressor(h.flatten(-2).flatten(0, 1)).unflatten(0, encoded.shape[:2])
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
+    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call, which adds a loss of the coarse pose; see MotionModel."""
-        return Learned(*self.advance(sparse, state), self.coarse_loss(truth))
+        return TrainingOutputs(*self.advance(sparse, state), self.coarse_loss(true_frames))
 
-    def coarse_loss(self, truth: Tensor) -> dict[str, Tensor]:
+    def coarse_loss(self, true_frames: Tensor) -> dict[str, Tensor]:
         """Return the mean absolute error of the coarse pose's joints relative to the head, weighted.
 
         Args:
-            truth: world frames [X | Theta] (B, T, 252).
+            true_frames: world frames [X | Theta] (B, T, 252).
         """
-        sparse, motion = truth[..., :SPARSE_DIM], truth[..., SPARSE_DIM:]
+        sparse, motion = true_frames[..., :SPARSE_DIM], true_frames[..., SPARSE_DIM:]
         origin = self.normalizer.origin(sparse)
         encoded = self.normalizer.encode_sparse(sparse, origin)
         made, _ = self.coarse_joints(self.embedding(joint_features(encoded)))

@@ -18,7 +18,7 @@ from memmlp.networks.baselines.agrol import TimeEmbedding, WholeWindow
 from memmlp.networks.baselines.ancestral_diffusion import AncestralDiffusion, Denoised
 from memmlp.networks.baselines.transformer_encoder import Attention
 from memmlp.networks.memory import State
-from memmlp.networks.motion_model import Learned
+from memmlp.networks.motion_model import TrainingOutputs
 
 SINES = 256  # of the diffusion time
 CHANNELS = SPARSE_DIM // len(TRACKED)  # of the inputs, of which each joint gets a mixture of thirds
@@ -192,7 +192,7 @@ class BoDiffusion(WholeWindow):
         rotation = self.diffusion.sample(step, self.drawn(count).to(self.noises))
         return self.normalizer.posed(rotation, sparse)
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
+    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call: add noise to the truth (B, T, 252), and denoise it in one call.
 
         A diffusion time is drawn for each window. The returned motion is made from the rotations that remain
@@ -202,16 +202,16 @@ class BoDiffusion(WholeWindow):
         Args:
             sparse: world inputs (B, n, 54) of the newest frames.
             state: what the last call returned, or `initial_state`.
-            truth: world frames [X | Theta] (B, T, 252) of the window.
+            true_frames: world frames [X | Theta] (B, T, 252) of the window.
         """
         _, kept = self.taken_in(sparse, state)
-        window, frames = truth[..., :SPARSE_DIM], self.normalizer.encode(truth)
+        window, frames = true_frames[..., :SPARSE_DIM], self.normalizer.encode(true_frames)
         encoded, clean = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:][..., ROTATION]
-        time = distributed.drawn(self.diffusion.random_times, truth)
+        time = distributed.drawn(self.diffusion.random_times, true_frames)
         noise = distributed.drawn(torch.randn_like, clean)
         noisy = self.diffusion.noised(clean, time, noise)
         made = self.denoise(noisy, time, encoded)
         error, bound = self.diffusion.losses(clean, noise, time, made, self.limits())
         found = self.diffusion.clean(noisy, made.noise, time).clamp(*self.limits())
         losses = {"noise": self.noise_weight * error, "bound": self.bound_weight * bound}
-        return Learned(self.normalizer.posed(found, window), kept, losses)
+        return TrainingOutputs(self.normalizer.posed(found, window), kept, losses)

@@ -27,7 +27,7 @@ from memmlp.motion.geometry import matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.transformer_encoder import EncoderLayer
 from memmlp.networks.memory import State
-from memmlp.networks.motion_model import Learned
+from memmlp.networks.motion_model import TrainingOutputs
 from memmlp.networks.windowless_model import WindowlessModel
 
 HANDS, OTHERS = 2, 3  # tokens of hands in the head's frame, and of the sensors that there are none of
@@ -251,10 +251,12 @@ class HMDPoser(WindowlessModel):
         wanted = sparse.shape[1] if newest is None else newest
         return self.normalizer.posed(self.pose(features[:, -wanted:]), sparse[:, -wanted:]), kept
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
+    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call, which adds the loss of the predicted shape; see MotionModel."""
         features, kept = self.features(sparse, state)
-        return Learned(self.normalizer.posed(self.pose(features), sparse), kept, self._shape_loss(features))
+        return TrainingOutputs(
+            self.normalizer.posed(self.pose(features), sparse), kept, self._shape_loss(features)
+        )
 
     def _shape_loss(self, features: Tensor) -> dict[str, Tensor]:
         """Return the weighted loss of how much the shapes of features (B, T, d) vary within a window."""

@@ -48,7 +48,7 @@ from memmlp.networks.baselines.limb_solver import (
 )
 from memmlp.networks.baselines.transformer_encoder import draw_weights
 from memmlp.networks.memory import State
-from memmlp.networks.motion_model import Learned, MotionModel
+from memmlp.networks.motion_model import MotionModel, TrainingOutputs
 
 KEPT = (1, 2, 3, 6, 9, 12, 13, 14, 16, 17)
 """The joints whose local rotations are predicted, beside the root's: the trunk's, shoulders and hips."""
@@ -186,23 +186,23 @@ class Manikin(MotionModel):
         with in_float32(made.device):
             return PredictedParts.of(made.to(encoded.dtype), self.normalizer).posed(encoded, self.normalizer)
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
+    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call in which each window is turned by its own random heading; see MotionModel."""
         inputs, kept = self.taken_in(sparse, state)
-        heading, space = self.heading(truth), Heading()
+        heading, space = self.heading(true_frames), Heading()
         window = space.sparse_in(inputs[:, -self.frames :], heading)
         encoded = self.normalizer.encode_sparse(window, self.normalizer.origin(window))
         made = self.predicted(encoded)
         count = made.shape[1]
         rotation = self.posed(made, encoded[:, -count:])
         motion = space.motion_out(self.normalizer.posed(rotation, window[:, -count:]), heading)
-        true = torch.cat([window, space.motion_in(truth[..., SPARSE_DIM:], heading)], -1)
-        return Learned(motion, kept, self.losses(made, true))
+        true = torch.cat([window, space.motion_in(true_frames[..., SPARSE_DIM:], heading)], -1)
+        return TrainingOutputs(motion, kept, self.losses(made, true))
 
-    def heading(self, truth: Tensor) -> Tensor:
+    def heading(self, true_frames: Tensor) -> Tensor:
         """Draw a turn about the world's vertical axis for each window, as an origin (B, 1, 5) of Heading."""
-        angle = self.turned * 2 * math.pi * distributed.drawn(torch.rand_like, truth[:, :1, :1])
-        return torch.cat([torch.zeros_like(truth[:, :1, :3]), angle.cos(), angle.sin()], -1)
+        angle = self.turned * 2 * math.pi * distributed.drawn(torch.rand_like, true_frames[:, :1, :1])
+        return torch.cat([torch.zeros_like(true_frames[:, :1, :3]), angle.cos(), angle.sin()], -1)
 
     def losses(self, made: Tensor, true: Tensor) -> dict[str, Tensor]:
         """Return the weighted losses of outputs (B, n, 86 or more), given true world frames (B, T, 252)."""

@@ -16,7 +16,7 @@ from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.transformer_encoder import Attention, EncoderLayer
 from memmlp.networks.memory import State
-from memmlp.networks.motion_model import Learned
+from memmlp.networks.motion_model import TrainingOutputs
 from memmlp.networks.windowless_model import WindowlessModel
 
 FRESH = 0.25  # of the training windows begin as a live stream does, without a past
@@ -154,7 +154,7 @@ class RPM(WindowlessModel):
         wanted = sparse.shape[1] if newest is None else newest
         return self.normalizer.posed(torch.cat(shown[-wanted:], 1), sparse[:, -wanted:]), state
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
+    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call: a few frames of free running without gradients, then one step with gradients.
 
         The number of free-running frames is drawn for each call. The step predicts the window's last W
@@ -163,13 +163,13 @@ class RPM(WindowlessModel):
         Args:
             sparse: world inputs (B, T, 54).
             state: a fresh start.
-            truth: world frames [X | Theta] (B, T, 252).
+            true_frames: world frames [X | Theta] (B, T, 252).
         """
         now = self.frames - self.horizon
         begin = now - int(torch.randint(now - self.context + 1, ()))
         encoded = self.encoded(sparse)
         past = slice(begin - self.context, begin)
-        state = self.begun(state, encoded[:, past], truth[:, past])
+        state = self.begun(state, encoded[:, past], true_frames[:, past])
         training = self.training
         self.train(training and self.own_dropout)
         with torch.no_grad():
@@ -178,18 +178,18 @@ class RPM(WindowlessModel):
         self.train(training)
         torch.clear_autocast_cache()  # weights that were cast without a gradient would have none below
         made, state = self.rolled(encoded[:, now : now + 1], state)
-        return Learned(self.normalizer.posed(made, sparse[:, now:]), state, {})
+        return TrainingOutputs(self.normalizer.posed(made, sparse[:, now:]), state, {})
 
-    def begun(self, fresh: State, encoded: Tensor, truth: Tensor) -> State:
+    def begun(self, fresh: State, encoded: Tensor, true_frames: Tensor) -> State:
         """Return the state after true frames, or a fresh start for a randomly drawn share of the windows.
 
         Args:
             fresh: a fresh start.
             encoded: inputs (B, context, 54) in network space.
-            truth: the same frames (B, context, 252) in the world.
+            true_frames: the same frames (B, context, 252) in the world.
         """
-        motion = self.normalizer.encode(truth)[..., SPARSE_DIM:][..., ROTATION]
-        known = (distributed.drawn(torch.rand_like, truth[:, :1, 0]) >= FRESH).to(truth.dtype)
+        motion = self.normalizer.encode(true_frames)[..., SPARSE_DIM:][..., ROTATION]
+        known = (distributed.drawn(torch.rand_like, true_frames[:, :1, 0]) >= FRESH).to(true_frames.dtype)
         return fresh | {
             "sparse": known[..., None] * encoded,
             "motion": known[..., None] * motion,

@@ -13,7 +13,7 @@ from memmlp.networks.baselines.avatar_poser import OwnWindows
 from memmlp.networks.baselines.diffusion import Diffusion
 from memmlp.networks.baselines.sage_parts import LATENT, Decoder, HalfVQVAE, LowerDenoiser, UpperDenoiser
 from memmlp.networks.memory import State
-from memmlp.networks.motion_model import Learned
+from memmlp.networks.motion_model import TrainingOutputs
 
 
 class SAGENet(OwnWindows):
@@ -95,6 +95,6 @@ class SAGENet(OwnWindows):
         upper = self.upper_latent(encoded)
         return self.decoder(upper, self.lower_latent(upper, encoded), encoded)[:, -1]
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
+    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call through both samplers, for the newest frame alone; see MotionModel."""
-        return Learned(*self.advance(sparse, state, 1), {})
+        return TrainingOutputs(*self.advance(sparse, state, 1), {})

@@ -18,7 +18,7 @@ from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.layers import Dropout
 from memmlp.networks.memory import State
-from memmlp.networks.motion_model import Learned
+from memmlp.networks.motion_model import TrainingOutputs
 from memmlp.networks.windowless_model import WindowlessModel
 
 POSES = (SPARSE_ROTATION, SPARSE_POSITION)
@@ -136,7 +136,7 @@ class VAEHMD(WindowlessModel):
         seen = sparse if newest is None else sparse[:, -newest:]
         return self.normalizer.posed(self.decoder(self.latent(seen).chunk(2, -1)[0]), seen), state
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
+    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call: each window is decoded either from its true poses or from its trackers.
 
         The one further loss is the latents' KL divergence.
@@ -144,13 +144,13 @@ class VAEHMD(WindowlessModel):
         Args:
             sparse: world inputs (B, T, 54).
             state: see `advance`.
-            truth: world frames [X | Theta] (B, T, 252).
+            true_frames: world frames [X | Theta] (B, T, 252).
         """
         posed = (distributed.drawn(torch.rand_like, sparse[:, :1, :1]) < 0.5).to(sparse.dtype)
-        of_pose = self.pose_encoder(self.normalizer.encode(truth)[..., SPARSE_DIM:])
+        of_pose = self.pose_encoder(self.normalizer.encode(true_frames)[..., SPARSE_DIM:])
         latent = posed * of_pose + (1 - posed) * self.latent(sparse)
         sample = drawn(latent)
         frozen = {name: weight.detach() for name, weight in self.decoder.named_parameters()}
         live, still = self.decoder(sample), functional_call(self.decoder, frozen, (sample,))
         motion = self.normalizer.posed(posed * live + (1 - posed) * still, sparse)
-        return Learned(motion, state, {"divergence": self.divergence_weight * divergence(latent)})
+        return TrainingOutputs(motion, state, {"divergence": self.divergence_weight * divergence(latent)})

@@ -151,19 +151,19 @@ class SAGERefinerLoss(Loss):
     def __init__(self) -> None:
         super().__init__()
         weights = {"rotation_all": 0.01, "rotation_velocity": 60.0, "rotation_velocity_3": 20.0}
-        self.weighting = Fixed({**weights, "position": 0.01, "trackers": 0.01, "jerk": 0.03})
+        self.weighting = Fixed({**weights, "position_from_pelvis": 0.01, "trackers": 0.01, "jerk": 0.03})
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         """Return each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
         error, pair = (motion - truth)[..., ROTATION], Comparison(motion, truth, sparse, normalizer)
-        tracked = [HEAD, *HANDS]
+        tracked, rooted = [HEAD, *HANDS], pair.made.posed[1]
         return {
             "rotation_all": _smooth(error),
             "rotation_velocity": _smooth(error.diff(dim=1)),
             "rotation_velocity_3": _smooth(error[:, ::3].diff(dim=1)),
-            "position": (pair.made.posed[1] - from_pelvis(pair.true_positions)).norm(dim=-1).mean(),
+            "position_from_pelvis": (rooted - from_pelvis(pair.true_positions)).norm(dim=-1).mean(),
             "trackers": _smooth((pair.positions - pair.true_positions)[..., tracked, :]),
-            "jerk": jerk_of(pair.made.posed[1]),
+            "jerk": jerk_of(rooted),
         }
 
 
@@ -173,7 +173,7 @@ def _smooth(error: Tensor) -> Tensor:
 
 
 class LossOfNetwork(Loss):
-    """No loss of the motion: a network trains with its own losses alone (`Learned.losses`)."""
+    """No loss of the motion: a network trains with its own losses alone (`TrainingOutputs.losses`)."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -129,7 +129,7 @@ def turn(pair: Comparison, error: Error) -> Tensor:
     return error(matrix_to_sixd(pair.made.turns) - matrix_to_sixd(pair.true.turns))
 
 
-def position(pair: Comparison, error: Error) -> Tensor:
+def position_from_pelvis(pair: Comparison, error: Error) -> Tensor:
     """Return the error of the joints by forward kinematics relative to the pelvis, without translation."""
     true = pair.true_positions - pair.true_positions[..., ROOT : ROOT + 1, :]
     return error(pair.made.posed[1] - true)
@@ -188,7 +188,7 @@ TERMS: dict[str, tuple[Callable[[Comparison, Error], Tensor], int]] = {
     "angle": (angle, 1),
     "sixd_velocity": (sixd_velocity, 2),
     "turn": (turn, 2),
-    "position": (position, 1),
+    "position_from_pelvis": (position_from_pelvis, 1),
     "world_position": (world_position, 1),
     "hand": (hand, 1),
     "velocity": (partial(velocity, step=1), 2),

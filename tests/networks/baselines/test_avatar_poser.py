@@ -67,6 +67,6 @@ def test_the_encoder_layer_is_torchs():
 def test_dropout_drops_in_training_alone():
     model = tiny.baseline("avatar_poser", dropout=0.5)
     call = SPARSE[:, :7], model.initial_state(1), CLIP[None, :7]
-    assert torch.equal(model.learn(*call)[0], model.learn(*call)[0])
+    assert torch.equal(model.training_call(*call)[0], model.training_call(*call)[0])
     model.train()
-    assert not torch.equal(model.learn(*call)[0], model.learn(*call)[0])
+    assert not torch.equal(model.training_call(*call)[0], model.training_call(*call)[0])

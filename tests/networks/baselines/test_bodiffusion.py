@@ -61,7 +61,9 @@ def test_the_denoiser_learns_from_the_noised_truth_of_the_window():
         denoise = model.denoise
         model.denoise = lambda *args, denoise=denoise, seen=seen: (seen.append(args), denoise(*args))[1]
         torch.manual_seed(0)
-        motion, _, losses = model.learn(TRUTH[:, -1:, :SPARSE_DIM], model.true_state(TRUTH[:, :-1]), TRUTH)
+        motion, _, losses = model.training_call(
+            TRUTH[:, -1:, :SPARSE_DIM], model.true_state(TRUTH[:, :-1]), TRUTH
+        )
         assert float(motion[..., ROTATION].detach().abs().max()) == pytest.approx(1)  # kept within limits
         found.append({name: float(term.detach()) for name, term in losses.items()})
     (noisy, time, encoded), *_ = seen
@@ -88,7 +90,7 @@ def test_learning_takes_what_a_perfect_denoiser_would_leave():
         return Denoised((noisy - signal.sqrt() * encoded) / (1 - signal).sqrt(), torch.zeros_like(noisy))
 
     model.denoise = perfect
-    motion, *_ = model.learn(truth[:, -1:, :SPARSE_DIM], model.true_state(truth[:, :-1]), truth)
+    motion, *_ = model.training_call(truth[:, -1:, :SPARSE_DIM], model.true_state(truth[:, :-1]), truth)
     true = truth[..., SPARSE_DIM:]
     torch.testing.assert_close(motion[..., ROTATION], true[..., ROTATION], atol=1e-6, rtol=0)
 

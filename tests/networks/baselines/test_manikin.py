@@ -159,13 +159,13 @@ def test_training_is_on_windows_turned_by_any_heading_and_the_motion_is_turned_b
     monkeypatch.setattr(torch, "rand_like", lambda like: torch.tensor([[[0.1]], [[0.7]]]).double())
     state = model.initial_state(2)
     expected = model.advance(SPARSE, state)[0]
-    motion, *_ = model.learn(SPARSE, state, TRUTH)
+    motion, *_ = model.training_call(SPARSE, state, TRUTH)
     torch.testing.assert_close(motion, expected[:, -motion.shape[1] :], atol=1e-6, rtol=0)
     world = tiny.baseline(name, World()).double()
     world.normalizer = Normalizer.raw(World(), tiny.REST).double()
     predicted = world.predicted
     world.predicted = lambda encoded: (seen.append(encoded), predicted(encoded))[1]
-    world.learn(SPARSE, state, TRUTH)
+    world.training_call(SPARSE, state, TRUTH)
     heads = [window[..., 36:39][:, -world.frames :] for window in (SPARSE, seen[0])]
     torch.testing.assert_close(heads[0][..., 2], heads[1][..., 2])
     torch.testing.assert_close(heads[0][..., :2].norm(dim=-1), heads[1][..., :2].norm(dim=-1))
@@ -173,7 +173,7 @@ def test_training_is_on_windows_turned_by_any_heading_and_the_motion_is_turned_b
     still = tiny.baseline(name, World(), turned=False).double()
     still.normalizer = world.normalizer
     torch.testing.assert_close(
-        still.learn(SPARSE, state, TRUTH)[0], still.advance(SPARSE, state)[0][:, -motion.shape[1] :]
+        still.training_call(SPARSE, state, TRUTH)[0], still.advance(SPARSE, state)[0][:, -motion.shape[1] :]
     )
 
 
@@ -182,7 +182,7 @@ def test_the_losses_of_the_parts_have_a_weight(name):
     found = []
     for weight in (1.0, 0.5):
         model = tiny.baseline(name, parts_weight=weight, turned=False)
-        losses = model.learn(SPARSE.float(), model.initial_state(2), TRUTH.float()).losses
+        losses = model.training_call(SPARSE.float(), model.initial_state(2), TRUTH.float()).losses
         found.append({key: float(term.detach()) for key, term in losses.items()})
     parts = found[0].keys() - {"coarse"}
     assert len(parts) == {"manikin_s": 6, "manikin_l": 5}[name]

@@ -54,7 +54,7 @@ def test_its_first_gradient_is_that_of_rotations(normalize: bool):
     """Zeros are no rotation, and the gradient of one made of them is 1e12 times that of another."""
     made = Normalizer.fit(Heading(), tiny.REST, CLIP) if normalize else Normalizer.raw(Heading(), tiny.REST)
     model = StillPose(made, frames=7)
-    motion = model.learn(CLIP[None, :7, :SPARSE_DIM], {}, CLIP[None, :7]).motion
+    motion = model.training_call(CLIP[None, :7, :SPARSE_DIM], {}, CLIP[None, :7]).motion
     (rotations(motion) * torch.rand(22, 3, 3)).sum().backward()
     assert 1e-3 < float(model.pose.grad.norm()) < 1e3
 
