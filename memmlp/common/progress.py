@@ -56,7 +56,7 @@ def remark(line: str) -> None:
 
 @contextmanager
 def during(name: str) -> Iterator[None]:
-    """Name the larger work, such as a validation, to which work that is counted in this context belongs."""
+    """Label the progress bars of this context with the larger work that they are a part of: a validation."""
     token = _DURING.set(name)
     try:
         yield

@@ -13,7 +13,7 @@ from memmlp.motion.body import FPS, N_JOINTS
 
 FRAME_RATE_RANGE = (1.0, 1000.0)
 INTERPOLATED = "interpolated"
-PART = 3600  # frames of a long clip that are worked on at a time
+PIECE = 3600  # frames of a long clip that are worked on at a time
 SPLINES, LINES = "splines", "lines"
 INTERPOLATIONS = (SPLINES, LINES)
 """How motion is interpolated at times that lie between two recorded frames.
@@ -56,11 +56,11 @@ class Clip:
     def __len__(self) -> int:
         return len(self.poses)
 
-    def parts(self, frames: int = PART) -> Iterator[Clip]:
-        """Yield the clip in successive parts of at most `frames` frames."""
+    def pieces(self, frames: int = PIECE) -> Iterator[Clip]:
+        """Yield the clip in successive pieces of at most `frames` frames."""
         for start in range(0, len(self), frames):
-            part = slice(start, start + frames)
-            yield replace(self, poses=self.poses[part], trans=self.trans[part])
+            piece = slice(start, start + frames)
+            yield replace(self, poses=self.poses[piece], trans=self.trans[piece])
 
 
 def resample(clip: Clip, fps: float = FPS, interpolation: str = SPLINES) -> tuple[Clip, str]:

@@ -123,7 +123,8 @@ class Normalizer(nn.Module):
     def posed_in_world(self, rotations: Tensor, sparse: Tensor, change: Change | None = None) -> Tensor:
         """Make world motion (..., 198) from global rotations (..., 132), 6D, and world inputs (..., 54).
 
-        The positions are sums of turned bones, without gradients, with the head on its tracker.
+        Joints follow by adding up the turned bones from the root on, the head on its tracker; no gradient
+        flows through them. `change` may alter rotations and positions before rotations are made local.
         """
         matrices = sixd_to_matrix(rotations.unflatten(-1, (N_JOINTS, 6)))
         parents = matrices[..., list(PARENTS[1:]), :, :]

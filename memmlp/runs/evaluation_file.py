@@ -74,7 +74,7 @@ def preference(path: Path, report: Mapping[str, Any], config: Mapping[str, Any])
 
 
 def combined_by(reports: Sequence[Mapping[str, Any]]) -> dict[str, str | None]:
-    """Return the inverse kinematics (`solver_of`) of the last report with the branch `combined`, by mode."""
+    """Return by mode which inverse kinematics (`solver_of`) made the branch `combined` of the last report."""
     having = [report for report in reports if COMBINED in report["mean"]]
     return {str(report.get("mode")): solver_of(report.get("settings") or {}) for report in having}
 

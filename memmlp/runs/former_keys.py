@@ -150,5 +150,5 @@ def present_key(key: str, allowed: Sequence[str]) -> str | None:
 
 
 def present_option(group: str, former: str) -> str | None:
-    """Return the present name of an option that its group does not have; None if it never had it."""
+    """Return the present name of an option of a group; None if `former` is no former name there."""
     return next((now for (slot, now), name in OPTIONS.items() if (slot, name) == (group, former)), None)

@@ -98,7 +98,7 @@ class SAGEUpstream:
 
 
 def of_whole(name: str, whole: Optim, part: Optim) -> tuple[str, ...]:
-    """Return the settings of optim that hold for the whole network, not for a part: "optim.warmup=100"."""
+    """Return the settings of optim that a part does not use, such as "optim.warmup=100"."""
     other = () if name == "adamw" else (f"optim={name}",)
     own = {key: getattr(whole, key, None) for key in WHOLE}
     return (*other, *(f"optim.{key}={own[key]}" for key in WHOLE if own[key] != getattr(part, key)))

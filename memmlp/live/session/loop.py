@@ -66,7 +66,8 @@ def run_loop(
     A message has the frame's number and time (s); the milliseconds that the network itself took (`ms`), and
     those that the whole pose took, from the sample's arrival until all outputs had it (`whole`); how many
     samples were dropped, malformed, or foreign so far; whether the samples' times jump (`OddSamples`); the
-    trackers that are held; and the joints, predicted and true (66 whole millimetres each, axes of openxr).
+    trackers that are held; and the joints' positions, predicted and true (66 whole millimetres each, in
+    openxr's axes).
     Packets that are not taken are reported at once, by a message with these counts alone.
 
     Args:
@@ -116,7 +117,7 @@ def run_loop(
             opening
             | times
             | refusals_message(dropped, *told)
-            | joints_message(stream.space, pose, source.truth(pose.time))
+            | positions_message(stream.space, pose, source.truth(pose.time))
         )
         publish(message | (avatar_message(stream.space, pose, stream.rest) if avatar else {}))
         number += 1
@@ -127,9 +128,9 @@ def refusals_message(dropped: int, malformed: int, foreign: int) -> dict[str, An
     return {"dropped": dropped, "malformed": malformed, "foreign": foreign}
 
 
-def joints_message(space: Space, pose: Pose, truth: np.ndarray | None) -> dict[str, Any]:
-    """Return the part of a message with the joints."""
-    return {"joints": millimetres(space, pose.positions), "truth": millimetres(space, truth)}
+def positions_message(space: Space, pose: Pose, truth: np.ndarray | None) -> dict[str, Any]:
+    """Return the part of a message with the joints' positions."""
+    return {"positions": millimetres(space, pose.positions), "truth": millimetres(space, truth)}
 
 
 def millimetres(space: Space, joints: np.ndarray | None) -> list[int] | None:

@@ -8,7 +8,7 @@ In OSC a bundle has the messages `/memmlp/head`, `/memmlp/left`, `/memmlp/right`
 `/memmlp/time` (a double or float) and `/memmlp/seq` (an integer).
 
 A tracker that is null or missing is lost. A packet without a time gets its time of arrival. By the sample's
-number, seq, lost packets are counted, and those that others have overtaken are left out.
+number, seq, missing packets are counted, and those that others have overtaken are left out.
 """
 
 from __future__ import annotations

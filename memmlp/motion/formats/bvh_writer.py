@@ -118,10 +118,10 @@ def _motion(clip: Clip, rest: np.ndarray) -> Iterator[str]:
     """Yield the lines from MOTION on."""
     yield from ("MOTION", f"Frames: {len(clip)}", f"Frame Time: {1 / clip.fps:.12f}")
     order, before = list(_below(0)), None
-    for part in clip.parts():
-        rotations, root = y_up_motion(part, rest)
+    for piece in clip.pieces():
+        rotations, root = y_up_motion(piece, rest)
         angles = euler_zxy(rotations, before)
         before = angles[-1]
-        values = np.concatenate([CENTIMETRES * root, angles[:, order].reshape(len(part), -1)], 1)
+        values = np.concatenate([CENTIMETRES * root, angles[:, order].reshape(len(piece), -1)], 1)
         form = " ".join([NUMBER] * values.shape[1])
         yield from (form % tuple(row) for row in values.tolist())

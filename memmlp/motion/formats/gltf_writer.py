@@ -121,10 +121,10 @@ def _curves(clip: Clip, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     quaternions = np.empty((len(clip), N_JOINTS, 4), "<f4")
     roots = np.empty((len(clip), 3), "<f4")
     end = 0
-    for part in clip.parts():
-        rotations, root = y_up_motion(part, rest)
+    for piece in clip.pieces():
+        rotations, root = y_up_motion(piece, rest)
         before = quaternions[end - 1] if end else None
-        here = slice(end, end := end + len(part))
+        here = slice(end, end := end + len(piece))
         quaternions[here], roots[here] = continuous_quaternions(rotations, before), root
     return quaternions, roots
 

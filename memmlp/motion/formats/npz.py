@@ -139,9 +139,9 @@ def write_clip(path: Path, clip: Clip) -> None:
         "mocap_framerate": np.array(float(clip.fps)),
     }
     with atomic_file(path) as file, zipfile.ZipFile(file, "w") as archive:
-        with archive.open("poses.npy", "w", force_zip64=True) as member:  # in parts: it may be an hour
+        with archive.open("poses.npy", "w", force_zip64=True) as member:  # in pieces: it may be an hour
             np.lib.format.write_array_header_1_0(member, about)
-            member.writelines(_smplh(part).tobytes() for part in clip.parts())
+            member.writelines(_smplh(piece).tobytes() for piece in clip.pieces())
         for name, array in others.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, array, allow_pickle=False)

@@ -195,7 +195,7 @@ def chain_frame(bent: Tensor, rest: Tensor) -> Tensor:
 
 
 def handed(arms: Tensor, hands: Tensor, forearm: Tensor) -> tuple[Tensor, Tensor]:
-    """Divide the rotations of the hands between elbows and wrists.
+    """Divide each hand's rotation: the roll of the forearm goes to the elbow, the rest stays at the wrist.
 
     Args:
         arms: global rotations (..., 2, 3, 3) of elbows that are bent and not yet rolled.

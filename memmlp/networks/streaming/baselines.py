@@ -232,7 +232,7 @@ class FrameGraph(StreamingGraph):
         self.model = model
 
     def windows(self) -> State:
-        """Return the network's own state at a fresh start."""
+        """Return the network's state at a fresh start, which is all that it carries: it has no window."""
         return self.model.initial_state(1)
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:

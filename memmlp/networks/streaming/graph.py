@@ -64,7 +64,7 @@ class StreamingGraph(nn.Module):
 
     @classmethod
     def fits(cls, model: MotionModel) -> bool:
-        """Return whether this class of graph can stream a network of its class with these parts."""
+        """Return whether this graph can stream this very model: its memory, its sizes."""
         return True
 
     def build(self, model: MotionModel) -> None:

@@ -71,7 +71,7 @@ class GridRow(NamedTuple):
 
     @property
     def capped(self) -> bool:
-        """Whether this cell is included in the promise that intervals are not too wide."""
+        """Whether intervals of this cell are promised not to be too wide: not with few seeds or groups."""
         return self.seeds >= 3 and self.groups[-1] >= 4
 
 

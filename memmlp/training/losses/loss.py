@@ -30,7 +30,7 @@ class Fixed(nn.Module):
     def build(self, names: list[str], own: Mapping[str, float] | None = None) -> None:
         """Check that every term has a weight, adding the weights of custom terms; there is nothing to learn.
 
-        A custom term's own weight counts, also where this has one for a term of that name which is not there.
+        Where a custom term has the name of a weight that no term uses, its own weight replaces that one.
 
         Raises:
             InputError: for a term that has no weight.

@@ -20,8 +20,8 @@ from memmlp.live.session.loop import (
     UNIT,
     avatar_message,
     greeting,
-    joints_message,
     millimetres,
+    positions_message,
     refusals_message,
     with_avatar,
 )
@@ -106,8 +106,8 @@ def test_an_avatar_s_bones_are_where_the_joints_are(browser: Browser, own: bytes
     person, space = pose(), SPACES["amass"]
     person = person._replace(positions=person.positions * size)
     words = with_avatar({})["avatar"]
-    given = joints_message(space, person, None) | avatar_message(space, person, REST * size)
-    joints = np.array(given["joints"]).reshape(22, 3) / 1000
+    given = positions_message(space, person, None) | avatar_message(space, person, REST * size)
+    joints = np.array(given["positions"]).reshape(22, 3) / 1000
     script = """
       import('./avatar.js').then(async ({ Avatar }) => {
         const avatar = await Avatar.load('avatar.vrm', WORDS);
@@ -158,7 +158,7 @@ def test_an_avatar_is_as_tall_as_the_wearer_of_the_frame(browser: Browser, own: 
           };
         })""")
         for number, size in enumerate((1.2, 0.9)):
-            told = avatar_message(space, person, REST * size) | joints_message(space, person, None)
+            told = avatar_message(space, person, REST * size) | positions_message(space, person, None)
             times = {"number": number, "time": 0.0, "held": [], "jumping": False, "ms": 1.0, "whole": 1.0}
             server.hub.publish(told | times | refusals_message(0, 0, 0))
             browser.wait(f"Math.abs(window.size - {size}) < 1e-3")

@@ -103,8 +103,8 @@ def test_it_says_what_it_waits_for_and_when_the_command_has_ended(
 def frame(number: int) -> dict[str, object]:
     """Return a frame's message."""
     counts = {"held": [], "jumping": False, "dropped": 0, "malformed": 0, "foreign": 0}
-    joints = np.random.default_rng(0).integers(0, 1500, 66).tolist()
-    return {"number": number, "time": 0.0, "ms": 1.0, "whole": 1.0, "joints": joints, "truth": None, **counts}
+    positions = {"positions": np.random.default_rng(0).integers(0, 1500, 66).tolist(), "truth": None}
+    return {"number": number, "time": 0.0, "ms": 1.0, "whole": 1.0, **positions, **counts}
 
 
 def test_another_command_at_the_address_gets_a_page_of_its_own(browser: Browser, clip: TrackedClip):

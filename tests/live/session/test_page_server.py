@@ -73,7 +73,7 @@ def test_truth_and_prediction_in_the_pages_axes(network: Path, clip: TrackedClip
     assert message["truth"] == pytest.approx(
         1000 * truth[:, [0, 2, 1]].ravel() * np.tile([1, 1, -1], 22), abs=1
     )
-    joints = np.array(message["joints"]).reshape(22, 3)
+    joints = np.array(message["positions"]).reshape(22, 3)
     assert joints[15] == pytest.approx(np.array(message["truth"]).reshape(22, 3)[15], abs=1)
     assert message["whole"] > message["ms"] > 0
     json.dumps(message)
@@ -81,8 +81,8 @@ def test_truth_and_prediction_in_the_pages_axes(network: Path, clip: TrackedClip
 
 def test_held_trackers_and_refused_samples_are_told(network: Path, clip: TrackedClip):
     told = played(network, clip, 60, Losing)
-    messages = [message for message in told if "joints" in message]
-    assert [message for message in told if "joints" not in message] == [
+    messages = [message for message in told if "positions" in message]
+    assert [message for message in told if "positions" not in message] == [
         {"dropped": 0, "malformed": 1, "foreign": 0}
     ]
     held = [m["number"] for m in messages if m["held"]]

@@ -37,14 +37,14 @@ function percentiles(values) {
 
 // Returns the frame in metres, with the joints' errors in cm where the truth is known.
 function measured(frame) {
-  const joints = Float32Array.from(frame.joints, mm => mm / 1000);
+  const positions = Float32Array.from(frame.positions, mm => mm / 1000);
   if (frame.turns) frame.turns = Int16Array.from(frame.turns);
-  if (!frame.truth) return { ...frame, joints, errors: null, mean: null };
+  if (!frame.truth) return { ...frame, positions, errors: null, mean: null };
   const truth = Float32Array.from(frame.truth, mm => mm / 1000);
-  const errors = new Float32Array(joints.length / 3);
+  const errors = new Float32Array(positions.length / 3);
   for (let j = 0; j < errors.length; j++) {
-    const [x, y, z] = [0, 1, 2].map(i => joints[3 * j + i] - truth[3 * j + i]);
+    const [x, y, z] = [0, 1, 2].map(i => positions[3 * j + i] - truth[3 * j + i]);
     errors[j] = 100 * Math.hypot(x, y, z);
   }
-  return { ...frame, joints, truth, errors, mean: errors.reduce((a, b) => a + b) / errors.length };
+  return { ...frame, positions, truth, errors, mean: errors.reduce((a, b) => a + b) / errors.length };
 }

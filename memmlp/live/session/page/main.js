@@ -26,7 +26,7 @@ events.addEventListener('wearer', event => wearer.show(JSON.parse(event.data)));
 events.addEventListener('frame', event => {
   const frame = JSON.parse(event.data);
   ({ malformed, foreign } = frame);
-  if (!frame.joints) return; // the message has the counts alone
+  if (!frame.positions) return; // the message has the counts alone
   if (frame.number <= history.last && history.frames.length) begin(); // the command was started again
   history.add(frame);
   arrived = performance.now();

@@ -62,16 +62,16 @@ export class Stage {
   }
 
   show(frame) {
-    const { joints, truth, errors } = frame;
+    const { positions, truth, errors } = frame;
     const known = errors !== null;
     const dressed = Boolean(this.avatar && this.dressed);
     if (this.avatar) this.avatar.scene.visible = dressed;
     this.prediction.group.visible = !dressed;
     this.truth.group.visible = known && !dressed;
-    if (dressed) this.avatar.pose(frame.turns, joints, frame.hips);
-    else this.prediction.pose(joints, known ? this.heat.bind(null, errors) : () => this.grey);
+    if (dressed) this.avatar.pose(frame.turns, positions, frame.hips);
+    else this.prediction.pose(positions, known ? this.heat.bind(null, errors) : () => this.grey);
     if (known && !dressed) this.truth.pose(truth, () => this.grey);
-    this.follow(truth ?? joints, frame.restarted);
+    this.follow(truth ?? positions, frame.restarted);
   }
 
   // Camera and light move along with the person's middle, smoothly but for a jump.

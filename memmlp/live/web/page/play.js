@@ -140,7 +140,7 @@ class Play {
     const millimetres = joints => Array.from(joints, x => 1000 * x);
     const number = this.history.frames.length ? this.history.last + 1 : 0;
     const { time, held, restarted } = pose;
-    this.history.add({ number, time, held, restarted, ms, joints: millimetres(pose.positions), truth: millimetres(truth) });
+    this.history.add({ number, time, held, restarted, ms, positions: millimetres(pose.positions), truth: millimetres(truth) });
   }
 
   paused() { return this.history.paused ? this.history.resume() : this.history.choose(this.history.last); }
