@@ -29,7 +29,7 @@ def content(**changes: Any) -> dict[str, Any]:
             {"optim.steps": list(STEPS), "data.split.train_fraction": [1.0]},
             {"optim.steps": [2000], "data.split.train_fraction": [0.5, 0.25]},
         ],
-        "scale": {"against": ["compute", "data.split.train_fraction"], "predict": ["profile=paper"]},
+        "scale": {"along": ["compute", "data.split.train_fraction"], "predict": ["profile=paper"]},
         **changes,
     }
 

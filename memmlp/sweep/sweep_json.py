@@ -9,6 +9,7 @@ from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import plain, read_json, write_json
+from memmlp.runs.former_keys import with_present_keys
 from memmlp.sweep.definition import Arm, Scale, Sweep
 
 NAME = "sweep.json"
@@ -31,14 +32,22 @@ def kept_sweep(folder: Path) -> Sweep | None:
         content = json.loads(path.read_bytes())
         if "extra" in content:  # what earlier versions called it
             content["command_line"] = content.pop("extra")
-        content["arms"] = tuple(
-            Arm(**_with_tuples(arm, ("overrides", "seeds", "cell"))) for arm in content["arms"]
-        )
-        scale = content.get("scale")
-        content["scale"] = Scale(**_with_tuples(scale, ("against", "predict"))) if scale else None
+        content["arms"] = tuple(map(_arm, content["arms"]))
+        content |= {name: with_present_keys(content[name]) for name in ("base", "command_line")}
+        content["scale"] = _scale(content["scale"]) if content.get("scale") else None
         return Sweep(**_with_tuples(content, ("notes", "base", "seeds", "arms", "metrics", "command_line")))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: not a sweep ({error}); start the sweep again") from None
+
+
+def _arm(fields: dict[str, Any]) -> Arm:
+    words = {name: with_present_keys(fields[name]) for name in ("overrides", "cell") if fields.get(name)}
+    return Arm(**_with_tuples(fields | words, ("overrides", "seeds", "cell")))
+
+
+def _scale(fields: dict[str, Any]) -> Scale:
+    named = {"along" if name == "against" else name: value for name, value in fields.items()}
+    return Scale(**_with_tuples(named, ("along", "predict")))  # `against` up to version 0.2
 
 
 def _with_tuples(fields: dict[str, Any], names: tuple[str, ...]) -> dict[str, Any]:

@@ -102,7 +102,7 @@ def test_a_scale_is_compute_where_the_file_names_nothing_else():
     axes = {"optim.steps": [5, 50]}
     scales = [
         parse_sweep("s", {"arms": arms, "axes": axes, "scale": scale}).scale
-        for scale in ({}, {"against": ["compute", "optim.steps"], "predict": ["profile=paper"]})
+        for scale in ({}, {"along": ["compute", "optim.steps"], "predict": ["profile=paper"]})
     ]
     assert scales == [Scale(), Scale(("compute", "optim.steps"), ("profile=paper",))]
     assert parse_sweep("s", {"arms": arms, "axes": axes}).scale is None

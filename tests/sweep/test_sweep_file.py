@@ -71,7 +71,7 @@ def test_every_metric_has_a_smallest_effect_that_a_file_may_set():
         ({"arms": ARMS, "axes": [{"a": [1]}, {"seed": [0]}]}, "axes[1].seed: allowed in a single grid"),
         ({"arms": ARMS, "scale": {}}, "scale: allowed with axes, and arms that name their control"),
         ({"arms": ARMS, "axes": {"a": [1]}, "scale": {}}, "scale: allowed with axes, and arms that name"),
-        ({**SCALED, "scale": {"agianst": []}}, "scale.agianst: no such key; did you mean against?"),
+        ({**SCALED, "scale": {"alnog": []}}, "scale.alnog: no such key; did you mean along?"),
         ({**SCALED, "scale": {"along": []}}, "scale.along: allowed is a list of at least one"),
         ({**SCALED, "scale": {"along": ["a", "a"]}}, "scale.along: allowed is a list of at least one"),
         ({**SCALED, "scale": {"along": ["c"]}}, "scale.along: 'c' is no axis; allowed are compute, a, b"),

@@ -34,6 +34,19 @@ def test_what_is_read_is_what_was_kept(tmp_path: Path):
         assert kept_sweep(tmp_path) == each
 
 
+def test_a_copy_of_an_earlier_version_has_the_names_of_today(tmp_path: Path):
+    sweep = parse_sweep("mine", CONTENT | {"base": ["normalizer.z_scores=false"]})
+    sweep = replace(sweep, scale=Scale(("compute",)), command_line=("loggers=none",))
+    keep_sweep(sweep, tmp_path)
+    text = (tmp_path / NAME).read_text()
+    former = ("normalizer.z_scores", "frame.normalize"), ('"along"', '"against"'), ("loggers=", "tracking=")
+    for now, then in former:
+        assert now in text
+        text = text.replace(now, then)
+    (tmp_path / NAME).write_text(text)
+    assert kept_sweep(tmp_path) == sweep
+
+
 def test_a_copy_of_the_same_content_is_not_written_again(tmp_path: Path):
     keep_sweep(parse_sweep("mine", CONTENT), tmp_path)
     before = (tmp_path / NAME).stat().st_mtime_ns

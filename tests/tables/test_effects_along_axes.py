@@ -151,14 +151,14 @@ def test_cells_that_share_no_clip_have_no_line(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("axes", "against", "reason"),
+    ("axes", "along", "reason"),
     [
         ([{"optim.steps": [500, 1000, 2000]}], ["compute"], "3 cells are too few, or too alike"),
         ([{"optim.steps": [500], "memory.width": [4, 8, 9]}], ["compute"], "all cells have the same compute"),
     ],
 )
-def test_too_few_cells_have_no_line(tmp_path: Path, axes: list, against: list, reason: str):
-    trend = trend_of(tmp_path, 1, 1.3, axes=axes, scale={"against": against})
+def test_too_few_cells_have_no_line(tmp_path: Path, axes: list, along: list, reason: str):
+    trend = trend_of(tmp_path, 1, 1.3, axes=axes, scale={"along": along})
     assert trend.line is None
     assert trend.reason.startswith(reason)
     assert trend.slopes == {}
