@@ -84,9 +84,9 @@ def test_a_jump_stays_one():
 
 
 @pytest.mark.parametrize(("frames", "lengths"), [(3, [3, 3, 1]), (7, [7]), (100, [7])])
-def test_parts_are_the_clip(frames: int, lengths: list[int]):
+def test_pieces_are_the_clip(frames: int, lengths: list[int]):
     poses, trans = analytic(np.arange(7.0))
-    parts = list(Clip("clip", poses, trans, 60.0).parts(frames))
-    assert [len(part) for part in parts] == lengths
-    np.testing.assert_array_equal(np.concatenate([part.poses for part in parts]), poses)
-    np.testing.assert_array_equal(np.concatenate([part.trans for part in parts]), trans)
+    pieces = list(Clip("clip", poses, trans, 60.0).pieces(frames))
+    assert [len(piece) for piece in pieces] == lengths
+    np.testing.assert_array_equal(np.concatenate([piece.poses for piece in pieces]), poses)
+    np.testing.assert_array_equal(np.concatenate([piece.trans for piece in pieces]), trans)

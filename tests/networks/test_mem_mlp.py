@@ -122,7 +122,7 @@ def test_in_window_mode_a_memory_recalls_what_it_was_trained_on(shift, back):
         torch.testing.assert_close(past, expected)
     trained = TeacherForcing().draw(model, tiny.frames((24,)), WindowSampler(tiny.frames((24,)), 4, 7, 0), 0)
     model.advance(trained.sparse, trained.state)
-    inputs = model.normalizer.encode(trained.truth)[..., :SPARSE_DIM]
+    inputs = model.normalizer.encode(trained.true_frames)[..., :SPARSE_DIM]
     torch.testing.assert_close(seen[-1][:, back:], inputs[:, :-back])
     assert found.shape == (24, MOTION_DIM)
 

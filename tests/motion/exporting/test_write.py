@@ -1,4 +1,4 @@
-"""Writing in parts: a file is the same, however long the parts are in which its clip is worked on."""
+"""Writing in pieces: a file is the same, however long the pieces are in which its clip is worked on."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ def spinning(frames: int = 50) -> Clip:
 
 @pytest.mark.parametrize("name", FORMATS)
 @pytest.mark.parametrize("frames", [1, 7, 49])
-def test_parts_leave_no_seam(name: str, frames: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_pieces_leave_no_seam(name: str, frames: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     chosen = FORMATS[name]
     whole, parted = (tmp_path / f"{kind}{chosen.suffix}" for kind in ("whole", "parted"))
     write_motion(whole, spinning(), REST, chosen)
-    monkeypatch.setattr(Clip.parts, "__defaults__", (frames,))
+    monkeypatch.setattr(Clip.pieces, "__defaults__", (frames,))
     write_motion(parted, spinning(), REST, chosen)
     assert parted.read_bytes() == whole.read_bytes()
 
