@@ -20,10 +20,10 @@ from memmlp.cli.main import main
 INTERRUPTIBLE = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
 MAIN = [sys.executable, "-c", f"{INTERRUPTIBLE}; from memmlp.cli.main import main; main()"]
 SIZES = ["profile.depth=2", "profile.memory_layers=[2]"]
-SMALL = [*SIZES, "data.synth.minutes=0.1"]  # smaller than profile=tiny
+SMALL = [*SIZES, "data.synth.minutes=0.05"]  # smaller than profile=tiny
 FEW = ["loggers=none", "threads=1", "optim.steps=6", "vqvae.steps=6"]
-TINY = ["profile=tiny", *SIZES, "data.synth.minutes=0.2", *FEW]
-BRIEF = ["profile=tiny", *SMALL, *FEW]  # half as much motion, where no two runs' weights are compared
+TINY = ["profile=tiny", *SIZES, "data.synth.minutes=0.1", *FEW]
+BRIEF = ["profile=tiny", *SMALL, *FEW]  # half as much motion, where no run is looked at
 
 
 def run(folder: Path, *arguments: str, code: int = 0) -> str:

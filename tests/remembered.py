@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
 import gc
 import hashlib
 import importlib
+import logging
 import pickle
 import sys
 import types
-from collections.abc import Callable
+import typing
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -41,13 +44,13 @@ def keep_exports(folder: Path) -> None:
 
 
 def _without_extras(export: Callable[..., Any]) -> Callable[..., Any]:
-    """Torch's exporter without a sixth of its work: what changes nothing in the file that memmlp writes.
+    """Torch's exporter without a quarter of its work: what changes nothing in the file that memmlp writes.
 
     It notes where in the source each node came from, which memmlp removes; it compiles Python code of each
-    graph on the way, which nobody calls; and the garbage collector goes through all that it makes.
+    graph on the way, which nobody calls; it writes each down for a log, because pytest listens to it; and the
+    garbage collector goes through all that it makes.
     """
     import torch.fx
-    from torch.fx._lazy_graph_module import _use_lazy_graph_module
 
     @functools.wraps(export)
     def exported(*arguments: Any, **options: Any) -> Any:
@@ -58,7 +61,7 @@ def _without_extras(export: Callable[..., Any]) -> Callable[..., Any]:
         try:
             if noting is not None:
                 setattr(torch.fx.config, SILENT, True)
-            with _use_lazy_graph_module(True):
+            with _without_code(torch.fx), _without_log("torch.__trace"):
                 return export(*arguments, **options)
         finally:
             if noting is not None:
@@ -67,6 +70,74 @@ def _without_extras(export: Callable[..., Any]) -> Callable[..., Any]:
                 gc.enable()
 
     return exported
+
+
+@contextlib.contextmanager
+def _without_code(fx: Any) -> Iterator[None]:
+    """Graphs that are made meanwhile have code once they are called, which the exporter's own seldom are."""
+    from torch.fx._lazy_graph_module import _use_lazy_graph_module
+
+    graphs = fx.GraphModule
+    compile_now = graphs.recompile
+
+    def compile_later(self: Any) -> None:
+        def called(self: Any, *arguments: Any, **options: Any) -> Any:
+            compile_now(self)
+            return self(*arguments, **options)
+
+        codegen = self.graph._codegen
+        if hasattr(codegen, "pytree_info"):
+            self._in_spec, self._out_spec = codegen.pytree_info.in_spec, codegen.pytree_info.out_spec
+        self._code = ""
+        type(self).forward = called
+
+    graphs.recompile = compile_later
+    try:
+        with _use_lazy_graph_module(True):
+            yield
+    finally:
+        graphs.recompile = compile_now
+
+
+@contextlib.contextmanager
+def _without_log(name: str) -> Iterator[None]:
+    """Nobody listens to a logger meanwhile."""
+    log = logging.getLogger(name)
+    handlers, log.handlers = log.handlers, []
+    try:
+        yield
+    finally:
+        log.handlers = handlers
+
+
+def _remember_values(module: Any) -> None:
+    """Of torch's exporter: what a node gives, written at it, and computed anew to look at numbers' types."""
+    interpreter = module._TypePromotionInterpreter
+    run = interpreter.run_node
+    if hasattr(run, "__wrapped__"):
+        return
+
+    @functools.wraps(run)
+    def run_node(self: Any, node: Any) -> Any:
+        if node.op != "call_function" or "val" not in node.meta:
+            return run(self, node)
+        with self._set_current_node(node):
+            if rule := module.get_type_promotion_rule(node, self.type_promotion_table):
+                self._maybe_promote_node(node, rule)
+        return node.meta["val"]  # which changes where the node does
+
+    interpreter.run_node = run_node
+
+
+def _remember_annotations(module: Any) -> None:
+    """Of torch's operators: annotations of a function that is made ten thousand times an export."""
+    module.Callable = typing.Callable  # which, unlike that of collections.abc, keeps its forms
+
+
+def _remember_protocols(module: Any) -> None:
+    """Of Python: the members of a protocol, collected anew by each `isinstance` before Python 3.12."""
+    if sys.version_info < (3, 12) and not hasattr(module._get_protocol_attrs, "cache_info"):
+        module._get_protocol_attrs = functools.cache(module._get_protocol_attrs)
 
 
 def _remember_exporter(module: Any) -> None:
@@ -276,7 +347,10 @@ def _remember_motion(module: Any) -> None:
 
 PATCHES = {
     **dict.fromkeys(("torch.cuda", "torch.mtia", "torch.xpu"), _forget_who_seeds),
+    "typing": _remember_protocols,
+    "torch._ops": _remember_annotations,
     "torch.onnx._internal.exporter._registration": _remember_exporter,
+    "torch.onnx._internal.fx.passes.type_promotion": _remember_values,
     "torch.fx.traceback": _share_origins,
     **dict.fromkeys(("torch.export.exported_program", "torch.export.decomp_utils"), _remember_operators),
     "onnx_ir.schemas": _remember_signatures,

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import onnx
 import pytest
+import torch
 from hydra._internal import defaults_list
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.global_hydra import GlobalHydra
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from onnx_ir import schemas
-from remembered import remember
+from remembered import _without_code, remember
 from torch.export import exported_program
 
 from memmlp.config import compose
@@ -109,3 +112,39 @@ def test_functions_that_the_exporter_knows_are_those_that_it_finds():
     assert repr(found.functions) == repr(anew.functions)
     found.functions.clear()
     assert repr(made().functions) == repr(anew.functions)
+
+
+class Promoting(torch.nn.Module):
+    """Adds what has other types of numbers."""
+
+    def forward(self, frames: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
+        return torch.cat([frames + count, frames / count, torch.pow(count, 0.5)]).softmax(-1)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # as memmlp does
+def test_what_the_exporter_does_without_changes_no_file(monkeypatch: pytest.MonkeyPatch):
+    inputs = torch.zeros(2, 3), torch.tensor([[1, 2, 3]])
+    options = {"dynamo": True, "verbose": False, "optimize": False, "input_names": ["frames", "count"]}
+
+    def text(export: Callable[..., Any]) -> str:
+        program = export(Promoting().eval(), inputs, **options)
+        return onnx.printer.to_text(program.model_proto.graph)
+
+    short = torch.onnx.export.__wrapped__
+    made = text(short)
+    from torch.onnx._internal.fx.passes import type_promotion
+
+    interpreter = type_promotion._TypePromotionInterpreter
+    monkeypatch.setattr(interpreter, "run_node", interpreter.run_node.__wrapped__)
+    assert made == text(short.__wrapped__)
+    assert "Cast" in made
+
+
+def test_a_graph_has_its_code_once_it_is_called():
+    with _without_code(torch.fx):
+        graph = torch.fx.symbolic_trace(Promoting())
+        assert graph.code == ""
+        inputs = torch.ones(2, 3), torch.tensor([[1, 2, 3]])
+        torch.testing.assert_close(graph(*inputs), Promoting()(*inputs))
+    assert "softmax" in graph.code

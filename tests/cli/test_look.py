@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_line import MAIN
+from command_line import MAIN, in_folder
 from conftest import Memmlp, one_line
 from PIL import Image
-from processes import PATIENCE, started
+from processes import PATIENCE, forked, started
 
 from memmlp.live.session.packets import Packet
 from memmlp.live.session.sources import PacketSource
@@ -222,8 +222,7 @@ def test_a_clip_that_is_sent_is_predicted(home: Path, finished: Run, stack: cont
     free.close()
     at = [kind, str(free.port), "--space", "unity"]
     watched = Watched(stack, home, finished.id, *at)
-    sends = [*MAIN, "live", finished.id, "--send", *at]
-    with started(sends, cwd=home, stdout=subprocess.DEVNULL):
+    with forked(in_folder, home, "live", finished.id, "--send", *at):
         frames = watched.frames()
         seen = [next(frames) for _ in range(30)]
     assert [f["number"] for f in seen] == list(range(seen[0]["number"], seen[0]["number"] + 30))

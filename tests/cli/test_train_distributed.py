@@ -32,14 +32,18 @@ def environment(file: Path) -> dict[str, str]:
 
 
 @pytest.mark.slow
-def test_two_processes_make_the_run_of_one(tiny_home: Path, tmp_path: Path):
+def test_two_processes_make_the_run_of_one(tmp_path: Path):
     """Its VQ-VAE and its network; the first process alone writes and evaluates (and would deploy).
 
     The processes have torchrun's environments, and are forked, since each would import torch for seconds.
     """
     ranks = [tmp_path / f"rank{rank}" for rank in range(2)]
     said = [tmp_path / f"said{rank}" for rank in range(2)]
-    words = ["train", *TINY, "export.graph=off"]
+    # Of less motion, steps depend on the order of sums: gradients of what never moves are of rounding alone.
+    words = ["train", *TINY, "data.synth.minutes=0.2", "export.graph=off"]
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    run(alone, *words)
     with forked(torchrun, tmp_path) as launcher, ExitStack() as stack:
         until(lambda: all(file.exists() for file in ranks), "both are started", launcher)
         both = []
@@ -54,14 +58,13 @@ def test_two_processes_make_the_run_of_one(tiny_home: Path, tmp_path: Path):
     assert codes == [0, 0], text
     assert text.count("MPJPE") == 1
     runs = {run.id: run for run in list_runs(tmp_path / "outputs")}
-    assert runs.keys() == {run.id for run in list_runs(tiny_home / "outputs")}
-    for one in list_runs(tiny_home / "outputs"):
+    assert runs.keys() == {run.id for run in list_runs(alone / "outputs")}
+    for one in list_runs(alone / "outputs"):
         other = runs[one.id]
         assert (one.manifest["processes"], other.manifest["processes"]) == (1, 2)
         assert [m.step for m in one.metrics()] == [m.step for m in other.metrics()]
         stages = [attempt["stage"] for attempt in one.manifest["attempts"]]
-        own = [stage for stage in stages if stage != "deployment"]
-        assert [attempt["stage"] for attempt in other.manifest["attempts"]] == own
+        assert [attempt["stage"] for attempt in other.manifest["attempts"]] == stages
         assert other.verify() == []
         ours, theirs = checkpoint.read(one.model)[0], checkpoint.read(other.model)[0]
         for name, tensor in ours.items():

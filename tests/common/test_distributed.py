@@ -79,7 +79,7 @@ def test_two_processes_train_the_weights_of_one_and_take_over_from_each_other(tm
     assert codes[1] == -signal.SIGKILL
     assert codes[0] not in (0, -signal.SIGKILL)
     shutil.copytree(pair / two_begin, tmp_path / "one" / two_begin)
-    assert checkpoint.read(pair / two_begin / "checkpoint.safetensors")[1]["step"] == 20
+    assert checkpoint.read(pair / two_begin / "checkpoint.safetensors")[1]["step"] == STEPS.checkpoint_every
     again = train_alone(two_begin, tmp_path / "one")
     assert train_together(pair, two_begin) == [0, 0]
     found = {name: difference(run, Run(pair / name)) for name, run in alone.items()}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import socket
 import subprocess
 import sys
@@ -21,14 +23,23 @@ from memmlp.runs.run import Run
 
 pytestmark = pytest.mark.slow
 
-# `mlflow server` asks for packages of 800 MB; its handlers and its store need none of them.
+# `mlflow server` asks for packages of 800 MB; its handlers and its store need none of them. At each line
+# a server is forked off a process that has imported them once, which takes seconds; its number is the answer.
 SERVE = """
 import os, sys
 from mlflow.server.constants import ARTIFACT_ROOT_ENV_VAR, BACKEND_STORE_URI_ENV_VAR
 os.environ[BACKEND_STORE_URI_ENV_VAR] = f"sqlite:///{sys.argv[1]}/server.db"
 os.environ[ARTIFACT_ROOT_ENV_VAR] = f"{sys.argv[1]}/artifacts"
 from mlflow.server import app
-app.run("127.0.0.1", int(sys.argv[2]), threaded=True)
+from mlflow.store.tracking import sqlalchemy_store
+for _ in sys.stdin:
+    if not (server := os.fork()):
+        os.dup2(2, 1)
+        app.run("127.0.0.1", int(sys.argv[2]), threaded=True)
+    print(server, flush=True)
+    print(ended := os.waitpid(server, 0)[1], flush=True)
+    if ended != 9:
+        sys.exit("the server ended by itself")
 """
 
 
@@ -41,14 +52,18 @@ class Server:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
         self.url = f"http://127.0.0.1:{self.port}"
-        self.process: subprocess.Popen | None = None
+        self.pid: int | None = None
+        line = [sys.executable, "-c", SERVE, str(folder), str(self.port)]
+        with open(folder / "server.log", "ab") as log:
+            self.parent = subprocess.Popen(
+                line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True
+            )
 
     def start(self) -> None:
         """Start it, and wait until it answers."""
-        line = [sys.executable, "-c", SERVE, str(self.folder), str(self.port)]
-        with open(self.folder / "server.log", "ab") as log:
-            self.process = subprocess.Popen(line, stdout=log, stderr=log)
-        until(self.answers, f"the server; see {self.folder / 'server.log'}", self.process)
+        print(file=self.parent.stdin, flush=True)
+        self.pid = int(self.parent.stdout.readline())
+        until(self.answers, f"the server; see {self.folder / 'server.log'}", self.parent)
 
     def answers(self) -> bool:
         """Whether it does."""
@@ -60,10 +75,16 @@ class Server:
 
     def kill(self) -> None:
         """Kill it, if it is there."""
-        if self.process is not None:
-            self.process.kill()
-            self.process.wait()
-        self.process = None
+        if self.pid is not None:
+            os.kill(self.pid, signal.SIGKILL)
+            assert int(self.parent.stdout.readline()) == signal.SIGKILL
+        self.pid = None
+
+    def close(self) -> None:
+        """End it, and what it is forked off."""
+        self.kill()
+        self.parent.kill()
+        self.parent.communicate()
 
     def shown(self) -> dict[str, Any]:
         """The runs that it has, by our id; each must be there once."""
@@ -95,7 +116,7 @@ def server(tmp_path: Path) -> Iterator[Server]:
     pytest.importorskip("flask_cors")
     made = Server(tmp_path)
     yield made
-    made.kill()
+    made.close()
 
 
 def test_a_server_that_is_killed_and_restarted_has_everything_once(
