@@ -247,7 +247,7 @@ def load_clip(given: InputOptions) -> TrackedClip:
     from memmlp.live.session.sources import TrackedClip, npz_frames
 
     if given.clip is not None and given.clip.endswith(".npz"):
-        body = ExportedNetwork(network_file(given)[0]).skeleton.rest
+        body = ExportedNetwork(network_file(given)[0]).body.rest
         return TrackedClip(Path(given.clip).stem, npz_frames(Path(given.clip), body))
     if given.network.endswith(".onnx"):
         check_file(Path(given.network))
@@ -355,10 +355,10 @@ def known_of(shown: ShowOptions, space: SpaceName, stream: Stream) -> Calibratio
     from memmlp.live.calibration_file import SAME, Calibration, read_calibration
     from memmlp.live.wearer import stature
 
-    body = stature(stream.network.skeleton)
+    body = stature(stream.network.body)
     known = Calibration(space)
     if shown.calibration is not None and shown.calibration.exists():
-        known = read_calibration(shown.calibration, space, stream.network.skeleton)
+        known = read_calibration(shown.calibration, space, stream.network.body)
     height = known.height if shown.height is None else shown.height
     floor = known.floor if shown.floor is None else shown.floor
     offsets = known.offsets
@@ -380,7 +380,7 @@ def outputs_of(shown: ShowOptions, stream: Stream) -> Outputs:
     found += [vrchat.VRChat(Receiver(host, port or vrchat.PORT, "--vrchat")) for host, port in shown.vrchat]
     if shown.record:
         network = stream.network
-        found.append(Recorder(shown.record, network.skeleton.rest, network.fps, note))
+        found.append(Recorder(shown.record, network.body.rest, network.fps, note))
     return Outputs(found, note)
 
 
@@ -407,7 +407,7 @@ def write_avatar(given: InputOptions, path: Path) -> None:
         raise InputError(f"--save-avatar {path}: is there already; allowed is a new file")
     file, _ = network_file(given)
     try:
-        write_vrm(path, ExportedNetwork(file).skeleton.rest)
+        write_vrm(path, ExportedNetwork(file).body.rest)
     except OSError as error:
         raise InputError(f"--save-avatar {path}: cannot be written ({error.strerror})") from error
     click.echo(f"{path}: an avatar of VRM 1.0, which anybody may use (CC0)")

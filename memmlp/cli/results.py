@@ -77,7 +77,7 @@ def save_command(
     They are the per-clip results of its finished runs. SWEEP and OVERRIDES are those of `memmlp sweep`.
     Results that the file already has of other arms and seeds stay.
     """
-    from memmlp.cli.shown_sweep import shown_sweep
+    from memmlp.cli.shown_seeds import shown_sweep
     from memmlp.common.files import plain
     from memmlp.config.compose_plan import find_sweep, is_path
     from memmlp.report.kept_results import Kept, load_kept, overrides_of, save, without_paths
@@ -247,7 +247,7 @@ def _table(kept: Kept, source: str | None = None, patterns: Sequence[str] = ()) 
         source: the only source whose test clips are shown; None for all.
         patterns: test clips that match one alike count as one group, beside the groups of the data.
     """
-    from memmlp.cli.shown_sweep import flag_of_other_rounds
+    from memmlp.cli.shown_seeds import flag_of_other_rounds
     from memmlp.config.compose_plan import find_sweep
     from memmlp.tables.build_table import make_table, on_source, together
     from memmlp.tables.seed_rounds import of_json

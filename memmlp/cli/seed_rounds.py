@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.shown_sweep import difference, rounds_path
+from memmlp.cli.shown_seeds import difference, rounds_path
 from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from memmlp.common.errors import InputError
 from memmlp.runs.identity import NETWORK
 
 if TYPE_CHECKING:
-    from memmlp.cli.shown_sweep import ShownSweep
+    from memmlp.cli.shown_seeds import ShownSweep
     from memmlp.sweep.definition import Sweep
     from memmlp.sweep.plan import Plan
 
@@ -77,7 +77,7 @@ def sweep(
     controls, get more, up to --max-seeds.
     """
     from memmlp.cli import seed_rounds
-    from memmlp.cli.shown_sweep import ShownSweep, spent_before
+    from memmlp.cli.shown_seeds import ShownSweep, spent_before
     from memmlp.config.compose_plan import find_sweep, kept_or_new_plan, sweep_folder
 
     seed_rounds.check(overrides, until_decided, max_seeds)

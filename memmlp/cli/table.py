@@ -23,7 +23,7 @@ from memmlp.common.errors import InputError
 from memmlp.sweep.definition import BRANCHES
 
 if TYPE_CHECKING:
-    from memmlp.cli.shown_sweep import ShownSweep
+    from memmlp.cli.shown_seeds import ShownSweep
     from memmlp.sweep.definition import Sweep
     from memmlp.tables.effects import RunsBySeed
     from memmlp.tables.runs_of_plan import Read
@@ -186,7 +186,7 @@ def gathered(
     Raises:
         InputError: if none of them can be composed with the command line's overrides, or has that selection.
     """
-    from memmlp.cli.shown_sweep import shown_sweep
+    from memmlp.cli.shown_seeds import shown_sweep
     from memmlp.common.progress import progress_bar
     from memmlp.tables.build_table import without_runs
 

@@ -57,7 +57,7 @@ class Evaluation:
         rows = [{key: row[key] for key in facts if key in row} | row[mode] for row in found["clips"]]
         if "position" not in model.branches:
             check_positions(type(model).__name__, rows)
-        label = {} if model.streams else {"offline": True}
+        label = {} if model.is_stream else {"offline": True}
         return {"mean": found["mean"][mode], "clips": rows, **label}
 
 
@@ -85,7 +85,7 @@ def picture(model: MotionModel, test: MotionDataset, path: Path) -> None:
 
     device = model.normalizer.rest.device
     clip = test.clip(0)[:PICTURE_FRAMES].to(device)
-    motion = modes.MODE_FUNCTIONS["stream" if model.streams else "window"](model, [clip])[0]
+    motion = modes.MODE_FUNCTIONS["stream" if model.is_stream else "window"](model, [clip])[0]
     predicted = model.normalizer.pose(motion, clip[:, :SPARSE_DIM])
     truth = modes.joint_positions(clip[:, SPARSE_DIM:])
     poses_png(path, truth.cpu().numpy(), predicted.cpu().numpy(), test.names[0])

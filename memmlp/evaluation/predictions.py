@@ -60,7 +60,7 @@ def predict_clip(model: MotionModel, clip: Tensor, mode: str) -> dict[str, np.nd
 
 def check_mode(model: MotionModel, mode: str) -> None:
     """Raise InputError for the stream of a network that makes frames with later ones."""
-    if mode == "stream" and not model.streams:
+    if mode == "stream" and not model.is_stream:
         raise InputError("mode stream: this network makes a frame with later ones; allowed is mode window")
 
 

@@ -22,7 +22,7 @@ class ExportedNetwork(OnnxStream):
     Attributes:
         sparse: the input (1, 54), to be written before a step.
         rotation6d, position: outputs (22, 6) and (22, 3) of the last step, overwritten by the next.
-        skeleton: joints, tree and rest pose.
+        body: its joints, their tree and the rest pose.
         fps: frames per second.
         frames: the window's length T.
         branches: what the network learned to predict: rotations, and perhaps positions.
@@ -50,7 +50,7 @@ class ExportedNetwork(OnnxStream):
             raise InputError(f"{self.path}: its inputs are not those of this version of memmlp; {AGAIN}")
         try:
             rest = np.array(json.loads(meta["rest"]), np.float64)
-            self.skeleton = BodyTree(json.loads(meta["joints"]), json.loads(meta["parents"]), rest)
+            self.body = BodyTree(json.loads(meta["joints"]), json.loads(meta["parents"]), rest)
             self.fps, self.frames = float(meta["fps"]), int(meta["T"])
             self.branches = frozenset(json.loads(meta["branches"]))
         except (ValueError, TypeError, LookupError):

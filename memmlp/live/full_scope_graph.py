@@ -110,9 +110,9 @@ class FullStep(nn.Module):
         self.names = list(model.initial_state(1))
         self.register_buffer("world", torch.tensor(space.world, dtype=torch.float32))
         self.register_buffer("body", torch.tensor(space.body, dtype=torch.float32))
-        skeleton = BodyTree(JOINTS, PARENTS, model.normalizer.rest.double().cpu().numpy())
-        self.ancestors = [torch.tensor(ancestor) for ancestor in skeleton.ancestors]
-        self.register_buffer("offsets", torch.tensor(skeleton.offsets, dtype=torch.float32)[None, ..., None])
+        tree = BodyTree(JOINTS, PARENTS, model.normalizer.rest.double().cpu().numpy())
+        self.ancestors = [torch.tensor(ancestor) for ancestor in tree.ancestors]
+        self.register_buffer("offsets", torch.tensor(tree.offsets, dtype=torch.float32)[None, ..., None])
 
     def initial_state(self) -> dict[str, Tensor]:
         """Return the states of a fresh start, which are zeros."""

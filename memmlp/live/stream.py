@@ -159,12 +159,12 @@ class Stream:
         if ik is not None and "position" not in self.network.branches:
             raise InputError(f"ik: {self.network.path} has no position branch to fit to; allowed is ik=None")
         self.offsets = None if offsets is None else checked_offsets(offsets)
-        self.wearer = wearer(self.network.skeleton, height, floor)
+        self.wearer = wearer(self.network.body, height, floor)
         self.network_seconds = 0.0
         self.odd = OddSamples()
-        self.solve = None if ik is None else Solver(ik, self.network.skeleton.rest)
+        self.solve = None if ik is None else Solver(ik, self.network.body.rest)
         self._output = ROTATION_FORMATS[rotations]
-        self._trackers = TrackerFrames(self.network.skeleton, self.network.fps)
+        self._trackers = TrackerFrames(self.network.body, self.network.fps)
         self._features = Features()
         self._sparse = self.network.sparse[0]  # the network's inputs, in place: written before each step
         self._last: Pose | None = None
@@ -172,7 +172,7 @@ class Stream:
     @property
     def rest(self) -> np.ndarray:
         """The wearer's joints in the rest pose (22, 3), metres, SMPL's body frame."""
-        return self.network.skeleton.rest / self.wearer.scale
+        return self.network.body.rest / self.wearer.scale
 
     def fit(self, height: float | None = None, floor: float = 0.0) -> None:
         """Set another body height (metres; None for the network's) and floor (metres), and begin anew.
@@ -189,7 +189,7 @@ class Stream:
     def refit(self, height: float | None, floor: float) -> bool:
         """Do as `fit` does, without the warning; return whether offsets were forgotten."""
         before = self.wearer.height
-        self.wearer = wearer(self.network.skeleton, height, floor)
+        self.wearer = wearer(self.network.body, height, floor)
         self.reset()
         if self.offsets is None or abs(self.wearer.height - before) <= ROUNDED:
             return False
@@ -277,7 +277,7 @@ class Stream:
                 "calibrate: the head looks backwards as seen from the hands; left and right look exchanged, "
                 "or the head's device is mounted backwards; allowed is neither"
             )
-        pose = t_pose(self.network.skeleton, world[0], heading)
+        pose = t_pose(self.network.body, world[0], heading)
         joints = pose.positions + (world - pose.positions).mean(0)
         inverse = rotations.swapaxes(1, 2)
         away = self._positions_out(joints) - positions
@@ -315,7 +315,7 @@ class Stream:
         if self.solve is not None:
             sixd = self.solve(sixd, network.position, self._sparse)
         local = sixd_to_matrix(sixd)
-        positions = self._positions_out(network.skeleton.positions(local) + head)
+        positions = self._positions_out(network.body.positions(local) + head)
         branch = self._positions_out(network.position)
         return Pose(time, positions, self._output(space.pose_out(local)), branch, held, True, restarted)
 

@@ -71,16 +71,16 @@ def between(a: TrackerSample, b: TrackerSample, time: float) -> TrackerSample:
     return TrackerSample(time, positions, slerp(a.rotations, b.rotations, weight))
 
 
-def t_pose(skeleton: BodyTree, place: np.ndarray, heading: float) -> TrackerSample:
+def t_pose(body: BodyTree, place: np.ndarray, heading: float) -> TrackerSample:
     """Return head and wrists of a person in T-pose whose head is at `place` (3,), metres, AMASS' world.
 
     Args:
-        skeleton: the person's rest pose.
+        body: the person's rest pose.
         place: the head's position.
         heading: radians to the left of looking along -Y, where the person's left is +X.
     """
     turn = about_vertical(heading) @ UPRIGHT
-    rest = skeleton.rest[skeleton.tracked]
+    rest = body.rest[body.tracked]
     return TrackerSample(0.0, place + (rest - rest[0]) @ turn.T, np.tile(turn, (3, 1, 1)))
 
 
@@ -103,12 +103,12 @@ class Hold:
     """Holds lost trackers at their last poses, and leads them smoothly to their true poses on their return.
 
     Args:
-        skeleton: the body whose T-pose stands for a tracker that was never seen.
+        body: the body whose T-pose stands for a tracker that was never seen.
         recovery: seconds over which a tracker that returns is led to its true pose; 0 for a jump.
     """
 
-    def __init__(self, skeleton: BodyTree, recovery: float = RECOVERY):
-        self.skeleton, self.recovery = skeleton, recovery
+    def __init__(self, body: BodyTree, recovery: float = RECOVERY):
+        self.body, self.recovery = body, recovery
         self.reset()
 
     def reset(self) -> None:
@@ -141,9 +141,9 @@ class Hold:
         if not any(lost):
             return sample
         if lost[0]:
-            height = self.skeleton.rest[self.skeleton.tracked[0], 1] - self.skeleton.rest[:, 1].min()
-            return t_pose(self.skeleton, np.array([0.0, 0.0, height]), 0.0)
-        return t_pose(self.skeleton, sample.positions[0], heading_of(sample.rotations[0]))
+            height = self.body.rest[self.body.tracked[0], 1] - self.body.rest[:, 1].min()
+            return t_pose(self.body, np.array([0.0, 0.0, height]), 0.0)
+        return t_pose(self.body, sample.positions[0], heading_of(sample.rotations[0]))
 
     def _return(self, which: list[bool], last: TrackerSample, sample: TrackerSample) -> None:
         """Remember how far the returning trackers are from the poses at which they were held."""
@@ -224,12 +224,12 @@ class TrackerFrames:
     """Turns samples of three trackers into frames at the network's rate, by the rules at this file's top.
 
     Args:
-        skeleton: the network's body.
+        body: the network's body.
         fps: the network's frames per second.
     """
 
-    def __init__(self, skeleton: BodyTree, fps: float):
-        self.hold, self.grid = Hold(skeleton), Resampler(fps)
+    def __init__(self, body: BodyTree, fps: float):
+        self.hold, self.grid = Hold(body), Resampler(fps)
 
     def reset(self) -> None:
         """Begin anew."""

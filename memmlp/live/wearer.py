@@ -48,17 +48,17 @@ class Wearer:
         return np.array([0.0, 0.0, self.floor], positions.dtype)
 
 
-def stature(skeleton: BodyTree) -> float:
+def stature(body: BodyTree) -> float:
     """Return the body height, metres, of a person with this rest pose."""
-    heights = skeleton.rest[:, 1]
-    return STATURE * float(heights[skeleton.tracked[0]] - heights.min())
+    heights = body.rest[:, 1]
+    return STATURE * float(heights[body.tracked[0]] - heights.min())
 
 
-def wearer(skeleton: BodyTree, height: float | None = None, floor: float = 0.0) -> Wearer:
+def wearer(body: BodyTree, height: float | None = None, floor: float = 0.0) -> Wearer:
     """Return a wearer, given a network's body.
 
     Args:
-        skeleton: the network's body.
+        body: the network's body.
         height: the wearer's body height, metres; None for the height of the network's body.
         floor: the height of the floor, metres.
 
@@ -72,7 +72,7 @@ def wearer(skeleton: BodyTree, height: float | None = None, floor: float = 0.0) 
         )
     if not (_number(floor) and abs(floor) <= DEEPEST):
         raise InputError(f"floor={floor}: allowed is a height in metres, at most {DEEPEST:g} from zero")
-    own = stature(skeleton)
+    own = stature(body)
     return Wearer(float(height or own), float(floor), own / height if height else 1.0)
 
 

@@ -67,7 +67,7 @@ class MotionModel(nn.Module):
         return False
 
     @property
-    def streams(self) -> bool:
+    def is_stream(self) -> bool:
         """Whether each frame is predicted without later ones; if not, only window mode can evaluate it."""
         return True
 

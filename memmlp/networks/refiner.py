@@ -78,9 +78,9 @@ class Refined(MotionModel):
         return self.network.settled
 
     @property
-    def streams(self) -> bool:
+    def is_stream(self) -> bool:
         """Whether the network predicts each frame without later ones."""
-        return self.network.streams
+        return self.network.is_stream
 
     @property
     def windowless(self) -> bool:

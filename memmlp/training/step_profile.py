@@ -21,7 +21,7 @@ MATRIX_PRODUCTS = frozenset(
 )  # fmt: skip
 """Kernels that are matrix products, or mostly: those of recurrences and of attention are one kernel."""
 
-PARTS = ("matrix products", "other kernels", "optimiser", SAMPLING, "rest")
+PHASES = ("matrix products", "other kernels", "optimiser", SAMPLING, "rest")
 """The parts of a step.
 
 Optimiser and sampling are all that happens in them. The rest is Python, autograd's own time, and what
@@ -29,8 +29,8 @@ torch.compile made.
 """
 
 
-def step_parts(take: Callable[[int], None], steps: int) -> dict[str, float]:
-    """Return how long each of PARTS takes in a step, in milliseconds; they add up to a profiled step.
+def step_phases(take: Callable[[int], None], steps: int) -> dict[str, float]:
+    """Return how long each of PHASES takes in a step, in milliseconds; they add up to a profiled step.
 
     The profiler itself takes time for each operation, so a profiled step is longer than another one. Matrix
     products, which are few and long, are affected least.
@@ -41,7 +41,7 @@ def step_parts(take: Callable[[int], None], steps: int) -> dict[str, float]:
     """
     with profile(activities=[ProfilerActivity.CPU]) as profiled, record_function("steps"):
         take(steps)
-    parts = dict.fromkeys(PARTS, 0.0)
+    parts = dict.fromkeys(PHASES, 0.0)
     for event in profiled.events() or ():
         parts[_part(event)] += event.self_cpu_time_total / 1000 / steps
     return parts

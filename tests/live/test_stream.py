@@ -298,7 +298,7 @@ def test_calibration_finds_how_the_devices_sit(name, file):
         turned = space.rotations_out(rotations) @ turns.swapaxes(1, 2)
         return [*zip(space.positions_out(positions + away), turned, strict=True)]
 
-    pose = t_pose(stream.network.skeleton, np.array([0.3, -0.2, 1.6]), 2.1)
+    pose = t_pose(stream.network.body, np.array([0.3, -0.2, 1.6]), 2.1)
     with pytest.warns(SampleWarning, match="138 degrees from upright"):
         offsets = stream.calibrate(*devices(pose.positions, pose.rotations))
     np.testing.assert_allclose(offsets.rotations, turns, atol=1e-9)
@@ -319,7 +319,7 @@ def test_calibration_finds_how_the_devices_sit(name, file):
 def test_exchanged_controllers_are_not_calibrated(name, heading, tilt, file):
     """The body would face backwards, and everything else would seem right."""
     space, stream = SPACES[name], Stream(file, space=name)
-    pose = t_pose(stream.network.skeleton, np.array([0.3, -0.2, 1.6]), heading)
+    pose = t_pose(stream.network.body, np.array([0.3, -0.2, 1.6]), heading)
     rotations = pose.rotations @ Rotation.from_euler("x", tilt, degrees=True).as_matrix()
     head, left, right = zip(space.positions_out(pose.positions), space.rotations_out(rotations), strict=True)
     with pytest.raises(InputError, match="exchanged, or the head's device is mounted backwards"):
@@ -332,7 +332,7 @@ def test_exchanged_controllers_are_not_calibrated(name, heading, tilt, file):
 def test_devices_that_no_t_pose_has_there_are_not_calibrated(name, file):
     """Arms that hang, and positions in centimetres, would move every later pose in silence."""
     space, stream = SPACES[name], Stream(file, space=name)
-    pose = t_pose(stream.network.skeleton, np.array([0.3, -0.2, 1.6]), 2.1)
+    pose = t_pose(stream.network.body, np.array([0.3, -0.2, 1.6]), 2.1)
     rotations = space.rotations_out(pose.rotations)
     standing = list(zip(space.positions_out(pose.positions), rotations, strict=True))
     before = stream.calibrate(*standing)
@@ -354,7 +354,7 @@ def test_devices_that_no_t_pose_has_there_are_not_calibrated(name, file):
 def test_quaternions_in_another_order_are_warned_of(name, file):
     """A head that seems to hang or to lie is no person in T-pose, unless the device is mounted so."""
     space, stream = SPACES[name], Stream(file, space=name)
-    pose = t_pose(stream.network.skeleton, np.array([0.3, -0.2, 1.6]), 0.4)
+    pose = t_pose(stream.network.body, np.array([0.3, -0.2, 1.6]), 0.4)
     places = space.positions_out(pose.positions)
     xyzw = matrix_to_quaternion(space.rotations_out(pose.rotations))
     stream.calibrate(*zip(places, xyzw, strict=True))

@@ -12,7 +12,7 @@ from bvh_samples import performed, write
 from memmlp.motion.importing import convert as module
 from memmlp.motion.importing.import_folder import import_folder
 from memmlp.motion.importing.skeleton_map import load_skeleton
-from memmlp.motion.importing.verify import verify
+from memmlp.motion.importing.verify_files import verify
 from memmlp.motion.synthetic import synthesize_clip
 from memmlp.motion.torch_threads import one_thread
 

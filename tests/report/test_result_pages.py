@@ -21,7 +21,7 @@ from memmlp.report.result_pages import KeptTable, Placeholders, _whole, origin_w
 from memmlp.sweep.definition import Sweep
 from memmlp.tables.build_table import make_table, together
 from memmlp.tables.statistics import Verdict, holm
-from memmlp.tables.statistics.crossed import error
+from memmlp.tables.statistics.crossed_seeds_and_groups import error
 from memmlp.tables.table import Cell, Effect
 from memmlp.tables.table_text import MINUS
 

@@ -328,7 +328,7 @@ def show_breakdown(arm: str, words: Sequence[str], steps: int) -> None:
     """Print how long a step takes, and each of its parts."""
     import torch
 
-    from memmlp.training.step_profile import PARTS, step_parts
+    from memmlp.training.step_profile import PHASES, step_phases
 
     experiment = compose_experiment((*words, f"optim.steps={WARM_UP + 2 * steps}"))
     one = learner(experiment, experiment.motion.prepare())
@@ -336,10 +336,10 @@ def show_breakdown(arm: str, words: Sequence[str], steps: int) -> None:
     before = one.seconds
     one.take(steps)
     alone = 1000 * (one.seconds - before) / steps
-    parts = step_parts(one.take, steps)
+    parts = step_phases(one.take, steps)
     whole = sum(parts.values())
     mine = of_processor(torch.get_num_threads())
     click.echo(f"{arm}: a step takes {alone:.1f} ms {mine}; with the profiler {whole:.1f} ms pass,")
-    click.echo(f"  {whole / parts[PARTS[0]]:.2f} times its matrix products:")
+    click.echo(f"  {whole / parts[PHASES[0]]:.2f} times its matrix products:")
     for name, value in parts.items():
         click.echo(f"  {name:<16}{value:8.2f} ms  {100 * value / whole:5.1f} %")

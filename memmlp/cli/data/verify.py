@@ -27,7 +27,7 @@ def verify(source: Path, skeleton: str | None, body: str, up: str | None, every:
     too: the head below the pelvis, knees that bend forward, feet that point backward or hang above the floor,
     odd lengths. Goes on past bad files; exits with 1 if any file has a fault or can't be imported.
     """
-    from memmlp.motion.importing.verify import Unusable, verify_folder
+    from memmlp.motion.importing.verify_files import Unusable, verify_folder
 
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     table.add_column("file", overflow="fold")

@@ -161,7 +161,7 @@ class Fitting:
         if self.path is not None:
             stream = self.stream
             made = Calibration(self.space, stream.offsets, self.own_height, stream.wearer.floor)
-            save_calibration(self.path, made, stream.network.skeleton)
+            save_calibration(self.path, made, stream.network.body)
 
     def _say(self, said: str, failed: bool = False) -> None:
         stream, waiting = self.stream, self.waiting

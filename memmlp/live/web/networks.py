@@ -20,7 +20,7 @@ from memmlp.live.full_scope_graph import export_full
 from memmlp.live.rotations import BodyTree
 from memmlp.live.spaces import SPACES
 from memmlp.live.wearer import stature
-from memmlp.live.web.without_weights import without_weights
+from memmlp.live.web.weightless_files import without_weights
 from memmlp.motion.body import FPS, JOINTS, PARENTS, TRACKED
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.streaming import StreamingGraph, has_stream, streaming

@@ -14,7 +14,7 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.motion.body import HEAD, JOINTS
 from memmlp.motion.importing.anatomy import LEGS, why_no_stance
-from memmlp.motion.importing.recording import Recording
+from memmlp.motion.importing.motion_file import MotionFile
 from memmlp.motion.importing.skeleton_map import REQUIRED, UPRIGHT, SkeletonMap
 
 UNITS = (1.0, 0.1, 0.0254 / 0.45, 0.0254, 0.01, 0.001)  # metres; 0.0254 / 0.45 is CMU's inch
@@ -24,7 +24,7 @@ TELL = "--up y or z, or up in the skeleton's map"
 MOST_UPRIGHT = 0.5  # how much of the way from pelvis to head lies along the up axis on average, to be found
 
 
-def with_unit_and_up(recording: Recording, skeleton: SkeletonMap) -> SkeletonMap:
+def with_unit_and_up(recording: MotionFile, skeleton: SkeletonMap) -> SkeletonMap:
     """Return the map with unit and up axis filled in from the recording, where the map leaves them open.
 
     Raises:
@@ -53,7 +53,7 @@ def _leg(positions: np.ndarray, at: dict[str, int]) -> float:
     return float(sum(np.linalg.norm(bone, axis=-1).mean() for bone in bones) / 2)
 
 
-def _unit(recording: Recording, skeleton: SkeletonMap, leg: float) -> float:
+def _unit(recording: MotionFile, skeleton: SkeletonMap, leg: float) -> float:
     """Return the unit, metres, of a file whose legs have the given length."""
     if skeleton.unit is not None:
         low, high = TOLD_LEG
@@ -69,7 +69,7 @@ def _unit(recording: Recording, skeleton: SkeletonMap, leg: float) -> float:
     return min(fitting, key=lambda unit: abs(leg * unit - 0.85))
 
 
-def _up(recording: Recording, trunk: np.ndarray, at: dict[str, int]) -> str:
+def _up(recording: MotionFile, trunk: np.ndarray, at: dict[str, int]) -> str:
     """Return the axis, `y` or `z`, that is up in a file, from the vectors from pelvis to head (N, 3)."""
     mean = (trunk / np.linalg.norm(trunk, axis=-1, keepdims=True).clip(1e-9)).mean(0)
     along = dict(zip("yz", mean[1:].tolist(), strict=True))
@@ -87,7 +87,7 @@ def _up(recording: Recording, trunk: np.ndarray, at: dict[str, int]) -> str:
     return standing
 
 
-def _standing(recording: Recording, at: dict[str, int]) -> str | None:
+def _standing(recording: MotionFile, at: dict[str, int]) -> str | None:
     """Return the axis along which the person stands in the zero pose; None if the pose is no stance."""
     if not set(REQUIRED) <= set(at):
         return None

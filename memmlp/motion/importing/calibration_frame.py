@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from memmlp.motion.importing.recording import Recording
+from memmlp.motion.importing.motion_file import MotionFile
 
 MAYBE, JUMP = 1.5, 4.0  # first steps from which on frame 0 may be, and is, a calibration pose
 JUMPED = 0.05  # a smaller step, in multiples of the skeleton's size, is none
 
 
-def first_step(recording: Recording) -> float:
+def first_step(recording: MotionFile) -> float:
     """Return the step from frame 0 to frame 1, divided by the 90 % quantile of all later steps.
 
     A step is the largest distance by which a node moves relative to the root. The result is 0 for a short

@@ -12,7 +12,7 @@ from memmlp.motion.importing.axes import with_unit_and_up
 from memmlp.motion.importing.fidelity import Fidelity, compare
 from memmlp.motion.importing.floor import find_floor
 from memmlp.motion.importing.mapped_motion import MappedMotion, pick_joints
-from memmlp.motion.importing.recording import Recording
+from memmlp.motion.importing.motion_file import MotionFile
 from memmlp.motion.importing.retarget import fit, to_body
 from memmlp.motion.importing.skeleton_map import SkeletonMap
 
@@ -46,7 +46,7 @@ class Converted:
 
 
 def convert(
-    recording: Recording,
+    recording: MotionFile,
     skeleton: SkeletonMap,
     rest: np.ndarray,
     *,

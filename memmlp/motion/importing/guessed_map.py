@@ -21,8 +21,8 @@ from memmlp.motion.importing.axes import with_unit_and_up
 from memmlp.motion.importing.calibration_frame import JUMP, MAYBE, first_step
 from memmlp.motion.importing.convert import convert
 from memmlp.motion.importing.limbs_by_shape import LimbNodes, Pair, Tree, find_limbs, middle, read_tree
+from memmlp.motion.importing.motion_file import MotionFile
 from memmlp.motion.importing.node_names import NodeWords, without_namespace, words
-from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.skeleton_map import SkeletonMap
 
 Found = dict[str, int | None]  # joint -> node; None where no node stands for it
@@ -62,7 +62,7 @@ class Guess:
     doubts: tuple[str, ...]
 
 
-def guess(recording: Recording, name: str) -> Guess:
+def guess(recording: MotionFile, name: str) -> Guess:
     """Propose a map with the given name for a file.
 
     Raises:
@@ -258,7 +258,7 @@ def _same_side(tree: Tree, shape: Found, leg: int) -> int:
 # The proposal on paper, and whether it holds
 
 
-def check(recording: Recording, proposed: Guess, body: str = "builtin") -> tuple[str, tuple[str, ...]]:
+def check(recording: MotionFile, proposed: Guess, body: str = "builtin") -> tuple[str, tuple[str, ...]]:
     """Import a file with a proposed map; return the stance from which it was read, and the faults.
 
     Raises:
@@ -268,7 +268,7 @@ def check(recording: Recording, proposed: Guess, body: str = "builtin") -> tuple
     return done.stance_words, done.fidelity.faults
 
 
-def as_yaml(proposed: Guess, recording: Recording) -> str:
+def as_yaml(proposed: Guess, recording: MotionFile) -> str:
     """Return the map as YAML, with comments about what is certain and what is guessed."""
     skeleton = proposed.skeleton
     guessed = [joint for joint, source in proposed.sources.items() if "name" not in source]
@@ -293,7 +293,7 @@ def as_yaml(proposed: Guess, recording: Recording) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _axes_lines(recording: Recording, skeleton: SkeletonMap) -> Iterator[str]:
+def _axes_lines(recording: MotionFile, skeleton: SkeletonMap) -> Iterator[str]:
     """Yield the lines of unit and up axis: found in each file, with this file's values as comments."""
     try:
         settled = with_unit_and_up(recording, skeleton)

@@ -25,8 +25,8 @@ from memmlp.motion.importing.calibration_frame import JUMP, first_step
 from memmlp.motion.importing.convert import AUTO, convert, lowered
 from memmlp.motion.importing.fidelity import FEET_STAY, off_the_floor
 from memmlp.motion.importing.importable_files import find_recordings, read_recording, tells_rate
+from memmlp.motion.importing.motion_file import MotionFile
 from memmlp.motion.importing.reading_stance import STRAIGHTEST
-from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.skeleton_map import SkeletonMap, find_skeleton, is_number, load_skeleton
 from memmlp.motion.importing.true_rate import HEADER, SIDECAR, folder_key, true_rate
 from memmlp.motion.preparing.groups import Grouping
@@ -251,7 +251,7 @@ def _staging(out: Path) -> tempfile.TemporaryDirectory:
 
 
 def _import_file(
-    recording: Recording,
+    recording: MotionFile,
     relative: Path,
     folder: Path,
     skeleton: SkeletonMap,

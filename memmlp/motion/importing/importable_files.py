@@ -7,7 +7,7 @@ from pathlib import Path
 from memmlp.common.errors import InputError
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.expmap import PUBLISHED_FPS, read_expmap
-from memmlp.motion.importing.recording import Recording
+from memmlp.motion.importing.motion_file import MotionFile
 
 BVH, EXPMAP = ".bvh", ".txt"
 COLUMNS = 90  # numbers in a first line that only exponential maps have; other text files are passed over
@@ -31,7 +31,7 @@ def find_recordings(source: Path) -> dict[Path, Path]:
     return files
 
 
-def read_recording(path: Path) -> Recording:
+def read_recording(path: Path) -> MotionFile:
     """Read a recording; if its format has no frame rate (`tells_rate`), it gets that of the published files.
 
     Raises:

@@ -16,7 +16,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.motion.formats.bvh import END
-from memmlp.motion.importing.recording import Recording
+from memmlp.motion.importing.motion_file import MotionFile
 
 Chains = tuple[tuple[int, ...], tuple[int, ...]]
 
@@ -76,7 +76,7 @@ class Tree:
         return self.nodes[node].endswith(END)
 
 
-def read_tree(recording: Recording, calibration_frame: bool) -> Tree:
+def read_tree(recording: MotionFile, calibration_frame: bool) -> Tree:
     """Return a recording's tree with the positions of evenly spread frames."""
     positions = recording.kinematics()[1][int(calibration_frame and len(recording) > 1) :]
     frames = np.unique(np.linspace(0, len(positions) - 1, FRAMES).astype(int))

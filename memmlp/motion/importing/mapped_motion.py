@@ -9,7 +9,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import JOINTS, PARENTS
-from memmlp.motion.importing.recording import Recording
+from memmlp.motion.importing.motion_file import MotionFile
 from memmlp.motion.importing.skeleton_map import SkeletonMap
 
 
@@ -37,7 +37,7 @@ class MappedMotion:
         return len(self.rotations)
 
 
-def pick_joints(recording: Recording, skeleton: SkeletonMap) -> MappedMotion:
+def pick_joints(recording: MotionFile, skeleton: SkeletonMap) -> MappedMotion:
     """Pick the mapped joints' motion from a recording, without its calibration frame.
 
     Raises:
@@ -61,7 +61,7 @@ def pick_joints(recording: Recording, skeleton: SkeletonMap) -> MappedMotion:
     )
 
 
-def _nodes(recording: Recording, skeleton: SkeletonMap) -> np.ndarray:
+def _nodes(recording: MotionFile, skeleton: SkeletonMap) -> np.ndarray:
     """Return the index (22,) of each body joint's node; a joint without a node has its parent's."""
     missing = sorted(set(skeleton.joints.values()) - set(recording.nodes))
     if missing:
@@ -79,7 +79,7 @@ def _nodes(recording: Recording, skeleton: SkeletonMap) -> np.ndarray:
     return nodes
 
 
-def _line(recording: Recording, node: int) -> list[int]:
+def _line(recording: MotionFile, node: int) -> list[int]:
     """Return the node and its ancestors."""
     line = [node]
     while recording.node_parents[line[-1]] >= 0:

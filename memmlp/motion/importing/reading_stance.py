@@ -13,7 +13,7 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.motion.importing import anatomy
 from memmlp.motion.importing.mapped_motion import MappedMotion
-from memmlp.motion.importing.recording import Recording
+from memmlp.motion.importing.motion_file import MotionFile
 from memmlp.motion.importing.skeleton_map import SkeletonMap
 
 STRAIGHTEST = "the straightest"  # how a frame was chosen, beside a given one
@@ -37,7 +37,7 @@ class Stance:
     straight: bool
 
 
-def find_stance(recording: Recording, skeleton: SkeletonMap, mapped_motion: MappedMotion) -> Stance:
+def find_stance(recording: MotionFile, skeleton: SkeletonMap, mapped_motion: MappedMotion) -> Stance:
     """Find the stance of a file: the map's, else the zero pose, else the straightest frame.
 
     Raises:
@@ -58,7 +58,7 @@ def find_stance(recording: Recording, skeleton: SkeletonMap, mapped_motion: Mapp
     return _straightest(mapped_motion, why)
 
 
-def _given(recording: Recording, skeleton: SkeletonMap, mapped_motion: MappedMotion) -> Stance:
+def _given(recording: MotionFile, skeleton: SkeletonMap, mapped_motion: MappedMotion) -> Stance:
     """Return the stance whose joints have the map's rotations."""
     assert isinstance(skeleton.rest, dict)
     rotations, positions = (array[mapped_motion.nodes] for array in recording.posed(skeleton.rest))

@@ -21,8 +21,8 @@ from memmlp.motion.clip import Clip
 from memmlp.motion.importing import anatomy
 from memmlp.motion.importing.anatomy import HINGES, HIPS, LEGS, LIMBS, Segment, least_rotation, segments
 from memmlp.motion.importing.mapped_motion import MappedMotion
+from memmlp.motion.importing.motion_file import MotionFile
 from memmlp.motion.importing.reading_stance import Stance, find_stance
-from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.skeleton_map import Z_UP, SkeletonMap
 
 POSITION_LIMIT = 1e4  # metres, as `read_clip` has it
@@ -45,7 +45,7 @@ class Retargeting:
 
 
 def fit(
-    recording: Recording, skeleton: SkeletonMap, mapped_motion: MappedMotion, rest: np.ndarray
+    recording: MotionFile, skeleton: SkeletonMap, mapped_motion: MappedMotion, rest: np.ndarray
 ) -> Retargeting:
     """Fit a recording's skeleton to a body's rest joints (22, 3), metres.
 

@@ -13,8 +13,8 @@ import yaml
 
 from memmlp.common.errors import InputError, why_unreadable
 from memmlp.motion.body import JOINTS
+from memmlp.motion.importing.motion_file import MotionFile
 from memmlp.motion.importing.node_names import find_nodes
-from memmlp.motion.importing.recording import Recording
 
 SKELETONS = Path(__file__).parent / "skeletons"
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # Y-up axes to the world's: y becomes z
@@ -84,7 +84,7 @@ def load_skeleton(which: str) -> SkeletonMap:
     return _parsed(path, content)
 
 
-def find_skeleton(recording: Recording, chosen: SkeletonMap | None = None) -> SkeletonMap:
+def find_skeleton(recording: MotionFile, chosen: SkeletonMap | None = None) -> SkeletonMap:
     """Find the shipped map all of whose nodes the file has; of several maps, the one with the most nodes.
 
     Of maps with equally many nodes, the one that finds unit and up axis in the file is preferred.
@@ -124,7 +124,7 @@ def _rank(skeleton: SkeletonMap) -> tuple[int, int]:
     return len(skeleton.joints), (skeleton.unit, skeleton.up).count(None)
 
 
-def spelt_as_in(skeleton: SkeletonMap, recording: Recording) -> SkeletonMap | None:
+def spelt_as_in(skeleton: SkeletonMap, recording: MotionFile) -> SkeletonMap | None:
     """Return a map with its nodes spelt as in the file, including the file's namespace.
 
     Returns None if the file lacks one of the nodes.

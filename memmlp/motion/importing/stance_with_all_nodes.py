@@ -10,8 +10,8 @@ from memmlp.motion.body import JOINTS, PARENTS
 from memmlp.motion.importing import anatomy
 from memmlp.motion.importing.axes import with_unit_and_up
 from memmlp.motion.importing.mapped_motion import MappedMotion, pick_joints
+from memmlp.motion.importing.motion_file import MotionFile
 from memmlp.motion.importing.reading_stance import Stance, find_stance
-from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.retarget import fit
 from memmlp.motion.importing.skeleton_map import SkeletonMap
 
@@ -37,7 +37,7 @@ class StanceWithAllNodes:
 
 
 def find_stance_with_all_nodes(
-    recording: Recording, skeleton: SkeletonMap, rest: np.ndarray
+    recording: MotionFile, skeleton: SkeletonMap, rest: np.ndarray
 ) -> StanceWithAllNodes:
     """Return the stance from which `import` reads a file's skeleton.
 
@@ -61,7 +61,7 @@ def find_stance_with_all_nodes(
 
 
 def _all_nodes(
-    recording: Recording, skeleton: SkeletonMap, mapped_motion: MappedMotion, stance: Stance
+    recording: MotionFile, skeleton: SkeletonMap, mapped_motion: MappedMotion, stance: Stance
 ) -> np.ndarray:
     """Return the positions (nodes, 3) of all nodes in a pose that is known for the mapped nodes only.
 

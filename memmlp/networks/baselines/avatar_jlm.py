@@ -32,12 +32,12 @@ UNSEEN = 0.01  # stands in all features of joints without a tracker
 TOKENS = 2 * N_JOINTS + 1  # positions, rotations, and the inputs as a whole
 LONGEST = 200  # frames that have a place of their own, as published
 GROUPS = 8  # of the regressor's normalisation
-PARTS = (SPARSE_ROTATION, SPARSE_ANGULAR_VELOCITY, SPARSE_POSITION, SPARSE_VELOCITY)
+TRACKER_FEATURES = (SPARSE_ROTATION, SPARSE_ANGULAR_VELOCITY, SPARSE_POSITION, SPARSE_VELOCITY)
 
 
 def tracker_features(encoded: Tensor) -> Tensor:
     """Return inputs (..., 54) grouped by tracker (..., 3, 18)."""
-    return torch.cat([encoded[..., part].unflatten(-1, (len(TRACKED), -1)) for part in PARTS], -1)
+    return torch.cat([encoded[..., part].unflatten(-1, (len(TRACKED), -1)) for part in TRACKER_FEATURES], -1)
 
 
 def joint_features(encoded: Tensor) -> Tensor:
@@ -133,7 +133,7 @@ class AvatarJLM(WholeWindow):
         embedded = self.embedding(joint_features(encoded))
         positions, rotations = self.coarse_joints(embedded)
         seen = encoded * self.normalizer.std[:SPARSE_DIM] + self.normalizer.mean[:SPARSE_DIM]
-        tracked = [seen[..., part].unflatten(-1, (len(TRACKED), -1)) for part in PARTS]
+        tracked = [seen[..., part].unflatten(-1, (len(TRACKED), -1)) for part in TRACKER_FEATURES]
         positions = with_tracked(positions, tracked[2] - tracked[2][..., :1, :])
         rotations = with_tracked(rotations, tracked[0])
         whole = self.input_token(embedded.detach())[..., None, :]

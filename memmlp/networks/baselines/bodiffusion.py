@@ -117,7 +117,7 @@ class BoDiffusion(WholeWindow):
         self.register_buffer("noises", self.drawn(frames), persistent=False)  # more with more sampling steps
 
     @property
-    def streams(self) -> bool:
+    def is_stream(self) -> bool:
         """Whether each frame is predicted without later ones; false in the published, offline mode."""
         return not self.offline
 

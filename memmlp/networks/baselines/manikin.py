@@ -347,7 +347,7 @@ class ManikinL(Manikin, AvatarJLM):
         self.parts_weight, self.turned, self.offline = parts_weight, turned, offline
 
     @property
-    def streams(self) -> bool:
+    def is_stream(self) -> bool:
         """Whether each frame is predicted without later ones; false for MANIKIN-LN."""
         return not self.offline
 

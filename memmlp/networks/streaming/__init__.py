@@ -89,7 +89,7 @@ def streaming(model: MotionModel) -> StreamingGraph:
 
 def check_streams(model: MotionModel) -> None:
     """Raise InputError for a network that makes frames with later ones: no live step makes its motion."""
-    if not model.streams:
+    if not model.is_stream:
         raise InputError("model.offline=true: makes frames with later ones; allowed is model.offline=false")
 
 
@@ -98,4 +98,4 @@ def has_stream(model: MotionModel) -> bool:
     if isinstance(model, Refined):
         return has_stream(model.network)
     graph = STREAMS.get(type(model))
-    return graph is not None and model.settled and model.streams and graph.fits(model)
+    return graph is not None and model.settled and model.is_stream and graph.fits(model)

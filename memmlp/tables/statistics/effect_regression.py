@@ -13,8 +13,8 @@ that of u, which is found where the weighted squares of the residuals are as man
 random-effects regression model for meta-analysis").
 
 Every number that is read from the line is a sum of the cells' effects with known factors c[i]. Its error has
-two sides, which are crossed as seeds and clips are (`memmlp.tables.statistics.crossed`), with cells in place
-of seeds:
+two sides, which are crossed as seeds and clips are (`crossed_seeds_and_groups`), with cells in place of
+seeds:
 
     A = sum of c^2 (n + tau^2)                                       K - P       (Knapp and Hartung 2003: t)
     B = variance of the groups' own sums x sum of w^2                G - 1
@@ -32,7 +32,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-from memmlp.tables.statistics.crossed import Error, Groups, by_group
+from memmlp.tables.statistics.crossed_seeds_and_groups import Error, Groups, by_group
 from memmlp.tables.statistics.paired_differences import LEVEL
 
 LEAST = 2

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from memmlp.tables.statistics.crossed import Groups, error
+from memmlp.tables.statistics.crossed_seeds_and_groups import Groups, error
 
 LEVEL = 0.05
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from memmlp.tables.statistics.crossed import Error, by_group
+from memmlp.tables.statistics.crossed_seeds_and_groups import Error, by_group
 from memmlp.tables.statistics.verdicts import looks
 
 
@@ -82,7 +82,7 @@ class SimulatedLook(NamedTuple):
 
     Attributes:
         noise: the means (K, S) of the noise over clips, by seed.
-        variance: the variance E (K,) of the noise alone (`memmlp.tables.statistics.crossed`).
+        variance: the variance E (K,) of the noise alone (`crossed_seeds_and_groups`).
         covariances: covariances (K, 4, 4) between the groups' means of the effects of groups, clips, skewed
             clips and noise.
     """

@@ -52,9 +52,7 @@ def played(tmp_path_factory: pytest.TempPathFactory, step_files: Callable[[str],
     stream = Stream(step_files("no_memory"), space="openxr", height=HEIGHT, floor=FLOOR)
     marionette = Marionette()
     files = {kind: folder / f"played.{kind}" for kind in ("npz", "bvh", "glb")}
-    recording = Recorder(
-        list(files.values()), stream.network.skeleton.rest, stream.network.fps, lambda _: None
-    )
+    recording = Recorder(list(files.values()), stream.network.body.rest, stream.network.fps, lambda _: None)
     outputs = Outputs([VMC(Receiver("127.0.0.1", marionette.port, "--vmc")), recording], pytest.fail)
     positions = space.positions_out(person.positions * SIZE + [0, 0, FLOOR])
     rotations = space.rotations_out(person.rotations)

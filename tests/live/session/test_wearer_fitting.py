@@ -37,7 +37,7 @@ class Wearing:
 
     def pose(self, shift: float = 0.0, lower: float = 0.0):
         """Devices of a person in T-pose, 5 cm before the joints; the left hand shifted, both lowered."""
-        pose = t_pose(self.stream.network.skeleton, np.array([0.0, 0.0, 1.57]), 0.0)
+        pose = t_pose(self.stream.network.body, np.array([0.0, 0.0, 1.57]), 0.0)
         positions = pose.positions + np.array([0, -0.05, 0])
         positions[1, 1] += shift
         positions[1:, 2] -= lower
@@ -69,7 +69,7 @@ def test_a_calibration_waits_for_its_countdown(worn: Wearing):
         "me.json",
     )
     assert "0 cm from the joints" in state["said"]
-    saved = read_calibration(worn.path, "amass", worn.stream.network.skeleton).offsets
+    saved = read_calibration(worn.path, "amass", worn.stream.network.body).offsets
     np.testing.assert_allclose(saved.positions, worn.stream.offsets.positions)
 
 
@@ -120,7 +120,7 @@ def test_height_and_floor(worn: Wearing):
     worn.order("height", None)
     worn.fitting.step(None)
     assert (worn.stream.wearer.scale, worn.stream.wearer.floor) == (1, 0)
-    saved = read_calibration(worn.path, "amass", worn.stream.network.skeleton)
+    saved = read_calibration(worn.path, "amass", worn.stream.network.body)
     assert (saved.height, saved.floor) == (None, 0)
 
 
@@ -137,7 +137,7 @@ def test_another_height_forgets_the_calibration(worn: Wearing):
     state = worn.told[-1]
     assert (state["calibrated"], state["height"], state["failed"]) == (False, 190, False)
     assert state["said"].startswith("Calibrate again: the calibration was of another height")
-    saved = read_calibration(worn.path, "amass", worn.stream.network.skeleton)
+    saved = read_calibration(worn.path, "amass", worn.stream.network.body)
     assert (saved.offsets, saved.height) == (None, 1.90)
 
 
@@ -166,7 +166,7 @@ def test_forgotten_and_cancelled(worn: Wearing):
     worn.now += 100
     worn.fitting.step(worn.pose())
     assert worn.stream.offsets is None
-    assert read_calibration(worn.path, "amass", worn.stream.network.skeleton).offsets is None
+    assert read_calibration(worn.path, "amass", worn.stream.network.body).offsets is None
     assert (worn.told[-1]["waiting"], worn.told[-1]["calibrated"]) == (None, False)
 
 

@@ -74,7 +74,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Made:
         patched.setattr("memmlp.live.web.networks.export", once(export))
         patched.setattr("memmlp.live.web.networks.export_full", once(export_full))
         patched.setattr(
-            "memmlp.live.web.without_weights.LEAST", 1_000_000
+            "memmlp.live.web.weightless_files.LEAST", 1_000_000
         )  # the yardstick's alone are drawn on the page
         if not made.step.exists():
             clip = packed("walk", PERSON.frames.numpy(), 4.0)

@@ -21,7 +21,7 @@ from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.importing.convert import NONE, convert
 from memmlp.motion.importing.import_folder import ImportSettings, import_folder
 from memmlp.motion.importing.skeleton_map import SKELETONS, find_skeleton, load_skeleton
-from memmlp.motion.importing.verify import verify
+from memmlp.motion.importing.verify_files import verify
 from memmlp.motion.synthetic import synthesize_clip
 
 REST = builtin_rest_joints()

@@ -13,7 +13,7 @@ from memmlp.common.errors import InputError
 from memmlp.motion.formats.expmap import WIDTH
 from memmlp.motion.importing.import_folder import ImportSettings, import_folder
 from memmlp.motion.importing.importable_files import find_recordings, read_recording, tells_rate
-from memmlp.motion.importing.verify import verify
+from memmlp.motion.importing.verify_files import verify
 
 
 def standing(frames: int = 40) -> str:

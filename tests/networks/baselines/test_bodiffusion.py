@@ -131,7 +131,7 @@ def test_offline_it_is_no_stream():
     changed[-1] += 0.5
     before, after = (modes.window(model, [one])[0] for one in (clip, changed))
     assert not torch.allclose(before[4], after[4])  # the windows in between carry it there
-    assert not model.streams
+    assert not model.is_stream
     assert not has_stream(model)
     with pytest.raises(InputError, match=r"model\.offline=true"):
         streaming(model)

@@ -193,14 +193,14 @@ def test_the_losses_of_the_parts_have_a_weight(name):
 
 def test_offline_it_is_no_stream():
     model = tiny.baseline("manikin_l", offline=True)
-    assert not model.streams
+    assert not model.is_stream
     assert not has_stream(model)
     evaluation = Evaluation(["window"], 4, NoIK(), 0)
     assert evaluation.report(model, tiny.frames((20,)), "window")["offline"]
     assert "offline" not in evaluation.report(tiny.baseline("manikin_l"), tiny.frames((20,)), "window")
     with pytest.raises(InputError, match=r"model\.offline=true"):
         streaming(model)
-    assert tiny.baseline("manikin_l").streams
+    assert tiny.baseline("manikin_l").is_stream
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from memmlp.tables.statistics.crossed import error
+from memmlp.tables.statistics.crossed_seeds_and_groups import error
 from memmlp.tables.statistics.effect_regression import FittedLine, fit
 from memmlp.tables.statistics.paired_differences import paired_effects
 

@@ -18,7 +18,7 @@ from memmlp.tables.statistics import (
     paired_effects,
     seeds_needed,
 )
-from memmlp.tables.statistics.crossed import error
+from memmlp.tables.statistics.crossed_seeds_and_groups import error
 
 
 def satterthwaite(d: np.ndarray) -> np.ndarray:

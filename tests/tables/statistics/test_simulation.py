@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from memmlp.tables.statistics.crossed import error
+from memmlp.tables.statistics.crossed_seeds_and_groups import error
 from memmlp.tables.statistics.simulation import SHARES, GridRow, Shares, Simulated, draw
 
 

@@ -1,4 +1,4 @@
-// Weights drawn at random in place of a network's own, for a graph that is only timed (memmlp.live.web.without_weights).
+// Weights drawn at random in place of a network's own, for a graph that is only timed (memmlp.live.web.weightless_files).
 
 const BYTES = { float32: 4, float16: 2, int8: 1 };
 const ROOT3 = Math.sqrt(3); // a uniform number between -1 and 1 has the standard deviation 1 / sqrt(3)

@@ -176,7 +176,7 @@ export class Replay {
     const index = Math.min(Math.max(Math.round(this.time * mine.fps) - mine.from, 0), mine.joints.length - 1);
     const truth = metres(mine.truth[index]);
     for (const view of this.views) {
-      const frame = view.data ? measured(metres(view.data.joints[index]), truth) : { joints: truth, truth: null, errors: null };
+      const frame = view.data ? measured(metres(view.data.joints[index]), truth) : { positions: truth, truth: null, errors: null };
       view.stage.show({ ...frame, restarted: this.jumped });
       if (view.data) view.error.textContent = number(frame.mean, 1);
     }
@@ -214,8 +214,8 @@ export class Replay {
 
 const metres = millimetres => Float32Array.from(millimetres, mm => mm / 1000);
 
-function measured(joints, truth) {
-  const errors = new Float32Array(joints.length / 3);
-  for (let j = 0; j < errors.length; j++) errors[j] = 100 * Math.hypot(...[0, 1, 2].map(i => joints[3 * j + i] - truth[3 * j + i]));
-  return { joints, truth, errors, mean: errors.reduce((a, b) => a + b) / errors.length };
+function measured(positions, truth) {
+  const errors = new Float32Array(positions.length / 3);
+  for (let j = 0; j < errors.length; j++) errors[j] = 100 * Math.hypot(...[0, 1, 2].map(i => positions[3 * j + i] - truth[3 * j + i]));
+  return { positions, truth, errors, mean: errors.reduce((a, b) => a + b) / errors.length };
 }

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 
-class Recording(Protocol):
+class MotionFile(Protocol):
     """Motion on a file's own skeleton, in the file's own unit and axes (`formats.bvh.Bvh` is one)."""
 
     @property

@@ -11,7 +11,7 @@ from drawn import TABLE
 from scipy import stats
 from scipy.special import stdtrit
 
-from memmlp.tables.statistics.crossed import error, skewed
+from memmlp.tables.statistics.crossed_seeds_and_groups import error, skewed
 
 
 def test_noise_by_hand():

@@ -10,7 +10,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from memmlp.deploy import latency
 from memmlp.deploy.latency import YARDSTICK_SHAPE, yardstick
-from memmlp.live.web.without_weights import LEAST, LOCATION, without_weights
+from memmlp.live.web.weightless_files import LEAST, LOCATION, without_weights
 
 
 def drawn_bytes(drawn: list) -> bytearray:

@@ -12,7 +12,7 @@ from memmlp.motion.clip import Clip
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.importing.fidelity import Fidelity
 from memmlp.motion.importing.skeleton_map import load_skeleton
-from memmlp.motion.importing.verify import Unusable, verify, verify_folder
+from memmlp.motion.importing.verify_files import Unusable, verify, verify_folder
 from memmlp.motion.synthetic import synthesize_clip
 
 
@@ -36,7 +36,7 @@ def test_verify_reads_the_npz(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         poses[17, 18] += 0.3  # the left elbow
         return replace(clip, poses=poses)
 
-    monkeypatch.setattr("memmlp.motion.importing.verify.read_clip", bent)
+    monkeypatch.setattr("memmlp.motion.importing.verify_files.read_clip", bent)
     fidelity = verify(write(tmp_path, walk()))
     assert (fidelity.mm.where, fidelity.mm.frame) == ("left_wrist", 17)
     assert (fidelity.degrees.where, fidelity.degrees.frame) == ("left_elbow to left_wrist", 17)
@@ -54,7 +54,7 @@ def test_the_rate_is_the_one_that_an_import_takes(
         kept.append(read_clip(path, name))
         return kept[-1]
 
-    monkeypatch.setattr("memmlp.motion.importing.verify.read_clip", reading)
+    monkeypatch.setattr("memmlp.motion.importing.verify_files.read_clip", reading)
     (tmp_path / "inner").mkdir()
     write(tmp_path / "inner", walk())
     if told:
