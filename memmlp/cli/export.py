@@ -96,14 +96,15 @@ EXPORTING = ("out", "graph", "precision", "max_growth", "opset", "scope", "space
     help="Format of the joints' rotations, with --scope full; quaternions are x, y, z, w.  [default: matrix]",
 )
 @click.option(
-    "--clips",
+    "--parity-clips",
+    "clips",
     default=1,
     show_default=True,
     type=click.IntRange(0),
-    help="How many test clips a float32 file is checked on, the longest first; 0 for all.",
+    help="How many test clips a float32 file is compared with the network on, the longest first; 0 for all.",
 )
 @click.option(
-    "--check",
+    "--operators-for",
     "targets",
     multiple=True,
     type=click.Choice(TARGETS),
@@ -155,7 +156,7 @@ def export(
         )
     if precision != "fp32" and given("clips"):
         raise InputError(
-            f"--clips {clips}: --precision {precision} is measured on all test clips; allowed with fp32 alone"
+            f"--parity-clips {clips}: allowed with fp32 alone; {precision} is measured on all test clips"
         )
     full = (space or "amass", rotations or "matrix") if scope == "full" else None
     check_runs(outputs, run)

@@ -55,7 +55,8 @@ POSITIONS = {"rotation": "predicted_positions", "position": "predicted_positions
     help="Time at which the piece ends, seconds.  [default: the clip's end]",
 )
 @click.option(
-    "--frames",
+    "--poses",
+    "frames",
     default=6,
     show_default=True,
     type=click.IntRange(1, 20),

@@ -1,4 +1,4 @@
-"""Which operators of an ONNX file are not among those that a runtime publishes (`memmlp export --check`).
+"""Which operators of an ONNX file a runtime does not publish (`memmlp export --operators-for`).
 
 The lists are data of this package (memmlp/deploy/operators), each with the document that it was taken from.
 The list of ONNX Runtime itself is read from the installed runtime.

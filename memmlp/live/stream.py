@@ -134,7 +134,7 @@ class Stream:
 
     Attributes:
         wearer: height and floor (`memmlp.live.wearer`), as `fit` sets them.
-        network_seconds: how long the network itself took in the last `step`.
+        step_seconds: how long the exported step took in the last `step`: the network with its features.
         odd: warns, once of each kind, of samples that are hardly metres or seconds (`SampleWarning`).
 
     Raises:
@@ -160,7 +160,7 @@ class Stream:
             raise InputError(f"ik: {self.network.path} has no position branch to fit to; allowed is ik=None")
         self.offsets = None if offsets is None else checked_offsets(offsets)
         self.wearer = wearer(self.network.body, height, floor)
-        self.network_seconds = 0.0
+        self.step_seconds = 0.0
         self.odd = OddSamples()
         self.solve = None if ik is None else Solver(ik, self.network.body.rest)
         self._output = ROTATION_FORMATS[rotations]
@@ -224,7 +224,7 @@ class Stream:
         if self.offsets is not None:
             positions = positions + (rotations @ self.offsets.positions[:, :, None])[..., 0]
             rotations = rotations @ self.offsets.rotations
-        self.network_seconds = 0.0
+        self.step_seconds = 0.0
         world = self._positions_in(positions)
         self.odd.take(time, world, lost)
         frames, restarted = self._trackers.take(time, world, self.space.rotations_in(rotations), lost)
@@ -240,7 +240,7 @@ class Stream:
                 self.network.peek()
             else:
                 self.network.advance()
-            self.network_seconds += perf_counter() - began
+            self.step_seconds += perf_counter() - began
         self._last = self._pose(frames[-1].time, frames[-1].positions[0], _names(lost), restarted)
         return self._last
 

@@ -1,4 +1,4 @@
-"""A prepared cache as tensors: segments for training, whole clips for evaluation, and the window sampler."""
+"""A prepared cache as tensors: stretches for training, whole clips for evaluation, and the window sampler."""
 
 from __future__ import annotations
 

@@ -133,7 +133,7 @@ class MotionModel(nn.Module):
         raise NotImplementedError
 
     def whole(self, sparse: Tensor) -> Tensor:
-        """Map the world inputs (N, 54) of a clip, N >= T, to its world motion (N, 198); see `joint`."""
+        """Map a clip's world inputs (N, 54), N >= T, to its world motion (N, 198); see `takes_whole_clip`."""
         raise NotImplementedError
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:

@@ -16,6 +16,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import number_of
 from memmlp.runs.deployment_folder import with_times_as_deployed
 from memmlp.runs.evaluation_file import with_solvers
+from memmlp.runs.former_keys import present_key
 from memmlp.runs.identity import SLOTS, flatten, option_in_slot, training_config
 from memmlp.runs.notes import read_notes
 from memmlp.runs.run import STATUSES, Run
@@ -137,6 +138,8 @@ def check_key(key: str, records: Iterable[Record], option: str) -> None:
     if key not in keys:
         near = difflib.get_close_matches(key, keys, n=1)
         hint = f"did you mean {near[0]}? " if near else ""
+        if (now := present_key(key, [name.rpartition(".")[2] for name in keys])) is not None:
+            hint = f"it is now {now}; "
         raise InputError(
             f"{option}: no run has the key '{key}'; {hint}allowed are keys of the config (memory, optim.lr), "
             "results (stream.MPJPE), id, kind, status, name, data, started, tag and note"

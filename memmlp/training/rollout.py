@@ -62,9 +62,9 @@ class TeacherForcing(Rollout):
         """Draw the training call of a step."""
         clips, end = map(distributed.own_rows, sampler.draw(step))
         past, stride = model.past_frames, model.stride
-        segment = dataset.stretches(clips, end, past + stride)
-        state = model.true_state(segment[:, :past])
-        return TrainingCall(segment[:, past:, :SPARSE_DIM], state, segment[:, -model.frames :], clips)
+        stretch = dataset.stretches(clips, end, past + stride)
+        state = model.true_state(stretch[:, :past])
+        return TrainingCall(stretch[:, past:, :SPARSE_DIM], state, stretch[:, -model.frames :], clips)
 
 
 class OwnPredictions(Rollout):
@@ -85,8 +85,8 @@ class OwnPredictions(Rollout):
         clips, end = map(distributed.own_rows, sampler.draw(step))
         past, stride = model.past_frames, model.stride
         passes = int(torch.randint(self.max_passes + 1, ())) if model.shift else 0
-        segment = dataset.stretches(clips, end, past + stride * (passes + 1))
-        sparse = segment[..., :SPARSE_DIM]
+        stretch = dataset.stretches(clips, end, past + stride * (passes + 1))
+        sparse = stretch[..., :SPARSE_DIM]
         state = model.running_state(sparse[:, :past])
         model.eval()
         with torch.no_grad():
@@ -95,7 +95,7 @@ class OwnPredictions(Rollout):
                 _, state = model.advance(sparse[:, start : start + stride], state, stride)
         torch.clear_autocast_cache()  # weights that were cast without a gradient would have none below
         model.train()
-        return TrainingCall(sparse[:, -stride:], state, segment[:, -model.frames :], clips)
+        return TrainingCall(sparse[:, -stride:], state, stretch[:, -model.frames :], clips)
 
 
 class PersistentStreams(Rollout):
@@ -147,14 +147,14 @@ class PersistentStreams(Rollout):
         self.lives[who] = True
         self.who, mine, going = who, distributed.own_rows(who), distributed.own_rows(going)
         past, stride = model.past_frames, model.stride
-        segment = dataset.stretches(self.clip[mine], self.end[mine], past + stride)
-        fresh = model.running_state(segment[:, :past, :SPARSE_DIM])
+        stretch = dataset.stretches(self.clip[mine], self.end[mine], past + stride)
+        fresh = model.running_state(stretch[:, :past, :SPARSE_DIM])
         state = {}
         for name, tensor in fresh.items():
             kept = self.get_buffer(f"state_{name}")[mine]
             state[name] = torch.where(going.view(-1, *[1] * (tensor.dim() - 1)), kept, tensor)
         return TrainingCall(
-            segment[:, past:, :SPARSE_DIM], state, segment[:, -model.frames :], self.clip[mine]
+            stretch[:, past:, :SPARSE_DIM], state, stretch[:, -model.frames :], self.clip[mine]
         )
 
     def keep(self, state: State) -> None:

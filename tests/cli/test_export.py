@@ -32,20 +32,22 @@ def write(path: Path, *kinds: str, opset: int = 15) -> None:
 def test_a_file_is_checked_without_a_run(memmlp: Memmlp, tmp_path: Path):
     fine, other = tmp_path / "fine.onnx", tmp_path / "other.onnx"
     write(fine, "Relu", "Sigmoid")
-    said = memmlp("export", str(fine), "--check", "unity", "--check", "tensorrt")
+    said = memmlp("export", str(fine), "--operators-for", "unity", "--operators-for", "tensorrt")
     assert said.code == 0
     assert said.out.startswith("fine.onnx: 2 nodes of 2 operators\nunity: ")
     assert said.out.count("  all operators are published\n") == 2
     assert "com.unity.ai.inference 2.4.0, 2025-10-22 (https://docs.unity3d.com" in said.out
     write(other, "Relu", "Det", "Det", opset=18)
-    said = memmlp("export", str(other), "--check", "unity", "--check", "onnxruntime")
+    said = memmlp("export", str(other), "--operators-for", "unity", "--operators-for", "onnxruntime")
     assert said.code == 1
     assert "  opset 18: published are 7 to 15\n  Det (version 11), 2 nodes: not in the list\n" in said.out
     assert "other.onnx: outside of what unity publishes" in said.err
 
 
 def test_no_number_of_clips_is_below_zero(memmlp: Memmlp):
-    assert one_line(memmlp("export", "0123", "--out", "a.onnx", "--clips", "-1"), "--clips", "-1")
+    assert one_line(
+        memmlp("export", "0123", "--out", "a.onnx", "--parity-clips", "-1"), "--parity-clips", "-1"
+    )
 
 
 def test_a_live_frame_is_of_one_thing(memmlp: Memmlp, tmp_path: Path):
@@ -57,7 +59,7 @@ def test_a_live_frame_is_of_one_thing(memmlp: Memmlp, tmp_path: Path):
 
 def test_web_is_all_of_its_backends(memmlp: Memmlp, tmp_path: Path):
     write(tmp_path / "step.onnx", "Relu", "Sign")
-    said = memmlp("export", str(tmp_path / "step.onnx"), "--check", "web")
+    said = memmlp("export", str(tmp_path / "step.onnx"), "--operators-for", "web")
     assert [line.partition(":")[0] for line in said.out.splitlines() if line.startswith("w")] == [
         "wasm",
         "webgpu",
@@ -71,9 +73,15 @@ def test_web_is_all_of_its_backends(memmlp: Memmlp, tmp_path: Path):
     ("line", "words"),
     [
         (["step.onnx"], "allowed with it is --check alone"),
-        (["step.onnx", "--check", "unity", "--out", "other.onnx"], "allowed with it is --check alone"),
-        (["step.onnx", "--check", "unity", "--precision", "int8"], "allowed with it is --check alone"),
-        (["none.onnx", "--check", "unity"], "none.onnx: no such file"),
+        (
+            ["step.onnx", "--operators-for", "unity", "--out", "other.onnx"],
+            "allowed with it is --check alone",
+        ),
+        (
+            ["step.onnx", "--operators-for", "unity", "--precision", "int8"],
+            "allowed with it is --check alone",
+        ),
+        (["none.onnx", "--operators-for", "unity"], "none.onnx: no such file"),
         (["0123"], "--out: is missing; it may be left out with --check alone"),
         (["0123", "--out", "step.txt"], "allowed ending is .onnx"),
         (["0123", "--out", "none/step.onnx"], "there is no folder none"),
@@ -82,7 +90,10 @@ def test_web_is_all_of_its_backends(memmlp: Memmlp, tmp_path: Path):
             ["0123", "--out", "a.onnx", "--max-growth", "2"],
             "allowed with --precision fp16, int8 or int8_blocks",
         ),
-        (["0123", "--out", "a.onnx", "--precision", "int8", "--clips", "3"], "measured on all test clips"),
+        (
+            ["0123", "--out", "a.onnx", "--precision", "int8", "--parity-clips", "3"],
+            "measured on all test clips",
+        ),
     ],
 )
 def test_what_does_not_go_together_is_refused(
@@ -115,7 +126,9 @@ def test_a_run_in_fp16_for_unity(home: Path, memmlp: Memmlp, monkeypatch: pytest
     monkeypatch.chdir(home)
     (run,) = (found.id for found in list_runs(Path("outputs")) if is_trained(found))
     whole = ["--scope", "full", "--space", "unity", "--rotations", "quaternion", "--opset", "15"]
-    said = memmlp("export", run, "--out", "unity.onnx", *whole, "--precision", "fp16", "--check", "unity")
+    said = memmlp(
+        "export", run, "--out", "unity.onnx", *whole, "--precision", "fp16", "--operators-for", "unity"
+    )
     assert said.code == 0
     assert "MPJPE" in said.out
     assert float(re.search(r"whole way differs from torch by (\S+) at most", said.out)[1]) < 0.01
@@ -133,7 +146,7 @@ def test_a_run_in_fp16_for_unity(home: Path, memmlp: Memmlp, monkeypatch: pytest
     shapes = {o.name: [d.dim_value for d in o.type.tensor_type.shape.dim] for o in model.graph.output}
     assert shapes["rotations"] == [1, 22, 4]
     assert one_line(memmlp("export", run, "--out", "a.onnx", *whole, "--precision", "int8"), "--scope step")
-    said = memmlp("export", run, "--check", "unity")
+    said = memmlp("export", run, "--operators-for", "unity")
     assert said.code == 1
     assert f"{run}.onnx: outside of what unity publishes" in said.err
     assert not list(home.glob("*export*"))

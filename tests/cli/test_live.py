@@ -145,7 +145,7 @@ def test_a_calibration_of_another_height_is_told(
     """Its offsets are of that height, would be wrong in silence, and be kept as those of the new height."""
     stream = Stream(step)
     worn = Offsets(np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1)))
-    save_calibration(tmp_path / "me.json", Calibration("amass", worn, 1.80, 0.02), stream.network.skeleton)
+    save_calibration(tmp_path / "me.json", Calibration("amass", worn, 1.80, 0.02), stream.network.body)
     room = ShowOptions(None, None, tmp_path / "me.json", (), (), (), None, 0, "127.0.0.1", None, True)
     known = known_of(room, "amass", stream)
     assert (known.height, known.floor, capsys.readouterr().err) == (1.80, 0.02, "")

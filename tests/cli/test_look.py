@@ -47,7 +47,7 @@ def rows(run: Run) -> list[dict[str, Any]]:
 
 def test_a_figure(memmlp: Memmlp, finished: Run, clips: list[str], tmp_path: Path):
     out = tmp_path / "heat.png"
-    ran = memmlp("render", finished.id, "--out", str(out), "--frames", "2", "--label", "ours")
+    ran = memmlp("render", finished.id, "--out", str(out), "--poses", "2", "--label", "ours")
     error = rows(finished)[0]["rotation"]["MPJPE"]
     assert (ran.code, ran.out) == (0, f"{out}: {clips[0]} (stream, rotation), ours {error:.1f} cm\n")
     assert f"run {finished.id}: hardly trained (its steps saw " in ran.err
@@ -204,7 +204,7 @@ def test_ctrl_c_ends_it_and_leaves_nothing(
     watched = Watched(stack, home, finished.id, *arguments)
     if source == "clip":
         frames = watched.frames()
-        assert {"joints", "truth", "held", "ms"} <= set(next(frames))
+        assert {"positions", "truth", "held", "ms"} <= set(next(frames))
     code, out, err = watched.interrupt()
     assert (code, out) == (0, "")
     assert err.startswith(f"run {finished.id[:8]}: hardly trained (its steps saw ")
@@ -227,6 +227,6 @@ def test_a_clip_that_is_sent_is_predicted(home: Path, finished: Run, stack: cont
         seen = [next(frames) for _ in range(30)]
     assert [f["number"] for f in seen] == list(range(seen[0]["number"], seen[0]["number"] + 30))
     assert all(f["truth"] is None and f["held"] == [] and f["malformed"] == 0 for f in seen)
-    head = [f["joints"][3 * 15 + 1] for f in seen]
+    head = [f["positions"][3 * 15 + 1] for f in seen]
     assert all(1000 < height < 2200 for height in head), head  # millimetres
     assert watched.interrupt()[0] == 0

@@ -75,7 +75,7 @@ FIRST = {
     "seed": (1, 0), "normalizer.z_scores": (True, 0), "model.frames": (10, 0), "model.code_width": (8, 0),
     "model.code_depth": (2, 0), "model.code_heads": (1, 0), "model.dropout": (0.2, 0),
     "data.drawn_by": ("clips", 0), "data.mirror": (True, 0), "optim.precision": ("bf16", 0),
-    "upstream.upper_codes.steps": (3, 0), "upstream.upper_codes.drop": (0.5, 0),
+    "upstream.upper_codes.steps": (3, 0), "upstream.upper_codes.lr_drop": (0.5, 0),
     "upstream.lower_codes.lr": (0.1, 1),
     "model.width": (8, 2), "model.depth": (2, 2), "model.heads": (1, 2), "model.diffusion_steps": (99, 2),
     "upstream.upper_diffusion.batch": (9, 2), "upstream.upper_diffusion.lr_drops_at": ([0.1], 2),

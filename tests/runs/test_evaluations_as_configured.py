@@ -10,7 +10,7 @@ from begun_runs import begun
 import memmlp.runs.recipe_versions
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
-from memmlp.report.ui.run_facts import facts
+from memmlp.report.ui.run_row import facts
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.evaluations_as_configured import EvaluationsAsConfigured
 from memmlp.runs.identity import evaluation_id_of

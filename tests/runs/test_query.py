@@ -86,6 +86,8 @@ def test_any_text_is_a_condition_or_one_line(text: str):
 def test_an_unknown_key_names_its_neighbour():
     with pytest.raises(InputError, match="no run has the key 'memry'; did you mean memory"):
         parse("memry=gru").of([ONE])
+    with pytest.raises(InputError, match=r"it is now data\.drawn_by"):
+        parse("data.weighting=clips").of([ONE | {"data.drawn_by": "clips"}])
     assert parse("anything=1").of([]) == []
 
 

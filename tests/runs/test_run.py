@@ -17,7 +17,7 @@ from memmlp.cli.runs.printing import measured_numbers
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.experiment_tracking.logged_values import facts_of
-from memmlp.report.ui.run_facts import facts
+from memmlp.report.ui.run_row import facts
 from memmlp.runs.deployment_folder import ONNX_FILES
 from memmlp.runs.evaluation_file import intact, write_report
 from memmlp.runs.identity import (

@@ -63,8 +63,8 @@ def run_loop(
 ) -> None:
     """Feed samples to the stream, and its frames to the outputs and to open pages, until `stopped` is set.
 
-    A message has the frame's number and time (s); the milliseconds that the network itself took (`ms`), and
-    those that the whole pose took, from the sample's arrival until all outputs had it (`whole`); how many
+    A message has the frame's number and time (s); the milliseconds that the exported step took (`ms`), and
+    those that passed from the sample's arrival until all outputs had the pose (`whole`); how many
     samples were dropped, malformed, or foreign so far; whether the samples' times jump (`OddSamples`); the
     trackers that are held; and the joints' positions, predicted and true (66 whole millimetres each, in
     openxr's axes).
@@ -105,7 +105,7 @@ def run_loop(
         if outputs:
             outputs.take(stream, pose)
         whole = 1000 * (time.perf_counter() - arrived)
-        times = {"ms": round(1000 * stream.network_seconds, 3), "whole": round(whole, 3)}
+        times = {"ms": round(1000 * stream.step_seconds, 3), "whole": round(whole, 3)}
         told = source.malformed + refused, source.foreign
         opening = {
             "number": number,

@@ -45,7 +45,7 @@ class Imported:
         skeleton: name of the skeleton map.
         unit: the file's unit, metres.
         up: the file's up axis, `y` or `z`.
-        rest_pose: the stance from which the skeleton was read, in words; a key of the record.
+        stance: the stance from which the skeleton was read, in words; a key of the record.
         frames: number of frames.
         header_fps: frame rate in the file's header, Hz.
         fps: frame rate of the clip, Hz.
@@ -64,7 +64,7 @@ class Imported:
     skeleton: str
     unit: float
     up: str
-    rest_pose: str
+    stance: str
     frames: int
     header_fps: float
     fps: float
@@ -278,7 +278,7 @@ def _import_file(
         skeleton=skeleton.name,
         unit=converted.unit,
         up=converted.up,
-        rest_pose=converted.stance_words,
+        stance=converted.stance_words,
         frames=len(converted.clip),
         header_fps=recording.fps,
         fps=rate.fps,
@@ -323,7 +323,7 @@ def _family_notes(name: str, clips: Sequence[Imported]) -> Iterator[str]:
         if len(found) > 1:
             several = ", ".join(f"{value} in {count} clips" for value, count in found.most_common())
             yield f"{name}: {key} is found as {several}; tell it in the map if that is wrong"
-    read = [clip for clip in clips if clip.rest_pose.endswith(STRAIGHTEST)]
+    read = [clip for clip in clips if clip.stance.endswith(STRAIGHTEST)]
     if len(read) > 1:
         each = f"{len(read)} clips, whose zero pose is no stance, are each read from a frame of their own"
         yield f"{name}: {each}, so head, hands and feet may be turned differently; a map's rest mends that"

@@ -8,7 +8,7 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-from memmlp.report.ui.run_facts import parsed_line
+from memmlp.report.ui.run_row import parsed_line
 
 MOST = 400  # about how many points a curve has at most
 

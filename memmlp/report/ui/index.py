@@ -12,11 +12,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from memmlp.report.ui import run_facts
+from memmlp.report.ui import run_row
 from memmlp.runs.identity import ID
 from memmlp.runs.run import Run
 
-FORMAT = hashlib.sha256(Path(run_facts.__file__).read_bytes()).hexdigest()[:16]
+FORMAT = hashlib.sha256(Path(run_row.__file__).read_bytes()).hexdigest()[:16]
 """A digest of the code that makes facts; stored facts from other code are made again."""
 
 FILES = ("config.yaml", "manifest.json", "metrics.jsonl", "DONE", "FAILED", "results.json", "notes.json")
@@ -76,7 +76,7 @@ class Index:
         signature = _signature(folder)
         known = self.runs.get(run_id)
         if known is None or self.signatures.get(run_id) != signature:
-            known = run_facts.facts(folder)
+            known = run_row.facts(folder)
             self.signatures[run_id] = signature
             if self.store:
                 self.store.put(run_id, signature, known)

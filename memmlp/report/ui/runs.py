@@ -9,7 +9,7 @@ from typing import Any
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
 from memmlp.report.ui.index import Index
-from memmlp.report.ui.run_facts import COSTS, read_config
+from memmlp.report.ui.run_row import COSTS, read_config
 from memmlp.runs.deployment_folder import as_deployed
 from memmlp.runs.evaluation_file import with_solvers
 from memmlp.runs.identity import NEUTRAL, flatten, is_data_path

@@ -45,7 +45,7 @@ SHARES = {
 }
 
 
-def choices(cell: GridRow) -> dict[str, Shares]:
+def choices(cell: SimulationSetting) -> dict[str, Shares]:
     """Return the shares that are simulated in a cell of the grid, by name.
 
     SHARES divide the variance of the mean. "values" instead gives every source the same variance in a single
@@ -57,7 +57,7 @@ def choices(cell: GridRow) -> dict[str, Shares]:
     return SHARES | {"values": values}
 
 
-class GridRow(NamedTuple):
+class SimulationSetting(NamedTuple):
     """A cell of the simulated grid: a number of seeds, of clips, and of clips in each group."""
 
     seeds: int
@@ -99,7 +99,7 @@ class Simulated:
     it is kept to mix the kinds in any shares later.
     """
 
-    def __init__(self, rng: np.random.Generator, cell: GridRow, comparisons: int):
+    def __init__(self, rng: np.random.Generator, cell: SimulationSetting, comparisons: int):
         """Draw the effects of all seeds, groups and clips, and the noise of all single values."""
         self.seeds = np.sqrt(cell.seeds) * rng.normal(size=(comparisons, cell.seeds))
         fixed, noise, self.weights = draw(rng, cell, comparisons)
@@ -138,7 +138,7 @@ class Simulated:
         return known, by_seed.mean(1) + self.means @ weights[1:4]
 
 
-def draw(rng: np.random.Generator, cell: GridRow, comparisons: int) -> tuple[np.ndarray, ...]:
+def draw(rng: np.random.Generator, cell: SimulationSetting, comparisons: int) -> tuple[np.ndarray, ...]:
     """Draw all effects except those of seeds, scaled so that each kind gives the mean a variance of 1.
 
     Returns:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from memmlp.tables.statistics.paired_differences import LEVEL
-from memmlp.tables.statistics.simulation import SHARES, GridRow, Shares, Simulated, choices
+from memmlp.tables.statistics.simulation import SHARES, Shares, Simulated, SimulationSetting, choices
 from memmlp.tables.statistics.verdicts import holm, sequential, spending
 
 SEEDS, CLIPS, SIZES = (2, 3, 5, 10), (4, 10, 40, 536), (1, 2, 10)
@@ -35,9 +35,9 @@ Both are in standard errors.
 CAMPAIGNS = 200  # tables with effects for each cell of the grid
 
 
-def grid() -> list[GridRow]:
+def grid() -> list[SimulationSetting]:
     """Return all cells of the grid that have at least two groups."""
-    cells = itertools.starmap(GridRow, itertools.product(SEEDS, CLIPS, SIZES))
+    cells = itertools.starmap(SimulationSetting, itertools.product(SEEDS, CLIPS, SIZES))
     return [cell for cell in cells if cell.groups[-1] > 0]
 
 
@@ -152,7 +152,7 @@ def _claimed(p: np.ndarray, before: np.ndarray, closed: np.ndarray, level: float
     return np.array([sequential(*row) <= level for row in rows])
 
 
-def simulate(cell: GridRow, tables: int, seed: int) -> dict[str, Any]:
+def simulate(cell: SimulationSetting, tables: int, seed: int) -> dict[str, Any]:
     """Simulate a cell of the grid, and return everything that is reported about it."""
     rng = np.random.default_rng([seed, *cell])
     size = max(1, CHUNK // (TABLE * cell.seeds * cell.clips))

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from report.ui.conftest import begun, run_of
 
-from memmlp.report.ui import run_facts
+from memmlp.report.ui import run_row
 from memmlp.report.ui.index import Index
-from memmlp.report.ui.run_facts import facts, last_entries, read_config
+from memmlp.report.ui.run_row import facts, last_entries, read_config
 
 
 def test_facts_of_a_finished_run(outputs: Path):
@@ -81,7 +81,7 @@ def test_a_folder_without_anything_is_a_run_that_is_damaged(outputs: Path):
 
 def test_only_what_changed_is_parsed_again(outputs: Path, monkeypatch: pytest.MonkeyPatch):
     parsed = []
-    monkeypatch.setattr(run_facts, "facts", lambda folder: parsed.append(folder.name) or facts(folder))
+    monkeypatch.setattr(run_row, "facts", lambda folder: parsed.append(folder.name) or facts(folder))
     index = Index(outputs)
     first = index.refresh()
     assert len(parsed) == 6
@@ -146,7 +146,7 @@ def test_facts_are_kept_between_starts(outputs: Path, monkeypatch: pytest.Monkey
     first.refresh()
     first.keep()
     parsed = []
-    monkeypatch.setattr(run_facts, "facts", lambda folder: parsed.append(folder.name) or facts(folder))
+    monkeypatch.setattr(run_row, "facts", lambda folder: parsed.append(folder.name) or facts(folder))
     changed = run_of(outputs)
     os.utime(changed.manifest_path, ns=(1, 1))
     second = Index(outputs, store)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from memmlp.tables.statistics.crossed_seeds_and_groups import error
-from memmlp.tables.statistics.simulation import SHARES, GridRow, Shares, Simulated, draw
+from memmlp.tables.statistics.simulation import SHARES, Shares, Simulated, SimulationSetting, draw
 
 
-@pytest.mark.parametrize("cell", [GridRow(5, 10, 1), GridRow(5, 11, 2)])
-def test_mixtures_are_those_of_whole_differences(cell: GridRow):
+@pytest.mark.parametrize("cell", [SimulationSetting(5, 10, 1), SimulationSetting(5, 11, 2)])
+def test_mixtures_are_those_of_whole_differences(cell: SimulationSetting):
     sample = Simulated(np.random.default_rng(3), cell, 24)
     rng = np.random.default_rng(3)
     of_seeds = np.sqrt(cell.seeds) * rng.normal(size=(24, cell.seeds))
@@ -30,7 +30,7 @@ def test_mixtures_are_those_of_whole_differences(cell: GridRow):
 
 @pytest.mark.parametrize("name", SHARES)
 def test_means_have_a_variance_of_one(name: str):
-    sample = Simulated(np.random.default_rng(0), GridRow(3, 11, 2), 24000)
+    sample = Simulated(np.random.default_rng(0), SimulationSetting(3, 11, 2), 24000)
     known, mean = sample.mixed(SHARES[name], 3)
     assert mean.var() == pytest.approx(1, abs=0.06)
     a, b, e = known.variances.mean(1)

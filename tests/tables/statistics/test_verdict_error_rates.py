@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from memmlp.tables.statistics.simulation import GridRow
+from memmlp.tables.statistics.simulation import SimulationSetting
 from memmlp.tables.statistics.verdict_error_rates import broken, grid, simulate
 
 
 def test_the_grid_is_all_that_have_two_groups():
     assert len(grid()) == 40
-    assert GridRow(3, 10, 10) not in grid()
-    assert GridRow(10, 536, 10) in grid()
-    assert [cell.capped for cell in (GridRow(2, 40, 1), GridRow(3, 4, 1), GridRow(3, 10, 2))] == [
+    assert SimulationSetting(3, 10, 10) not in grid()
+    assert SimulationSetting(10, 536, 10) in grid()
+    assert [
+        cell.capped
+        for cell in (SimulationSetting(2, 40, 1), SimulationSetting(3, 4, 1), SimulationSetting(3, 10, 2))
+    ] == [
         False,
         False,
         True,
@@ -18,13 +21,13 @@ def test_the_grid_is_all_that_have_two_groups():
 
 
 def test_a_cell_is_the_same_again_and_another_with_another_seed():
-    cell = GridRow(3, 4, 2)
+    cell = SimulationSetting(3, 4, 2)
     assert simulate(cell, 20, 1) == simulate(cell, 20, 1)
     assert simulate(cell, 20, 1) != simulate(cell, 20, 2)
 
 
 def test_looks_spend_fewer_seeds_where_effects_are_plain():
-    told = simulate(GridRow(10, 40, 1), 20, 0)["campaign"]
+    told = simulate(SimulationSetting(10, 40, 1), 20, 0)["campaign"]
     assert told["decided"] > 0.95
     assert told["seeds"] < 9
     assert told["error"] <= 0.05
