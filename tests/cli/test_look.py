@@ -113,7 +113,7 @@ def test_eval_says_that_code_has_changed_since(
 def test_a_run_is_there_once_unless_labelled(memmlp: Memmlp, finished: Run, tmp_path: Path):
     same = [finished.id, str(finished.folder)]
     assert one_line(memmlp("render", *same, "--out", "a.png"), "RUNS: one is there twice")
-    labels = ["--label", "a", "--label", "b", "--frames", "1", "--to", "0.1"]
+    labels = ["--label", "a", "--label", "b", "--poses", "1", "--to", "0.1"]
     assert memmlp("render", *same, "--out", str(tmp_path / "a.PNG"), *labels).code == 0
 
 
