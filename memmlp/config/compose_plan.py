@@ -18,6 +18,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import digest, read_json, write_json
 from memmlp.config.package_data import packaged
 from memmlp.config.plugins import activate, named, texts_outside_memmlp
+from memmlp.runs.former_keys import with_former_keys
 from memmlp.sweep.definition import Arm, Sweep, key_of
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
 from memmlp.sweep.sweep_file import load_sweep
@@ -111,14 +112,15 @@ def is_path(name: str) -> bool:
 def sweep_folder(sweep: Sweep, outputs: Path) -> Path:
     """Return the folder of a sweep with its overrides: its plan, its rounds and its workers' logs.
 
-    It is the same in whatever order the overrides are written. Earlier versions had a folder for each order;
-    one that is there is used.
+    It is the same in whatever order the overrides are written, and with the former names of renamed keys.
+    Earlier versions had a folder for each order; one that is there is used.
     """
     if not sweep.command_line:
         return outputs / "sweeps" / sweep.name
-    ordered = tuple(sorted(sweep.command_line, key=lambda word: word.partition("=")[0]))
+    words = with_former_keys(sweep.command_line)
+    ordered = tuple(sorted(words, key=lambda word: word.partition("=")[0]))
     as_written, same_for_all = (
-        outputs / "sweeps" / f"{sweep.name}-{digest(words)[:8]}" for words in (sweep.command_line, ordered)
+        outputs / "sweeps" / f"{sweep.name}-{digest(order)[:8]}" for order in (words, ordered)
     )
     return as_written if as_written.is_dir() else same_for_all
 

@@ -25,7 +25,7 @@ class Renamed(NamedTuple):
     option: str | None = None
 
 
-GROUPS = {"frame": "normalizer", "tracker": "loggers", "tracking": "loggers"}
+GROUPS = {"frame": "normalizer", "tracking": "loggers", "tracker": "loggers"}
 """The present names of groups, by their former ones. `tracker` was a group of version 0.1."""
 
 PARTS = ("upper_codes", "lower_codes", "upper_diffusion", "lower_diffusion", "decoder")
@@ -131,6 +131,18 @@ def _present_override(word: str, overrides: Sequence[str]) -> str:
         return f"{key}={now}"
     group, dot, rest = key.partition(".")
     return f"{GROUPS.get(group, group)}{dot}{rest}{equals}{value}"
+
+
+def with_former_keys(overrides: Sequence[str]) -> tuple[str, ...]:
+    """Return overrides KEY=VALUE with the former names, by which a sweep's folder is called."""
+    options = dict(word.partition("=")[::2] for word in overrides if "." not in word.partition("=")[0])
+    named = {f"{group}.name": name for group, name in options.items()}
+    return tuple(_former_override(word, named) for word in overrides)
+
+
+def _former_override(word: str, named: Mapping[str, str]) -> str:
+    key, equals, value = word.partition("=")
+    return f"{_former_key(key, named)}{equals}{former_option(key, value)}"
 
 
 def present_key(key: str, allowed: Sequence[str]) -> str | None:

@@ -114,6 +114,9 @@ def test_a_sweep_has_one_folder_in_whatever_order_it_is_asked_for(tmp_path: Path
     assert a == b != c
     assert sweep_folder(replace(sweep, command_line=("seed=4", "seed=3", "threads=1")), tmp_path) != c
     assert sweep_folder(sweep, tmp_path) == tmp_path / "sweeps" / sweep.name
+    renamed = "profile=small", "loggers=none", "threads=1", "normalizer.z_scores=false", "data=mocap"
+    of_0_2 = "table14-af91e19b"  # of the former names, made by version 0.2's code (commit ae007ecb)
+    assert sweep_folder(replace(sweep, command_line=renamed), tmp_path).name == of_0_2
     earlier = tmp_path / "sweeps" / f"{sweep.name}-{digest(('threads=1', 'seed=3'))[:8]}"
     earlier.mkdir(parents=True)
     assert sweep_folder(replace(sweep, command_line=("threads=1", "seed=3")), tmp_path) == earlier

@@ -13,6 +13,7 @@ from memmlp.runs.former_keys import (
     OPTIONS,
     RENAMED,
     present_key,
+    with_former_keys,
     with_former_names,
     with_present_keys,
     with_present_names,
@@ -135,6 +136,21 @@ def test_a_former_name_on_the_command_line_is_answered_with_todays(words: list[s
         composed(words)
     assert said in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_overrides_have_their_former_names():
+    words = [
+        "model=bodiffusion",
+        "model.noise_weight=0.5",
+        "normalizer.z_scores=false",
+        "loggers=none",
+        "seed=1,2",
+    ]
+    former = ("model=bodiffusion", "model.noise=0.5", "frame.normalize=false", "tracking=none", "seed=1,2")
+    assert with_former_keys(words) == former
+    assert with_present_keys(former) == tuple(words)
+    assert with_former_keys(["loss=of_network"]) == ("loss=own",)
+    assert with_former_keys(["model=sage", "model.noise=1"]) == ("model=sage", "model.noise=1")
 
 
 def test_a_key_that_never_was_has_no_present_name():
