@@ -227,7 +227,7 @@ def test_a_nan_on_a_later_clip_is_not_exported(home, memmlp, monkeypatch):
     monkeypatch.setattr("memmlp.deploy.parity.parity", lambda *_: next(found))
     monkeypatch.setattr("memmlp.deploy.export.export", lambda model, path, run, opset: path.write_bytes(b""))
     monkeypatch.setattr(MotionDataset, "clips", lambda self: [None, None])
-    ran = memmlp("export", motion_run(home).id, "--out", "never.onnx", "--clips", "0")
+    ran = memmlp("export", motion_run(home).id, "--out", "never.onnx", "--parity-clips", "0")
     assert (ran.code, "not written" in ran.err) == (1, True)
     assert not list(home.glob("*never*")) + list(home.glob(".export-*"))
 

@@ -8,11 +8,13 @@ import pytest
 
 from memmlp.cli.bench import verdict_simulation
 from memmlp.common.files import read_json
-from memmlp.tables.statistics.simulation import GridRow
+from memmlp.tables.statistics.simulation import SimulationSetting
 
 
 def test_the_command(memmlp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(verdict_simulation, "grid", lambda: [GridRow(3, 10, 2), GridRow(5, 536, 10)])
+    monkeypatch.setattr(
+        verdict_simulation, "grid", lambda: [SimulationSetting(3, 10, 2), SimulationSetting(5, 536, 10)]
+    )
     file = tmp_path / "rates.json"
     ran = memmlp("bench", "verdicts", "--quick", "--tables", "30", "--json", str(file), "--markdown")
     assert ran.code == 0, ran.err
