@@ -17,7 +17,7 @@ from memmlp.common.files import atomic_write
 from memmlp.live.rotations import BodyTree
 from memmlp.live.spaces import SPACES, Space
 from memmlp.motion.body import JOINTS, PARENTS, TRACKED, builtin_rest_joints
-from memmlp.motion.displayed_limbs import RADII
+from memmlp.motion.limb_shapes import RADII
 from memmlp.render.canvas import FAINT, INK, Sheet, png
 from memmlp.render.raster import Camera, draw
 from memmlp.render.skeleton_picture import LEFT, MIDDLE, RIGHT

@@ -93,7 +93,8 @@ processes.mark()
 # processes stand among those that compute.
 LONGEST = (
     "cli/test_sweep", "deploy/test_deployment", "config/test_build", "pipeline/test_run_stages",
-    "kills/test_search", "pipeline/test_experiment", "live/test_full_scope_graph", "pipeline/test_baselines",
+    "kills/test_search", "pipeline/test_experiment", "live/test_trackers_to_body_graph",
+    "pipeline/test_baselines",
     "test_example_package", "networks/test_streaming", "training/test_loop", "config/test_baselines",
     "kills/test_rounds", "config/test_compose", "cli/test_main", "live/test_stream",
     "kills/test_sweep", "tables/test_seed_rounds", "networks/baselines/test_baselines", "deploy/test_export",

@@ -54,7 +54,7 @@ def play(folder: Path, step: Path, space: str) -> Played:
 
 def export(path: Path, space: str) -> None:
     """Export the whole way from trackers to joints."""
-    from memmlp.live.full_scope_graph import export_full  # it takes seconds to import
+    from memmlp.live.trackers_to_body_graph import export_full  # it takes seconds to import
     from memmlp.networks.streaming import streaming
 
     export_full(streaming(exported.NETWORKS["mem_mlp"]()), path, "0123456789abcdef", space)

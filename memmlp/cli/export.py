@@ -233,7 +233,7 @@ def write_exact(
     import numpy as np
 
     from memmlp.deploy.parity import TOLERANCE, parity, tolerated
-    from memmlp.live.full_scope_graph import full_parity, full_tolerated
+    from memmlp.live.trackers_to_body_graph import full_parity, full_tolerated
 
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
         path = Path(folder) / "step.onnx"
@@ -257,7 +257,7 @@ def write_exact(
 def write_graph(network: MotionModel | StreamingGraph, path: Path, run_id: str, form: Form) -> None:
     """Write the ONNX file of the network's step, or of the full graph, in float32 and unchecked."""
     from memmlp.deploy.export import export as export_network
-    from memmlp.live.full_scope_graph import export_full
+    from memmlp.live.trackers_to_body_graph import export_full
 
     if form.full:
         export_full(network, path, run_id, *form.full, form.opset)
@@ -298,7 +298,7 @@ def write_less_precise(
 
     from memmlp.deploy.deployment import lower
     from memmlp.deploy.precision_cost import compared
-    from memmlp.live.full_scope_graph import full_parity
+    from memmlp.live.trackers_to_body_graph import full_parity
 
     precision = form.precision
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:

@@ -96,7 +96,7 @@ def save_command(
     files: tuple[str, ...] = ()
     its_own = 0
     if also_kept:
-        from memmlp.config.runs_from_kept_results import with_kept
+        from memmlp.config.runs_shared_by_sweeps import with_kept
 
         # What the file itself has stands before the same runs of other files, whose costs were measured then.
         before = _count(found)

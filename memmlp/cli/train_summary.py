@@ -10,7 +10,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from memmlp.common.core_share_used import LEAST_CORE_SHARE
+from memmlp.common.thread_core_share import LEAST_CORE_SHARE
 from memmlp.evaluation.metric_facts import UNITS
 from memmlp.pipeline.run_stages import Outcome
 from memmlp.runs.deployment_folder import (

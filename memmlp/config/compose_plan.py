@@ -72,7 +72,7 @@ def check_preset(sweep: Sweep, arm: Arm) -> None:
     if options and (lost := [option for option in before if option not in options]):
         both = ",".join(dict.fromkeys([*before, *options]))
         raise InputError(f"{where} would replace {EXPERIMENT}={lost[0]}; allowed is {EXPERIMENT}=[{both}]")
-    known = set_by_experiments(options, sweep.overrides(arm))
+    known = set_by_experiments(options, sweep.all_overrides(arm))
     for key, word in (around | {key_of(word): word for word in others}).items():
         if key in known:
             raise InputError(
@@ -216,7 +216,7 @@ def _experiments(sweep: Sweep, arm: Arm, outputs: Path) -> Iterable[tuple[int, E
     from memmlp.config.compose import composed
 
     try:
-        cfg = composed(list(sweep.overrides(arm)))
+        cfg = composed(list(sweep.all_overrides(arm)))
         if cfg.force:  # arms that share a run would make it again and again
             raise InputError("force=true: allowed is --again, which does a sweep's finished runs again")
         for seed in sweep.seeds_of(arm):

@@ -83,4 +83,4 @@ def predicted_flops(sweep: Sweep) -> dict[str, float]:
         )
     ((own, control),) = controls.items()
     elsewhere = replace(control, overrides=(*own, *words))
-    return {" ".join(words): float(flops_of(composed(list(sweep.overrides(elsewhere)))))}
+    return {" ".join(words): float(flops_of(composed(list(sweep.all_overrides(elsewhere)))))}

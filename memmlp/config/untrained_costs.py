@@ -35,7 +35,7 @@ def with_costs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> tuple[dict[str, 
     with counting("networks", len(without)) as count:
         for arm in without:
             count.note(arm.label)  # a large one takes minutes
-            costs[arm.label] = {sweep.seeds_of(arm)[0]: measure_costs(sweep.overrides(arm), timed)}
+            costs[arm.label] = {sweep.seeds_of(arm)[0]: measure_costs(sweep.all_overrides(arm), timed)}
             count.advance()
     names = ", ".join(f"'{label}'" for label in costs)
     flags = (f"networks that were not trained, with random weights: {names}",) if costs else ()

@@ -16,7 +16,7 @@ import onnxruntime
 import torch
 from onnx import TensorProto, helper
 
-from memmlp.common.core_share_used import CoreClock
+from memmlp.common.thread_core_share import CoreClock
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.networks.flop_counter import counting_flops

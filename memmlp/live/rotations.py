@@ -93,7 +93,7 @@ class BodyTree:
 
     Attributes:
         tracked: the indices of head, left and right wrist.
-        offsets: (J, 3), metres, from the parent to the joint; 0 for the root.
+        bone_offsets: (J, 3), metres, from the parent to the joint; 0 for the root.
         ancestors: for 1, 2, 4, ... the index of the ancestor that many levels above each joint (J + 1); the
             last entry is an extra joint above the root, which stands for the identity.
     """
@@ -108,10 +108,10 @@ class BodyTree:
         while (self.ancestors[-1] != count).any():
             self.ancestors.append(self.ancestors[-1][self.ancestors[-1]])
         self.ancestors.pop()
-        self.offsets = np.zeros((count, 3))
-        self.offsets[1:] = rest[1:] - rest[parent[1:count]]
+        self.bone_offsets = np.zeros((count, 3))
+        self.bone_offsets[1:] = rest[1:] - rest[parent[1:count]]
         self._transforms = np.tile(np.eye(4, dtype=np.float32), (count + 1, 1, 1))
-        self._transforms[:count, :3, 3] = self.offsets
+        self._transforms[:count, :3, 3] = self.bone_offsets
 
     def positions(self, local: np.ndarray) -> np.ndarray:
         """Return the positions (J, 3), metres, relative to the head.

@@ -10,7 +10,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import FPS, ROOT
-from memmlp.motion.displayed_limbs import LIMBS, RADII
+from memmlp.motion.limb_shapes import LIMBS, RADII
 from memmlp.render.error_colours import scale
 from memmlp.render.raster import ELEVATION, Camera
 

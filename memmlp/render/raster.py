@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from memmlp.motion.displayed_limbs import LIMBS, Limb, ends
+from memmlp.motion.limb_shapes import LIMBS, Limb, ends
 from memmlp.render.error_colours import NEUTRAL, heat
 
 SAMPLES = 2  # samples along a pixel's side

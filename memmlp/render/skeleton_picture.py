@@ -10,10 +10,10 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 from memmlp.common.files import atomic_write
-from memmlp.motion.displayed_limbs import RADII
 from memmlp.motion.importing.node_names import without_namespace
 from memmlp.motion.importing.skeleton_map import Z_UP
 from memmlp.motion.importing.stance_with_all_nodes import StanceWithAllNodes
+from memmlp.motion.limb_shapes import RADII
 from memmlp.render.canvas import DPI, FAINT, INK, Sheet, png
 from memmlp.render.raster import Camera, draw
 

@@ -204,7 +204,7 @@ class Kept:
 def overrides_of(sweep: Sweep) -> dict[str, tuple[str, ...]]:
     """Return the overrides that a sweep's file gives each arm, including those of the base."""
     bare = replace(sweep, command_line=())
-    return {arm.label: without_paths(bare.overrides(arm)) for arm in sweep.runnable()}
+    return {arm.label: without_paths(bare.all_overrides(arm)) for arm in sweep.runnable()}
 
 
 def without_paths(overrides: Iterable[str]) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import memmlp
-from memmlp.runs.imported_code import imported_modules, imports_by_computed_names, module_spec
+from memmlp.runs.user_modules import imported_modules, imports_by_computed_names, module_spec
 
 PACKAGE = Path(memmlp.__file__).parent
 NOT_NUMBERS = (

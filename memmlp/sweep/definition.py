@@ -178,7 +178,7 @@ class Sweep:
                     "allowed are keys that no arm sets"
                 )
 
-    def overrides(self, arm: Arm) -> tuple[str, ...]:
+    def all_overrides(self, arm: Arm) -> tuple[str, ...]:
         """Return an arm's overrides: the base's, the command line's, its own; the last one of a key wins."""
         words = (*self.base, *self.command_line, *(arm.overrides or ()))
         return tuple({key_of(word): word for word in words}.values())
@@ -203,7 +203,7 @@ class Sweep:
     def arm_seeds(self) -> list[ArmSeed]:
         """Return the trainings that the sweep needs, arm by arm."""
         return [
-            ArmSeed(arm.label, seed, (*self.overrides(arm), f"seed={seed}"))
+            ArmSeed(arm.label, seed, (*self.all_overrides(arm), f"seed={seed}"))
             for arm in self.runnable()
             for seed in self.seeds_of(arm)
         ]

@@ -293,7 +293,7 @@ def with_existing_branches(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Swee
     def single(arm: Arm) -> bool:
         found = runs.get(arm.label, {}).values()
         solved = arm.branch == "combined" and all(run.has("combined") for run in found)
-        return bool(found) and not solved and all(run.one_head for run in found)
+        return bool(found) and not solved and all(run.one_branch for run in found)
 
     arms = tuple(replace(arm, branch="rotation") if single(arm) else arm for arm in sweep.arms)
     return replace(sweep, arms=arms)

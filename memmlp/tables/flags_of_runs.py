@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from memmlp.common.core_share_used import LEAST_CORE_SHARE
+from memmlp.common.thread_core_share import LEAST_CORE_SHARE
 from memmlp.runs.motion_seen import hardly_trained
 from memmlp.sweep.definition import COSTS, TIMES, Arm, Sweep
 from memmlp.tables import flags_of_code

@@ -192,7 +192,7 @@ class Measured:
         return {mode: branches.get(branch) for mode, branches in self.means.items()}
 
     @property
-    def one_head(self) -> bool:
+    def one_branch(self) -> bool:
         """Whether the network predicts rotations alone.
 
         Its positions then follow from the rotations by forward kinematics, so both branches have the same

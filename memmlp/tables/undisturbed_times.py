@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from memmlp.common.core_share_used import LEAST_CORE_SHARE
+from memmlp.common.thread_core_share import LEAST_CORE_SHARE
 from memmlp.sweep.definition import TIMES
 from memmlp.tables.measured_run import CORE_SHARES, Measured
 

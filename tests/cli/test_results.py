@@ -137,8 +137,8 @@ def test_what_a_file_has_stands_before_the_same_runs_of_other_files(
     memmlp: Memmlp, planned: None, monkeypatch: pytest.MonkeyPatch
 ):
     """Their costs were measured at another time."""
-    monkeypatch.setattr("memmlp.config.runs_from_kept_results.outdated", lambda recipes: [])
-    monkeypatch.setattr("memmlp.config.runs_from_kept_results.plan_anew", compose_plan.kept_or_new_plan)
+    monkeypatch.setattr("memmlp.config.runs_shared_by_sweeps.outdated", lambda recipes: [])
+    monkeypatch.setattr("memmlp.config.runs_shared_by_sweeps.plan_anew", compose_plan.kept_or_new_plan)
     memmlp("results", "save", "14")
     path = Path("docs/results/data/table14.json")
     own = path.read_text()

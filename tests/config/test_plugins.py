@@ -257,7 +257,7 @@ WALKS = """
 from dataclasses import dataclass, field
 from memmlp.common.plugin import Plugin
 from memmlp.config.schema.data import SynthConfig, SynthDataConfig
-from memmlp.config.schema.rules import target
+from memmlp.config.schema.value_rules import target
 
 def walks(folder, minutes, seed):
     (folder / f"{minutes} {seed}").touch()

@@ -24,8 +24,8 @@ def test_jobs_are_arms_by_seeds_with_base_and_difference():
 def test_the_command_line_stands_over_the_base_and_beside_the_arm():
     content = {"base": ["model.depth=8"], "arms": {"wide": ["model.width=10"], "base": []}}
     sweep = parse_sweep("s", content).with_overrides(["model.depth=4", "optim.lr=1"])
-    assert set(sweep.overrides(sweep.arms[0])) == {"model.width=10", "model.depth=4", "optim.lr=1"}
-    assert set(sweep.overrides(sweep.arms[1])) == {"model.depth=4", "optim.lr=1"}
+    assert set(sweep.all_overrides(sweep.arms[0])) == {"model.width=10", "model.depth=4", "optim.lr=1"}
+    assert set(sweep.all_overrides(sweep.arms[1])) == {"model.depth=4", "optim.lr=1"}
 
 
 @pytest.mark.parametrize("word", ["memory.layers=[2]", "+memory.layers=[9]", "~hand"])

@@ -126,7 +126,7 @@ def test_rows_with_table_6s_combined_values_show_the_combined_branch(path: Path)
     assert bool(full) == (sweep.table not in (2, 3))
     assert {arm.branch for arm in full} <= {"combined"}
     for arm in sweep.runnable():
-        words = sweep.overrides(arm)
+        words = sweep.all_overrides(arm)
         single = any(word.startswith(("model=", "predictor=rotation_only")) for word in words)
         assert (arm.branch == "rotation") == (single or arm.label == "Rotation Branch")
         assert ("evaluation.ik=off" in words) == single
@@ -152,7 +152,7 @@ def test_the_decomposition_changes_one_ingredient_a_step():
     """Each arm's config differs from its control's in what its label names, or only its branch does."""
     arms = {arm.label: arm for arm in DECOMPOSITION.arms}
     configs = {
-        label: flatten(OmegaConf.to_container(composed([*DECOMPOSITION.overrides(arm)]), resolve=True))
+        label: flatten(OmegaConf.to_container(composed([*DECOMPOSITION.all_overrides(arm)]), resolve=True))
         for label, arm in arms.items()
     }
     changed = {}
@@ -207,7 +207,7 @@ def test_the_backbone_is_agrols_mlp_of_ten_blocks():
 @pytest.mark.parametrize("arm", DECOMPOSITION.arms, ids=lambda arm: arm.label)
 def test_an_arm_of_the_decomposition_trains(arm: Arm):
     """A step of each arm changes the weights, under the loss that its label names."""
-    experiment = build_experiment(composed([*DECOMPOSITION.overrides(arm), "profile=tiny"]))
+    experiment = build_experiment(composed([*DECOMPOSITION.all_overrides(arm), "profile=tiny"]))
     torch.manual_seed(0)
     architecture, frames = experiment.architecture, tiny.frames((60, 70))
     normalizer = Normalizer.raw(architecture.coordinates, tiny.REST)

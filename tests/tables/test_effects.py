@@ -122,13 +122,13 @@ def test_a_row_has_its_own_control(sweep: Sweep, tmp_path: Path):
 def test_one_head_is_told_by_its_positions(tmp_path: Path):
     """Without a position branch both branches have the errors of the rotations, up to rounding."""
     run = fake_run(tmp_path, "a")
-    assert not load(run.folder).one_head
+    assert not load(run.folder).one_branch
     for mode in ("stream", "window"):
         report = json.loads(run.evaluation(f"{mode}-0").read_text())
         same = {"rotation": {"MPJPE": 26.688274383}, "position": {"MPJPE": 26.688272476}}
         clips = [clip | same for clip in report["clips"]]
         write_report(run.evaluation(f"{mode}-0"), {"mode": mode, "mean": same, "clips": clips})
-    assert load(run.folder).one_head
+    assert load(run.folder).one_branch
 
 
 def test_one_head_is_told_where_it_diverged_on_a_clip(sweep: Sweep, tmp_path: Path):
@@ -150,7 +150,7 @@ def test_one_head_is_told_where_it_diverged_on_a_clip(sweep: Sweep, tmp_path: Pa
     table = make_table(replace(sweep, seeds=(0, 1)).with_branch("combined"), runs)
     rows = {row.label: row.branch for row in table.rows}
     assert (rows["no | memory"], rows["full_model"]) == ("rotation", "combined")
-    assert not runs["full_model"][1].one_head
+    assert not runs["full_model"][1].one_branch
     assert np.isnan(cell(table, "no | memory", "MPJPE").mean)
     assert cell(table, "no | memory", "MPJPE").effect.clips == 11
 

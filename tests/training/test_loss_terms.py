@@ -7,7 +7,7 @@ import torch
 from plain_body import posed
 
 from memmlp.common.errors import InputError
-from memmlp.config.schema.checks import TERM_FRAMES
+from memmlp.config.schema.config_checks import TERM_FRAMES
 from memmlp.motion.body import PARENTS, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.geometry import axis_angle_to_matrix, matrix_to_sixd
 from memmlp.motion.network_coordinates import World

@@ -222,7 +222,7 @@ def busy(rows: list[dict[str, Any]]) -> str:
 
     A long step is interrupted more often than a short one, so that other work is in their ratio, too.
     """
-    from memmlp.common.core_share_used import LEAST_CORE_SHARE
+    from memmlp.common.thread_core_share import LEAST_CORE_SHARE
     from memmlp.tables.flag_words import had_core, listed
 
     found = [

@@ -78,8 +78,8 @@ def _synthetic() -> MotionDataset:
 
 def _motion(clips: MotionDataset) -> TrackedMotion:
     """Join all clips into one motion of trackers and true joints."""
-    from memmlp.live.full_scope_graph import trackers_of
     from memmlp.live.soak import TrackedMotion
+    from memmlp.live.trackers_to_body_graph import trackers_of
     from memmlp.motion.body import N_JOINTS, POSITION, SPARSE_DIM
 
     positions, rotations = trackers_of(clips.frames)

@@ -59,7 +59,7 @@ def import_(
     SOURCE is a folder or one file. The clips are brought to the 22-joint tree, and each is compared with its
     file; what looks wrong is said.
     """
-    from memmlp.config.shipped_groupings import grouping_to_choose
+    from memmlp.config.clip_groupings import grouping_to_choose
     from memmlp.motion.importing.import_folder import ImportSettings, import_folder
 
     rates = _rates(fps)

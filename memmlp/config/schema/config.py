@@ -54,24 +54,6 @@ from memmlp.config.schema.network import (
     VAEHMDConfig,
     VQVAEConfig,
 )
-from memmlp.config.schema.rules import (
-    DEVICE,
-    EachOf,
-    OneOf,
-    OneOfOrPath,
-    Registered,
-    Text,
-    Within,
-    at_least,
-    called,
-    empty_list,
-    key,
-    one_of,
-    optional,
-    positive,
-    target,
-    with_default,
-)
 from memmlp.config.schema.training import (
     AdamWConfig,
     AGRoLLossConfig,
@@ -94,6 +76,24 @@ from memmlp.config.schema.training import (
     TermConfig,
     TermsLossConfig,
     UncertaintyConfig,
+)
+from memmlp.config.schema.value_rules import (
+    DEVICE,
+    EachOf,
+    OneOf,
+    OneOfOrPath,
+    Registered,
+    Text,
+    Within,
+    at_least,
+    called,
+    empty_list,
+    key,
+    one_of,
+    optional,
+    positive,
+    target,
+    with_default,
 )
 from memmlp.runs.deployment_folder import ONNX_FILES
 

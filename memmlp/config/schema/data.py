@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Optional
 
-from memmlp.config.schema.rules import (
+from memmlp.config.schema.value_rules import (
     EachOf,
     Existing,
     FolderPaths,

@@ -7,7 +7,7 @@ from typing import Optional, Union
 
 from omegaconf import MISSING
 
-from memmlp.config.schema.rules import (
+from memmlp.config.schema.value_rules import (
     EachOf,
     OneOf,
     OneOfOrPath,

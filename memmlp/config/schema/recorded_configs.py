@@ -7,8 +7,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from memmlp.config.schema.checks import WITHOUT_STREAM
 from memmlp.config.schema.config import DATA, GROUPS, SCHEMAS, Config, LoggerConfig
+from memmlp.config.schema.config_checks import WITHOUT_STREAM
 from memmlp.config.schema.data import SynthDataConfig
 from memmlp.runs.former_keys import with_present_names
 from memmlp.runs.identity import option_in_slot

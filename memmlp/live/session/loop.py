@@ -18,8 +18,8 @@ from memmlp.live.session.wearer_fitting import Fitting
 from memmlp.live.spaces import SPACES, Space
 from memmlp.live.stream import Pose, Stream
 from memmlp.motion.body import FPS, JOINTS, PARENTS, ROOT
-from memmlp.motion.displayed_limbs import LIMBS
 from memmlp.motion.formats.humanoid_bones import VRM
+from memmlp.motion.limb_shapes import LIMBS
 from memmlp.render.error_colours import HEAT
 
 PAGE_SPACE = SPACES["openxr"]  # the page's axes: those of three.js

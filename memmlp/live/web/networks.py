@@ -16,9 +16,9 @@ from torch import Tensor
 from memmlp.common.progress import tell
 from memmlp.deploy.deployment import lower
 from memmlp.deploy.export import export
-from memmlp.live.full_scope_graph import export_full
 from memmlp.live.rotations import BodyTree
 from memmlp.live.spaces import SPACES
+from memmlp.live.trackers_to_body_graph import export_full
 from memmlp.live.wearer import stature
 from memmlp.live.web.weightless_files import without_weights
 from memmlp.motion.body import FPS, JOINTS, PARENTS, TRACKED

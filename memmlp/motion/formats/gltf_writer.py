@@ -21,8 +21,8 @@ import memmlp
 from memmlp.common.files import atomic_file
 from memmlp.motion.body import JOINTS, N_JOINTS, PARENTS
 from memmlp.motion.clip import Clip
-from memmlp.motion.displayed_limbs import LIMBS, ends
 from memmlp.motion.formats.y_up import y_up_motion
+from memmlp.motion.limb_shapes import LIMBS, ends
 
 COMPONENTS = {"<f4": 5126, "<u2": 5123, "|u1": 5121}  # glTF's numbers for types of components
 VERTICES, INDICES = 34962, 34963  # what a buffer view is for

@@ -15,7 +15,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
 from memmlp.live.spaces import SPACES
 from memmlp.motion.body import FPS, JOINTS
-from memmlp.motion.displayed_limbs import LIMBS
+from memmlp.motion.limb_shapes import LIMBS
 from memmlp.render.error_colours import HEAT, scale
 from memmlp.runs.identity import evaluation_id
 from memmlp.runs.run import Run

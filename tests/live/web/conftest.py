@@ -18,7 +18,7 @@ from filelock import FileLock
 from memmlp.common.errors import InputError
 from memmlp.common.npm import ONNXRUNTIME_WEB, Package, read
 from memmlp.deploy.export import export
-from memmlp.live.full_scope_graph import export_full
+from memmlp.live.trackers_to_body_graph import export_full
 from memmlp.live.web.clips import packed
 from memmlp.live.web.networks import SiteNetwork
 from memmlp.live.web.site import Site

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from memmlp.config.schema.network import MemoryConfig
-from memmlp.config.schema.rules import EachOf, Within, at_least, called, key, one_of, target
+from memmlp.config.schema.value_rules import EachOf, Within, at_least, called, key, one_of, target
 
 # ruff: noqa: RUF009
 

@@ -2,7 +2,7 @@
 //
 // Everything is in OpenXR's frame of reference: metres, Y up, -Z forward; a rotation is the identity for a person in
 // T-pose who looks along -Z. This module knows neither three.js nor what runs the network: `run` does one frame of the
-// full graph (memmlp.live.full_scope_graph, space openxr), and its caller is a page, a worker or node.
+// full graph (memmlp.live.trackers_to_body_graph, space openxr), and its caller is a page, a worker or node.
 
 import { headingOf, inverse, matrix, minus, multiply, plus, rotate } from './rotations.js';
 import { tPose, TrackerFrames } from './trackers.js';

@@ -97,7 +97,7 @@ class FullStep(nn.Module):
 
     world: Tensor
     body: Tensor
-    offsets: Tensor
+    bones: Tensor
 
     def __init__(
         self,
@@ -112,7 +112,7 @@ class FullStep(nn.Module):
         self.register_buffer("body", torch.tensor(space.body, dtype=torch.float32))
         tree = BodyTree(JOINTS, PARENTS, model.normalizer.rest.double().cpu().numpy())
         self.ancestors = [torch.tensor(ancestor) for ancestor in tree.ancestors]
-        self.register_buffer("offsets", torch.tensor(tree.offsets, dtype=torch.float32)[None, ..., None])
+        self.register_buffer("bones", torch.tensor(tree.bone_offsets, dtype=torch.float32)[None, ..., None])
 
     def initial_state(self) -> dict[str, Tensor]:
         """Return the states of a fresh start, which are zeros."""
@@ -156,7 +156,7 @@ class FullStep(nn.Module):
         These products are few operations on large arrays, which run faster in a graph than many small ones.
         """
         bottom = torch.tensor([0.0, 0.0, 0.0, 1.0]).expand(1, N_JOINTS, 1, 4)
-        transforms = torch.cat([torch.cat([local, self.offsets], -1), bottom], -2)
+        transforms = torch.cat([torch.cat([local, self.bones], -1), bottom], -2)
         transforms = torch.cat([transforms, torch.eye(4).expand(1, 1, 4, 4)], 1)
         for ancestor in self.ancestors:
             transforms = transforms.index_select(1, ancestor) @ transforms

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from memmlp.runs.imported_code import imported_modules, imports_by_computed_names
+from memmlp.runs.user_modules import imported_modules, imports_by_computed_names
 
 FILES = {
     "lab/__init__.py": "",

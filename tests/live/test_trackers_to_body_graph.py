@@ -18,10 +18,16 @@ from memmlp.common.errors import InputError
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.opsets import OPSETS, converted
 from memmlp.deploy.parity import ROUNDING, TOLERANCE
-from memmlp.live.full_scope_graph import export_full, full_parity, full_tolerated, quaternions, trackers_of
 from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream
+from memmlp.live.trackers_to_body_graph import (
+    export_full,
+    full_parity,
+    full_tolerated,
+    quaternions,
+    trackers_of,
+)
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.features import sparse_features
 from memmlp.motion.geometry import axis_angle_to_matrix

@@ -9,8 +9,8 @@ import pytest
 from fake_runs import fake_sweep, runs_of
 
 from memmlp.common.errors import InputError
-from memmlp.config import runs_from_kept_results
-from memmlp.config.runs_from_kept_results import with_kept
+from memmlp.config import runs_shared_by_sweeps
+from memmlp.config.runs_shared_by_sweeps import with_kept
 from memmlp.report.kept_results import Kept, overrides_of, save
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.plan import Entry, Plan
@@ -42,9 +42,9 @@ def plan_today(monkeypatch: pytest.MonkeyPatch, runs: dict[str, RunsBySeed], **c
         else entry
         for entry in entries
     ]
-    monkeypatch.setattr("memmlp.config.runs_from_kept_results.outdated", lambda recipes: [])
+    monkeypatch.setattr("memmlp.config.runs_shared_by_sweeps.outdated", lambda recipes: [])
     monkeypatch.setattr(
-        "memmlp.config.runs_from_kept_results.plan_anew",
+        "memmlp.config.runs_shared_by_sweeps.plan_anew",
         lambda sweep, outputs: Plan(sweep.name, outputs, tuple(planned), ()),
     )
 
@@ -100,7 +100,7 @@ def test_a_file_without_such_runs_is_not_planned(
     def refused(*given: object) -> Plan:
         raise AssertionError("planned")
 
-    monkeypatch.setattr("memmlp.config.runs_from_kept_results.plan_anew", refused)
+    monkeypatch.setattr("memmlp.config.runs_shared_by_sweeps.plan_anew", refused)
     plan = Plan("mine", Path(), (Entry("Mine", 0, "0" * 16, ("e1",)),), ())
     assert with_kept({"Mine": {}}, plan, [file]) == ({"Mine": {}}, (), (), ())
 
@@ -109,7 +109,7 @@ def test_a_run_of_an_earlier_recipe_is_not_taken(
     monkeypatch: pytest.MonkeyPatch, runs: dict[str, RunsBySeed], file: Path
 ):
     plan_today(monkeypatch, runs)
-    monkeypatch.setattr("memmlp.config.runs_from_kept_results.outdated", lambda recipes: ["metrics 1"])
+    monkeypatch.setattr("memmlp.config.runs_shared_by_sweeps.outdated", lambda recipes: ["metrics 1"])
     assert with_kept({"Mine": {}}, wanted(runs), [file]) == ({"Mine": {}}, (), (), ())
 
 
@@ -120,14 +120,14 @@ def test_a_file_that_cannot_be_planned_here_is_named_and_the_others_are_used(
     plan_today(monkeypatch, runs)
     other = file.with_name("a.json")
     save(other, Kept("table04", ("data=mocap",), runs, {}))
-    planned = runs_from_kept_results.plan_anew
+    planned = runs_shared_by_sweeps.plan_anew
 
     def plan(sweep: Sweep, outputs: Path) -> Plan:
         if sweep.name == "table04":
             raise InputError("data.root=mine: allowed is an existing folder")
         return planned(sweep, outputs)
 
-    monkeypatch.setattr("memmlp.config.runs_from_kept_results.plan_anew", plan)
+    monkeypatch.setattr("memmlp.config.runs_shared_by_sweeps.plan_anew", plan)
     found = with_kept({"Mine": {}}, wanted(runs), [other, file])
     assert found.files == ("table14",)
     assert sorted(found.runs["Mine"]) == sorted(runs["2"])
