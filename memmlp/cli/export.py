@@ -47,7 +47,11 @@ EXPORTING = ("out", "graph", "precision", "max_growth", "opset", "scope", "space
 
 @click.command("export")
 @click.argument("run", metavar="RUN|FILE.onnx")
-@click.option("--out", type=click.Path(path_type=Path), help="ONNX file to write; not needed with --check.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="ONNX file to write; not needed with --operators-for.",
+)
 @click.option(
     "--graph",
     default="auto",
@@ -129,7 +133,8 @@ def export(
 ) -> None:
     """Export a finished run (id, its beginning, or folder) as ONNX and check it on whole test clips.
 
-    With --check the exit code is 1 where a target does not have all operators; the file is written anyway.
+    With --operators-for the exit code is 1 where a target does not have all operators; the file is written
+    anyway.
     """
     import tempfile
 
@@ -137,11 +142,11 @@ def export(
 
     if run.endswith(".onnx"):
         if given(*EXPORTING) or not targets:
-            raise InputError(f"{run}: is an ONNX file already; allowed with it is --check alone")
+            raise InputError(f"{run}: is an ONNX file already; allowed with it is --operators-for alone")
         check(Path(run), targets)
         return
     if out is None and not targets:
-        raise InputError("--out: is missing; it may be left out with --check alone")
+        raise InputError("--out: is missing; it may be left out with --operators-for alone")
     if out is not None and out.suffix != ".onnx":
         raise InputError(f"--out {out}: the only allowed ending is .onnx")
     if out is not None and not out.parent.is_dir():

@@ -1,4 +1,4 @@
-"""The tracking slot: the interface of loggers, and a run as one logger shows it."""
+"""The slot of loggers: the interface of loggers, and a run as one logger shows it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How long a whole pose takes on a CPU: from a sample of the trackers to the joints in the caller's frame."""
+"""How long a whole pose takes on a CPU: from a sample of the trackers to the joints in the caller's space."""
 
 from __future__ import annotations
 

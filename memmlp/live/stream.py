@@ -134,7 +134,8 @@ class Stream:
 
     Attributes:
         wearer: height and floor (`memmlp.live.wearer`), as `fit` sets them.
-        step_seconds: how long the exported step took in the last `step`: the network with its features.
+        step_seconds: how long the exported step, the network with its features, took in the last `step`:
+            the sum over all frames that the sample made.
         odd: warns, once of each kind, of samples that are hardly metres or seconds (`SampleWarning`).
 
     Raises:

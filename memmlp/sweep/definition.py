@@ -223,8 +223,9 @@ def parse_branch(value: Any, name: str) -> str:
 
 def parse_seeds(value: Any, name: str) -> tuple[int, ...]:
     """Return the seeds, after a check that they are different whole numbers."""
-    items = value if isinstance(value, list) else [value]
-    words = [str(item).strip() for item in items]
+    if not isinstance(value, list):  # a number may be meant as how many
+        raise InputError(f"{name}: {value}; allowed is a list of whole numbers, each once, such as [0, 1, 2]")
+    words = [str(item).strip() for item in value]
     if not words or not all(re.fullmatch(r"\d+", word) for word in words) or len(set(words)) < len(words):
         raise InputError(f"{name}: {value}; allowed is a list of whole numbers, each once")
     return tuple(map(int, words))

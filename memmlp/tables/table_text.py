@@ -238,7 +238,7 @@ def _lines(table: Table, row: Row, mode: str) -> Iterable[ArmLine]:
 
 
 def value_words(cell: Cell, metric: str) -> str:
-    """Return mean ± standard deviation over seeds; for costs other than milliseconds only the mean."""
+    """Return mean ± standard deviation over seeds; for costs other than the column `ms` only the mean."""
     if cell.mean is None:
         return MISSING
     if metric in COSTS and (metric != "ms" or cell.sd is None):

@@ -59,6 +59,10 @@ def test_every_metric_has_a_smallest_effect_that_a_file_may_set():
         ({"arms": {"a": {"paper": {"MPJPE": "3"}}}}, "arms.a.paper.MPJPE: '3'; allowed is a number"),
         ({"arms": ARMS, "seeds": [0, 0]}, "seeds: [0, 0]; allowed is a list of whole numbers, each once"),
         ({"arms": ARMS, "seeds": [-1]}, "seeds: [-1]"),
+        (
+            {"arms": ARMS, "seeds": 3},
+            "seeds: 3; allowed is a list of whole numbers, each once, such as [0, 1, 2]",
+        ),
         ({"arms": ARMS, "control": "half"}, "control: 'half' is no arm; allowed are 'full', 'none'"),
         ({"arms": ARMS, "metrics": ["FID"]}, "metrics: 'FID'; allowed are MPJRE"),
         ({"arms": ARMS, "table": "four"}, "table: 'four'"),

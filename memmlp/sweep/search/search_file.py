@@ -4,7 +4,7 @@ name: loss_weights
 base: [loss=manual]                 # overrides of every trial
 space:                              # a tree of config keys; its leaves are ranges
   loss:
-    rotation: {low: 0.1, high: 10.0, log: true, first: 1.0}
+    rotation_all: {low: 0.1, high: 10.0, log: true, first: 1.0}
   optim:
     batch: {low: 16, high: 64, step: 16}
   hand: {choices: ['off', fk]}

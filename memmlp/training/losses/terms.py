@@ -48,7 +48,7 @@ class Body:
 
     @cached_property
     def turns(self) -> Tensor:
-        """The rotations from each frame to the next (B, T - 1, 22, 3, 3), in the joints' own frames."""
+        """The rotations from each frame to the next (B, T - 1, 22, 3, 3), in the joints' own axes."""
         return self.local[:, :-1].transpose(-1, -2) @ self.local[:, 1:]
 
 
