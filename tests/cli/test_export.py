@@ -72,17 +72,17 @@ def test_web_is_all_of_its_backends(memmlp: Memmlp, tmp_path: Path):
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        (["step.onnx"], "allowed with it is --check alone"),
+        (["step.onnx"], "allowed with it is --operators-for alone"),
         (
             ["step.onnx", "--operators-for", "unity", "--out", "other.onnx"],
-            "allowed with it is --check alone",
+            "allowed with it is --operators-for alone",
         ),
         (
             ["step.onnx", "--operators-for", "unity", "--precision", "int8"],
-            "allowed with it is --check alone",
+            "allowed with it is --operators-for alone",
         ),
         (["none.onnx", "--operators-for", "unity"], "none.onnx: no such file"),
-        (["0123"], "--out: is missing; it may be left out with --check alone"),
+        (["0123"], "--out: is missing; it may be left out with --operators-for alone"),
         (["0123", "--out", "step.txt"], "allowed ending is .onnx"),
         (["0123", "--out", "none/step.onnx"], "there is no folder none"),
         (["0123", "--out", "a.onnx", "--rotations", "quaternion"], "allowed with --scope full"),
