@@ -117,7 +117,8 @@ def sweep_folder(sweep: Sweep, outputs: Path) -> Path:
     """
     if not sweep.command_line:
         return outputs / "sweeps" / sweep.name
-    words = with_former_keys(sweep.command_line)
+    of_arms = [word for arm in sweep.runnable() for word in sweep.all_overrides(arm)]
+    words = with_former_keys(sweep.command_line, beside=of_arms)
     ordered = tuple(sorted(words, key=lambda word: word.partition("=")[0]))
     as_written, same_for_all = (
         outputs / "sweeps" / f"{sweep.name}-{digest(order)[:8]}" for order in (words, ordered)

@@ -268,8 +268,10 @@ def load_kept(path: Path) -> Kept:
             label: {int(seed): measured[name] for seed, name in seeds.items()}
             for label, seeds in content["cells"].items()
         }
-        arms = {label: with_present_keys(words) for label, words in content["arms"].items()}
-        words, flags = with_present_keys(content["overrides"]), tuple(content.get("flags", ()))
+        typed, own = content["overrides"], content["arms"]
+        words = with_present_keys(typed, beside=[word for arm in own.values() for word in arm])
+        arms = {label: with_present_keys(arm, beside=typed) for label, arm in own.items()}
+        flags = tuple(content.get("flags", ()))
         predicted = content.get("predicted_flops", {})
         return Kept(content["sweep"], words, cells, arms, content["rounds"], flags, predicted)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

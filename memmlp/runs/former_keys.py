@@ -60,6 +60,19 @@ RENAMED = (
 OPTIONS = {("loss", "of_network"): "own"}
 """The former names of options, by their groups and present names."""
 
+NETWORKS = ("avatar_jlm", "ego_poser", "hmd_poser", "manikin_l", "manikin_s", "sage", "vae_hmd")
+"""The networks whose loss of the same name is the option `loss=terms` with other weights."""
+
+KINDS = {
+    **{f"loss={name}": "terms" for name in (*NETWORKS, "calm", "kinematic")},
+    **{f"model={name}": "terms" for name in (*NETWORKS, "recurrent_poser")},
+    "model=rpm": "rpm",
+}
+"""Of overrides GROUP=NAME, the loss whose keys they bring, where it is not NAME."""
+
+SIGNS = "+~"
+"""What an override may begin with, to add a key or to remove it."""
+
 
 def with_present_names(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return a recorded config, or some of its groups, with the names that keys and options have today."""
@@ -103,9 +116,15 @@ def with_former_names(flat: Mapping[str, Any]) -> dict[str, Any]:
 
 def _former_key(key: str, flat: Mapping[str, Any]) -> str:
     group, dot, rest = key.partition(".")
-    option = f"{group}={flat.get(f'{group}.name')}"
+    option = _option_of(key, flat)
     named = (one.former for one in RENAMED if key == one.now and one.option in (None, option))
     return next(named, _former_group(group) + dot + rest)
+
+
+def _option_of(key: str, flat: Mapping[str, Any]) -> str:
+    """Return the option GROUP=NAME of a key's group, with `flat` for the names of groups' options."""
+    group = key.partition(".")[0]
+    return f"{group}={flat.get(f'{group}.name')}"
 
 
 def _former_group(group: str) -> str:
@@ -117,32 +136,57 @@ def former_option(group: str, name: str | None) -> str | None:
     return OPTIONS.get((group, name or ""), name)
 
 
-def with_present_keys(overrides: Sequence[str]) -> tuple[str, ...]:
-    """Return recorded overrides KEY=VALUE with the names of today."""
-    return tuple(_present_override(word, overrides) for word in overrides)
+def with_present_keys(overrides: Sequence[str], beside: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return recorded overrides KEY=VALUE with the names of today.
+
+    Args:
+        overrides: the overrides.
+        beside: others that hold for the same runs; they may choose the option that a key belongs to.
+    """
+    options = _options((*beside, *overrides))
+    return tuple(_present_override(word, options) for word in overrides)
 
 
-def _present_override(word: str, overrides: Sequence[str]) -> str:
-    key, equals, value = word.partition("=")
-    for one in RENAMED:
-        if key == one.former and (one.option is None or one.option in overrides):
-            return f"{one.now}{equals}{value}"
-    if (now := present_option(key, value)) is not None:
-        return f"{key}={now}"
+def _options(overrides: Sequence[str]) -> dict[str, str]:
+    """Return what GROUP.name is with overrides; a loss that is chosen goes before that of the network."""
+    words = (word.lstrip(SIGNS).partition("=") for word in overrides)
+    chosen = {key: value for key, _, value in words if "." not in key}
+    options = {f"{group}.name": name for group, name in chosen.items()}
+    with_keys = (group for group in ("loss", "model") if group in chosen)
+    loss = next((KINDS.get(f"{group}={chosen[group]}") for group in with_keys), None)
+    return options | ({"loss.name": loss} if loss else {})
+
+
+def _present_override(word: str, options: Mapping[str, str]) -> str:
+    signs, key, equals, value = _parts(word)
     group, dot, rest = key.partition(".")
-    return f"{GROUPS.get(group, group)}{dot}{rest}{equals}{value}"
+    of_it = (
+        one.now for one in RENAMED if one.former == key and one.option in (None, _option_of(key, options))
+    )
+    now = next(of_it, GROUPS.get(group, group) + dot + rest)
+    return f"{signs}{now}{equals}{present_option(key, value) or value}"
 
 
-def with_former_keys(overrides: Sequence[str]) -> tuple[str, ...]:
-    """Return overrides KEY=VALUE with the former names, by which a sweep's folder is called."""
-    options = dict(word.partition("=")[::2] for word in overrides if "." not in word.partition("=")[0])
-    named = {f"{group}.name": name for group, name in options.items()}
-    return tuple(_former_override(word, named) for word in overrides)
+def with_former_keys(overrides: Sequence[str], beside: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return overrides KEY=VALUE with the former names, by which a sweep's folder is called.
+
+    Args:
+        overrides: the overrides.
+        beside: others that hold for the same runs; they may choose the option that a key belongs to.
+    """
+    options = _options((*beside, *overrides))
+    return tuple(_former_override(word, options) for word in overrides)
 
 
-def _former_override(word: str, named: Mapping[str, str]) -> str:
-    key, equals, value = word.partition("=")
-    return f"{_former_key(key, named)}{equals}{former_option(key, value)}"
+def _former_override(word: str, options: Mapping[str, str]) -> str:
+    signs, key, equals, value = _parts(word)
+    return f"{signs}{_former_key(key, options)}{equals}{former_option(key, value)}"
+
+
+def _parts(word: str) -> tuple[str, str, str, str]:
+    """Return an override's signs (+, ~), key, = and value; the last two are empty without an =."""
+    bare = word.lstrip(SIGNS)
+    return word[: len(word) - len(bare)], *bare.partition("=")
 
 
 def present_key(key: str, allowed: Sequence[str]) -> str | None:

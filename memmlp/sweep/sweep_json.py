@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -32,16 +33,21 @@ def kept_sweep(folder: Path) -> Sweep | None:
         content = json.loads(path.read_bytes())
         if "extra" in content:  # what earlier versions called it
             content["command_line"] = content.pop("extra")
-        content["arms"] = tuple(map(_arm, content["arms"]))
-        content |= {name: with_present_keys(content[name]) for name in ("base", "command_line")}
+        base, typed, arms = content["base"], content["command_line"], content["arms"]
+        own = [word for arm in arms for word in arm["overrides"] or ()]
+        content["arms"] = tuple(_arm(fields, beside=(*base, *typed)) for fields in arms)
+        content["base"] = with_present_keys(base, beside=(*own, *typed))
+        content["command_line"] = with_present_keys(typed, beside=(*own, *base))
         content["scale"] = _scale(content["scale"]) if content.get("scale") else None
         return Sweep(**_with_tuples(content, ("notes", "base", "seeds", "arms", "metrics", "command_line")))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: not a sweep ({error}); start the sweep again") from None
 
 
-def _arm(fields: dict[str, Any]) -> Arm:
-    words = {name: with_present_keys(fields[name]) for name in ("overrides", "cell") if fields.get(name)}
+def _arm(fields: dict[str, Any], beside: Sequence[str]) -> Arm:
+    """Return a kept arm; `beside` are the overrides of every arm of its sweep."""
+    named = {name: fields[name] for name in ("overrides", "cell") if fields.get(name)}
+    words = {name: with_present_keys(own, beside) for name, own in named.items()}
     return Arm(**_with_tuples(fields | words, ("overrides", "seeds", "cell")))
 
 

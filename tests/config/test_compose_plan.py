@@ -117,6 +117,9 @@ def test_a_sweep_has_one_folder_in_whatever_order_it_is_asked_for(tmp_path: Path
     renamed = "profile=small", "loggers=none", "threads=1", "normalizer.z_scores=false", "data=mocap"
     of_0_2 = "table14-af91e19b"  # of the former names, made by version 0.2's code (commit ae007ecb)
     assert sweep_folder(replace(sweep, command_line=renamed), tmp_path).name == of_0_2
+    arms = tuple(replace(arm, overrides=("model=vae_hmd",)) for arm in sweep.runnable())  # choose the loss
+    typed = replace(sweep, arms=arms, command_line=("loss.position_from_pelvis=2",))
+    assert sweep_folder(typed, tmp_path).name == f"{sweep.name}-{digest(('loss.position=2',))[:8]}"
     earlier = tmp_path / "sweeps" / f"{sweep.name}-{digest(('threads=1', 'seed=3'))[:8]}"
     earlier.mkdir(parents=True)
     assert sweep_folder(replace(sweep, command_line=("threads=1", "seed=3")), tmp_path) == earlier

@@ -37,6 +37,16 @@ def test_kept_results_make_the_runs_table(sweep: Sweep, kept: Kept, tmp_path: Pa
     assert [run.origin for run in read.every] == [run.origin for run in kept.every]
 
 
+def test_results_of_an_earlier_version_have_the_names_of_today(kept: Kept, tmp_path: Path):
+    label = next(iter(kept.arms))
+    arms = {**kept.arms, label: ("model=vae_hmd",)}
+    words = "data.drawn_by=clips", "loss.position_from_pelvis=1"
+    content = json.loads(dumps(replace(kept, arms=arms, overrides=words)))
+    content |= {"overrides": ["data.weighting=clips", "loss.position=1"], "digest": None}
+    (tmp_path / "kept.json").write_text(json.dumps(content))
+    assert load_kept(tmp_path / "kept.json").overrides == words
+
+
 def test_a_run_that_diverged_on_one_clip_has_no_means(sweep: Sweep, kept: Kept, tmp_path: Path):
     """Not those over the other clips; a clip that is too short for a metric does not count in that one."""
     run, other = kept.runs["2"][1], kept.runs["2"][0]

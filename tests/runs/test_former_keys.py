@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import pytest
+import yaml
 
 from memmlp.common.errors import InputError
 from memmlp.config.compose import composed
@@ -10,6 +14,7 @@ from memmlp.config.schema.config import SCHEMAS
 from memmlp.config.schema.network import PartConfig
 from memmlp.runs.former_keys import (
     GROUPS,
+    KINDS,
     OPTIONS,
     RENAMED,
     present_key,
@@ -136,6 +141,60 @@ def test_a_former_name_on_the_command_line_is_answered_with_todays(words: list[s
         composed(words)
     assert said in str(error.value)
     assert "\n" not in str(error.value)
+
+
+CONF = Path(__file__).parents[2] / "conf"
+
+
+def _schema(loss: str) -> str:
+    """Return the name under which a config of a loss, or one that it extends, has its schema."""
+    first = yaml.safe_load((CONF / "loss" / f"{loss}.yaml").read_text())["defaults"][0]
+    found = re.fullmatch(r"/schema/loss_(\w+)@_here_", first)
+    return found[1] if found else _schema(first)
+
+
+def test_the_losses_that_options_bring_are_those_of_the_configs():
+    losses = {path.stem: _schema(path.stem) for path in (CONF / "loss").glob("*.yaml")}
+    brought = {f"loss={name}": kind for name, kind in losses.items()}
+    for path in (CONF / "model").glob("*.yaml"):
+        entries = yaml.safe_load(path.read_text())["defaults"]
+        loss = next((one["override /loss"] for one in entries if "override /loss" in one), None)
+        brought |= {f"model={path.stem}": losses[loss]} if loss else {}
+    renamed = {one.option for one in RENAMED}
+    differ = {word: kind for word, kind in brought.items() if kind != word.partition("=")[2]}
+    assert {word: kind for word, kind in differ.items() if f"loss={kind}" in renamed} | {
+        "model=rpm": "rpm"
+    } == KINDS
+
+
+@pytest.mark.parametrize(
+    ("chosen", "now"),
+    [
+        (("loss=kinematic",), "position_from_pelvis"),
+        (("model=vae_hmd",), "position_from_pelvis"),
+        (("model=rpm",), "world_position"),
+        (("model=rpm", "loss=calm"), "position_from_pelvis"),
+        (("loss=manual", "model=rpm"), "position_branch"),
+        (("model=avatar_poser",), "position"),
+        (("model=vae_hmd", "loss=agrol"), "position"),
+    ],
+)
+def test_a_key_is_of_the_loss_that_other_overrides_choose(chosen: tuple[str, ...], now: str):
+    assert with_present_keys(["loss.position=1"], beside=chosen) == (f"loss.{now}=1",)
+    assert with_present_keys([*chosen, "loss.position=1"]) == (*chosen, f"loss.{now}=1")
+    assert with_former_keys([f"loss.{now}=1"], beside=chosen) == ("loss.position=1",)
+    assert with_former_keys([*chosen, f"loss.{now}=1"]) == (*chosen, "loss.position=1")
+
+
+def test_a_key_of_terms_that_is_named_like_a_renamed_one_of_another_loss_stays():
+    assert with_former_keys(["loss=kinematic", "loss.world_position=1"])[1] == "loss.world_position=1"
+
+
+@pytest.mark.parametrize("signs", ["+", "++", "~"])
+def test_what_an_override_begins_with_stays(signs: str):
+    assert with_present_keys([f"{signs}frame.normalize=false"]) == (f"{signs}normalizer.z_scores=false",)
+    assert with_former_keys([f"{signs}normalizer.z_scores=false"]) == (f"{signs}frame.normalize=false",)
+    assert with_former_keys(["~normalizer"]) == ("~frame",)
 
 
 def test_overrides_have_their_former_names():

@@ -47,6 +47,20 @@ def test_a_copy_of_an_earlier_version_has_the_names_of_today(tmp_path: Path):
     assert kept_sweep(tmp_path) == sweep
 
 
+def test_a_key_of_an_earlier_version_is_of_the_loss_that_the_base_or_an_arm_chooses(tmp_path: Path):
+    chosen = {"base": ["loss=kinematic", "loss.position_from_pelvis=1"]}
+    sweep = replace(parse_sweep("mine", CONTENT | chosen), command_line=("loss.position_from_pelvis=3",))
+    arm = replace(sweep.arms[0], overrides=("model=rpm", "loss=rpm", "loss.world_position=2"))
+    keep_sweep(replace(sweep, arms=(arm,)), tmp_path)
+    text = (tmp_path / NAME).read_text()
+    former = text.replace("position_from_pelvis", "position").replace("world_position", "position")
+    (tmp_path / NAME).write_text(former)
+    read = kept_sweep(tmp_path)
+    assert (read.base, read.arms[0].overrides) == (sweep.base, arm.overrides)
+    (tmp_path / NAME).write_text(former.replace("loss=kinematic", "optim.lr=1"))  # then the arm's
+    assert kept_sweep(tmp_path).command_line == ("loss.world_position=3",)
+
+
 def test_a_copy_of_the_same_content_is_not_written_again(tmp_path: Path):
     keep_sweep(parse_sweep("mine", CONTENT), tmp_path)
     before = (tmp_path / NAME).stat().st_mtime_ns
