@@ -10,7 +10,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import processes
 import pytest
@@ -38,6 +38,16 @@ def pytest_make_collect_report(collector: pytest.Collector) -> Iterator[None]:
         first = round(share * int(worker.removeprefix("gw")))
         report.result = report.result[first:] + report.result[:first]
     return report
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """By files, some of which stay together (work_units.py)."""
+    if config.getvalue("dist") != "loadfile":
+        return None
+    from work_units import WorkUnits  # here, since it needs xdist
+
+    return WorkUnits(config, log)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -92,13 +102,13 @@ processes.mark()
 # Begun first, so that no process is left alone with one of them at the end. Those that mostly wait for other
 # processes stand among those that compute.
 LONGEST = (
-    "cli/test_sweep", "deploy/test_deployment", "config/test_build", "pipeline/test_run_stages",
-    "kills/test_search", "pipeline/test_experiment", "live/test_trackers_to_body_graph",
-    "pipeline/test_baselines",
+    "cli/test_sweep", "deploy/test_deployment", "live/web/test_page", "config/test_build",
+    "pipeline/test_run_stages", "kills/test_search", "pipeline/test_experiment",
+    "live/test_trackers_to_body_graph", "pipeline/test_baselines",
     "test_example_package", "networks/test_streaming", "training/test_loop", "config/test_baselines",
     "kills/test_rounds", "config/test_compose", "cli/test_main", "live/test_stream",
     "kills/test_sweep", "tables/test_seed_rounds", "networks/baselines/test_baselines", "deploy/test_export",
-    "cli/test_tune", "live/web/test_page", "report/ui/test_page", "kills/test_command", "kills/test_training",
+    "cli/test_tune", "report/ui/test_page", "kills/test_command", "kills/test_training",
     "cli/test_train_distributed", "experiment_tracking/test_mlflow_server",
     "experiment_tracking/test_mlflow_logger", "live/session/test_live_page", "common/test_distributed",
     "cli/test_look",
