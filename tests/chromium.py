@@ -23,9 +23,10 @@ MODEST = [SETPRIV, "--bounding-set=-sys_nice"] if SETPRIV and os.geteuid() == 0 
 """What keeps a root's browser from a priority above all others', which its drawing by software takes."""
 DRAWN = """{
   const display = window.requestAnimationFrame.bind(window);
-  window.requestAnimationFrame = callback => setTimeout(() => display(callback), 150);
+  window.seldom = 150;
+  window.requestAnimationFrame = callback => setTimeout(() => display(callback), window.seldom);
 }"""
-"""What lets a page draw so seldom that everything else has its turn, too: software draws slowly."""
+"""What lets a page draw so seldom (ms) that everything else has its turn, too: software draws slowly."""
 STALL = "GPU stall due to ReadPixels"
 """What a driver warns of where software puts a page together: no fault of the page."""
 UNSEEN = [f"WebUIOmnibox{which}Popup" for which in ("", "Full", "Aim")] + ["SpareRendererForSitePerProcess"]
