@@ -98,9 +98,15 @@ def started(line: Sequence[str], **options: Any) -> Iterator[subprocess.Popen]:
 
 PRELOADED = [
     "memmlp.config.build", "memmlp.pipeline.run_stages", "memmlp.deploy.export", "memmlp.motion.synthetic",
-    "memmlp.render.heatmap", "torch.onnx", "torch._dynamo", "submitit.local.local", "warm_server",
+    "memmlp.render.heatmap", "torch.onnx", "torch._dynamo", "submitit.local.local",
+    "memmlp.cli.sweep", "memmlp.config.worker_process", "memmlp.sweep.controller",
+    "memmlp.sweep.executors.local", "memmlp.tables.build_table", "memmlp.tables.sweep_summary",
+    "memmlp.cli.tune", "memmlp.sweep.search.director", "memmlp.sweep.search.results", "optuna.importance",
+    "optuna.visualization",
+    "warm_server",
 ]  # fmt: skip
-"""What a training imports, its optimiser, its export and its picture included; what else is done once."""
+"""What a training imports, its optimiser, its export and its picture included; what a sweep and a search do
+beside it; what else is done once."""
 
 
 class Forked:
