@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from work_units import SHARED, WorkUnits, shared
 
-SERVER, BROWSER = SHARED
+SERVER, BROWSER, MLFLOW = SHARED
 
 
 def test_files_that_share_something_are_one_unit(pytestconfig: pytest.Config):
@@ -29,7 +29,9 @@ def test_files_that_share_something_are_one_unit(pytestconfig: pytest.Config):
     [
         ("from processes import forked, until", SERVER),
         ("x = 1\nfrom chromium import Browser", BROWSER),
-        ("chromium = 'forkedness'", None),
+        ("def test():\n    from mlflow import MlflowClient", MLFLOW),
+        ("from a import forkedness  # as chromium import", None),
+        ("# forked", None),
     ],
 )
 def test_a_file_is_known_by_its_words(tmp_path: Path, text: str, unit: str | None):

@@ -9,10 +9,11 @@ from pathlib import Path
 from xdist.scheduler import LoadFileScheduling
 
 SHARED = {
-    "the server that processes are forked off": r"\b(forked|forked_controllers|run_apart)\b",
+    "the fork server": r"^from .* import .*\b(forked|forked_controllers|run_apart)\b",
     "the browser": r"^from chromium import",
+    "MLflow": r"^ *from mlflow",
 }
-"""What each process that needs it starts for seconds of CPU time, and what is found in the files that do."""
+"""What each process that needs it starts or imports for seconds, and what is found in the files that do."""
 
 
 class WorkUnits(LoadFileScheduling):
