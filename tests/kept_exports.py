@@ -84,6 +84,8 @@ class _Pickler(pickle.Pickler):
         self.weights = {id(tensor): i for i, tensor in enumerate(_weights(module).values())}
 
     def persistent_id(self, thing: Any) -> Any:
+        if isinstance(thing, set | frozenset):
+            return sorted(thing, key=repr)  # which a set is not, in each process otherwise
         if not isinstance(thing, Tensor):
             return None
         form = (tuple(thing.shape), thing.stride(), str(thing.dtype), str(thing.device), thing.requires_grad)

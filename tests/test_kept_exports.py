@@ -60,3 +60,14 @@ def test_weights_are_each_modules_own_and_all_else_makes_another_graph(export):
     assert export(nn.Sequential(nn.Linear(3, 4), first[1]).requires_grad_(False))[1] == 4
     assert export(nn.Sequential(first, Foreign()))[1] == export(nn.Sequential(first, Foreign()))[1] - 1 == 5
     assert export(second)[1] == 6
+
+
+def test_a_set_is_the_same_in_whatever_order(export):
+    orders = frozenset([0, 8]), frozenset([8, 0])  # as two processes have the same set of words
+    assert list(orders[0]) != list(orders[1])
+    for order in orders:
+        module = nn.Sequential(nn.Linear(3, 4))
+        module.chosen = order
+        assert export(module)[1] == 1
+    module.chosen = frozenset([8])
+    assert export(module)[1] == 2
