@@ -246,3 +246,16 @@ def test_the_metrics_of_the_guide_are_the_field_s():
     )
     listed = {name: (unit, float(smallest)) for name, unit, smallest in rows if name in UNITS}
     assert listed == {name: (UNITS[name], SMALLEST[name]) for name in UNITS if name != "GT Jitter"}
+
+
+def test_the_first_quickstart_names_every_option_and_no_other():
+    text = (DOCS / "quickstart" / "train.md").read_text(encoding="utf-8")
+    rows = dict(re.findall(r"^\| `(\w+)` \| (.*) \|$", text, re.MULTILINE))
+    groups = {name for name in rows if (ROOT / "conf" / name).is_dir()}
+    assert {"model", "memory", "loss", "rollout"} <= groups
+    keys = {"null", "batch", "lr", "drops", "drop"}  # what is said of options beside their names
+    for group in sorted(groups):
+        options = {path.stem for path in (ROOT / "conf" / group).glob("*.yaml")}
+        named = set(re.findall(r"`([a-z_0-9]+)`", rows[group]))
+        assert options <= named, group
+        assert named - options <= keys, group
