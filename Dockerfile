@@ -10,7 +10,7 @@ COPY constraints.txt .
 RUN if [ "$VARIANT" = cuda ]; then pip install --no-cache-dir -c constraints.txt torch==2.13.0; \
     else pip install --no-cache-dir -c constraints.txt torch==2.13.0 --index-url https://download.pytorch.org/whl/cpu; fi
 COPY . .
-RUN pip install --no-cache-dir -c constraints.txt .
+RUN pip install --no-cache-dir -c constraints.txt '.[plots]'
 
 FROM base
 RUN useradd --create-home user

@@ -1,7 +1,9 @@
 """The errors that the command line turns into one line and an exit code."""
 
 import errno
+import importlib
 import unicodedata
+from types import ModuleType
 
 BREAKING = ("Cc", "Cs", "Zl", "Zp")  # Unicode's controls, surrogates, separators of lines and of paragraphs
 
@@ -29,6 +31,26 @@ def why_unreadable(error: Exception) -> str:
     if (mark := getattr(error, "problem_mark", None)) is not None:
         return f"line {mark.line + 1}, column {mark.column + 1}: {getattr(error, 'problem', 'no YAML')}"
     return " ".join(str(error).replace('"<unicode string>"', "it").split())
+
+
+def require(module: str, extra: str, purpose: str) -> ModuleType:
+    """Import and return a module of an optional package.
+
+    Args:
+        module: the module, such as "matplotlib" or "av".
+        extra: the extra of memmlp that installs it, such as "plots".
+        purpose: what needs it, with which the message begins: an override, an option or a file.
+
+    Raises:
+        InputError: if the package is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if (error.name or "").split(".")[0] != module.split(".")[0]:
+            raise
+        package = module.split(".")[0]
+        raise InputError(f"{purpose}: needs {package}: pip install 'memmlp[{extra}]'") from None
 
 
 class TrainingDiverged(RuntimeError):

@@ -12,6 +12,7 @@ import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 
 import torch
@@ -299,7 +300,7 @@ def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequen
             report = {"mode": mode, "run": run.manifest["id"], "name": name, "settings": settings}
             report |= {"recipes": evaluation_recipes(settings), **machine(experiment), **own_code(experiment)}
             write_report(run.evaluation(name), report | experiment.evaluation.report(model, test, mode))
-        if not run.picture.exists():
+        if not run.picture.exists() and find_spec("matplotlib"):
             picture(model, test, run.picture)
 
 
