@@ -82,7 +82,7 @@ def checks(text: str) -> None:
         given = [words[at + 1].partition("=")[0] for at, word in enumerate(words) if word == "--build-arg"]
         assert set(given) <= set(known)
     else:
-        known = words[:2] in INSTALLS or words[:3] in MODULES
+        known = words[:2] in INSTALLS or words[:3] in MODULES or (ROOT / words[1]).is_file()
         assert known or program in ("git", "cd", "source", "build/full_body"), text
 
 

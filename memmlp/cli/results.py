@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from memmlp.report.result_pages import KeptTable
     from memmlp.sweep.definition import Sweep
     from memmlp.tables.effects import RunsBySeed
-    from memmlp.tables.effects_along_axes import Trends
     from memmlp.tables.measured_run import Measured
     from memmlp.tables.table import Table
 
@@ -117,10 +116,6 @@ def save_command(
     kept = Kept(source, without_paths(words), found, overrides_of(sweep), rounds, known.flags)
     if not kept.every:
         raise InputError(f"sweep {name}: no finished run to keep; make them with: {kept.command}")
-    if sweep.scale:
-        from memmlp.config.flops_of_configs import predicted_flops, with_flops
-
-        kept = replace(kept, runs=with_flops(found), predicted=predicted_flops(sweep))
     ids = {(entry.label, entry.seed): entry.id for entry in known.plan.entries}
     merged = _merged(path, load_kept(path), kept, ids) if path.exists() else kept
     save(path, merged)
@@ -173,20 +168,17 @@ def docs(folder: Path, check: bool) -> None:
 
     found = kept_tables(folder)
     made = pages(found, _templates(folder))
-    drawn = _pictures(folder, found)
     if PROSE.exists():
         check_claims(str(PROSE), PROSE.read_text(encoding="utf-8"))
     differing = [name for name, text in made.items() if _text(folder / name) != text]
     stale = _stale(folder, made)
     if check:
-        differing = [*differing, *drawn]
         for name in [*differing, *stale]:
             click.echo(f"differs: {folder / name}; make it again with: memmlp results docs", err=True)
         if differing or stale:
             raise SystemExit(1)
     else:
         _write(folder, made, stale)
-        _draw(folder, drawn)
     count = f"{len(made)} page{'s' * (len(made) != 1)}"
     click.echo(f"{folder}: {count}, {len(differing)} {'differ' if check else 'written'}")
 
@@ -207,27 +199,8 @@ def kept_tables(folder: Path) -> dict[str, KeptTable]:
         # Verdicts of rounds are those of all clips together, and of no source alone.
         names = () if kept.rounds else kept.sources
         by_source = tuple(titled(_table(kept, name), name) for name in names)
-        found[path.stem] = KeptTable(
-            kept, _table(kept), by_source, _trends(kept, path.stem), partial(_table, kept, None)
-        )
+        found[path.stem] = KeptTable(kept, _table(kept), by_source, partial(_table, kept, None))
     return found
-
-
-def _trends(kept: Kept, stem: str) -> Trends | None:
-    """Return the effects of kept results against their sweep's scale; None if it has none.
-
-    Args:
-        kept: the results.
-        stem: the name of the results' page.
-    """
-    from memmlp.config.compose_plan import find_sweep
-    from memmlp.tables.effects_along_axes import trends
-
-    sweep = find_sweep(kept.sweep)
-    if sweep.scale is None:
-        return None
-    sweep = _with_seeds(sweep, kept)
-    return replace(trends(sweep, kept.of(sweep), kept.predicted), name=stem)
 
 
 def _with_seeds(sweep: Sweep, kept: Kept) -> Sweep:
@@ -335,32 +308,6 @@ def _stale(folder: Path, made: Mapping[str, str]) -> list[str]:
 
     every = {path.name for path in folder.glob("*.md") if (_text(path) or "").startswith(MARK)}
     return sorted(every - made.keys())
-
-
-def _pictures(folder: Path, found: Mapping[str, KeptTable]) -> dict[str, Trends]:
-    """Return the figures whose files are missing or show other numbers, by the files' names."""
-    from memmlp.report.scaling_section import picture_name
-
-    wanted = {
-        picture_name(one.trends): one.trends
-        for one in found.values()
-        if one.trends and any(trend.line for trend in one.trends.trends)
-    }
-    if not wanted:
-        return {}
-    from memmlp.report.scaling_figure import figure_is_of
-
-    return {name: trends for name, trends in wanted.items() if not figure_is_of(folder / name, trends)}
-
-
-def _draw(folder: Path, wanted: Mapping[str, Trends]) -> None:
-    """Draw figures into their files."""
-    from memmlp.common.files import atomic_write
-
-    for name, trends in wanted.items():
-        from memmlp.report.scaling_figure import scaling_figure
-
-        atomic_write(folder / name, scaling_figure(trends))
 
 
 def _write(folder: Path, made: Mapping[str, str], stale: list[str]) -> None:

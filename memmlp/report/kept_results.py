@@ -12,7 +12,7 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path, PurePath
 from typing import Any
@@ -55,8 +55,6 @@ class Kept:
         rounds: the rounds in which seeds were spent, in types for JSON; None if they were not spent in
             rounds.
         flags: what a reader has to know about how the seeds were chosen.
-        predicted: the FLOPs of the control's training at the scale for which the sweep predicts, by that
-            scale's overrides as one line.
     """
 
     sweep: str
@@ -65,7 +63,6 @@ class Kept:
     arms: Mapping[str, tuple[str, ...]]
     rounds: Mapping[str, Any] | None = None
     flags: tuple[str, ...] = ()
-    predicted: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def command(self) -> str:
@@ -141,8 +138,7 @@ class Kept:
         labels = dict.fromkeys([*self.runs, *other.runs])
         runs = {label: {**self.runs.get(label, {}), **other.runs.get(label, {})} for label in labels}
         arms, flags = {**self.arms, **other.arms}, tuple(dict.fromkeys([*self.flags, *other.flags]))
-        predicted = {**self.predicted, **other.predicted}
-        return replace(self, runs=runs, arms=arms, rounds=other.rounds, flags=flags, predicted=predicted)
+        return replace(self, runs=runs, arms=arms, rounds=other.rounds, flags=flags)
 
     def check_runs(self, wanted: Mapping[tuple[str, int], str]) -> None:
         """Check that the arms and seeds have the same runs that the sweep gives them now.
@@ -235,7 +231,6 @@ def dumps(kept: Kept) -> str:
         "arms": {label: list(words) for label, words in sorted(kept.arms.items())},
         "rounds": kept.rounds,
         **({"flags": list(kept.flags)} if kept.flags else {}),
-        **({"predicted_flops": dict(kept.predicted)} if kept.predicted else {}),
         "clips": dict(sorted(clips.items())),
         "cells": {
             label: {str(seed): kept.name(runs[seed]) for seed in sorted(runs)}
@@ -272,8 +267,7 @@ def load_kept(path: Path) -> Kept:
         words = with_present_keys(typed, beside=[word for arm in own.values() for word in arm])
         arms = {label: with_present_keys(arm, beside=typed) for label, arm in own.items()}
         flags = tuple(content.get("flags", ()))
-        predicted = content.get("predicted_flops", {})
-        return Kept(content["sweep"], words, cells, arms, content["rounds"], flags, predicted)
+        return Kept(content["sweep"], words, cells, arms, content["rounds"], flags)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: no file of results ({error}); make it with memmlp results save") from None
 

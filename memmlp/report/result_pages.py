@@ -10,9 +10,7 @@ from jinja2 import Environment, StrictUndefined, TemplateError
 
 from memmlp.common.errors import InputError
 from memmlp.report.kept_results import Kept
-from memmlp.report.scaling_section import scaling_section, scaling_summary
 from memmlp.report.unbacked_claims import claims
-from memmlp.tables.effects_along_axes import Trends
 from memmlp.tables.formats import escaped, markdown
 from memmlp.tables.measured_run import UNKNOWN, Measured
 from memmlp.tables.statistics import Verdict
@@ -51,7 +49,6 @@ class KeptTable(NamedTuple):
     kept: Kept
     table: Table
     by_source: tuple[Table, ...] = ()
-    trends: Trends | None = None
     together: Callable[[Sequence[str]], Table] | None = None
 
 
@@ -99,8 +96,7 @@ def _filled(name: str, text: str, words: Placeholders) -> str:
 
 def _table_page(source: KeptTable) -> str:
     tables = "\n".join(map(markdown, (source.table, *source.by_source)))
-    scaling = f"{scaling_section(source.trends)}\n" if source.trends else ""
-    return f"{MARK}\n\n{scaling}{tables}\n{origin_words(source.kept)}\n"
+    return f"{MARK}\n\n{tables}\n{origin_words(source.kept)}\n"
 
 
 def origin_words(kept: Kept) -> str:
@@ -208,12 +204,9 @@ class Placeholders:
     def summary(self, name: str, mode: str = "stream") -> str:
         """Return a table with a line for each arm: measured and the paper's differences, and verdicts.
 
-        For a sweep with a scale, return a list of what the lines through its cells show; for a table without
-        errors, its costs beside the paper's.
+        For a table without errors, return its costs beside the paper's.
         """
         table = self._table(name)
-        if (trends := self.sources[name].trends) is not None:
-            return scaling_summary(trends)
         metrics = table.measured_metrics
         if not metrics:
             return self._costs(name)

@@ -22,9 +22,6 @@ COSTS = (*SIZES, *TIMES)
 Their units: GFLOP, GMAC, millions, MB, ms, multiples of the yardstick's time, and frames per second.
 """
 
-COMPUTE = "compute"
-"""The name of the axis of compute: the FLOPs of training a cell's control."""
-
 
 @dataclass(frozen=True)
 class Arm:
@@ -62,21 +59,6 @@ class Arm:
 
 
 @dataclass(frozen=True)
-class Scale:
-    """The axes against which a sweep's effects are shown, as lines through its cells.
-
-    Attributes:
-        along: COMPUTE, or keys of the axes, whose values are numbers above 0. The first one is the figure's
-            axis; the others distinguish cells beside it.
-        predict: overrides that replace the cells', at whose compute the effects are predicted; empty for no
-            prediction.
-    """
-
-    along: tuple[str, ...] = (COMPUTE,)
-    predict: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
 class ArmSeed:
     """One training: an arm with a seed, as overrides of `memmlp train`."""
 
@@ -102,7 +84,6 @@ class Sweep:
         command_line: overrides given on the command line.
         branch_source: how we know which branch the paper's values belong to; None if the file does not say.
         smallest: the smallest effect of interest by metric, in its unit; every metric but costs has one.
-        scale: the axes against which effects are shown, as lines through the cells; None for tables alone.
     """
 
     name: str
@@ -117,7 +98,6 @@ class Sweep:
     command_line: tuple[str, ...] = ()
     branch_source: str | None = None
     smallest: Mapping[str, float] = field(default_factory=lambda: SMALLEST)
-    scale: Scale | None = None
 
     def with_branch(self, branch: str) -> Sweep:
         """Return the same sweep with its arms showing another branch.

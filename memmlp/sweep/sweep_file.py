@@ -15,7 +15,6 @@ arms:
   "4": {overrides: ['memory.layers=[4]'], branch: rotation, against: "2"}     # its own branch and control
 axes: {model.frames: [11, 21], seed: [0, 1, 2]}      # a grid, instead of arms or over each of them
 axes: [{optim.steps: [500, 2000]}, {model.frames: [11]}]           # or a list of grids: the cells of all
-scale: {along: [compute], predict: [profile=paper]}    # effects as lines through the cells
 """
 
 from __future__ import annotations
@@ -35,10 +34,8 @@ from memmlp.common.errors import InputError, why_unreadable
 from memmlp.evaluation.metric_facts import SMALLEST, UNITS
 from memmlp.sweep.definition import (
     BRANCHES,
-    COMPUTE,
     COSTS,
     Arm,
-    Scale,
     Sweep,
     key_of,
     parse_branch,
@@ -47,10 +44,9 @@ from memmlp.sweep.definition import (
 
 KEYS = (
     "title", "table", "notes", "base", "seeds", "control", "metrics", "branch", "branch_source", "smallest",
-    "arms", "axes", "scale",
+    "arms", "axes",
 )  # fmt: skip
 ARM_KEYS = ("overrides", "branch", "against", "paper", "note")
-SCALE_KEYS = ("along", "predict")
 BASE = "base"  # the arm of a sweep that has only seeds
 
 
@@ -120,7 +116,6 @@ def parse_sweep(name: str, content: Any) -> Sweep:
         metrics=_metrics(content.get("metrics", ["MPJRE", "MPJPE", "MPJVE", "Jitter"])),
         branch_source=None if source is None else _text(source, "branch_source"),
         smallest=SMALLEST | _smallest(content.get("smallest", {})),
-        scale=_scale(content["scale"], grids, arms) if "scale" in content else None,
     )
 
 
@@ -218,33 +213,6 @@ def _check_free(arm: Arm, cells: Iterable[Sequence[str]]) -> None:
     axes = {key_of(word) for words in cells for word in words}
     if both := sorted(own & axes):
         raise InputError(f"arm '{arm.label}': sets {both[0]}, which is an axis; allowed is one of both")
-
-
-def _scale(value: Any, grids: Sequence[Mapping[str, Any]], arms: Sequence[Arm]) -> Scale:
-    """Return the axes against which effects are shown, checked to exist and to have numbers."""
-    value = _mapping(value or {}, "scale", SCALE_KEYS)
-    if not any(arm.cell and arm.against for arm in arms):
-        raise InputError("scale: allowed with axes, and arms that name their control with against")
-    along = _texts(value.get("along", [COMPUTE]), "scale.along")
-    if not along or len(set(along)) < len(along):
-        raise InputError("scale.along: allowed is a list of at least one, each once")
-    keys = [str(key) for grid in grids for key in grid]
-    for name in along:
-        if name != COMPUTE and name not in keys:
-            allowed = ", ".join(dict.fromkeys([COMPUTE, *keys]))
-            raise InputError(f"scale.along: '{name}' is no axis; allowed are {allowed}")
-        _check_numbers(name, grids)
-    return Scale(tuple(along), tuple(_overrides(value.get("predict", []), "scale.predict")))
-
-
-def _check_numbers(name: str, grids: Sequence[Mapping[str, Any]]) -> None:
-    """Raise InputError for an axis against which effects can't be shown: each cell needs a number above 0."""
-    for place, grid in enumerate(grids) if name != COMPUTE else ():
-        if name not in grid:
-            raise InputError(f"scale.along: axes[{place}] has no {name}; allowed is a key of every grid")
-        for number in grid[name]:
-            if not _positive(number):
-                raise InputError(f"scale.along: {name}={_word(number)}; allowed are numbers above 0")
 
 
 def _positive(number: Any) -> bool:

@@ -7,7 +7,6 @@ import re
 from pathlib import Path
 from types import SimpleNamespace
 
-import fake_cells
 import pytest
 from conftest import Memmlp, one_line
 from fake_runs import CLIPS, fake_sweep
@@ -17,7 +16,6 @@ from memmlp.config import compose_plan
 from memmlp.runs.recipe_versions import RECIPES
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.plan import Entry, Plan
-from memmlp.sweep.sweep_file import parse_sweep
 from memmlp.tables.build_table import Find, finished_runs
 from memmlp.tables.effects import RunsBySeed
 
@@ -154,31 +152,6 @@ def test_what_a_file_has_stands_before_the_same_runs_of_other_files(
     assert memmlp("results", "save", "14", "--kept").out.endswith(
         "12 runs, 12 of them from here and earlier\n"
     )
-
-
-@pytest.mark.slow
-def test_a_sweep_with_a_scale_has_a_figure_beside_its_page(
-    memmlp: Memmlp, planned: None, monkeypatch: pytest.MonkeyPatch
-):
-    """It is checked as the page is, by the numbers that it shows, and drawn again where they changed."""
-    sweep = parse_sweep("cells", fake_cells.content())
-    steps = {arm.label: fake_cells.steps_of(arm.cell) for arm in sweep.arms}
-    monkeypatch.setattr(
-        "memmlp.config.flops_of_configs.with_flops",
-        lambda found: {label: fake_cells.trained(runs, steps[label]) for label, runs in found.items()},
-    )
-    monkeypatch.setattr(
-        "memmlp.config.flops_of_configs.predicted_flops", lambda sweep: {"profile=paper": 1e15}
-    )
-    Path("cells.yaml").write_text(json.dumps(fake_cells.content()))
-    memmlp("results", "save", "cells.yaml", "--name", "small")
-    assert memmlp("results", "docs").out == "docs/results: 1 page, 1 written\n"
-    page, figure = Path("docs/results/small.md"), Path("docs/results/small.png")
-    assert "(small.png)" in page.read_text()
-    figure.write_bytes(b"")
-    assert "differs: docs/results/small.png" in memmlp("results", "docs", "--check").err
-    memmlp("results", "docs")
-    assert memmlp("results", "docs", "--check").code == 0
 
 
 def test_check_names_the_page_that_differs(memmlp: Memmlp, planned: None):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.sweep.definition import Scale
 from memmlp.sweep.sweep_file import parse_sweep
 
 ARMS = {"full": [], "none": {"overrides": ["memory=none"], "paper": {"MPJPE": 4.13}}}
@@ -95,45 +94,3 @@ def test_a_list_of_grids_gives_each_of_their_cells_once():
     assert sweep.control_of(sweep.arms[4]) == "full, a=2, b=3"
     assert (sweep.arms[4].series, sweep.arms[4].own_overrides) == ("none", ("memory=none",))
     assert parse_sweep("s", {"arms": arms, "axes": axes[0]}).arms == sweep.arms[:2] + sweep.arms[3:5]
-
-
-def test_a_scale_is_compute_where_the_file_names_nothing_else():
-    arms = {"full": [], "none": {"overrides": ["memory=none"], "against": "full"}}
-    axes = {"optim.steps": [5, 50]}
-    scales = [
-        parse_sweep("s", {"arms": arms, "axes": axes, "scale": scale}).scale
-        for scale in ({}, {"along": ["compute", "optim.steps"], "predict": ["profile=paper"]})
-    ]
-    assert scales == [Scale(), Scale(("compute", "optim.steps"), ("profile=paper",))]
-    assert parse_sweep("s", {"arms": arms, "axes": axes}).scale is None
-
-
-def test_rows_of_the_paper_alone_are_not_run():
-    sweep = parse_sweep("s", {"arms": {"AvatarPoser": {"overrides": None}, "ours": []}})
-    assert [one.label for one in sweep.arm_seeds()] == ["ours"]
-    assert sweep.control == "ours"
-
-
-def test_arms_show_the_sweeps_branch_or_their_own_and_another_where_asked():
-    arms = {"full": [], "one head": {"overrides": ["memory=none"], "branch": "rotation"}}
-    content = {"branch": "combined", "branch_source": "Table 6", "arms": arms}
-    sweep = parse_sweep("s", content)
-    assert [arm.branch for arm in sweep.arms] == ["combined", "rotation"]
-    assert sweep.branch_source == "Table 6"
-    assert [arm.branch for arm in sweep.with_branch("position").arms] == ["position", "rotation"]
-    with pytest.raises(InputError, match="branch: 'hips'; allowed are rotation, position, combined"):
-        sweep.with_branch("hips")
-    plain = parse_sweep("s", {"arms": ARMS, "axes": {"model.frames": [11]}})
-    assert {arm.branch for arm in plain.arms} == {"rotation"}
-    assert plain.branch_source is None
-    grid = parse_sweep("s", {"branch": "position", "axes": {"model.frames": [11]}})
-    assert [arm.branch for arm in grid.arms] == ["position"]
-
-
-def test_an_arm_is_compared_with_the_sweeps_control_or_with_its_own_control():
-    arms = {"a": [], "b": {"against": "a"}, "c": {"overrides": ["loss=manual"], "against": "b"}, "d": []}
-    sweep = parse_sweep("s", {"arms": arms, "control": "d"})
-    assert [sweep.control_of(arm) for arm in sweep.arms] == ["d", "a", "b", None]
-    grid = parse_sweep("s", {"arms": arms, "axes": {"model.frames": [11, 21]}})
-    assert grid.arms[3].label == "b, model.frames=21"
-    assert grid.control_of(grid.arms[3]) == "a, model.frames=21"

@@ -1,4 +1,4 @@
-"""`memmlp bench`: measurements on this machine of speed, of sweeps under kills, and of the verdicts."""
+"""`memmlp bench`: measurements on this machine of speed, and of sweeps under kills."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ from memmlp.cli.bench.soak import soak
 from memmlp.cli.bench.stream_evaluation import stream
 from memmlp.cli.bench.time_to_error import train
 from memmlp.cli.bench.ui_page import ui
-from memmlp.cli.bench.verdict_simulation import verdicts
 
 
 @click.group("bench")
 def bench() -> None:
-    """Measure this machine: speed as rates and ratios within one run, sweeps under kills, verdicts, pages."""
+    """Measure this machine: speed as rates and ratios within one run, sweeps under kills, pages."""
 
 
 for command in (
-    prepare, stream, train, latency, live_frame, soak, loggers, chaos, chaos_tune, verdicts, ui,
+    prepare, stream, train, latency, live_frame, soak, loggers, chaos, chaos_tune, ui,
 ):  # fmt: skip
     bench.add_command(command)

@@ -1,12 +1,12 @@
-"""Simulated differences have the variances that they are said to have."""
+"""Simulated differences have the variances that they are said to have, and broken promises are counted."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from benchmarks.verdicts import SHARES, Shares, Simulated, SimulationSetting, broken, draw, grid, simulate
 
 from memmlp.tables.statistics.crossed_seeds_and_groups import error
-from memmlp.tables.statistics.simulation import SHARES, Shares, Simulated, SimulationSetting, draw
 
 
 @pytest.mark.parametrize("cell", [SimulationSetting(5, 10, 1), SimulationSetting(5, 11, 2)])
@@ -35,3 +35,32 @@ def test_means_have_a_variance_of_one(name: str):
     assert mean.var() == pytest.approx(1, abs=0.06)
     a, b, e = known.variances.mean(1)
     assert a + b - e == pytest.approx(1, abs=0.06 if SHARES[name].groups else 0.2)
+
+
+def test_the_grid_is_all_that_have_two_groups():
+    assert len(grid()) == 40
+    assert SimulationSetting(3, 10, 10) not in grid()
+    assert SimulationSetting(10, 536, 10) in grid()
+
+
+def test_a_cell_is_the_same_again_and_another_with_another_seed():
+    cell = SimulationSetting(3, 4, 2)
+    assert simulate(cell, 20, 1) == simulate(cell, 20, 1)
+    assert simulate(cell, 20, 1) != simulate(cell, 20, 2)
+
+
+def test_looks_spend_fewer_seeds_where_effects_are_plain():
+    told = simulate(SimulationSetting(10, 40, 1), 20, 0)["campaign"]
+    assert told["decided"] > 0.95
+    assert told["seeds"] < 9
+    assert told["error"] <= 0.05
+
+
+def test_a_broken_promise_is_told():
+    row = {"tables": 1000, "shares": {"one": {"coverage": 0.95, "error": 0.05, "sequential_error": 0.03}}}
+    assert broken(row, True) == []
+    row["shares"]["other"] = {"coverage": 0.999, "error": 0.09, "sequential_error": 0.01}
+    assert broken(row, False) == ["error 9.00 % (other)"]
+    assert broken(row, True) == ["error 9.00 % (other)", "coverage 99.90 % (other)"]
+    row["shares"]["other"] = {"coverage": 0.92, "error": 0.0, "sequential_error": 0.09}
+    assert broken(row, True) == ["coverage 92.00 % (other)", "sequential_error 9.00 % (other)"]
