@@ -28,7 +28,7 @@ from memmlp.sweep.sweep_file import load_sweep
 DOCS = ROOT / "docs"
 MADE = ("reference", "earlier", "templates")  # by the code, kept for the record, or not yet pages
 PAGES = [
-    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "sweeps/README.md")),
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "sweeps/README.md")),
     *(page for page in sorted(DOCS.rglob("*.md")) if not set(MADE) & set(page.parts)),
 ]
 LINES = list({line.text: line for page in PAGES for line in shell_lines(page)}.values())
