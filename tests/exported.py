@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING
 import tiny
 
 from memmlp.motion.network_coordinates import Heading
-from memmlp.networks.memory import CodeMemory, LSTMMemory, NoMemory
+from memmlp.networks.memory import NoMemory
 from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.predictor_slot import RotationOnly
+from memmlp.networks.own_past_memory import CodeMemory
+from memmlp.networks.predictor import RotationOnly
+from memmlp.networks.recurrent_memory import LSTMMemory
 
 if TYPE_CHECKING:
     from onnx import GraphProto

@@ -32,18 +32,13 @@ from memmlp.motion.mirror import MirroredDataset
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.motion.synthetic import ACTIVITIES, synthesize, synthesize_clip
-from memmlp.networks.baselines.still_pose import StillPose
-from memmlp.networks.memory import (
-    CodeMemory,
-    GRUMemory,
-    JointCodeMemory,
-    LSTMMemory,
-    NoCodesMemory,
-    NoMemory,
-)
+from memmlp.networks.memory import NoMemory
 from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.predictor_slot import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
-from memmlp.networks.recurrent_cells import CELLS
+from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, NoCodesMemory
+from memmlp.networks.predictor import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
+from memmlp.networks.recurrent_memory import GRUMemory, LSTMMemory
+from memmlp.networks.recurrent_poser import CELLS
+from memmlp.networks.still_pose import StillPose
 from memmlp.runs.recipe_versions import RECIPES
 from memmlp.training.loop import seed_step
 from memmlp.training.losses import (

@@ -13,10 +13,9 @@ from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.network_coordinates import World
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.baselines.sage_parts import LATENT, ProductQuantiser
-from memmlp.networks.memory import State
-from memmlp.networks.motion_model import MotionModel, TrainingOutputs
+from memmlp.networks.motion_model import MotionModel, State, TrainingOutputs
 from memmlp.networks.refiner import SAGERefiner
+from memmlp.networks.sage_parts import LATENT, ProductQuantiser
 from memmlp.networks.vqvae import VQVAE
 from memmlp.training.loop import seed_step, train_step
 from memmlp.training.losses import Fixed, Loss, Terms

@@ -14,22 +14,24 @@ from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.features import motion_frames
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP
-from memmlp.networks.baselines.avatar_jlm import AvatarJLM
-from memmlp.networks.baselines.avatar_poser import AvatarPoser
-from memmlp.networks.baselines.bodiffusion import BoDiffusion
-from memmlp.networks.baselines.ego_poser import EgoPoser
-from memmlp.networks.baselines.hmd_poser import HMDPoser
-from memmlp.networks.baselines.manikin import ManikinL, ManikinS
-from memmlp.networks.baselines.rpm import RPM
-from memmlp.networks.baselines.sage_net import SAGENet
-from memmlp.networks.baselines.vae_hmd import VAEHMD
+from memmlp.networks.agrol import AGRoLDiffusion, AGRoLMLP
+from memmlp.networks.avatar_jlm import AvatarJLM
+from memmlp.networks.avatar_poser import AvatarPoser
+from memmlp.networks.bodiffusion import BoDiffusion
+from memmlp.networks.ego_poser import EgoPoser
+from memmlp.networks.hmd_poser import HMDPoser
+from memmlp.networks.manikin import ManikinL, ManikinS
 from memmlp.networks.mem_mlp import MemMLP
-from memmlp.networks.memory import CodeMemory, JointCodeMemory, Memory, NoMemory, RecurrentMemory
+from memmlp.networks.memory import Memory, NoMemory
 from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.predictor_slot import Predictor, TwoBranch
+from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory
+from memmlp.networks.predictor import Predictor, TwoBranch
+from memmlp.networks.recurrent_memory import RecurrentMemory
 from memmlp.networks.recurrent_poser import RecurrentPoser
 from memmlp.networks.refiner import Refined
+from memmlp.networks.rpm import RPM
+from memmlp.networks.sage_net import SAGENet
+from memmlp.networks.vae_hmd import VAEHMD
 from memmlp.networks.vqvae import VQVAE
 from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, Loss, LossOfNetwork, RPMLoss, TermsLoss
 

@@ -9,8 +9,8 @@ import torch
 from torch import nn
 
 from memmlp.networks import checkpoint
-from memmlp.networks.baselines.sage_parts import LOWER, UPPER
-from memmlp.networks.memory import JointCodeMemory
+from memmlp.networks.own_past_memory import JointCodeMemory
+from memmlp.networks.sage_parts import LOWER, UPPER
 from memmlp.networks.vqvae import VQVAE
 from memmlp.runs.run import Run
 from memmlp.training.losses import HandPosition, MotionLoss, TermsLoss, Uncertainty

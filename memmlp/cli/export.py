@@ -14,8 +14,7 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from memmlp.networks.motion_model import MotionModel
-    from memmlp.networks.streaming import StreamingGraph
+    from memmlp.networks.motion_model import MotionModel, StreamingGraph
 
 TARGETS = ("onnxruntime", "web", "wasm", "webgpu", "webnn", "unity", "tensorrt", "coreml", "qnn")
 """The names in memmlp.deploy.operator_support, repeated so that the help need not import ONNX Runtime."""
@@ -188,7 +187,8 @@ def write(run: str, out: Path, outputs: Path, form: Form, clips: int, max_growth
     from memmlp.config.open_run import open_run
     from memmlp.deploy.deployment import GRAPHS
     from memmlp.deploy.parity import clips_to_check
-    from memmlp.networks.streaming import StreamingGraph, check_streams
+    from memmlp.networks.motion_model import StreamingGraph
+    from memmlp.networks.streaming import check_streams
     from memmlp.runs.lookup import find_run
 
     found = find_run(outputs, run)

@@ -19,8 +19,8 @@ from memmlp.deploy.opsets import NATIVE
 from memmlp.deploy.parity import TOLERANCE, clips_to_check, frames_of_full_past, parity, tolerated
 from memmlp.deploy.precision_cost import compared
 from memmlp.deploy.quantization import quantise
-from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.streaming import StreamingGraph, has_stream, streaming
+from memmlp.networks.motion_model import MotionModel, StreamingGraph
+from memmlp.networks.streaming import has_stream, streaming
 from memmlp.runs.deployment_folder import DeploymentFolder
 
 GRAPHS: dict[str, Callable[[MotionModel], MotionModel | StreamingGraph]] = {

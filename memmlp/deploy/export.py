@@ -27,8 +27,7 @@ from memmlp.common.lease_fences import publish, temporary
 from memmlp.deploy.opsets import NATIVE, converted
 from memmlp.deploy.parity import deterministic
 from memmlp.motion.body import FEATURES, FPS, JOINTS, N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM
-from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.streaming import StreamingGraph
+from memmlp.networks.motion_model import MotionModel, StreamingGraph
 
 
 class OneStep(nn.Module):

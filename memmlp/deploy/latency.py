@@ -20,8 +20,7 @@ from memmlp.common.thread_core_share import CoreClock
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.networks.flop_counter import counting_flops
-from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.streaming import StreamingGraph
+from memmlp.networks.motion_model import MotionModel, StreamingGraph
 from memmlp.networks.vqvae import EMACodebook
 
 WARM_UP = 30  # steps before the timed ones

@@ -16,8 +16,8 @@ from memmlp.common.progress import progress_bar
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.torch_threads import one_thread
-from memmlp.networks.memory import Blend
 from memmlp.networks.motion_model import MotionModel
+from memmlp.networks.own_past_memory import Blend
 from memmlp.networks.vqvae import Codebook
 
 TOLERANCE = 1e-4  # on 6D components and metres

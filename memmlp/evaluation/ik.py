@@ -22,7 +22,7 @@ from memmlp.motion.geometry import (
     sixd_to_matrix,
 )
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.reaching_arms import reached, tracked
+from memmlp.networks.limb_solver import reached, tracked
 
 Objective = Callable[[Tensor, Tensor], Tensor]
 
@@ -86,7 +86,7 @@ class LBFGS:
 
 
 class Arms:
-    """The arms alone, in closed form: wrists are brought to their trackers (`memmlp.networks.reaching_arms`).
+    """The arms alone, in closed form: wrists are brought to their trackers (`memmlp.networks.limb_solver`).
 
     It needs no predicted positions, so it works with every network.
     """

@@ -29,7 +29,7 @@ from memmlp.motion.body import N_JOINTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.geometry import sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.memory import State
+from memmlp.networks.motion_model import State
 
 
 class Evaluable(Protocol):

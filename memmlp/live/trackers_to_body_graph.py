@@ -46,8 +46,7 @@ from memmlp.motion.body import (
 from memmlp.motion.features import sparse_features
 from memmlp.motion.geometry import sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.streaming import StreamingGraph
+from memmlp.networks.motion_model import MotionModel, StreamingGraph
 
 INPUTS = ("tracker_positions", "tracker_rotations")
 OUTPUTS = ("rotations", "positions", "joints")

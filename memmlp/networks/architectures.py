@@ -17,7 +17,7 @@ from memmlp.networks import checkpoint
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import Memory
 from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.predictor_slot import Predictor
+from memmlp.networks.predictor import Predictor
 from memmlp.networks.refiner import Refined, SAGERefiner
 from memmlp.networks.vqvae import VQVAE
 

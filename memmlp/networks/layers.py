@@ -5,6 +5,8 @@ This file also says which layers several processes can't train together.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -127,3 +129,23 @@ def _draws(layer: nn.Module) -> bool:
 
 def _counts(layer: nn.Module) -> bool:
     return isinstance(layer, _BatchNorm) or getattr(layer, "of_whole_batch", False)
+
+
+def products(weights: Sequence[Tensor], x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the contributions of an input (B, n) and of the hidden state (B, d) to a layer's gates.
+
+    Args:
+        weights: the layer's weights and biases, in the order of `nn.RNNBase.all_weights`.
+        x: the input.
+        hidden: the hidden state.
+    """
+    of_input, of_hidden, input_bias, hidden_bias = weights
+    return F.linear(x, of_input, input_bias), F.linear(hidden, of_hidden, hidden_bias)
+
+
+def gru_step(weights: Sequence[Tensor], x: Tensor, state: Tensor) -> Tensor:
+    """Return a GRU layer's state (B, d) after an input (B, n) at a state (B, d), in plain layers."""
+    entering, again = (part.chunk(3, -1) for part in products(weights, x, state))
+    reset, keep = (torch.sigmoid(entering[gate] + again[gate]) for gate in range(2))
+    new = torch.tanh(entering[2] + reset * again[2])
+    return new + keep * (state - new)

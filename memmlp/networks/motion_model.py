@@ -1,15 +1,17 @@
-"""The interface of every network: one call takes in new frames and returns motion and a state."""
+"""The interface of every network, and of its streaming graph, from which the live step is exported."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import copy
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.memory import State
+
+State = dict[str, Tensor]
 
 
 class TrainingOutputs(NamedTuple):
@@ -42,9 +44,12 @@ class MotionModel(nn.Module):
     Attributes:
         branches: the parts of the motion that are learned, out of "rotation" and "position"; positions that
             are not learned follow from the rotations.
+        graph: the class of the streaming graph; None if the network has none. A subclass names its own, since
+            it may compute something else than its base.
     """
 
     branches: frozenset[str] = frozenset({"rotation"})
+    graph: ClassVar[type[StreamingGraph] | None] = None
 
     def __init__(self, normalizer: Normalizer, frames: int):
         super().__init__()
@@ -152,3 +157,201 @@ class MotionModel(nn.Module):
         A frozen VQ-VAE is not counted; one that is trained with the network is, its decoder included.
         """
         return sum(p.numel() for p in self.parameters() if p.requires_grad)
+
+
+class WindowlessModel(MotionModel):
+    """A network that carries all it knows of the past in its state; every live step takes the same work.
+
+    `frames` is how many frames a training call takes in, from a fresh start. In both evaluation modes the
+    network is a stream over the whole clip.
+    """
+
+    @property
+    def windowless(self) -> bool:
+        """Whether the network has no window; true here."""
+        return True
+
+    @property
+    def past_frames(self) -> int:
+        """How many past frames of inputs are kept in a buffer; 0 here."""
+        return 0
+
+    @property
+    def stride(self) -> int:
+        """By how many frames a training step moves on: by all that it takes in."""
+        return self.frames
+
+    def initial_state(self, batch: int = 1) -> State:
+        """Return the state of a fresh start, all zeros; by default nothing is carried."""
+        return {}
+
+    def running_state(self, sparse: Tensor) -> State:
+        """Return the state of a fresh start, since no earlier frames (B, 0, 54) are kept."""
+        return self.initial_state(len(sparse))
+
+
+class WholeWindow(MotionModel):
+    """The base of networks that map a whole window of inputs to its rotations (`rotations`)."""
+
+    def rotations(self, encoded: Tensor) -> Tensor:
+        """Map inputs (B, T, 54) to rotations (B, T, 132), both in network space."""
+        raise NotImplementedError
+
+    def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
+        """Take in the newest frames; see MotionModel.
+
+        By default all T frames are returned. The work is always that of the whole window, as published.
+        """
+        inputs, kept = self.taken_in(sparse, state)
+        window = inputs[:, -self.frames :]
+        rotation = self.rotations(self.normalizer.encode_sparse(window, self.normalizer.origin(window)))
+        wanted = self.frames if newest is None else newest
+        return self.normalizer.posed(rotation[:, -wanted:], window[:, -wanted:]), kept
+
+
+class OwnWindows(MotionModel):
+    """The base of networks that predict every frame from the window that ends with it (`rotations`).
+
+    Both evaluation modes give the same numbers, to rounding.
+    """
+
+    def rotations(self, encoded: Tensor) -> Tensor:
+        """Map windows (B, T, 54) to their last frames' rotations (B, 132), both in network space."""
+        raise NotImplementedError
+
+    def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
+        """Take in the newest frames; see MotionModel.
+
+        By default the n new frames are returned, which are the most that this network can make.
+        """
+        inputs, kept = self.taken_in(sparse, state)
+        wanted = sparse.shape[1] if newest is None else newest
+        ends = torch.arange(inputs.shape[1] - wanted, inputs.shape[1], device=inputs.device)
+        window = ends[:, None] + torch.arange(1 - self.frames, 1, device=inputs.device)
+        encoded = self.normalizer.encode_sparse(inputs, self.normalizer.origin(inputs))
+        windows = torch.unflatten(encoded.index_select(1, window.flatten()), 1, window.shape)
+        rotation = torch.unflatten(self.rotations(windows.flatten(0, 1)), 0, (len(inputs), wanted))
+        return self.normalizer.posed(rotation, inputs[:, -wanted:]), kept
+
+
+def filled(earlier: Tensor, first: Tensor, fresh: Tensor) -> Tensor:
+    """Return a window's earlier frames, which at a fresh start are all copies of the first frame.
+
+    The carried frames are zeros then, so a sum is enough; a condition is not available in every runtime.
+
+    Args:
+        earlier: the carried frames (n, size).
+        first: the copy that stands for earlier frames (1, size).
+        fresh: 1 at a fresh start and 0 after it (1,).
+    """
+    return earlier + fresh * first
+
+
+def slid(window: Tensor, entering: Tensor, before: Tensor, fresh: Tensor) -> Tensor:
+    """Return a window (T, size) without its oldest frame and with a new one (1, size) at its end.
+
+    At a fresh start `before` (1, size) stands for the frames before it; see `filled`.
+    """
+    return torch.cat([filled(window[1:], before, fresh), entering])
+
+
+def counted(count: Tensor, frames: int) -> Tensor:
+    """Return the count (1,) of frames taken in, after one more step; it grows no further than `frames`."""
+    return count.clamp_max(frames - 1) + 1
+
+
+class StreamingGraph(nn.Module):
+    """A network as a graph for one live stream, without gradients; the interface of all of them.
+
+    Args:
+        model: the trained network; the graph is made from a copy.
+
+    Attributes:
+        float32_modules: names of the modules that stay in float32 when the graph is quantised: those at the
+            network's two ends, from the inputs to the hidden state and from there to the motion, and others
+            whose rounding would be visible.
+    """
+
+    float32_modules: tuple[str, ...]
+
+    def __init__(self, model: MotionModel):
+        super().__init__()
+        model = copy.deepcopy(model).eval().requires_grad_(False)
+        self.frames, self.normalizer, self.branches = model.frames, model.normalizer, model.branches
+        self.build(model)
+        self.requires_grad_(False)
+
+    @classmethod
+    def fits(cls, model: MotionModel) -> bool:
+        """Return whether this graph can stream this very model: its memory, its sizes."""
+        return True
+
+    def build(self, model: Any) -> None:
+        """Make the graph's parts from a copy of the network."""
+        raise NotImplementedError
+
+    def windows(self) -> State:
+        """Return the state of a fresh start, without the count of steps: zeros."""
+        raise NotImplementedError
+
+    def initial_state(self, batch: int = 1) -> State:
+        """Return the state of a fresh start, all zeros.
+
+        At the first call the first frame stands for all frames before it.
+
+        Args:
+            batch: must be 1. Without a batch axis, windows (T, size) are exported to fewer operations.
+        """
+        assert batch == 1
+        state = {"count": torch.zeros(1), **self.windows()}
+        return {name: tensor.to(self.normalizer.mean) for name, tensor in state.items() if tensor.numel()}
+
+    def advance(self, sparse: Tensor, state: State, newest: int = 1) -> tuple[Tensor, State]:
+        """Take in one frame.
+
+        Args:
+            sparse: world inputs (1, 1, 54).
+            state: what the last call returned, or `initial_state`.
+            newest: must be 1, since no other frame is computed.
+
+        Returns:
+            Motion (1, 1, 198) in the world, and the new state.
+        """
+        # Parts of the state that are empty (a queue of no frames) are no inputs of the exported graph, so
+        # they are taken out of the new state and put back from `windows` here.
+        fresh = 1 - state["count"].clamp_max(1)
+        motion, kept = self.step(sparse[0], self.windows() | state, fresh)
+        kept["count"] = counted(state["count"], self.frames)
+        return motion[None], {name: tensor for name, tensor in kept.items() if tensor.numel()}
+
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
+        """Take in one frame.
+
+        Args:
+            sparse: world inputs (1, 54).
+            state: the state, all zeros at a fresh start.
+            fresh: 1 at a fresh start and 0 after it (1,).
+
+        Returns:
+            World motion (1, 198), and the new state.
+        """
+        raise NotImplementedError
+
+
+class FrameGraph(StreamingGraph):
+    """The streaming graph of a network without a window: the network itself, one frame per step."""
+
+    model: WindowlessModel
+
+    def build(self, model: Any) -> None:
+        """Make the graph's parts from a copy of the network."""
+        self.model = model
+
+    def windows(self) -> State:
+        """Return the network's state at a fresh start, which is all that it carries: it has no window."""
+        return self.model.initial_state(1)
+
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
+        motion, kept = self.model.advance(sparse[None], state, 1)
+        return motion[0], kept

@@ -8,6 +8,7 @@ behind any network. It is trained on the poses that the finished network streams
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -15,8 +16,8 @@ from torch import Tensor, nn
 from memmlp.common.float32_regions import in_float32
 from memmlp.motion.body import POSITION, ROTATION
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.memory import State
-from memmlp.networks.motion_model import MotionModel
+from memmlp.networks.motion_model import MotionModel, State, StreamingGraph
+from memmlp.networks.streaming import FrameGRU, has_stream, streaming
 
 HIDDEN = "refiner"  # the name of the refiner's own state
 
@@ -47,6 +48,35 @@ class SAGERefiner:
         return Refined(network, self.width, self.depth)
 
 
+class RefinedGraph(StreamingGraph):
+    """The network's own streaming graph, followed by a step of the refiner's recurrent layers."""
+
+    model: Refined
+
+    @classmethod
+    def fits(cls, model: Any) -> bool:
+        """Return whether the network in front of the refiner has a streaming graph."""
+        return has_stream(model.network)
+
+    def build(self, model: Any) -> None:
+        """Make the network's streaming graph and keep a copy of the refiner."""
+        self.model, self.hidden = model, model.initial_state(1)[HIDDEN]
+        self.graph = streaming(model.network)
+        model.add_module("layers", FrameGRU(model.layers))  # of another class than the network's
+        inner = (f"graph.{name}" for name in self.graph.float32_modules)
+        self.float32_modules = (*inner, "model.layers", "model.head")
+
+    def windows(self) -> State:
+        """Return zeros: the state that the network's graph carries, and the hidden one (1, depth, width)."""
+        return {**self.graph.windows(), HIDDEN: self.hidden}
+
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
+        motion, kept = self.graph.step(sparse, state, fresh)
+        refined, hidden = self.model.refined(motion[None], sparse[None], state[HIDDEN])
+        return refined[0], {**kept, HIDDEN: hidden}
+
+
 class Refined(MotionModel):
     """A network followed by recurrent layers that correct its rotations; a stream in both evaluation modes.
 
@@ -60,6 +90,8 @@ class Refined(MotionModel):
         width: the width of the recurrent layers (GRU).
         depth: number of recurrent layers.
     """
+
+    graph = RefinedGraph
 
     def __init__(self, network: MotionModel, width: int, depth: int):
         nn.Module.__init__(self)

@@ -14,8 +14,7 @@ from torch import Tensor, nn
 from memmlp.common import distributed
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset, WindowSampler
-from memmlp.networks.memory import State
-from memmlp.networks.motion_model import MotionModel
+from memmlp.networks.motion_model import MotionModel, State
 
 
 class TrainingCall(NamedTuple):

@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from memmlp.common import distributed
 from memmlp.common.float32_regions import in_float32
 from memmlp.motion.body import HANDS, HEAD, N_JOINTS, ROOT, ROTATION, SPARSE_DIM, SPARSE_POSITION
-from memmlp.networks.baselines.sage_net import SAGENet
-from memmlp.networks.baselines.sage_parts import HIDDEN, HalfVQVAE
+from memmlp.networks.sage_net import SAGENet
+from memmlp.networks.sage_parts import HIDDEN, HalfVQVAE
 from memmlp.training.losses.terms import Body
 
 HIDDEN_SHARE = 0.5  # of a half's joints, which its VQ-VAE has to guess

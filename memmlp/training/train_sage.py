@@ -22,8 +22,8 @@ from memmlp.motion.mirror import MirroredDataset
 from memmlp.motion.motion_source import Prepared
 from memmlp.networks import checkpoint
 from memmlp.networks.architectures import Architecture, PartedArchitecture
-from memmlp.networks.baselines.sage_net import SAGENet
-from memmlp.networks.baselines.sage_parts import LOWER, UPPER
+from memmlp.networks.sage_net import SAGENet
+from memmlp.networks.sage_parts import LOWER, UPPER
 from memmlp.runs.run import Run
 from memmlp.training.loop import StepResult, train
 from memmlp.training.optim import Optim

@@ -271,7 +271,7 @@ def test_a_failed_job_does_not_stop_the_others(memmlp: Memmlp, monkeypatch: pyte
 def test_cfg_job_prints_the_config(memmlp: Memmlp, jobs: list[DictConfig]):
     ran = memmlp("train", "--cfg", "job", "--resolve", "seed=7")
     assert "seed: 7\n" in ran.out
-    assert "_target_: memmlp.networks.memory.CodeMemory" in ran.out
+    assert "_target_: memmlp.networks.own_past_memory.CodeMemory" in ran.out
     assert jobs == []
 
 

@@ -230,4 +230,4 @@ def test_profiles_and_the_papers_experiment_fit(name, profile):
     cfg = composed([f"model={name}", "experiment=paper", f"profile={profile}", "model.frames=22"])
     assert cfg.model.frames == 22
     assert (cfg.memory, cfg.predictor, cfg.hand) == (None, None, None)
-    assert build_experiment(cfg).config["model"]["_target_"].startswith("memmlp.networks.baselines.")
+    assert build_experiment(cfg).config["model"]["_target_"].startswith("memmlp.networks.")

@@ -237,7 +237,10 @@ BAD = [
     (["normalizer.coordinates=polar"], ["normalizer.coordinates=polar", "head_relative or world"]),
     (["data.synth.minutes=0"], ["data.synth.minutes=0", "above 0"]),
     (["paths.outputs="], ["paths.outputs=", "not empty"]),
-    (["memory._target_=os.system"], ["memory._target_=os.system", "memmlp.networks.memory.CodeMemory"]),
+    (
+        ["memory._target_=os.system"],
+        ["memory._target_=os.system", "CodeMemory"],
+    ),
     # impossible combinations
     (["~memory"], ["memory", "memory=none for none"]),
     (["~hand"], ["hand", "hand=off for none"]),

@@ -20,8 +20,9 @@ from memmlp.deploy.deployment import GRAPHS, Deployment
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import streamed
 from memmlp.deploy.quantization import quantise
-from memmlp.networks.memory import CodeMemory
-from memmlp.networks.streaming import StreamingGraph, streaming
+from memmlp.networks.motion_model import StreamingGraph
+from memmlp.networks.own_past_memory import CodeMemory
+from memmlp.networks.streaming import streaming
 from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.lookup import list_runs
 

@@ -28,7 +28,7 @@ from memmlp.deploy.parity import (
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading
 from memmlp.networks.mem_mlp import MemMLP
-from memmlp.networks.memory.own_past import NoCodesMemory
+from memmlp.networks.own_past_memory import NoCodesMemory
 from memmlp.networks.streaming import streaming
 from memmlp.networks.vqvae import Codebook
 

@@ -12,8 +12,8 @@ from torch.backends import mha
 from memmlp.deploy.latency import macs
 from memmlp.motion.body import MOTION_DIM, SPARSE_DIM
 from memmlp.networks.flop_counter import counting_flops
-from memmlp.networks.memory.recurrent import LSTM
 from memmlp.networks.motion_model import MotionModel
+from memmlp.networks.recurrent_memory import LSTM
 from memmlp.networks.streaming import streaming
 
 T, WIDTH, HEADS, INNER = 7, 16, 4, 32

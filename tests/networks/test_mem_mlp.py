@@ -13,8 +13,10 @@ from memmlp.motion.dataset import WindowSampler
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
-from memmlp.networks.memory import CodeMemory, GRUMemory, JointCodeMemory, LSTMMemory, NoCodesMemory, NoMemory
-from memmlp.networks.predictor_slot import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
+from memmlp.networks.memory import NoMemory
+from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, NoCodesMemory
+from memmlp.networks.predictor import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
+from memmlp.networks.recurrent_memory import GRUMemory, LSTMMemory
 from memmlp.networks.vqvae import VQVAE
 from memmlp.training.rollout import TeacherForcing
 

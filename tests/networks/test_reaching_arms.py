@@ -8,7 +8,7 @@ from memmlp.motion.body import HANDS, HEAD, N_JOINTS, POSITION, ROTATION, SPARSE
 from memmlp.motion.body import SPARSE_POSITION as PLACES
 from memmlp.motion.body import SPARSE_ROTATION as TURNS
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
-from memmlp.networks.reaching_arms import ELBOWS, SHOULDERS, SLACK, WRISTS, reached, tracked
+from memmlp.networks.limb_solver import ELBOWS, SHOULDERS, SLACK, WRISTS, reached, tracked
 
 REST = tiny.REST.double()
 LENGTHS = [

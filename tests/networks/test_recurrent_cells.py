@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from memmlp.networks.recurrent_cells import CELLS, RecurrentCell, scan
+from memmlp.networks.recurrent_poser import CELLS, RecurrentCell, scan
 
 X = torch.randn(2, 9, 4, generator=torch.Generator().manual_seed(1)).double()
 

@@ -15,8 +15,7 @@ from memmlp.evaluation import modes as evaluation
 from memmlp.motion.body import HANDS, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.network_coordinates import Heading
 from memmlp.networks import checkpoint
-from memmlp.networks.recurrent_cells import CELLS
-from memmlp.networks.recurrent_poser import OUTPUTS
+from memmlp.networks.recurrent_poser import CELLS, OUTPUTS
 from memmlp.networks.streaming import streaming
 
 CLIP = tiny.clip(24)

@@ -17,9 +17,12 @@ from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.networks.flop_counter import counting_flops
 from memmlp.networks.mem_mlp import MemMLP
-from memmlp.networks.memory import CodeMemory, GRUMemory, JointCodeMemory, LSTMMemory, NoCodesMemory, NoMemory
-from memmlp.networks.predictor_slot import RotationOnly, TwoBranch, TwoBranchMemory
-from memmlp.networks.streaming import StreamingGraph, streaming
+from memmlp.networks.memory import NoMemory
+from memmlp.networks.motion_model import StreamingGraph
+from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, NoCodesMemory
+from memmlp.networks.predictor import RotationOnly, TwoBranch, TwoBranchMemory
+from memmlp.networks.recurrent_memory import GRUMemory, LSTMMemory
+from memmlp.networks.streaming import streaming
 
 MEMORIES = [
     (NoMemory, {}),

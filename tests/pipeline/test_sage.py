@@ -14,7 +14,7 @@ from memmlp.config.compose import composed
 from memmlp.config.compose_plan import tasks_of
 from memmlp.config.worker_process import check_identity
 from memmlp.networks import checkpoint
-from memmlp.networks.baselines.sage_net import SAGENet
+from memmlp.networks.sage_net import SAGENet
 from memmlp.pipeline.run_stages import make_upstream_runs
 from memmlp.runs.lookup import check_trained, list_runs
 from memmlp.training.train_sage import PARTS

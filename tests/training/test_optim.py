@@ -14,7 +14,7 @@ from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.networks.layers import TimeMix
-from memmlp.networks.recurrent_cells import CELLS
+from memmlp.networks.recurrent_poser import CELLS
 from memmlp.runs.run import Run
 from memmlp.training.loop import Watch, train, unwatched
 from memmlp.training.optim import Muon, Optim, ScheduleFree

@@ -18,7 +18,7 @@ from memmlp.motion.network_coordinates import World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import checkpoint
 from memmlp.networks.architectures import PartedArchitecture
-from memmlp.networks.baselines.sage_parts import LOWER, UPPER
+from memmlp.networks.sage_parts import LOWER, UPPER
 from memmlp.training import sage_part_losses
 from memmlp.training.loop import train_step
 from memmlp.training.train_sage import PARTS, DroppingOptim

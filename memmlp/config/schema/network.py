@@ -73,19 +73,19 @@ class LayeredConfig(BaselineConfig):
 @dataclass
 class StillPoseConfig(BaselineConfig):
     name: str = called("still_pose")
-    _target_: str = target("memmlp.networks.baselines.still_pose.StillPose")
+    _target_: str = target("memmlp.networks.still_pose.StillPose")
 
 
 @dataclass
 class AGRoLMLPConfig(LayeredConfig):
     name: str = called("agrol_mlp")
-    _target_: str = target("memmlp.networks.baselines.agrol.AGRoLMLP")
+    _target_: str = target("memmlp.networks.agrol.AGRoLMLP")
 
 
 @dataclass
 class AGRoLDiffusionConfig(LayeredConfig):
     name: str = called("agrol_diffusion")
-    _target_: str = target("memmlp.networks.baselines.agrol.AGRoLDiffusion")
+    _target_: str = target("memmlp.networks.agrol.AGRoLDiffusion")
     width: int = at_least(2)
     diffusion_steps: int = at_least(1)
     sampling_steps: int = at_least(1)
@@ -95,7 +95,7 @@ class AGRoLDiffusionConfig(LayeredConfig):
 @dataclass
 class BoDiffusionConfig(AGRoLDiffusionConfig):
     name: str = called("bodiffusion")
-    _target_: str = target("memmlp.networks.baselines.bodiffusion.BoDiffusion")
+    _target_: str = target("memmlp.networks.bodiffusion.BoDiffusion")
     heads: int = at_least(1)
     noise_weight: float = at_least(0)
     bound_weight: float = positive()
@@ -105,7 +105,7 @@ class BoDiffusionConfig(AGRoLDiffusionConfig):
 @dataclass
 class AvatarPoserConfig(LayeredConfig):
     name: str = called("avatar_poser")
-    _target_: str = target("memmlp.networks.baselines.avatar_poser.AvatarPoser")
+    _target_: str = target("memmlp.networks.avatar_poser.AvatarPoser")
     heads: int = at_least(1)
     feedforward: int = at_least(1)
     dropout: float = fraction()
@@ -114,13 +114,13 @@ class AvatarPoserConfig(LayeredConfig):
 @dataclass
 class EgoPoserConfig(AvatarPoserConfig):
     name: str = called("ego_poser")
-    _target_: str = target("memmlp.networks.baselines.ego_poser.EgoPoser")
+    _target_: str = target("memmlp.networks.ego_poser.EgoPoser")
 
 
 @dataclass
 class HMDPoserConfig(AvatarPoserConfig):
     name: str = called("hmd_poser")
-    _target_: str = target("memmlp.networks.baselines.hmd_poser.HMDPoser")
+    _target_: str = target("memmlp.networks.hmd_poser.HMDPoser")
     width: int = at_least(4)
     encoder_layers: int = at_least(1)
     shape_weight: float = at_least(0)
@@ -129,7 +129,7 @@ class HMDPoserConfig(AvatarPoserConfig):
 @dataclass
 class VAEHMDConfig(LayeredConfig):
     name: str = called("vae_hmd")
-    _target_: str = target("memmlp.networks.baselines.vae_hmd.VAEHMD")
+    _target_: str = target("memmlp.networks.vae_hmd.VAEHMD")
     latent: int = at_least(1)
     dropout: float = fraction()
     divergence_weight: float = at_least(0)
@@ -138,7 +138,7 @@ class VAEHMDConfig(LayeredConfig):
 @dataclass
 class RPMConfig(AvatarPoserConfig):
     name: str = called("rpm")
-    _target_: str = target("memmlp.networks.baselines.rpm.RPM")
+    _target_: str = target("memmlp.networks.rpm.RPM")
     context: int = at_least(1)
     horizon: int = at_least(1)
     own_dropout: bool = with_default(True)
@@ -147,7 +147,7 @@ class RPMConfig(AvatarPoserConfig):
 @dataclass
 class AvatarJLMConfig(AvatarPoserConfig):
     name: str = called("avatar_jlm")
-    _target_: str = target("memmlp.networks.baselines.avatar_jlm.AvatarJLM")
+    _target_: str = target("memmlp.networks.avatar_jlm.AvatarJLM")
     width: int = at_least(4)
     coarse_weight: float = at_least(0)
 
@@ -167,7 +167,7 @@ class RecurrentPoserConfig(LayeredConfig):
 @dataclass
 class SAGEConfig(LayeredConfig):
     name: str = called("sage")
-    _target_: str = target("memmlp.networks.baselines.sage_net.SAGENet")
+    _target_: str = target("memmlp.networks.sage_net.SAGENet")
     width: int = at_least(1)
     heads: int = at_least(1)
     code_width: int = at_least(2)
@@ -183,7 +183,7 @@ class SAGEConfig(LayeredConfig):
 @dataclass
 class ManikinSConfig(AvatarPoserConfig):
     name: str = called("manikin_s")
-    _target_: str = target("memmlp.networks.baselines.manikin.ManikinS")
+    _target_: str = target("memmlp.networks.manikin.ManikinS")
     parts_weight: float = at_least(0)
     turned: bool = key()
 
@@ -191,7 +191,7 @@ class ManikinSConfig(AvatarPoserConfig):
 @dataclass
 class ManikinLConfig(AvatarJLMConfig):
     name: str = called("manikin_l")
-    _target_: str = target("memmlp.networks.baselines.manikin.ManikinL")
+    _target_: str = target("memmlp.networks.manikin.ManikinL")
     parts_weight: float = at_least(0)
     turned: bool = key()
     offline: bool = key()
@@ -210,26 +210,26 @@ class PredictorConfig:
 @dataclass
 class TwoBranchConfig(PredictorConfig):
     name: str = called("two_branch")
-    _target_: str = target("memmlp.networks.predictor_slot.TwoBranch")
+    _target_: str = target("memmlp.networks.predictor.TwoBranch")
 
 
 @dataclass
 class RotationOnlyConfig(PredictorConfig):
     name: str = called("rotation_only")
-    _target_: str = target("memmlp.networks.predictor_slot.RotationOnly")
+    _target_: str = target("memmlp.networks.predictor.RotationOnly")
 
 
 @dataclass
 class TwoBranchMemoryConfig(PredictorConfig):
     name: str = called("two_branch_memory")
-    _target_: str = target("memmlp.networks.predictor_slot.TwoBranchMemory")
+    _target_: str = target("memmlp.networks.predictor.TwoBranchMemory")
     depth: int = at_least(1)
 
 
 @dataclass
 class RotationOnlyMemoryConfig(PredictorConfig):
     name: str = called("rotation_only_memory")
-    _target_: str = target("memmlp.networks.predictor_slot.RotationOnlyMemory")
+    _target_: str = target("memmlp.networks.predictor.RotationOnlyMemory")
     depth: int = at_least(1)
 
 
@@ -263,19 +263,19 @@ class OwnPastMemoryConfig(MemoryConfig):
 @dataclass
 class NoCodesMemoryConfig(OwnPastMemoryConfig):
     name: str = called("no_codes")
-    _target_: str = target("memmlp.networks.memory.NoCodesMemory")
+    _target_: str = target("memmlp.networks.own_past_memory.NoCodesMemory")
 
 
 @dataclass
 class CodeMemoryConfig(OwnPastMemoryConfig):
     name: str = called("vq")
-    _target_: str = target("memmlp.networks.memory.CodeMemory")
+    _target_: str = target("memmlp.networks.own_past_memory.CodeMemory")
 
 
 @dataclass
 class JointCodeMemoryConfig(OwnPastMemoryConfig):
     name: str = called("vq_joint")
-    _target_: str = target("memmlp.networks.memory.JointCodeMemory")
+    _target_: str = target("memmlp.networks.own_past_memory.JointCodeMemory")
 
 
 @dataclass
@@ -290,13 +290,13 @@ class RecurrentMemoryConfig(MemoryConfig):
 @dataclass
 class LSTMMemoryConfig(RecurrentMemoryConfig):
     name: str = called("lstm")
-    _target_: str = target("memmlp.networks.memory.LSTMMemory")
+    _target_: str = target("memmlp.networks.recurrent_memory.LSTMMemory")
 
 
 @dataclass
 class GRUMemoryConfig(RecurrentMemoryConfig):
     name: str = called("gru")
-    _target_: str = target("memmlp.networks.memory.GRUMemory")
+    _target_: str = target("memmlp.networks.recurrent_memory.GRUMemory")
 
 
 @dataclass

@@ -22,8 +22,8 @@ from memmlp.live.trackers_to_body_graph import export_full
 from memmlp.live.wearer import stature
 from memmlp.live.web.weightless_files import without_weights
 from memmlp.motion.body import FPS, JOINTS, PARENTS, TRACKED
-from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.streaming import StreamingGraph, has_stream, streaming
+from memmlp.networks.motion_model import MotionModel, StreamingGraph
+from memmlp.networks.streaming import has_stream, streaming
 
 SPACE = SPACES["openxr"]  # of everything on the site
 EYES = 0.936

@@ -14,7 +14,7 @@ from memmlp.cli.bench.latency import CHECK, VARIANTS, busy, show, summary
 from memmlp.cli.bench.torch_avatar_poser import TorchAvatarPoser, export_plainly
 from memmlp.deploy.latency import InTurn
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.networks.baselines.avatar_poser import AvatarPoser
+from memmlp.networks.avatar_poser import AvatarPoser
 
 BENCHED = ["profile=tiny", "model.depth=2", "model.heads=4"]
 

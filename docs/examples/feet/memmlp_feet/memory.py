@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from torch import Tensor, nn
 
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.networks.memory import State
-from memmlp.networks.memory.memory_slot import FeatureMemory
+from memmlp.networks.memory import FeatureMemory
+from memmlp.networks.motion_model import State
 from memmlp.networks.vqvae import VQVAE
 
 

@@ -1,0 +1,221 @@
+"""AGRoL (Du et al., CVPR 2023): the MLP, and the diffusion model whose denoiser is that MLP.
+
+Both take a window of inputs and predict the rotations of all its frames; a live stream keeps the last frame.
+The paper's sizes are T = 196, d = 512 and 12 blocks, each the pre-norm pair of
+`memmlp.networks.layers.MLPBlock`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from memmlp.common import distributed
+from memmlp.motion.body import ROTATION, SPARSE_DIM
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.diffusion import Diffusion, TimeEmbedding
+from memmlp.networks.layers import MLPBlock
+from memmlp.networks.motion_model import (
+    State,
+    TrainingOutputs,
+    WholeWindow,
+)
+from memmlp.networks.streaming import AGRoLGraph
+
+
+class AGRoLMLPGraph(AGRoLGraph):
+    """The streaming graph of AGRoL's MLP."""
+
+    model: AGRoLMLP
+    blocks: list[MLPBlock]
+
+    def build(self, model: Any) -> None:
+        """Make the graph's parts from a copy of the network."""
+        self.model, self.width = model, model.stem.out_features
+        self.blocks = cast(list[MLPBlock], list(model.blocks))
+
+    def entering(self, encoded: Tensor) -> Tensor:
+        """Return the stem's output (1, d) for a frame's inputs (1, 54)."""
+        return self.model.stem(encoded)
+
+    def rotation(self, window: Tensor) -> Tensor:
+        """Apply the blocks to (T, d), the last block for the newest frame alone, then the head: (1, 132)."""
+        *earlier, last = self.blocks
+        for block in earlier:
+            window = block(window)
+        return self.model.head(last.newest(window, 1))
+
+
+class AGRoLMLP(WholeWindow):
+    """AGRoL's MLP: stem, MLP blocks, head.
+
+    It has 3,735,668 parameters at the paper's sizes (3.74 M in Table 16).
+
+    Args:
+        normalizer: converts between the world and network space.
+        frames: T, the window's length.
+        width: d, the width of the hidden state.
+        depth: number of blocks.
+    """
+
+    graph = AGRoLMLPGraph
+
+    def __init__(self, normalizer: Normalizer, *, frames: int, width: int, depth: int):
+        super().__init__(normalizer, frames)
+        self.stem = nn.Linear(SPARSE_DIM, width)
+        self.blocks = nn.ModuleList(MLPBlock(width, frames) for _ in range(depth))
+        self.head = nn.Linear(width, ROTATION.stop)
+
+    def rotations(self, encoded: Tensor) -> Tensor:
+        """Map inputs (B, T, 54) to rotations (B, T, 132), both in network space."""
+        h = self.stem(encoded)
+        for block in self.blocks:
+            h = block(h)
+        return self.head(h)
+
+
+class TimedBlock(MLPBlock):
+    """An MLP block whose input is shifted by a projection of the diffusion time's embedding."""
+
+    def __init__(self, width: int, frames: int):
+        super().__init__(width, frames)
+        self.time = nn.Linear(width, width)
+
+    def forward(self, h: Tensor, past: object = None) -> Tensor:
+        """Map the hidden state (B, T, d) to (B, T, d).
+
+        Args:
+            h: hidden state (B, T, d).
+            past: the embedding (B, d) of the diffusion time; it is passed where other blocks get the past.
+        """
+        assert isinstance(past, Tensor)
+        return super().forward(h + self.time(F.silu(past))[:, None])
+
+
+class AGRoLDiffusionGraph(AGRoLGraph):
+    """The streaming graph of AGRoL's diffusion model.
+
+    The shift that each block adds for the diffusion time is the same at every step of a stream, so it is
+    computed once.
+    """
+
+    model: AGRoLDiffusion
+    blocks: list[MLPBlock]
+    shifts: Tensor
+
+    def build(self, model: Any) -> None:
+        """Make the graph's parts from a copy of the network."""
+        self.model, self.width = model, model.stem.out_features
+        self.blocks = cast(list[MLPBlock], list(model.blocks))
+        embedding = F.silu(model.time(torch.tensor(model.diffusion.times).to(model.noise)))
+        timed = cast(list[TimedBlock], self.blocks)
+        self.register_buffer("shifts", torch.stack([block.time(embedding) for block in timed], 1))
+
+    def entering(self, encoded: Tensor) -> Tensor:
+        """Return the part of the stem's output (1, d) that comes from a frame's inputs (1, 54).
+
+        The part that comes from the noisy motion is added at each denoiser call.
+        """
+        return F.linear(encoded, self.model.stem.weight[:, ROTATION.stop :], self.model.stem.bias)
+
+    def rotation(self, window: Tensor) -> Tensor:
+        """Sample by DDIM; the denoiser's last call computes the newest frame (1, 132) alone."""
+        diffusion, noisy = self.model.diffusion, self.model.noise
+        for index in range(len(diffusion.times) - 1):
+            noisy = diffusion.stepped(noisy, self._denoised(noisy, window, index, self.frames), index)
+        return self._denoised(noisy, window, len(diffusion.times) - 1, 1)
+
+    def _denoised(self, noisy: Tensor, window: Tensor, index: int, count: int) -> Tensor:
+        """Predict the newest `count` clean rotations at sampling step `index` from noisy ones (T, 132)."""
+        h = window + F.linear(noisy, self.model.stem.weight[:, : ROTATION.stop])
+        *earlier, last = zip(self.blocks, self.shifts[index], strict=True)
+        for block, shift in earlier:
+            h = block.newest(h + shift, self.frames)
+        block, shift = last
+        return self.model.head(block.newest(h + shift, count))
+
+
+class AGRoLDiffusion(WholeWindow):
+    """A denoiser of rotations, conditioned on the window's inputs, that predicts the clean rotations.
+
+    It has 7,480,436 parameters at the paper's sizes (7.48 M in Table 16): the MLP's blocks and head
+    (3,707,508), a linear layer of each block for the time's embedding (12 x 262,656), the embedding's own two
+    linear layers (525,312), and a stem for noisy motion and inputs side by side (95,744). The paper says that
+    the embedding enters every block. That two layers come before is our reading of its parameter count; the
+    released code has none, and as many parameters in linear layers for motion and inputs (docs/readings.md).
+
+    The noise that sampling starts from is always the same, drawn from `noise_seed`: sampling is then a
+    function of the inputs alone, in torch as in ONNX, and consecutive windows of a stream do not differ by
+    their noise.
+
+    Args:
+        normalizer: converts between the world and network space.
+        frames: T, the window's length.
+        width: d, the width of the hidden state.
+        depth: number of blocks.
+        diffusion_steps: number of steps of the training's noise schedule.
+        sampling_steps: number of denoiser calls at inference.
+        noise_seed: seed of the noise that sampling starts from.
+    """
+
+    graph = AGRoLDiffusionGraph
+    noise: Tensor
+
+    def __init__(
+        self,
+        normalizer: Normalizer,
+        *,
+        frames: int,
+        width: int,
+        depth: int,
+        diffusion_steps: int,
+        sampling_steps: int,
+        noise_seed: int,
+    ):
+        super().__init__(normalizer, frames)
+        self.diffusion = Diffusion(diffusion_steps, sampling_steps)
+        self.time = TimeEmbedding(width)
+        self.stem = nn.Linear(ROTATION.stop + SPARSE_DIM, width)
+        self.blocks = nn.ModuleList(TimedBlock(width, frames) for _ in range(depth))
+        self.head = nn.Linear(width, ROTATION.stop)
+        draw = torch.Generator().manual_seed(noise_seed)
+        self.register_buffer("noise", torch.randn(frames, ROTATION.stop, generator=draw))
+
+    def denoise(self, noisy: Tensor, time: Tensor, encoded: Tensor) -> Tensor:
+        """Predict the clean rotations (B, T, 132).
+
+        Args:
+            noisy: noisy rotations (B, T, 132).
+            time: diffusion times (B,).
+            encoded: inputs (B, T, 54) in network space.
+        """
+        embedding = self.time(time)
+        h = self.stem(torch.cat([noisy, encoded], -1))
+        for block in self.blocks:
+            h = block(h, embedding)
+        return self.head(h)
+
+    def rotations(self, encoded: Tensor) -> Tensor:
+        """Sample rotations (B, T, 132) for inputs (B, T, 54), both in network space."""
+        noise = self.noise.expand(len(encoded), -1, -1)
+        return self.diffusion.sample(lambda noisy, time: self.denoise(noisy, time, encoded), noise)
+
+    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
+        """Make a training call: add noise to the truth (B, T, 252), and denoise it in one call.
+
+        A diffusion time is drawn for each window.
+
+        Args:
+            sparse: world inputs (B, n, 54) of the newest frames.
+            state: what the last call returned, or `initial_state`.
+            true_frames: world frames [X | Theta] (B, T, 252) of the window.
+        """
+        _, kept = self.taken_in(sparse, state)
+        window, frames = true_frames[..., :SPARSE_DIM], self.normalizer.encode(true_frames)
+        encoded, clean = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:][..., ROTATION]
+        time = distributed.drawn(self.diffusion.random_times, true_frames)
+        noisy = self.diffusion.noised(clean, time, distributed.drawn(torch.randn_like, clean))
+        return TrainingOutputs(self.normalizer.posed(self.denoise(noisy, time, encoded), window), kept, {})

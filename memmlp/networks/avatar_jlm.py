@@ -1,0 +1,240 @@
+"""AvatarJLM (Zheng et al., ICCV 2023): joint-level tokens, attended over joints and over time."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, cast
+
+import torch
+from torch import Tensor, nn
+
+from memmlp.common.float32_regions import in_float32
+from memmlp.motion.body import (
+    HEAD,
+    N_JOINTS,
+    POSITION,
+    ROTATION,
+    SPARSE_ANGULAR_VELOCITY,
+    SPARSE_DIM,
+    SPARSE_POSITION,
+    SPARSE_ROTATION,
+    SPARSE_VELOCITY,
+    TRACKED,
+)
+from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.motion_model import (
+    State,
+    StreamingGraph,
+    TrainingOutputs,
+    WholeWindow,
+    filled,
+)
+from memmlp.networks.transformer import EncoderLayer, draw_weights
+
+JOINT_DIM = 18  # features of a joint: rotation, angular velocity, position, velocity
+UNSEEN = 0.01  # stands in all features of joints without a tracker
+TOKENS = 2 * N_JOINTS + 1  # positions, rotations, and the inputs as a whole
+LONGEST = 200  # frames that have a place of their own, as published
+GROUPS = 8  # of the regressor's normalisation
+TRACKER_FEATURES = (SPARSE_ROTATION, SPARSE_ANGULAR_VELOCITY, SPARSE_POSITION, SPARSE_VELOCITY)
+
+
+def tracker_features(encoded: Tensor) -> Tensor:
+    """Return inputs (..., 54) grouped by tracker (..., 3, 18)."""
+    return torch.cat([encoded[..., part].unflatten(-1, (len(TRACKED), -1)) for part in TRACKER_FEATURES], -1)
+
+
+def joint_features(encoded: Tensor) -> Tensor:
+    """Spread inputs (..., 54) over the joints (..., 22 x 18); joints without a tracker hold a constant."""
+    trackers = tracker_features(encoded)
+    unseen = torch.full_like(trackers[..., :1, :], UNSEEN)
+    seen = dict(zip(TRACKED, trackers.split(1, -2), strict=True))
+    rows = [seen.get(joint, unseen) for joint in range(N_JOINTS)]
+    return torch.cat(rows, -2).flatten(-2)
+
+
+def with_tracked(joints: Tensor, tracked: Tensor) -> Tensor:
+    """Return features of all joints (..., 22, n), those of the tracked joints replaced by (..., 3, n)."""
+    rows = list(joints.unbind(-2))
+    for joint, row in zip(TRACKED, tracked.unbind(-2), strict=True):
+        rows[joint] = row
+    return torch.stack(rows, -2)
+
+
+def attended(layer: EncoderLayer, h: Tensor, seen: Tensor) -> Tensor:
+    """Apply an encoder layer to (N, n, d), which attends to (N, m, d), written as plain matrix products."""
+    attention, flat, all_seen = layer.attention, h.flatten(0, 1), seen.flatten(0, 1)
+    query = attention.query(flat).view(h.shape)
+    key, value = (part(all_seen).view(seen.shape) for part in (attention.key, attention.value))
+    return layer.finish(flat, attention.attend(query, key, value).flatten(0, 1)).view(h.shape)
+
+
+class AvatarJLMGraph(StreamingGraph):
+    """AvatarJLM's streaming graph, which carries the tokens of each frame, in order of time.
+
+    The tokens' position embeddings change at every step and attention looks both ways in time, so all layers
+    are computed anew; the last one, over time, is computed for the newest frame alone.
+    """
+
+    float32_modules = ("model.embedding", "model.coarse", "model.regressor")
+    model: AvatarJLM
+    layers: list[EncoderLayer]
+
+    def build(self, model: Any) -> None:
+        """Make the graph's parts from a copy of the network."""
+        self.model, self.layers = model, cast(list[EncoderLayer], list(model.layers))
+
+    def windows(self) -> State:
+        """Return zeros (T - 1, 45 d): each earlier frame's tokens, without position embeddings."""
+        return {"tokens": torch.zeros(self.frames - 1, self.model.joint_places.numel())}
+
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
+        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
+        entering = self.model.tokens(encoded).flatten(1)
+        window = torch.cat([filled(state["tokens"], entering, fresh), entering])
+        h = self.model.placed(window.unflatten(-1, (TOKENS, -1)))
+        first = h[:, -1:]
+        for index, layer in enumerate(self.layers[:-1]):
+            turned = h if index % 2 == 0 else h.transpose(0, 1)
+            made = attended(layer, turned, turned)
+            h = self.model.renewed(made if index % 2 == 0 else made.transpose(0, 1), first)
+        by_token = h.transpose(0, 1)
+        newest = attended(self.layers[-1], by_token[:, -1:], by_token).transpose(0, 1)
+        features = self.model.renewed(newest, first[-1:]).flatten(1)
+        return self.normalizer.posed(self.rotation(features, encoded), sparse), {"tokens": window[1:]}
+
+    def rotation(self, features: Tensor, encoded: Tensor) -> Tensor:
+        """Map the newest frame's tokens (1, 45 d) and inputs (1, 54) to its rotations (1, 132)."""
+        return self.model.regressor(features)
+
+
+class AvatarJLM(WholeWindow):
+    """A coarse pose of each frame, tokens of its joints, encoder layers, and a head on all tokens of a frame.
+
+    It has 63,807,240 parameters at the paper's sizes (T = 41, d = 512, 6 blocks). It predicts all frames of a
+    window; a live stream keeps the last one.
+
+    Args:
+        normalizer: converts between the world and network space.
+        frames: T, the window's length.
+        width: d, the width of a token; the layers of the coarse pose have 2 d.
+        depth: number of blocks: an encoder layer over a frame's tokens, and one over each token's frames.
+        heads: number of attention heads; it divides d.
+        feedforward: width of the encoders' hidden layers.
+        dropout: dropout rate of the encoders, while training.
+        coarse_weight: weight of the loss of the coarse pose's joints.
+
+    Attributes:
+        outputs: how many numbers are read from the tokens of a frame.
+    """
+
+    graph = AvatarJLMGraph
+    outputs: ClassVar[int] = ROTATION.stop
+
+    def __init__(
+        self,
+        normalizer: Normalizer,
+        *,
+        frames: int,
+        width: int,
+        depth: int,
+        heads: int,
+        feedforward: int,
+        dropout: float,
+        coarse_weight: float,
+    ):
+        super().__init__(normalizer, frames)
+        self.coarse_weight, hidden = coarse_weight, 2 * width
+        self.embedding = nn.Linear(N_JOINTS * JOINT_DIM, hidden)
+        self.coarse = nn.Sequential(
+            nn.Linear(hidden, hidden), nn.LeakyReLU(0.1), nn.Linear(hidden, ROTATION.stop)
+        )
+        self.position_token, self.rotation_token = nn.Linear(3, width), nn.Linear(6, width)
+        self.input_token = nn.Linear(hidden, width)
+        self.joint_places = nn.Parameter(torch.empty(TOKENS, width))
+        self.time_places = nn.Parameter(torch.empty(max(LONGEST, frames), 1, width))
+        for places in (self.joint_places, self.time_places):
+            nn.init.trunc_normal_(places, std=0.02)
+        self.layers = nn.ModuleList(
+            EncoderLayer(width, heads, feedforward, dropout) for _ in range(2 * depth)
+        )
+        self.regressor = nn.Sequential(
+            nn.Linear(TOKENS * width, hidden),
+            nn.GroupNorm(GROUPS, hidden),
+            nn.LeakyReLU(0.1),
+            nn.Linear(hidden, self.outputs),
+        )
+        draw_weights(self)
+
+    def coarse_joints(self, embedded: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the coarse pose of embeddings (..., 2 d), in the network's coordinates without z-scores.
+
+        Returns:
+            Joints (..., 22, 3), metres, relative to the head, and their global 6D rotations (..., 22, 6).
+        """
+        mean, std = (part[SPARSE_DIM:][ROTATION] for part in (self.normalizer.mean, self.normalizer.std))
+        sixd = (self.coarse(embedded) * std + mean).unflatten(-1, (N_JOINTS, 6))
+        with in_float32(sixd.device):
+            local = sixd_to_matrix(sixd)
+            pelvis = torch.zeros_like(local[..., 0, :, 0])
+            rotations, positions = forward_kinematics(local, pelvis, self.normalizer.rest)
+        return positions - positions[..., HEAD : HEAD + 1, :], matrix_to_sixd(rotations)
+
+    def tokens(self, encoded: Tensor) -> Tensor:
+        """Map inputs (..., 54) in network space to tokens (..., 45, d), without position embeddings."""
+        embedded = self.embedding(joint_features(encoded))
+        positions, rotations = self.coarse_joints(embedded)
+        seen = encoded * self.normalizer.std[:SPARSE_DIM] + self.normalizer.mean[:SPARSE_DIM]
+        tracked = [seen[..., part].unflatten(-1, (len(TRACKED), -1)) for part in TRACKER_FEATURES]
+        positions = with_tracked(positions, tracked[2] - tracked[2][..., :1, :])
+        rotations = with_tracked(rotations, tracked[0])
+        whole = self.input_token(embedded.detach())[..., None, :]
+        return torch.cat([self.position_token(positions), self.rotation_token(rotations), whole], -2)
+
+    def placed(self, tokens: Tensor) -> Tensor:
+        """Add the position embeddings of joints and frames to the tokens (..., T, 45, d) of a window."""
+        return tokens + self.joint_places + self.time_places[: tokens.shape[-3]]
+
+    @staticmethod
+    def renewed(h: Tensor, first: Tensor) -> Tensor:
+        """Return tokens (..., 45, d) with `first` (..., 1, d) in place of the last, the token of the inputs.
+
+        `first` is that token before any block. It is detached: no gradient flows through it.
+        """
+        return torch.cat([h[..., :-1, :], first.detach()], -2)
+
+    def rotations(self, encoded: Tensor) -> Tensor:
+        """Map inputs (B, T, 54) to rotations (B, T, 132), both in network space."""
+        return self.regressed(encoded)
+
+    def regressed(self, encoded: Tensor) -> Tensor:
+        """Map inputs (B, T, 54) in network space to what the regressor reads from their tokens (B, T, n)."""
+        h = self.placed(self.tokens(encoded))
+        first = h[..., -1:, :]
+        for index, layer in enumerate(self.layers):
+            if index % 2 == 0:
+                h = layer(h.flatten(0, 1)).unflatten(0, encoded.shape[:2])
+            else:
+                h = layer(h.transpose(1, 2).flatten(0, 1)).unflatten(0, (-1, TOKENS)).transpose(1, 2)
+            h = self.renewed(h, first)
+        return self.regressor(h.flatten(-2).flatten(0, 1)).unflatten(0, encoded.shape[:2])
+
+    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
+        """Make a training call, which adds a loss of the coarse pose; see MotionModel."""
+        return TrainingOutputs(*self.advance(sparse, state), self.coarse_loss(true_frames))
+
+    def coarse_loss(self, true_frames: Tensor) -> dict[str, Tensor]:
+        """Return the mean absolute error of the coarse pose's joints relative to the head, weighted.
+
+        Args:
+            true_frames: world frames [X | Theta] (B, T, 252).
+        """
+        sparse, motion = true_frames[..., :SPARSE_DIM], true_frames[..., SPARSE_DIM:]
+        origin = self.normalizer.origin(sparse)
+        encoded = self.normalizer.encode_sparse(sparse, origin)
+        made, _ = self.coarse_joints(self.embedding(joint_features(encoded)))
+        true = self.normalizer.coordinates.motion_in(motion, origin)[..., POSITION]
+        joints = true.unflatten(-1, (N_JOINTS, 3))
+        error = made - (joints - joints[..., HEAD : HEAD + 1, :])
+        return {"coarse": self.coarse_weight * error.abs().mean()}

@@ -1,0 +1,120 @@
+"""AvatarPoser (Jiang et al., ECCV 2022): a transformer encoder whose feature of the newest frame is read.
+
+Its final step, inverse kinematics of the arms, is not part of the network and is left out here.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, cast
+
+import torch
+from torch import Tensor, nn
+
+from memmlp.motion.body import N_JOINTS, SPARSE_DIM
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.motion_model import OwnWindows, State, StreamingGraph, slid
+from memmlp.networks.transformer import EncoderLayer, draw_weights
+
+ROOT = 6  # components of the root's orientation, the first of the rotations
+
+
+def head(width: int, size: int) -> nn.Module:
+    """Make two linear layers with a ReLU between them, from `width` to `size`."""
+    return nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, size))
+
+
+class AvatarPoserGraph(StreamingGraph):
+    """AvatarPoser's streaming graph."""
+
+    float32_modules: tuple[str, ...] = ("model.embedding", "model.orientation", "model.rotation")
+    model: AvatarPoser
+    layers: list[EncoderLayer]
+
+    def build(self, model: Any) -> None:
+        """Make the graph's parts from a copy of the network."""
+        self.model, self.layers = model, cast(list[EncoderLayer], list(model.layers))
+
+    def windows(self) -> State:
+        """Return zeros (T, 4 d): each frame's embedding and first query, key and value, side by side."""
+        return {"first": torch.zeros(self.frames, 4 * self.model.embedding.out_features)}
+
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
+        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
+        embedded = self.model.embedding(encoded)
+        *earlier, last = self.layers
+        attention = self.layers[0].attention
+        entering = torch.cat(
+            [embedded, attention.query(embedded), attention.key(embedded), attention.value(embedded)], -1
+        )
+        first = slid(state["first"], entering, entering, fresh)
+        h, query, key, value = first.chunk(4, -1)
+        for layer, following in zip(earlier, self.layers[1:], strict=True):
+            h = layer.finish(h, layer.attention.attend(query[None], key[None], value[None])[0])
+            attention = following.attention
+            query, key, value = attention.query(h), attention.key(h), attention.value(h)
+        attended = last.attention.attend(query[-1:][None], key[None], value[None])[0]
+        features = last.finish(h[-1:], attended)
+        return self.normalizer.posed(self.rotation(features, encoded), sparse), {"first": first}
+
+    def rotation(self, newest: Tensor, encoded: Tensor) -> Tensor:
+        """Map the newest frame's feature (1, d) and inputs (1, 54) to its rotations (1, 132)."""
+        return self.model.read(newest)
+
+
+class AvatarPoser(OwnWindows):
+    """An embedding, an encoder, and two heads on the newest frame, for the root's orientation and the rest.
+
+    It has 4,124,804 parameters at the paper's sizes (T = 40, d = 256, 8 heads, 3 layers, feed-forward 2048),
+    4.12 M in Table 16. Post-norm, ReLU, dropout 0.1 and the lack of a positional encoding are our readings:
+    the paper names none of them, and its parameter count leaves no room for learned positions.
+
+    Args:
+        normalizer: converts between the world and network space.
+        frames: T, the window's length.
+        width: d, the width of the features.
+        depth: number of encoder layers.
+        heads: number of attention heads; it divides d.
+        feedforward: width of the feed-forward's hidden layers.
+        dropout: dropout rate in the encoder, while training.
+
+    Attributes:
+        inputs: how many features of a frame are embedded.
+        rotated: how many joints' rotations are predicted besides the root's.
+    """
+
+    graph: ClassVar[type[StreamingGraph] | None] = AvatarPoserGraph
+    inputs: ClassVar[int] = SPARSE_DIM
+    rotated: ClassVar[int] = N_JOINTS - 1
+
+    def __init__(
+        self,
+        normalizer: Normalizer,
+        *,
+        frames: int,
+        width: int,
+        depth: int,
+        heads: int,
+        feedforward: int,
+        dropout: float,
+    ):
+        super().__init__(normalizer, frames)
+        self.embedding = nn.Linear(self.inputs, width)
+        self.layers = nn.ModuleList(EncoderLayer(width, heads, feedforward, dropout) for _ in range(depth))
+        self.orientation = head(width, ROOT)
+        self.rotation = head(width, 6 * self.rotated)
+        draw_weights(self)
+
+    def rotations(self, encoded: Tensor) -> Tensor:
+        """Map windows (B, T, 54) to their last frames' rotations (B, 132), both in network space."""
+        return self.encode(self.embedding(encoded))
+
+    def encode(self, h: Tensor) -> Tensor:
+        """Map the embeddings of windows (B, T, d) to the rotations (B, 132) of their last frames."""
+        for layer in self.layers:
+            h = layer(h)
+        return self.read(h[:, -1])
+
+    def read(self, newest: Tensor) -> Tensor:
+        """Map the newest frame's feature (..., d) to rotations (..., 132)."""
+        return torch.cat([self.orientation(newest), self.rotation(newest)], -1)

@@ -1,1 +1,0 @@
-"""The baselines: networks that the paper compares Mem-MLP with, made from their papers."""

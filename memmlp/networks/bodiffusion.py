@@ -1,0 +1,240 @@
+"""BoDiffusion (Castillo et al., ICCV 2023): a transformer denoises the rotations of a window.
+
+As published it is offline: windows that overlap by half are denoised together, and averaged at every step.
+"""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from memmlp.common import distributed
+from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM, TRACKED
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.diffusion import AncestralDiffusion, Denoised, TimeEmbedding
+from memmlp.networks.motion_model import State, TrainingOutputs, WholeWindow
+from memmlp.networks.streaming import AGRoLGraph, linear
+from memmlp.networks.transformer import DiTBlock
+
+SINES = 256  # of the diffusion time
+CHANNELS = SPARSE_DIM // len(TRACKED)  # of the inputs, of which each joint gets a mixture of thirds
+NOISY = 6  # channels of the noisy motion, a joint's 6D rotation
+
+
+class BoDiffusionGraph(AGRoLGraph):
+    """BoDiffusion's streaming graph, in which successive layers without a non-linearity between are merged.
+
+    The stem's output for each frame's inputs is carried, in order of time. What the blocks compute from the
+    diffusion times is the same at every step of a stream, so it is computed once. The last denoiser call
+    makes the newest frame alone.
+    """
+
+    float32_modules = ("sparse", "motion", "made")
+    model: BoDiffusion
+    blocks: list[DiTBlock]
+    modulations: Tensor
+
+    def build(self, model: Any) -> None:
+        """Make the graph's parts from a copy of the network."""
+        self.model, self.width = model, model.stem.out_features
+        self.blocks = cast(list[DiTBlock], list(model.blocks))
+        embedding = F.silu(model.time(torch.tensor(model.diffusion.times).to(model.noises)))
+        self.register_buffer(
+            "modulations", torch.stack([block.modulation(embedding) for block in self.blocks], 1)
+        )
+        motion, sparse = model.stem.weight.unflatten(-1, (N_JOINTS, -1)).tensor_split([NOISY], -1)
+        self.motion = linear(motion.flatten(1))
+        mixture = model.mixed(torch.eye(SPARSE_DIM).to(sparse)).flatten(1)
+        self.sparse = linear(sparse.flatten(1) @ mixture.T, model.stem.bias)
+        head = model.head.weight.unflatten(0, (N_JOINTS, -1)).transpose(0, 1).flatten(1)
+        offset = model.head.bias.unflatten(0, (N_JOINTS, -1))
+        made = (model.joint_head.weight @ head).unflatten(1, (N_JOINTS, -1)).unflatten(0, (2, NOISY))
+        bias = model.joint_head(offset).unflatten(1, (2, NOISY))
+        self.made = linear(made.transpose(1, 2).flatten(0, 2), bias.transpose(0, 1).flatten())
+
+    def entering(self, encoded: Tensor) -> Tensor:
+        """Return the part of the stem's output (1, d) that comes from a frame's inputs (1, 54).
+
+        The part that comes from the noisy motion is added at each denoiser call.
+        """
+        return self.sparse(encoded)
+
+    def rotation(self, window: Tensor) -> Tensor:
+        """Sample step by step; the last step makes the newest frame (1, 132) alone."""
+        diffusion, limits = self.model.diffusion, self.model.limits()
+        last = len(diffusion.times) - 1
+
+        def step(noisy: Tensor, index: int) -> tuple[Tensor, Tensor]:
+            count = 1 if index == last else self.frames
+            made = self._made(noisy, window, index, count)
+            mean, variance = diffusion.step(noisy[-count:], made, index, limits)
+            return mean, variance.sqrt()
+
+        return diffusion.sample(step, self.model.noises)
+
+    def _made(self, noisy: Tensor, window: Tensor, index: int, count: int) -> Denoised:
+        """Predict noise and variance of the newest `count` frames of (T, 132) at sampling step `index`."""
+        h = window + self.motion(noisy) + self.model.places
+        *earlier, last = zip(self.blocks, self.modulations[index], strict=True)
+        for block, modulation in earlier:
+            h = block.newest(h, modulation.chunk(6), self.frames)
+        block, modulation = last
+        return Denoised(*self.made(block.newest(h, modulation.chunk(6), count)).split(ROTATION.stop, -1))
+
+
+class BoDiffusion(WholeWindow):
+    """A denoiser of rotations that predicts their noise, conditioned on the window's inputs.
+
+    It has 21,942,270 trained parameters at the paper's sizes (T = 41, d = 384, 12 blocks), and position
+    embeddings of the frames that are zero and not trained, as published.
+
+    The noise of a sample is always the same, drawn from `noise_seed`, as AGRoLDiffusion's is. A live stream
+    samples a window at each frame and keeps its last one.
+
+    Args:
+        normalizer: converts between the world and network space.
+        frames: T, the window's length.
+        width: d, the width of the features.
+        depth: number of blocks.
+        heads: number of attention heads; it divides d.
+        diffusion_steps: number of steps of the training's noise schedule.
+        sampling_steps: number of denoiser calls at inference.
+        noise_seed: seed of the noise of samples.
+        noise_weight: weight of the loss of the predicted noise.
+        bound_weight: weight of the variational bound, from which the variances learn.
+        offline: whether window mode denoises the windows of a clip together, as published.
+    """
+
+    graph = BoDiffusionGraph
+    noises: Tensor
+
+    def __init__(
+        self,
+        normalizer: Normalizer,
+        *,
+        frames: int,
+        width: int,
+        depth: int,
+        heads: int,
+        diffusion_steps: int,
+        sampling_steps: int,
+        noise_seed: int,
+        noise_weight: float,
+        bound_weight: float,
+        offline: bool,
+    ):
+        super().__init__(normalizer, frames)
+        self.noise_weight, self.bound_weight = noise_weight, bound_weight
+        self.noise_seed, self.offline = noise_seed, offline
+        self.diffusion = AncestralDiffusion(diffusion_steps, sampling_steps)
+        self.time = TimeEmbedding(width, SINES)
+        self.spread = nn.Linear(len(TRACKED), N_JOINTS, bias=False)
+        self.stem = nn.Linear(N_JOINTS * (NOISY + CHANNELS), width)
+        self.places = nn.Parameter(torch.zeros(frames, width), requires_grad=False)
+        self.blocks = nn.ModuleList(DiTBlock(width, heads) for _ in range(depth))
+        self.head = nn.Linear(width, N_JOINTS * (NOISY + CHANNELS))
+        self.joint_head = nn.Linear(NOISY + CHANNELS, 2 * NOISY)
+        self.register_buffer("noises", self.drawn(frames), persistent=False)  # more with more sampling steps
+
+    @property
+    def is_stream(self) -> bool:
+        """Whether each frame is predicted without later ones; false in the published, offline mode."""
+        return not self.offline
+
+    @property
+    def takes_whole_clip(self) -> bool:
+        """Whether window mode denoises all windows of a clip together; true in the published mode."""
+        return self.offline
+
+    def drawn(self, frames: int) -> Tensor:
+        """Draw the noise (draws, N, 132) for a sample of N frames; it is always the same."""
+        draw = torch.Generator().manual_seed(self.noise_seed)
+        return torch.randn(self.diffusion.draws, frames, ROTATION.stop, generator=draw)
+
+    def limits(self) -> tuple[Tensor, Tensor]:
+        """Return the least and the largest values (132,) of 6D rotations, -1 and 1, in network space."""
+        mean, std = (part[SPARSE_DIM:][ROTATION] for part in (self.normalizer.mean, self.normalizer.std))
+        return (-1 - mean) / std, (1 - mean) / std
+
+    def mixed(self, encoded: Tensor) -> Tensor:
+        """Spread inputs (..., 54) over the joints (..., 22, 18), mixing the thirds of the input vector."""
+        thirds = encoded.unflatten(-1, (len(TRACKED), CHANNELS))
+        return self.spread(thirds.transpose(-1, -2)).transpose(-1, -2)
+
+    def denoise(self, noisy: Tensor, time: Tensor, encoded: Tensor) -> Denoised:
+        """Predict the noise in rotations (B, T, 132), and where each step's variance lies between its limits.
+
+        Args:
+            noisy: noisy rotations (B, T, 132).
+            time: diffusion times (B,).
+            encoded: inputs (B, T, 54) in network space.
+        """
+        joints = torch.cat([noisy.unflatten(-1, (N_JOINTS, NOISY)), self.mixed(encoded)], -1)
+        h, embedding = self.stem(joints.flatten(-2)) + self.places, F.silu(self.time(time))
+        for block in self.blocks:
+            h = block(h, embedding)
+        made = self.joint_head(self.head(h).unflatten(-1, (N_JOINTS, -1)))
+        return Denoised(*(part.flatten(-2).to(noisy) for part in made.chunk(2, -1)))
+
+    def step(self, noisy: Tensor, encoded: Tensor, index: int) -> tuple[Tensor, Tensor]:
+        """Return mean and variance (B, T, 132) after a sampling step, given motion and inputs (B, T, 54)."""
+        time = torch.full((len(noisy),), self.diffusion.times[index], device=noisy.device)
+        return self.diffusion.step(noisy, self.denoise(noisy, time, encoded), index, self.limits())
+
+    def rotations(self, encoded: Tensor) -> Tensor:
+        """Sample rotations (B, T, 132) for inputs (B, T, 54), both in network space."""
+
+        def step(noisy: Tensor, index: int) -> tuple[Tensor, Tensor]:
+            mean, variance = self.step(noisy, encoded, index)
+            return mean, variance.sqrt()
+
+        return self.diffusion.sample(step, self.noises[:, None].expand(-1, len(encoded), -1, -1))
+
+    def whole(self, sparse: Tensor) -> Tensor:
+        """Sample the world motion (N, 198) of a clip's world inputs (N, 54), N >= T, all windows together.
+
+        A window begins every T // 2 frames, and the last one ends with the clip. After every sampling step,
+        overlapping windows are averaged (Castillo et al. 2023; the released code drops the clip's tail).
+        """
+        count, size = len(sparse), self.frames
+        begin = torch.tensor([*range(0, count - size, size // 2), count - size], device=sparse.device)
+        windows = begin[:, None] + torch.arange(size, device=sparse.device)
+        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))[windows]
+        times_covered = torch.bincount(windows.flatten(), minlength=count)[:, None]
+
+        def total(parts: Tensor) -> Tensor:
+            return parts.new_zeros(count, ROTATION.stop).index_add(0, windows.flatten(), parts.flatten(0, 1))
+
+        def step(noisy: Tensor, index: int) -> tuple[Tensor, Tensor]:
+            mean, variance = self.step(noisy[windows], encoded, index)
+            return total(mean) / times_covered, total(variance).sqrt() / times_covered
+
+        rotation = self.diffusion.sample(step, self.drawn(count).to(self.noises))
+        return self.normalizer.posed(rotation, sparse)
+
+    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
+        """Make a training call: add noise to the truth (B, T, 252), and denoise it in one call.
+
+        A diffusion time is drawn for each window. The returned motion is made from the rotations that remain
+        once the predicted noise is removed, clamped to their limits as in sampling; the losses are those of
+        the noise and of the variances.
+
+        Args:
+            sparse: world inputs (B, n, 54) of the newest frames.
+            state: what the last call returned, or `initial_state`.
+            true_frames: world frames [X | Theta] (B, T, 252) of the window.
+        """
+        _, kept = self.taken_in(sparse, state)
+        window, frames = true_frames[..., :SPARSE_DIM], self.normalizer.encode(true_frames)
+        encoded, clean = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:][..., ROTATION]
+        time = distributed.drawn(self.diffusion.random_times, true_frames)
+        noise = distributed.drawn(torch.randn_like, clean)
+        noisy = self.diffusion.noised(clean, time, noise)
+        made = self.denoise(noisy, time, encoded)
+        error, bound = self.diffusion.losses(clean, noise, time, made, self.limits())
+        found = self.diffusion.clean(noisy, made.noise, time).clamp(*self.limits())
+        losses = {"noise": self.noise_weight * error, "bound": self.bound_weight * bound}
+        return TrainingOutputs(self.normalizer.posed(found, window), kept, losses)

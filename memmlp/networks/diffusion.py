@@ -1,0 +1,274 @@
+"""Denoising diffusion: schedules of noise, the noising of training signals, and sampling."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+Denoise = Callable[[Tensor, Tensor], Tensor]
+
+
+def cosine_schedule(steps: int) -> Tensor:
+    """Return the cosine schedule: the signal's share (steps,) of the noisy signal's variance, float64.
+
+    This is Eq. 17 of Nichol & Dhariwal 2021, where the noise that one step adds has a share of at most 0.999.
+    """
+    offset = 0.008
+    time = torch.arange(steps + 1, dtype=torch.float64) / steps
+    level = ((time + offset) / (1 + offset) * math.pi / 2).cos().square()
+    kept = (level[1:] / level[:-1]).clamp_min(1 - 0.999)
+    return kept.cumprod(0)
+
+
+def linear_schedule(steps: int) -> Tensor:
+    """Return the linear schedule: the signal's share (steps,) of the noisy signal's variance, float64.
+
+    The noise that one step adds has a share that grows linearly from 1e-4 to 0.02 over 1000 steps (Ho et al.
+    2020, Sec. 4); with fewer steps each one adds proportionally more, at most 0.999.
+    """
+    added = torch.linspace(1e-4, 0.02, steps, dtype=torch.float64) * (1000 / steps)
+    return (1 - added.clamp_max(0.999)).cumprod(0)
+
+
+class Noising(nn.Module):
+    """The noising of training signals, and the times at which a sample is denoised.
+
+    Args:
+        signal: share (steps,) of signal in the noisy signal's variance, by step.
+        sampling_steps: number of denoiser calls for a sample, evenly spaced, from the noise schedule's last
+            step down (Song et al. 2021, App. D.2: linear), so that the first one sees noise alone.
+    """
+
+    signal: Tensor
+
+    def __init__(self, signal: Tensor, sampling_steps: int):
+        super().__init__()
+        self.steps = len(signal)
+        self.times = [self.steps * (i + 1) // sampling_steps - 1 for i in reversed(range(sampling_steps))]
+        self.register_buffer("signal", signal.float(), persistent=False)
+
+    def random_times(self, clean: Tensor) -> Tensor:
+        """Draw a time (B,) for each signal of a batch (B, ...)."""
+        return torch.randint(self.steps, (len(clean),), device=clean.device)
+
+    def noised(self, clean: Tensor, time: Tensor, noise: Tensor) -> Tensor:
+        """Mix clean signals (B, ...) with standard normal noise (B, ...) as the times (B,) demand."""
+        signal = at(self.signal, time, clean)
+        return signal.sqrt() * clean + (1 - signal).sqrt() * noise
+
+
+def at(table: Tensor, time: Tensor, like: Tensor) -> Tensor:
+    """Return a table's values (..., B, 1, ...) at times (B,), to be broadcast to signals (B, ...)."""
+    return table[..., time].unflatten(-1, (-1, *[1] * (like.dim() - 1)))
+
+
+class Diffusion(Noising):
+    """Diffusion with a cosine schedule, whose network predicts the clean signal; DDIM samples it.
+
+    Args:
+        steps: number of steps of the noise schedule.
+        sampling_steps: number of denoiser calls for a sample; see Noising.
+    """
+
+    def __init__(self, steps: int, sampling_steps: int):
+        super().__init__(cosine_schedule(steps), sampling_steps)
+
+    def sample(self, denoise: Denoise, noise: Tensor) -> Tensor:
+        """Sample the clean signal (B, ...) by DDIM that adds no noise (Song et al. 2021, Eq. 12, eta = 0).
+
+        Args:
+            denoise: maps a noisy signal (B, ...) and times (B,) to an estimate of the clean signal.
+            noise: the noise (B, ...) to start from.
+        """
+        x = noise
+        for index, time in enumerate(self.times):
+            clean = denoise(x, torch.full((len(x),), time, device=x.device))
+            if index + 1 < len(self.times):
+                x = self.stepped(x, clean, index)
+        return clean
+
+    def stepped(self, x: Tensor, clean: Tensor, index: int) -> Tensor:
+        """Take one sampling step.
+
+        Args:
+            x: the noisy signal (B, ...) at sampling step `index`.
+            clean: the estimate of the clean signal that was made from it.
+            index: number of the sampling step, from 0.
+
+        Returns:
+            The noisy signal (B, ...) at sampling step `index` + 1.
+        """
+        here, there = (self.signal[time] for time in self.times[index : index + 2])
+        direction = (x - here.sqrt() * clean) / (1 - here).sqrt()
+        return there.sqrt() * clean + (1 - there).sqrt() * direction
+
+
+Step = Callable[[Tensor, int], tuple[Tensor, Tensor]]
+"""Maps a noisy signal and the number of its sampling step to the next one's mean and deviation."""
+QUIET = 50  # from this time of the noise schedule on a sample takes the mean; BoDiffusion's code has 49
+BIN = 2 / 255  # the width of the bins of the first step's likelihood: a pixel's, as BoDiffusion's code has it
+
+
+class Denoised(NamedTuple):
+    """What a network predicts from noisy signals (B, ...).
+
+    Attributes:
+        noise: the noise in the signals (B, ...).
+        share: where the logarithm of a step's variance lies (B, ...) between its limits: -1 at the least
+            variance, 1 at the largest.
+    """
+
+    noise: Tensor
+    share: Tensor
+
+
+def posterior(signal: Tensor) -> Tensor:
+    """Return the coefficients of the step from a noisy signal to the one before it (Ho et al. 2020, Eq. 7).
+
+    Args:
+        signal: share (n,) of signal in the noisy signal's variance, float64.
+
+    Returns:
+        (4, n): the mean's coefficients of the clean and of the noisy signal, and the logarithms of the least
+        and of the largest variance. The very first step's least variance, 0, is replaced by the second's.
+    """
+    before = torch.cat([torch.ones_like(signal[:1]), signal[:-1]])
+    added = 1 - signal / before
+    least = added * (1 - before) / (1 - signal)
+    least = torch.cat([least[1:2], least[1:]]) if len(signal) > 1 else added
+    clean = added * before.sqrt() / (1 - signal)
+    noisy = (1 - before) * (signal / before).sqrt() / (1 - signal)
+    return torch.stack([clean, noisy, least.log(), added.log()])
+
+
+class AncestralDiffusion(Noising):
+    """Diffusion with a linear schedule, whose network predicts noise and variances; sampled step by step.
+
+    Args:
+        steps: number of steps of the noise schedule.
+        sampling_steps: number of denoiser calls for a sample; see Noising.
+    """
+
+    trained: Tensor
+    spaced: Tensor
+
+    def __init__(self, steps: int, sampling_steps: int):
+        signal = linear_schedule(steps)
+        super().__init__(signal, sampling_steps)
+        self.register_buffer("trained", posterior(signal).float(), persistent=False)
+        spaced = posterior(signal[self.times[::-1]]).flip(-1)  # by sampling step: the noisiest first
+        self.register_buffer("spaced", spaced.float(), persistent=False)
+
+    @property
+    def draws(self) -> int:
+        """How many draws of noise a sample takes: one for its start, one for each step that adds noise.
+
+        The last step adds none, nor do those in the last 50 times of the schedule, of which a sample of few
+        steps has hardly any: without noise its steps' means are no sample of what the network has learned.
+        """
+        return 1 + sum(time >= QUIET for time in self.times[:-1])
+
+    def clean(self, noisy: Tensor, noise: Tensor, time: Tensor) -> Tensor:
+        """Return the clean signals (B, ...) of noisy ones, given their noise (B, ...) and times (B,)."""
+        signal = at(self.signal, time, noisy)
+        return (noisy - (1 - signal).sqrt() * noise) / signal.sqrt()
+
+    def losses(
+        self, clean: Tensor, noise: Tensor, time: Tensor, made: Denoised, limits: tuple[Tensor, Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Return the hybrid loss' two terms, means over components (Nichol & Dhariwal 2021, Eq. 16).
+
+        Args:
+            clean: true signals (B, ...).
+            noise: the noise (B, ...) that was mixed into them.
+            time: the times (B,) at which the noise was mixed in.
+            made: what the network predicted from the noisy signals.
+            limits: the least and the largest value of a clean signal, to be broadcast to it.
+
+        Returns:
+            The mean squared error of the noise, and the variational bound in bits, whose gradient reaches the
+            variances only.
+        """
+        noisy = self.noised(clean, time, noise)
+        first, second, least, largest = at(self.trained, time, clean)
+        found = first * self.clean(noisy, made.noise.detach(), time) + second * noisy
+        true = first * clean + second * noisy
+        log_variance = least + (made.share + 1) / 2 * (largest - least)
+        spread = log_variance - least
+        divergence = (spread + (-spread).exp() + (true - found).square() * (-log_variance).exp() - 1) / 2
+        surprise = binned_surprise(clean, found, log_variance, limits)
+        bound = torch.where(time.view_as(first) == 0, surprise, divergence)
+        return (noise - made.noise).square().mean(), bound.mean() / math.log(2)
+
+    def step(
+        self, noisy: Tensor, made: Denoised, index: int, limits: tuple[Tensor, Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Return the mean and the variance (B, ...) of the signal after a sampling step.
+
+        The last step's estimate is not clamped to the limits: if the network has not learned a rotation,
+        clamping could make the two columns of its 6D form parallel, which is no rotation.
+
+        Args:
+            noisy: the noisy signal (B, ...) at sampling step `index`.
+            made: what the network predicted from the noisy signal.
+            index: number of the sampling step, from 0.
+            limits: the least and the largest value to which the estimate of the clean signal is clamped.
+        """
+        time = torch.full((1,), self.times[index], device=noisy.device)
+        first, second, least, largest = self.spaced[:, index]
+        clean = self.clean(noisy, made.noise, time)
+        if index + 1 < len(self.times):
+            clean = clean.clamp(*limits)
+        mean = first * clean + second * noisy
+        return mean, (least + (made.share + 1) / 2 * (largest - least)).exp()
+
+    def sample(self, step: Step, noise: Tensor) -> Tensor:
+        """Sample a clean signal (...) from draws of noise (`draws`, ...)."""
+        x, *further = noise
+        for index in range(len(self.times)):
+            mean, deviation = step(x, index)
+            x = mean + deviation * further[index] if index < len(further) else mean
+        return x
+
+
+def binned_surprise(
+    clean: Tensor, mean: Tensor, log_variance: Tensor, limits: tuple[Tensor, Tensor]
+) -> Tensor:
+    """Return how surprising clean signals (B, ...) are to a Gaussian, in nats, by bins of 2/255 (Ho et al.).
+
+    The two outermost bins, at the limits, reach to minus and plus infinity.
+    """
+    scale, (low, high) = (-log_variance / 2).exp(), limits
+    below, above = (torch.special.ndtr((clean + edge - mean) * scale) for edge in (-BIN / 2, BIN / 2))
+    below = torch.where(clean < low + BIN / 8, 0.0, below)
+    above = torch.where(clean > high - BIN / 8, 1.0, above)
+    return -(above - below).clamp_min(1e-12).log()
+
+
+class TimeEmbedding(nn.Module):
+    """Sines and cosines of the diffusion time, then Linear, SiLU, Linear (Ho et al. 2020).
+
+    Args:
+        width: d, the width of the embedding.
+        sines: how many sines and cosines there are; by default d.
+    """
+
+    PERIOD = 10_000
+
+    rates: Tensor
+
+    def __init__(self, width: int, sines: int | None = None):
+        super().__init__()
+        half = (sines or width) // 2
+        rates = torch.exp(-math.log(self.PERIOD) * torch.arange(half) / half)
+        self.register_buffer("rates", rates, persistent=False)
+        self.mlp = nn.Sequential(nn.Linear(2 * len(rates), width), nn.SiLU(), nn.Linear(width, width))
+
+    def forward(self, time: Tensor) -> Tensor:
+        """Map times (B,) to embeddings (B, d)."""
+        angles = time[:, None] * self.rates
+        return self.mlp(torch.cat([angles.cos(), angles.sin()], -1))

@@ -1,0 +1,94 @@
+"""EgoPoser (Jiang et al., ECCV 2024): AvatarPoser's encoder over a fast and a slow view of a longer window.
+
+Its mask of hands out of sight is left out, since all trackers are seen here, and so is its head for the
+body's shape, since all bodies here have the mean one.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from memmlp.motion.body import SPARSE_DIM, SPARSE_POSITION, TRACKED
+from memmlp.motion.network_coordinates import HeadRelative
+from memmlp.networks.avatar_poser import AvatarPoser
+from memmlp.networks.motion_model import State, StreamingGraph, filled
+from memmlp.networks.transformer import EncoderLayer, newest_frame
+
+PLACES = 2 * len(TRACKED)  # components of the trackers' places on the floor
+
+
+def beside_head(sparse: Tensor) -> Tensor:
+    """Return inputs (..., 54) with positions on the floor relative to the head in the same frame."""
+    space = HeadRelative()
+    return space.sparse_in(sparse, space.origin(sparse))
+
+
+def places(sparse: Tensor) -> Tensor:
+    """Return the trackers' positions on the floor (..., 6), from inputs (..., 54)."""
+    return sparse[..., SPARSE_POSITION].unflatten(-1, (len(TRACKED), 3))[..., :2].flatten(-2)
+
+
+class EgoPoserGraph(StreamingGraph):
+    """EgoPoser's streaming graph, which carries the embedding's output for each frame, in order of time.
+
+    At every step the slow view pairs other frames, so nothing after the embedding can be carried. The
+    movement since the window's first frame enters linearly, so the first frame's contribution is subtracted
+    from the sum.
+    """
+
+    float32_modules = ("model.embedding", "model.orientation", "model.rotation")
+    model: EgoPoser
+
+    def build(self, model: Any) -> None:
+        """Make the graph's parts from a copy of the network."""
+        self.model, self.layers = model, cast(list[EncoderLayer], list(model.layers))
+
+    def windows(self) -> State:
+        """Return zeros (T - 1, n): each earlier frame's embedding (n = d) and places on the floor (n = 6)."""
+        sizes = {"embedded": self.model.embedding.out_features, "places": PLACES}
+        return {name: torch.zeros(self.frames - 1, size) for name, size in sizes.items()}
+
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
+        local = beside_head(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
+        place = places(local)
+        entering = {"embedded": self.model.embedding(torch.cat([local, place], -1)), "places": place}
+        window = {
+            name: torch.cat([filled(state[name], frame, fresh), frame]) for name, frame in entering.items()
+        }
+        slow, fast = self.model.views(window["embedded"])
+        first = F.linear(window["places"][:1], self.model.embedding.weight[:, SPARSE_DIM:])
+        newest = newest_frame(self.layers, slow + fast - 2 * first)
+        kept = {name: frames[1:] for name, frames in window.items()}
+        return self.normalizer.posed(self.model.read(newest), sparse), kept
+
+
+class EgoPoser(AvatarPoser):
+    """AvatarPoser's encoder over the sum of two views: the window's newer half, and its every second frame.
+
+    It has 4,126,340 parameters at the paper's sizes (T = 80, otherwise AvatarPoser's); the released code has
+    a further layer of 7,808 that nothing uses. Positions are relative to the point of the floor below the
+    head in the same frame, and how far these moved since the window's first frame is appended to each frame's
+    inputs: the head's not at all. In the released code the hands' positions and movements are the world's
+    (docs/readings.md).
+    """
+
+    graph = EgoPoserGraph
+    inputs: ClassVar[int] = SPARSE_DIM + PLACES
+
+    def rotations(self, encoded: Tensor) -> Tensor:
+        """Map windows (B, T, 54) to their last frames' rotations (B, 132), both in network space."""
+        local = beside_head(encoded)
+        moved = places(local) - places(local[:, :1])
+        slow, fast = self.views(torch.cat([local, moved], -1))
+        return self.encode(self.embedding(slow) + self.embedding(fast))
+
+    @staticmethod
+    def views(window: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the slow and the fast view of a window (..., T, n): half of its frames each."""
+        slow = window[..., ::2, :]
+        return slow, window[..., -slow.shape[-2] :, :]

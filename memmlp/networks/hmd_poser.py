@@ -1,0 +1,278 @@
+"""HMD-Poser (Dai et al., CVPR 2024): recurrent layers over time, a transformer over the trackers of a frame.
+
+It is the published network with three trackers, whose inputs for further sensors on legs and pelvis are zero.
+All bodies here have the mean shape, so the predicted shape does not enter the joints' positions.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from memmlp.common.float32_regions import in_float32
+from memmlp.motion.body import (
+    ROTATION,
+    SPARSE_ANGULAR_VELOCITY,
+    SPARSE_POSITION,
+    SPARSE_ROTATION,
+    SPARSE_VELOCITY,
+    TRACKED,
+)
+from memmlp.motion.geometry import matrix_to_sixd, sixd_to_matrix
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel
+from memmlp.networks.transformer import EncoderLayer
+
+HANDS, OTHERS = 2, 3  # tokens of hands in the head's frame, and of the sensors that there are none of
+TOKENS = len(TRACKED) + HANDS + OTHERS
+SHAPE = 16  # components of a body's shape
+
+# On a GPU cuDNN copies an LSTM's weights into one piece: at each call, since they are computed at each call.
+warnings.filterwarnings("ignore", message="RNN module weights are not part of single contiguous chunk")
+
+
+def by_tracker(sparse: Tensor) -> list[Tensor]:
+    """Split inputs (..., 54) by tracker: rotations (..., 3, 6), angular velocities (..., 3, 6), positions
+    (..., 3, 3) and velocities (..., 3, 3).
+    """
+    parts = SPARSE_ROTATION, SPARSE_ANGULAR_VELOCITY, SPARSE_POSITION, SPARSE_VELOCITY
+    return [sparse[..., part].unflatten(-1, (len(TRACKED), -1)) for part in parts]
+
+
+def in_head(rotation: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the hands' rotations (..., 2, 3, 3) and positions (..., 2, 3) in the head's frame.
+
+    Args:
+        rotation: rotations of head and hands (..., 3, 3, 3).
+        position: their positions (..., 3, 3).
+    """
+    back = rotation[..., :1, :, :].transpose(-1, -2)
+    away = position[..., 1:, :] - position[..., :1, :]
+    return back @ rotation[..., 1:, :, :], (back @ away[..., None])[..., 0]
+
+
+def hands_in_head(sparse: Tensor) -> list[Tensor]:
+    """Return what `by_tracker` returns, for both hands in the head's frame, from world inputs (..., 54).
+
+    The previous frame is reconstructed from the velocities in the inputs. All is computed in float32 in a
+    mixed-precision training, too: velocities are small differences.
+    """
+    rotation, turn, position, velocity = by_tracker(sparse)
+    with in_float32(sparse.device):
+        now = sixd_to_matrix(rotation)
+        before = now @ sixd_to_matrix(turn).transpose(-1, -2)
+        rotations, positions = in_head(now, position)
+        earlier, places = in_head(before, position - velocity)
+        turned = earlier.transpose(-1, -2) @ rotations
+    return [matrix_to_sixd(rotations), matrix_to_sixd(turned), positions, positions - places]
+
+
+class TokenEmbedding(nn.Module):
+    """A token made of several parts side by side, each through a linear layer and LeakyReLU.
+
+    Args:
+        inputs: number of features of each part.
+        outputs: number of the token's features that each part makes.
+    """
+
+    def __init__(self, inputs: Sequence[int], outputs: Sequence[int]):
+        super().__init__()
+        self.parts = nn.ModuleList(nn.Linear(*sizes) for sizes in zip(inputs, outputs, strict=True))
+
+    def forward(self, *parts: Tensor) -> Tensor:
+        """Map the parts (..., n) to the token (..., d)."""
+        made = [layer(part) for layer, part in zip(self.parts, parts, strict=True)]
+        return F.leaky_relu(torch.cat(made, -1))
+
+
+def shares(width: int) -> list[int]:
+    """Divide a width into four parts that are as equal as possible."""
+    bounds = [width * part // 4 for part in range(5)]
+    return [stop - start for start, stop in pairwise(bounds)]
+
+
+class NormedLSTM(nn.Module):
+    """An LSTM whose weights are directions times a learned gain for each row (Salimans & Kingma 2016).
+
+    Args:
+        width: d, the width of inputs and outputs.
+    """
+
+    def __init__(self, width: int):
+        super().__init__()
+        plain = nn.LSTM(width, width)
+        self.directions = nn.ParameterList([plain.weight_ih_l0, plain.weight_hh_l0])
+        for direction in self.directions:
+            nn.init.orthogonal_(direction)
+        self.gains = nn.ParameterList([d.detach().norm(dim=1, keepdim=True) for d in self.directions])
+        self.biases = nn.ParameterList([plain.bias_ih_l0, plain.bias_hh_l0])
+
+    def forward(self, x: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Run over inputs (B, n, d) from states (B, d).
+
+        Returns:
+            Outputs (B, n, d), and the states after the last input.
+        """
+        pairs = zip(self.directions, self.gains, strict=True)
+        weights = [F.normalize(direction, dim=1) * gain for direction, gain in pairs]
+        states = [state.contiguous()[None] for state in (hidden, cell)]
+        with in_float32(x.device):  # not every CPU has an LSTM in bfloat16
+            made, *after = torch.lstm(
+                x.float() if x.dtype == torch.bfloat16 else x,
+                states, [*weights, *self.biases], True, 1, 0.0, self.training, False, True,
+            )  # fmt: skip
+        return made, after[0][0], after[1][0]
+
+
+class TimeAndTokenBlock(nn.Module):
+    """An LSTM over time for each token, then encoder layers over the tokens of each frame.
+
+    Args:
+        width: d, the width of a token.
+        layers: number of encoder layers.
+        heads: number of attention heads; it divides d.
+        feedforward: width of the encoder's hidden layers.
+        dropout: dropout rate of the encoder.
+    """
+
+    def __init__(self, width: int, layers: int, heads: int, feedforward: int, dropout: float):
+        super().__init__()
+        self.over_time = nn.ModuleList(NormedLSTM(width) for _ in range(TOKENS))
+        self.layers = nn.ModuleList(EncoderLayer(width, heads, feedforward, dropout) for _ in range(layers))
+
+    def forward(self, tokens: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Map tokens (B, n, 8, d) and states (B, 8, d) to tokens and the states after the last frame."""
+        each = [part.unbind(axis) for part, axis in ((tokens, 2), (hidden, 1), (cell, 1))]
+        made = [lstm(*of) for lstm, *of in zip(self.over_time, *each, strict=True)]
+        outputs, hidden, cell = (
+            torch.stack(of, axis) for of, axis in zip(zip(*made, strict=True), (2, 1, 1), strict=True)
+        )
+        h = outputs.flatten(0, 1).squeeze(0)  # without a batch axis, a live frame is exported to plain layers
+        for layer in self.layers:
+            h = layer(h)
+        return h.view(tokens.shape), hidden, cell
+
+
+class HMDPoserGraph(FrameGraph):
+    """HMD-Poser's streaming graph."""
+
+    float32_modules = ("model.trackers", "model.hands", "model.others", "model.pose")
+    model: HMDPoser
+
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
+        features, kept = self.model.features(sparse[None], state)
+        return self.normalizer.posed(self.model.pose(features[0]), sparse), kept
+
+
+class HMDPoser(WindowlessModel):
+    """Tokens of trackers, blocks of LSTMs and encoder layers, and a head on all tokens of a frame.
+
+    It has 17,444,484 parameters at the paper's sizes, of which 528,656 belong to the head for the body's
+    shape, and carries two states of d for each LSTM: 8,192 numbers. Evaluation runs over whole clips,
+    training over windows of T frames, both from zero states.
+
+    Args:
+        normalizer: converts between the world and network space.
+        frames: T, the frames of a training window.
+        width: d, the width of a token.
+        depth: number of blocks.
+        encoder_layers: number of encoder layers of a block.
+        heads: number of attention heads; it divides d.
+        feedforward: width of the encoders' hidden layers.
+        dropout: dropout rate of the encoders, while training.
+        shape_weight: weight of the loss that keeps the predicted shape the same in a window; 0 leaves out the
+            head for the shape, which no prediction needs.
+    """
+
+    graph = HMDPoserGraph
+
+    def __init__(
+        self,
+        normalizer: Normalizer,
+        *,
+        frames: int,
+        width: int,
+        depth: int,
+        encoder_layers: int,
+        heads: int,
+        feedforward: int,
+        dropout: float,
+        shape_weight: float,
+    ):
+        super().__init__(normalizer, frames)
+        self.width, self.depth, self.shape_weight = width, depth, shape_weight
+        tracked, turns = ((6, 6, 3, 3), shares(width)), 15 * width // 32
+        self.trackers = nn.ModuleList(TokenEmbedding(*tracked) for _ in TRACKED)
+        self.hands = nn.ModuleList(TokenEmbedding(*tracked) for _ in range(HANDS))
+        unseen = (6, 6, 3), (turns, turns, width - 2 * turns)
+        self.others = nn.ModuleList(TokenEmbedding(*unseen) for _ in range(OTHERS))
+        self.norm = nn.LayerNorm(width, eps=1e-6)
+        self.blocks = nn.ModuleList(
+            TimeAndTokenBlock(width, encoder_layers, heads, feedforward, dropout) for _ in range(depth)
+        )
+        self.pose = self._head(ROTATION.stop)
+        self.shape = self._head(SHAPE) if shape_weight else None
+
+    def _head(self, size: int) -> nn.Module:
+        return nn.Sequential(
+            nn.Linear(TOKENS * self.width, self.width), nn.LeakyReLU(), nn.Linear(self.width, size)
+        )
+
+    def initial_state(self, batch: int = 1) -> State:
+        """Return the state of a fresh start: zeros (B, 8 x depth, d)."""
+        state = torch.zeros(batch, TOKENS * self.depth, self.width).to(self.normalizer.mean)
+        return {"hidden": state, "cell": state.clone()}
+
+    def tokens(self, sparse: Tensor) -> Tensor:
+        """Map world inputs (B, n, 54) to the tokens (B, n, 8, d)."""
+        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
+        nothing = [encoded.new_zeros(*encoded.shape[:-1], OTHERS, size) for size in (6, 6, 3)]
+        found = []
+        for layers, parts in (
+            (self.trackers, by_tracker(encoded)),
+            (self.hands, hands_in_head(sparse)),
+            (self.others, nothing),
+        ):
+            each = zip(layers, *(part.unbind(-2) for part in parts), strict=True)
+            found += [layer(*own) for layer, *own in each]
+        return self.norm(torch.stack(found, -2))
+
+    def features(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
+        """Map world inputs (B, n, 54) and the state to features (B, n, 8 d) and the state after them."""
+        tokens = self.tokens(sparse)
+        states = (state[name].split(TOKENS, 1) for name in ("hidden", "cell"))
+        carried = []
+        for block, *of in zip(self.blocks, *states, strict=True):
+            tokens, *after = block(tokens, *of)
+            carried.append(after)
+        hidden, cell = (torch.cat(of, 1) for of in zip(*carried, strict=True))
+        return tokens.flatten(-2), {"hidden": hidden, "cell": cell}
+
+    def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
+        """Take in the newest frames; see MotionModel.
+
+        By default the n new frames are returned, which are the most that this network can make.
+        """
+        features, kept = self.features(sparse, state)
+        wanted = sparse.shape[1] if newest is None else newest
+        return self.normalizer.posed(self.pose(features[:, -wanted:]), sparse[:, -wanted:]), kept
+
+    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
+        """Make a training call, which adds the loss of the predicted shape; see MotionModel."""
+        features, kept = self.features(sparse, state)
+        return TrainingOutputs(
+            self.normalizer.posed(self.pose(features), sparse), kept, self._shape_loss(features)
+        )
+
+    def _shape_loss(self, features: Tensor) -> dict[str, Tensor]:
+        """Return the weighted loss of how much the shapes of features (B, T, d) vary within a window."""
+        if self.shape is None:
+            return {}
+        shapes = self.shape(features).to(self.normalizer.mean)  # their differences are small
+        return {"shape": self.shape_weight * (shapes - shapes.mean(1, keepdim=True)).abs().mean()}

@@ -1,0 +1,337 @@
+"""Arms and legs in closed form, as MANIKIN has them (Jiang et al., ECCV 2024).
+
+A limb has a base (shoulder, hip), a middle (elbow, knee) and an end (wrist, ankle). Given its base and end,
+the middle can be anywhere on a circle; the **swivel** is the angle on that circle. Elbows and knees bend
+about one axis each.
+
+Vectors and rotations of the four limbs stand side by side: left arm, right arm, left leg, right leg.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from memmlp.motion.body import HEAD, PARENTS, SPARSE_POSITION, SPARSE_ROTATION
+from memmlp.motion.geometry import matrix_to_wxyz
+
+BASES, MIDDLES, ENDS = (16, 17, 1, 2), (18, 19, 4, 5), (20, 21, 7, 8)
+ANKLES, TOES = ENDS[2:], (10, 11)
+FLEXION = ((0.189, -0.966, 0.179), (0.085, 0.970, -0.227), (0.985, 0.003, -0.174), (0.995, -0.029, 0.096))
+"""The axes, in the rest pose, about which elbows and knees bend, as published for SMPL's bodies."""
+TWIST = (90.0, 90.0, 40.0, 40.0)
+"""How far, in degrees, shoulders and hips may be twisted about their upper bone, to either side."""
+SKEW = ((0, 0, 0, 0, 0, -1, 0, 1, 0), (0, 0, 1, 0, 0, 0, -1, 0, 0), (0, -1, 0, 1, 0, 0, 0, 0, 0))
+"""What each component of a vector adds to the 3 x 3 matrix of its cross product, row by row."""
+IDENTITY = ((1.0, 0, 0), (0, 1, 0), (0, 0, 1))
+STRAIGHT = 5e-4  # from 1, of the cosine of the least bend, 1.8 degrees: on a straighter limb rounding is seen
+OFFSET = 1e-3  # metres; which way a limb bends that is straighter than that follows from its axis of flexion
+
+
+def dot(one: Tensor, other: Tensor) -> Tensor:
+    """Return the dot products (..., 1) of vectors (..., 3)."""
+    return (one * other).sum(-1, keepdim=True)
+
+
+def of_joints(joints: Tensor, which: Sequence[int], axis: int = -2) -> Tensor:
+    """Return the entries of a tensor for some joints, which are indexed along the given axis."""
+    return joints.index_select(axis, torch.tensor(which, device=joints.device))
+
+
+def skew(vector: Tensor) -> Tensor:
+    """Return the matrices (..., 3, 3) that take the cross product of vectors (..., 3) with another."""
+    return (vector @ vector.new_tensor(SKEW)).unflatten(-1, (3, 3))
+
+
+def cross(one: Tensor, other: Tensor) -> Tensor:
+    """Return the cross products (..., 3) of vectors (..., 3)."""
+    return applied(skew(one), other)
+
+
+def applied(rotation: Tensor, vector: Tensor) -> Tensor:
+    """Apply rotations (..., 3, 3) to vectors (..., 3)."""
+    return (rotation @ vector[..., None])[..., 0]
+
+
+def about(axis: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
+    """Return the rotations (..., 3, 3) about unit axes (..., 3), given the cosine and sine (..., 1)."""
+    across, identity = skew(axis), axis.new_tensor(IDENTITY)
+    return identity + sine[..., None] * across + (1 - cosine)[..., None] * (across @ across)
+
+
+def aligning(start: Tensor, goal: Tensor) -> Tensor:
+    """Return the smallest rotations (..., 3, 3) that turn unit vectors (..., 3) onto others."""
+    across, identity = skew(cross(start, goal)), goal.new_tensor(IDENTITY)
+    return identity + across + across @ across / (1 + dot(start, goal)).clamp_min(1e-6)[..., None]
+
+
+def frame(first: Tensor, second: Tensor) -> Tensor:
+    """Return the rotations (..., 3, 3) whose columns are two perpendicular unit vectors and their product."""
+    return torch.stack([first, second, cross(first, second)], -1)
+
+
+def circle(axis: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the directions (..., 3) that belong to swivels of 0 and of 90 degrees.
+
+    Args:
+        axis: unit vectors (..., 3) from base to end.
+        up: the bases' Y axes (..., 3).
+    """
+    start = F.normalize(dot(up, axis) * axis - up, dim=-1)
+    return start, cross(start, axis)
+
+
+def swivels(base: Tensor, middle: Tensor, end: Tensor, up: Tensor) -> Tensor:
+    """Return the cosines and sines (..., 2) of swivels, from limbs' joints (..., 3) and the bases' Y axes."""
+    axis = F.normalize(end - base, dim=-1)
+    start, quarter = circle(axis, up)
+    away = middle - base
+    return F.normalize(torch.cat([dot(away, start), dot(away, quarter)], -1), dim=-1)
+
+
+def bend_direction(axis: Tensor, up: Tensor, swivel: Tensor) -> Tensor:
+    """Return the unit vectors (..., 3) from the axis to the middle, for swivels (..., 2), cosine and sine."""
+    start, quarter = circle(axis, up)
+    return swivel[..., :1] * start + swivel[..., 1:] * quarter
+
+
+def middle_at(base: Tensor, end: Tensor, up: Tensor, swivel: Tensor, upper: Tensor, lower: Tensor) -> Tensor:
+    """Return the middle joints (..., 3) of limbs, metres.
+
+    Args:
+        base, end: the limbs' other joints (..., 3), metres.
+        up: the bases' Y axes (..., 3).
+        swivel: cosines and sines (..., 2) of the swivels.
+        upper, lower: lengths of the bones (..., 1), metres.
+    """
+    away = end - base
+    reach = away.norm(dim=-1, keepdim=True).clamp_min(1e-4)
+    axis = away / reach
+    cosine = ((upper.square() + reach.square() - lower.square()) / (2 * upper * reach)).clamp(-1, 1)
+    sine = (1 - cosine.square()).clamp_min(1e-6).sqrt()
+    return base + upper * (cosine * axis + sine * bend_direction(axis, up, swivel))
+
+
+def bones(rest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the limbs' upper and lower bones (4, 3) and axes of flexion (4, 3) in a rest pose (22, 3)."""
+    base, middle, end = (rest[list(joints)] for joints in (BASES, MIDDLES, ENDS))
+    return middle - base, end - middle, F.normalize(rest.new_tensor(FLEXION), dim=-1)
+
+
+def flexed(upper: Tensor, lower: Tensor, axis: Tensor, reach: Tensor) -> Tensor:
+    """Return the rotations (..., 4, 3, 3) of elbows and knees that bring hands and feet to a given reach.
+
+    Of the two ways to bend, each limb takes the one about its own axis of flexion. If the reach is out of a
+    limb's range, the limb is as straight, or as bent, as possible.
+
+    Args:
+        upper, lower, axis: see `bones`.
+        reach: the distances (..., 4, 1), metres.
+    """
+    along = dot(upper, axis) * dot(lower, axis)
+    cosine, sine = dot(upper, lower) - along, dot(upper, cross(axis, lower))
+    size = (cosine.square() + sine.square()).sqrt()
+    wanted = (reach.square() - dot(upper, upper) - dot(lower, lower)) / 2 - along
+    bend = (wanted / size).clamp(-1 + STRAIGHT, 1 - STRAIGHT)
+    across, cosine, sine = ((1 - bend) * (1 + bend)).sqrt(), cosine / size, sine / size
+    axes = axis.expand(*bend.shape[:-1], 3)
+    return about(axes, cosine * bend - sine * across, sine * bend + cosine * across)
+
+
+def twist(rotation: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
+    """Return cosines and sines (..., 1) of the angles by which rotations (..., 3, 3) turn about an axis.
+
+    Args:
+        rotation: rotations (..., 3, 3).
+        axis: the axes, unit vectors (..., 3).
+    """
+    flat = rotation.flatten(-2)
+    turned, trace = flat @ flat.new_tensor(SKEW).T, flat @ flat.new_tensor(IDENTITY).flatten()[:, None]
+    both = torch.cat([trace - dot(axis, applied(rotation, axis)), dot(axis, turned)], -1)
+    cosine, sine = F.normalize(both, dim=-1).split(1, -1)
+    return cosine, sine
+
+
+def untwisting(local: Tensor, bone: Tensor, axis: Tensor) -> Tensor:
+    """Return rotations (..., 4, 3, 3) about the limbs' axes that bring the bases' twists within limits.
+
+    Each is the smallest that does.
+
+    If h is half of such a rotation's angle, the twist of the rotated base is a ratio of sums of sin h and cos
+    h, from which tan h follows. A base within its limits is not rotated.
+
+    Args:
+        local: the bases' local rotations (..., 4, 3, 3).
+        bone: the upper bones' unit vectors (4, 3) in the rest pose.
+        axis: the unit vectors (..., 4, 3) from base to end, in the frames of the bases' parents.
+    """
+    real, vector = matrix_to_wxyz(local).split([1, 3], -1)
+    limit = (local.new_tensor(TWIST) * (math.pi / 360)).tan()[:, None]
+    turned = dot(vector, bone)
+    by_sine = real * dot(axis, bone) + dot(cross(axis, vector), bone)
+    found = []
+    for bound in (limit, -limit):
+        share = by_sine + bound * dot(axis, vector)
+        found.append((bound * real - turned) / torch.where(share.abs() < 1e-9, 1e-9, share))
+    nearest = torch.where(found[0].abs() < found[1].abs(), found[0], found[1])
+    half = torch.where(turned.abs() > limit * real, nearest, 0.0)
+    size = 1 + half.square()
+    return about(axis, 2 / size - 1, 2 * half / size)
+
+
+def chain_frame(bent: Tensor, rest: Tensor) -> Tensor:
+    """Return the orientation of limbs with bent middles (..., 4, 3, 3), in the frames of their bases.
+
+    The first columns of these rotations (..., 4, 3, 3) point to the ends, the second ones out to the middles.
+    """
+    upper, lower, flexion = bones(rest)
+    chain = F.normalize(upper + applied(bent, lower), dim=-1)
+    side = upper + OFFSET * cross(chain, flexion)
+    return frame(chain, F.normalize(side - dot(side, chain) * chain, dim=-1))
+
+
+def handed(arms: Tensor, hands: Tensor, forearm: Tensor) -> tuple[Tensor, Tensor]:
+    """Divide each hand's rotation: the roll of the forearm goes to the elbow, the rest stays at the wrist.
+
+    Args:
+        arms: global rotations (..., 2, 3, 3) of elbows that are bent and not yet rolled.
+        hands: global rotations (..., 2, 3, 3) of the wrists.
+        forearm: the forearms (2, 3) in the rest pose.
+
+    Returns:
+        The elbows' roll about their forearms, and the wrists' local rotations, (..., 2, 3, 3) each.
+    """
+    seen = arms.transpose(-1, -2) @ hands
+    axis = F.normalize(forearm, dim=-1).expand(*seen.shape[:-2], 3)
+    rolled = about(axis, *twist(seen, axis))
+    return rolled, rolled.transpose(-1, -2) @ seen
+
+
+def footed(shins: Tensor, toe: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
+    """Return unit vectors (..., 2, 3) in the knees' frames: to the toe at rest, and to where it should be.
+
+    Args:
+        shins: global rotations (..., 2, 3, 3) of the knees.
+        toe: vectors (..., 2, 3) from the ankles to the toes, of any length.
+        rest: rest positions (22, 3), metres.
+    """
+    bone = F.normalize(rest[list(TOES)] - rest[list(ANKLES)], dim=-1)
+    goal = applied(shins.transpose(-1, -2), F.normalize(toe, dim=-1))
+    return bone.expand(goal.shape), goal
+
+
+def solved(
+    local: Tensor,
+    turned: Tensor,
+    base: Tensor,
+    end: Tensor,
+    swivel: Tensor,
+    hands: Tensor,
+    toe: Tensor,
+    rest: Tensor,
+) -> Tensor:
+    """Return the local rotations (..., 22, 3, 3) of a body with its limbs solved.
+
+    Wrists and ankles get to their given positions as far as the limbs reach. The part of a hand's rotation
+    about its forearm goes to the elbow, the rest to the wrist; a foot takes the smallest rotation to its toe.
+
+    Args:
+        local: local rotations (..., 22, 3, 3), of which those of the limbs are ignored.
+        turned: global rotations (..., 22, 3, 3) of the same body.
+        base: positions (..., 4, 3) of shoulders and hips, metres.
+        end: positions (..., 4, 3) of wrists and ankles.
+        swivel: cosines and sines (..., 4, 2).
+        hands: global rotations (..., 2, 3, 3) of the wrists.
+        toe: vectors (..., 2, 3) from the ankles to the toes, of any length.
+        rest: rest positions (22, 3), metres.
+    """
+    upper, lower, _ = bones(rest)
+    away = end - base
+    bent = flexed(*bones(rest), away.norm(dim=-1, keepdim=True))
+    back = of_joints(turned, [PARENTS[joint] for joint in BASES], -3).transpose(-1, -2)
+    axis = F.normalize(away, dim=-1)
+    direction = bend_direction(axis, of_joints(turned[..., 1], BASES), swivel)
+    bases = back @ frame(axis, direction) @ chain_frame(bent, rest).transpose(-1, -2)
+    bases = untwisting(bases, F.normalize(upper, dim=-1), applied(back, axis)) @ bases
+    arms, shins = (back.transpose(-1, -2) @ bases @ bent).split(2, -3)
+    rolled, wrists = handed(arms, hands, lower[:2])
+    ankles = aligning(*footed(shins, toe, rest))
+    middles = torch.cat([bent[..., :2, :, :] @ rolled, bent[..., 2:, :, :]], -3)
+    rows = list(local.unbind(-3))
+    groups = ((BASES, bases), (MIDDLES, middles), (ENDS, torch.cat([wrists, ankles], -3)))
+    for joints, rotations in groups:
+        for joint, rotation in zip(joints, rotations.unbind(-3), strict=True):
+            rows[joint] = rotation
+    return torch.stack(rows, -3)
+
+
+SHOULDERS, ELBOWS, WRISTS = (slice(left, right + 1) for left, right, *_ in (BASES, MIDDLES, ENDS))
+"""The joints of both arms, which are the body's last ones, and follow each other."""
+BEGINNING, ENDING = slice(SHOULDERS.start, ELBOWS.stop), slice(ELBOWS.start, WRISTS.stop)
+"""Where the arms' bones begin and end: the upper ones, then the lower ones."""
+SLACK = 1e-3  # the part of its reach by which an arm is never quite straight, nor folded: so it has a side
+
+
+def tracked(rotations: Tensor, sparse: Tensor) -> Tensor:
+    """Replace the rotations of head and wrists by those of their trackers.
+
+    Args:
+        rotations: global rotations (..., 132), 6D, world.
+        sparse: inputs (..., 54), world.
+    """
+    seen = sparse[..., SPARSE_ROTATION]
+    head, wrists = 6 * HEAD, 6 * WRISTS.start
+    return torch.cat(
+        [rotations[..., :head], seen[..., :6], rotations[..., head + 6 : wrists], seen[..., 6:]], -1
+    )
+
+
+def reached(rotations: Tensor, joints: Tensor, sparse: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
+    """Bend the arms of a body so that its wrists get to their trackers, as far as the arms reach.
+
+    Each elbow stays on its side of the line from shoulder to hand; the elbow of a straight arm goes to the
+    back of the upper arm. The bones are turned by the smallest rotations.
+
+    Args:
+        rotations: global rotations (..., 22, 3, 3), world.
+        joints: positions (..., 22, 3), metres, world, the head on its tracker.
+        sparse: inputs (..., 54), world.
+        rest: rest positions (22, 3), metres.
+
+    Returns:
+        Rotations and positions of the body with its arms bent.
+    """
+    hands = sparse[..., SPARSE_POSITION].unflatten(-1, (3, 3))[..., 1:, :]
+    shoulder, arms = joints[..., SHOULDERS, :], rotations[..., BEGINNING, :, :]
+    bones = joints[..., ENDING, :] - joints[..., BEGINNING, :]
+    lengths = (rest[ENDING] - rest[BEGINNING]).norm(dim=-1, keepdim=True)
+    side = bones[..., :2, :] - OFFSET * arms[..., :2, :, 2]  # the upper arms' third axes point to the front
+    elbow, wrist = bent_to(hands - shoulder, side, *lengths.split(2))
+    bent = torch.cat([elbow, wrist - elbow], -2)
+    arms = aligning(bones / lengths, bent / lengths) @ arms
+    turned = [rotations[..., : BEGINNING.start, :, :], arms, rotations[..., BEGINNING.stop :, :, :]]
+    placed = [joints[..., : ENDING.start, :], shoulder + elbow, shoulder + wrist]
+    return torch.cat(turned, -3), torch.cat(placed, -2)
+
+
+def bent_to(goal: Tensor, side: Tensor, upper: Tensor, lower: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the positions of elbows and wrists of arms that reach to a goal, all relative to the shoulders.
+
+    Args:
+        goal: where the wrists should be (..., 2, 3), metres.
+        side: to which side of the goal the elbows are (..., 2, 3).
+        upper: lengths of the upper bones (2, 1).
+        lower: lengths of the lower ones (2, 1).
+    """
+    distance = goal.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+    axis = goal / distance
+    most, least = (upper + lower) * (1 - SLACK), (upper - lower).abs() + upper * SLACK
+    reach = distance.minimum(most).maximum(least)
+    cosine = reach / (2 * upper) + (upper.square() - lower.square()) / (2 * upper) / reach
+    sine = (1 - cosine.square()).clamp_min(1e-9).sqrt()
+    out = F.normalize(side - dot(side, axis) * axis, dim=-1)
+    return upper * (cosine * axis + sine * out), reach * axis

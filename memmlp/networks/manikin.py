@@ -1,0 +1,407 @@
+"""MANIKIN (Jiang et al., ECCV 2024): networks predict the trunk and where limbs end; the limbs are solved.
+
+MANIKIN-S has AvatarPoser's encoder, MANIKIN-L AvatarJLM's network. What they predict of a frame
+(`PredictedParts`) is turned into a pose in closed form (memmlp.networks.baselines.limb_solver). Readings: all
+heights are the world's, since a stream does not know the lowest foot of its clip; the head has its tracker's
+rotation; and a straight limb does not keep the swivel of the frame before.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from memmlp.common import distributed
+from memmlp.common.float32_regions import in_float32
+from memmlp.motion.body import (
+    HEAD,
+    N_JOINTS,
+    PARENTS,
+    POSITION,
+    ROOT,
+    ROTATION,
+    SPARSE_DIM,
+    SPARSE_POSITION,
+    SPARSE_ROTATION,
+    TRACKED,
+)
+from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
+from memmlp.motion.network_coordinates import Heading
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.avatar_jlm import AvatarJLM, AvatarJLMGraph
+from memmlp.networks.avatar_poser import AvatarPoser, AvatarPoserGraph, head
+from memmlp.networks.limb_solver import (
+    ANKLES,
+    BASES,
+    ENDS,
+    IDENTITY,
+    MIDDLES,
+    TOES,
+    middle_at,
+    of_joints,
+    solved,
+    swivels,
+)
+from memmlp.networks.motion_model import MotionModel, State, TrainingOutputs
+from memmlp.networks.transformer import draw_weights
+
+KEPT = (1, 2, 3, 6, 9, 12, 13, 14, 16, 17)
+"""The joints whose local rotations are predicted, beside the root's: the trunk's, shoulders and hips."""
+SWIVELS, PLACES = 2 * len(BASES), 3 * (len(ANKLES) + len(TOES))
+PREDICTED = 6 * (1 + len(KEPT)) + SWIVELS + PLACES
+AUXILIARY = 6 * (N_JOINTS - 1)  # rotations that MANIKIN-L predicts in training alone
+
+
+def follows(joint: int) -> bool:
+    """Return whether a joint's position follows from the predicted rotations alone."""
+    parent = PARENTS[joint]
+    return parent <= ROOT or (parent in KEPT and follows(parent))
+
+
+PLACED = [joint for joint in range(N_JOINTS) if follows(joint)]
+
+
+class PredictedParts(NamedTuple):
+    """What the network predicts for a frame, in its own coordinates without z-scores.
+
+    Attributes:
+        sixd: the local 6D rotations (..., 11, 6) of the root and of the joints KEPT.
+        swivel: cosines and sines (..., 4, 2) of the limbs' swivels, of any size.
+        ankle: both ankles relative to the head (..., 2, 3), metres.
+        toe: both toes relative to their ankles (..., 2, 3), metres.
+    """
+
+    sixd: Tensor
+    swivel: Tensor
+    ankle: Tensor
+    toe: Tensor
+
+    @classmethod
+    def of(cls, made: Tensor, normalizer: Normalizer) -> PredictedParts:
+        """Return the parts of a network's outputs (..., 86 or more)."""
+        chosen = [ROOT, *KEPT]
+        mean, std = (
+            part[SPARSE_DIM:][ROTATION].unflatten(0, (N_JOINTS, 6))[chosen]
+            for part in (normalizer.mean, normalizer.std)
+        )
+        rotations, swivel, ankle, toe = made[..., :PREDICTED].split([6 * len(chosen), SWIVELS, 6, 6], -1)
+        return cls(
+            rotations.unflatten(-1, (len(chosen), 6)) * std + mean,
+            swivel.unflatten(-1, (2, -1)).transpose(-1, -2),
+            *(part.unflatten(-1, (2, 3)) for part in (ankle, toe)),
+        )
+
+    @property
+    def trunk(self) -> Tensor:
+        """The local rotations (..., 22, 3, 3) of a body; joints that are not predicted have no rotation."""
+        found = sixd_to_matrix(self.sixd)
+        still = found.new_tensor(IDENTITY).expand(found[..., 0, :, :].shape)
+        rows = [still] * N_JOINTS
+        for joint, rotation in zip((ROOT, *KEPT), found.unbind(-3), strict=True):
+            rows[joint] = rotation
+        return torch.stack(rows, -3)
+
+    def body(self, rest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the trunk, its global rotations (..., 22, 3, 3), and joints (..., 22, 3) from the pelvis."""
+        trunk = self.trunk
+        return trunk, *forward_kinematics(trunk, torch.zeros_like(trunk[..., ROOT, :, 0]), rest)
+
+    def posed(self, encoded: Tensor, normalizer: Normalizer) -> Tensor:
+        """Return the rotations (..., 132) in network space, with the limbs solved, given inputs (..., 54)."""
+        seen = encoded * normalizer.std[:SPARSE_DIM] + normalizer.mean[:SPARSE_DIM]
+        places = seen[..., SPARSE_POSITION].unflatten(-1, (len(TRACKED), 3))
+        trackers = sixd_to_matrix(seen[..., SPARSE_ROTATION].unflatten(-1, (len(TRACKED), 6)))
+        trunk, turned, joints = self.body(normalizer.rest)
+        anchor = places[..., :1, :]
+        joints = joints + (anchor - joints[..., HEAD : HEAD + 1, :])
+        local = solved(
+            trunk,
+            turned,
+            of_joints(joints, BASES),
+            torch.cat([places[..., 1:, :], anchor + self.ankle], -2),
+            F.normalize(self.swivel, dim=-1),
+            trackers[..., 1:, :, :],
+            self.toe,
+            normalizer.rest,
+        )
+        rows = list(local.unbind(-3))
+        rows[HEAD] = turned[..., PARENTS[HEAD], :, :].transpose(-1, -2) @ trackers[..., 0, :, :]
+        sixd = matrix_to_sixd(torch.stack(rows, -3)).flatten(-2)
+        return (sixd - normalizer.mean[SPARSE_DIM:][ROTATION]) / normalizer.std[SPARSE_DIM:][ROTATION]
+
+
+class Truth:
+    """The true values that the predicted parts of a frame are compared with.
+
+    Args:
+        motion: true motion (..., 198), in the network's coordinates without z-scores.
+    """
+
+    def __init__(self, motion: Tensor):
+        self.sixd = motion[..., ROTATION].unflatten(-1, (N_JOINTS, 6))
+        self.joints = motion[..., POSITION].unflatten(-1, (N_JOINTS, 3))
+
+    def limbs(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the bases, middles and ends (..., 4, 3) of the limbs."""
+        base, middle, end = (self.joints[..., list(joints), :] for joints in (BASES, MIDDLES, ENDS))
+        return base, middle, end
+
+    def between(self, joints: tuple[int, ...], others: tuple[int, ...]) -> Tensor:
+        """Return the vectors (..., n, 3) from some joints to others."""
+        return self.joints[..., list(others), :] - self.joints[..., list(joints), :]
+
+
+class Manikin(MotionModel):
+    """The common base of both MANIKIN networks: how limbs are solved, and how the networks are trained.
+
+    The losses of the motion compare the solved pose, and their gradients reach every predicted part through
+    it. The network's own losses, as its authors have them, compare the predicted parts themselves.
+
+    Attributes:
+        parts_weight: weight of all losses of the parts.
+        turned: whether training windows are turned by headings drawn at random.
+    """
+
+    parts_weight: float
+    turned: bool
+
+    def predicted(self, encoded: Tensor) -> Tensor:
+        """Map windows (B, T, 54) in network space to outputs (B, n, 86 or more) for their last n frames."""
+        raise NotImplementedError
+
+    def losses_of_parts(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
+        """Return the losses of the parts in outputs (B, n, 86 or more), weighted as in the authors' work."""
+        raise NotImplementedError
+
+    def posed(self, made: Tensor, encoded: Tensor) -> Tensor:
+        """Map outputs (..., 86 or more) and the same frames' inputs (..., 54) to rotations (..., 132).
+
+        Limbs are solved in float32 in a mixed-precision training, too.
+        """
+        with in_float32(made.device):
+            return PredictedParts.of(made.to(encoded.dtype), self.normalizer).posed(encoded, self.normalizer)
+
+    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
+        """Make a training call in which each window is turned by its own random heading; see MotionModel."""
+        inputs, kept = self.taken_in(sparse, state)
+        heading, space = self.heading(true_frames), Heading()
+        window = space.sparse_in(inputs[:, -self.frames :], heading)
+        encoded = self.normalizer.encode_sparse(window, self.normalizer.origin(window))
+        made = self.predicted(encoded)
+        count = made.shape[1]
+        rotation = self.posed(made, encoded[:, -count:])
+        motion = space.motion_out(self.normalizer.posed(rotation, window[:, -count:]), heading)
+        true = torch.cat([window, space.motion_in(true_frames[..., SPARSE_DIM:], heading)], -1)
+        return TrainingOutputs(motion, kept, self.losses(made, true))
+
+    def heading(self, true_frames: Tensor) -> Tensor:
+        """Draw a turn about the world's vertical axis for each window, as an origin (B, 1, 5) of Heading."""
+        angle = self.turned * 2 * math.pi * distributed.drawn(torch.rand_like, true_frames[:, :1, :1])
+        return torch.cat([torch.zeros_like(true_frames[:, :1, :3]), angle.cos(), angle.sin()], -1)
+
+    def losses(self, made: Tensor, true: Tensor) -> dict[str, Tensor]:
+        """Return the weighted losses of outputs (B, n, 86 or more), given true world frames (B, T, 252)."""
+        motion = self.normalizer.coordinates.motion_in(
+            true[..., SPARSE_DIM:], self.normalizer.origin(true[..., :SPARSE_DIM])
+        )
+        with in_float32(made.device):
+            parts = self.losses_of_parts(made.to(true.dtype), Truth(motion[:, -made.shape[1] :]))
+        return {name: self.parts_weight * term for name, term in parts.items()}
+
+
+class ManikinSGraph(AvatarPoserGraph):
+    """MANIKIN-S' streaming graph: AvatarPoser's graph, then the solver of the newest frame's limbs."""
+
+    float32_modules = (*AvatarPoserGraph.float32_modules, "model.swivel", "model.places")
+    model: ManikinS
+
+    def rotation(self, newest: Tensor, encoded: Tensor) -> Tensor:
+        """Map the newest frame's feature (1, d) and inputs (1, 54) to its rotations (1, 132)."""
+        return self.model.posed(self.model.read(newest), encoded)
+
+
+class ManikinS(Manikin, AvatarPoser):
+    """AvatarPoser's embedding and encoder, with heads for root, rotations, swivels, and ankles and toes.
+
+    It has 4,244,566 parameters at the paper's sizes (AvatarPoser's).
+
+    Args:
+        normalizer: converts between the world and network space.
+        frames: T, the window's length.
+        width: d, the width of the features.
+        depth: number of encoder layers.
+        heads: number of attention heads; it divides d.
+        feedforward: width of the feed-forward's hidden layers.
+        dropout: dropout rate in the encoder, while training.
+        parts_weight: weight of the losses of what the limbs are solved from.
+        turned: whether training windows are turned by headings drawn at random.
+    """
+
+    graph = ManikinSGraph
+    rotated: ClassVar[int] = len(KEPT)
+
+    def __init__(
+        self,
+        normalizer: Normalizer,
+        *,
+        frames: int,
+        width: int,
+        depth: int,
+        heads: int,
+        feedforward: int,
+        dropout: float,
+        parts_weight: float,
+        turned: bool,
+    ):
+        super().__init__(
+            normalizer,
+            frames=frames,
+            width=width,
+            depth=depth,
+            heads=heads,
+            feedforward=feedforward,
+            dropout=dropout,
+        )
+        self.parts_weight, self.turned = parts_weight, turned
+        self.swivel, self.places = head(width, SWIVELS), head(width, PLACES)
+        for added in (self.swivel, self.places):
+            draw_weights(added)
+
+    def read(self, newest: Tensor) -> Tensor:
+        """Map the newest frame's feature (..., d) to outputs (..., 86)."""
+        return torch.cat([super().read(newest), self.swivel(newest), self.places(newest)], -1)
+
+    def predicted(self, encoded: Tensor) -> Tensor:
+        """Map windows (B, T, 54) in network space to outputs (B, 1, 86) for their last frame."""
+        return self.encode(self.embedding(encoded))[:, None]
+
+    def rotations(self, encoded: Tensor) -> Tensor:
+        """Map windows (B, T, 54) to their last frames' rotations (B, 132), both in network space."""
+        return self.posed(self.predicted(encoded), encoded[:, -1:])[:, 0]
+
+    def losses_of_parts(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
+        """Return the losses of the parts in outputs (B, 1, 86), weighted as in the authors' work.
+
+        Swivels are measured from the predicted shoulders and hips, to which no gradient flows from them: it
+        would have no bound where a limb is nearly along the axis from which its swivel is measured, as in a
+        standing leg, and trainings diverged. The losses of middles and of swivels are sums over the limbs.
+        """
+        parts = PredictedParts.of(made, self.normalizer)
+        _, turned, joints = parts.body(self.normalizer.rest)
+        base, middle, end = true.limbs()
+        up, angle = turned[..., list(BASES), :, 1].detach(), F.normalize(parts.swivel, dim=-1)
+        lengths = [(one - other).norm(dim=-1, keepdim=True) for one, other in ((base, middle), (middle, end))]
+        rooted = (true.joints - true.joints[..., ROOT : ROOT + 1, :])[..., PLACED, :]
+        limbs = len(BASES)
+        return {
+            "trunk_rotation": F.l1_loss(parts.sixd[..., 1:, :], true.sixd[..., list(KEPT), :]),
+            "trunk_position": 5 * F.l1_loss(joints[..., PLACED, :], rooted),
+            "swivel": 0.1 * 2 * limbs * F.l1_loss(parts.swivel, swivels(base, middle, end, up)),
+            "middle": limbs * F.l1_loss(middle_at(base, end, up, angle, *lengths), middle),
+            "ankle": 5 * F.l1_loss(parts.ankle, true.between((HEAD,), ANKLES)),
+            "toe": 0.3 * F.l1_loss(parts.toe, true.between(ANKLES, TOES)),
+        }
+
+
+class ManikinLGraph(AvatarJLMGraph):
+    """MANIKIN-L's streaming graph: AvatarJLM's graph, then the solver of the newest frame's limbs."""
+
+    model: ManikinL
+
+    def rotation(self, features: Tensor, encoded: Tensor) -> Tensor:
+        """Map the newest frame's tokens (1, 45 d) and inputs (1, 54) to its rotations (1, 132)."""
+        return self.model.posed(self.model.regressor(features), encoded)
+
+
+class ManikinL(Manikin, AvatarJLM):
+    """AvatarJLM's network, whose regressor predicts the parts and, for training only, all rotations as well.
+
+    It has 63,889,240 parameters at the paper's sizes (AvatarJLM's). Its authors' MANIKIN-LN uses the same
+    weights on windows that do not overlap and takes all frames of each: it can't run as a live stream. (They
+    also raise ankles to the true floor, which is left out here.)
+
+    Args:
+        normalizer: converts between the world and network space.
+        frames: T, the window's length.
+        width: d, the width of a token; the layers of the coarse pose have 2 d.
+        depth: number of blocks: an encoder layer over a frame's tokens, and one over each token's frames.
+        heads: number of attention heads; it divides d.
+        feedforward: width of the encoders' hidden layers.
+        dropout: dropout rate of the encoders, while training.
+        coarse_weight: weight of the loss of the coarse pose's joints.
+        parts_weight: weight of the losses of what the limbs are solved from.
+        turned: whether training windows are turned by headings drawn at random.
+        offline: whether it is used as MANIKIN-LN.
+    """
+
+    graph = ManikinLGraph
+    outputs: ClassVar[int] = PREDICTED + AUXILIARY
+
+    def __init__(
+        self,
+        normalizer: Normalizer,
+        *,
+        frames: int,
+        width: int,
+        depth: int,
+        heads: int,
+        feedforward: int,
+        dropout: float,
+        coarse_weight: float,
+        parts_weight: float,
+        turned: bool,
+        offline: bool,
+    ):
+        super().__init__(
+            normalizer,
+            frames=frames,
+            width=width,
+            depth=depth,
+            heads=heads,
+            feedforward=feedforward,
+            dropout=dropout,
+            coarse_weight=coarse_weight,
+        )
+        self.parts_weight, self.turned, self.offline = parts_weight, turned, offline
+
+    @property
+    def is_stream(self) -> bool:
+        """Whether each frame is predicted without later ones; false for MANIKIN-LN."""
+        return not self.offline
+
+    def predicted(self, encoded: Tensor) -> Tensor:
+        """Map windows (B, T, 54) in network space to outputs (B, T, 212) for all their frames."""
+        return self.regressed(encoded)
+
+    def rotations(self, encoded: Tensor) -> Tensor:
+        """Map inputs (B, T, 54) to rotations (B, T, 132), both in network space."""
+        return self.posed(self.predicted(encoded), encoded)
+
+    def losses(self, made: Tensor, true: Tensor) -> dict[str, Tensor]:
+        """Return the weighted losses of the parts and of the coarse pose; see Manikin."""
+        return super().losses(made, true) | self.coarse_loss(true)
+
+    def losses_of_parts(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
+        """Return the losses of the parts in outputs (B, T, 212), weighted as in the authors' work.
+
+        Swivels are compared as angles, measured from the true shoulders and hips. Toes are compared with the
+        head on its tracker.
+        """
+        parts = PredictedParts.of(made, self.normalizer)
+        turned, _ = forward_kinematics(
+            sixd_to_matrix(true.sixd), torch.zeros_like(true.joints[..., ROOT, :]), self.normalizer.rest
+        )
+        wanted = swivels(*true.limbs(), turned[..., list(BASES), :, 1])
+        (x, y), (cosine, sine) = parts.swivel.unbind(-1), wanted.unbind(-1)
+        toe = true.between((HEAD,), TOES)
+        return {
+            "trunk_rotation": 2 * F.l1_loss(parts.sixd[..., 1:, :], true.sixd[..., list(KEPT), :]),
+            "swivel": 0.1 * torch.atan2(y * cosine - x * sine, x * cosine + y * sine).abs().mean(),
+            "ankle": 5 * F.l1_loss(parts.ankle, true.between((HEAD,), ANKLES)),
+            "toe": 5 * F.l1_loss(parts.ankle + parts.toe, toe),
+            "auxiliary": 2 * F.l1_loss(made[..., PREDICTED:], true.sixd[..., 1:, :].flatten(-2)),
+        }

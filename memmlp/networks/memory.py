@@ -1,0 +1,246 @@
+"""The memory slot: what the backbone sees of the past, and what is kept for the next call.
+
+A memory makes the backbone's blocks (`block`), turns the buffers of past frames into what those blocks see
+(`recall`), and updates its buffers with the network's output (`remember`). All of these values are in network
+space.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple
+
+from torch import Tensor, nn
+
+from memmlp.common.errors import InputError
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.layers import MLPBlock, PlainFusion, ResidualFusion
+from memmlp.networks.motion_model import State
+from memmlp.networks.vqvae import VQVAE
+
+
+class Past(NamedTuple):
+    """What a memory of the network's own past recalls: the T frames that end one shift before the newest.
+
+    Attributes:
+        sparse: inputs (B, T, 54).
+        motion: the network's motion (B, T, 198).
+        codes: code-vectors (B, T, width), of width 0 for a memory without them.
+    """
+
+    sparse: Tensor
+    motion: Tensor
+    codes: Tensor
+
+
+class Recurred(NamedTuple):
+    """What a recurrent memory recalls.
+
+    Attributes:
+        features: SiLU of the recurrent layers' outputs in the window (B, blocks, T, k).
+        carried: the layers' states after the newest frame, each (B, blocks, k).
+    """
+
+    features: Tensor
+    carried: State
+
+
+class MemoryBlock(nn.Module):
+    """A block that computes a memory feature from the recalled past, and takes that feature in.
+
+    Args:
+        feature: computes the feature (B, T, k).
+        fusion: the MLP block that takes it in.
+    """
+
+    def __init__(self, feature: nn.Module, fusion: ResidualFusion | PlainFusion):
+        super().__init__()
+        self.feature = feature
+        self.fusion = fusion
+
+    def forward(self, h: Tensor, past: Past | Recurred) -> Tensor:
+        """Map the hidden state (B, T, d) to (B, T, d)."""
+        return self.fusion.fuse(h, self.feature(past))
+
+
+Pieces = Sequence[Tensor]
+
+
+class Recall(nn.Module):
+    """Computes, for each memory block, what the recalled feature adds to it at this step.
+
+    Args:
+        memory: the network's memory.
+        features: the feature modules of its memory blocks.
+        parts: the layers that map each block's feature (1, k) to its contribution (1, d).
+    """
+
+    def __init__(self, memory: Memory, features: Sequence[Any], parts: Sequence[nn.Module]):
+        super().__init__()
+        # The memory is asked for windows of one frame: only the frame that enters is new to the stream.
+        self.memory = copy.copy(memory)
+        self.memory.frames, self.memory.past_frames = 1, memory.past_frames - memory.frames + 1
+        self.parts = nn.ModuleList(parts)
+        if features:
+            self.gather(features)
+
+    def gather(self, features: Sequence[Any]) -> None:
+        """Join the blocks' feature modules into one that computes a frame's features for all of them."""
+
+    def forward(self, past: Past | Recurred | None) -> tuple[Pieces, Pieces]:
+        """Return each block's contribution (1, d): of the entering frame, and of frames before the first."""
+        if not self.parts:
+            return (), ()
+        z = self.feature(past)
+        contributions = self._contributions(z)
+        before = self.before(z)
+        return contributions, contributions if before is z else self._contributions(before)
+
+    def feature(self, past: Any) -> Tensor:
+        """Return the features (1, blocks, k) of the frame that enters."""
+        raise NotImplementedError
+
+    def before(self, first: Tensor) -> Tensor:
+        """Return the features of frames before the first one, given the first one's (1, blocks, k)."""
+        return first
+
+    def _contributions(self, z: Tensor) -> Pieces:
+        return [part(of) for part, of in zip(self.parts, z.flatten(0, 1).split(1), strict=True)]
+
+
+FUSIONS: dict[str, type[ResidualFusion | PlainFusion]] = {"residual": ResidualFusion, "plain": PlainFusion}
+
+
+class Memory(nn.Module):
+    """The memory slot's interface; in this base class nothing is kept and nothing is recalled.
+
+    Attributes:
+        uses_codes: whether the memory needs a frozen VQ-VAE.
+        trains_codes: whether it has a VQ-VAE of its own that is trained with the network.
+        shift: how many frames before the newest one the recalled past ends, which is also how many frames a
+            training step moves on; 0 without a past.
+        past_frames: how many past frames of inputs the buffer holds; the last one directly precedes the new.
+        frames: T, the window's length.
+        settled: whether what is recalled of a frame never changes, so that a stream may compute it once. For
+            a custom memory that does not set it, only the graph of the network as trained can be exported.
+        streaming_recall: what computes the blocks' contributions in a streaming graph.
+    """
+
+    streaming_recall: ClassVar[type[Recall]] = Recall
+
+    uses_codes: ClassVar[bool] = False
+    trains_codes: ClassVar[bool] = False
+    shift: int
+    past_frames: int
+    frames: int
+    settled: bool = False
+
+    def block(self, layer: int) -> nn.Module:
+        """Make the backbone's block of a layer (1-based)."""
+        raise NotImplementedError
+
+    def memory_block(self) -> nn.Module:
+        """Make one more block that takes in a memory feature, for the predictor's branches (Table 8)."""
+        raise NotImplementedError
+
+    def initial_state(self, batch: int) -> State:
+        """Return the memory's state at a fresh start: zeros."""
+        return {}
+
+    def true_state(self, sparse: Tensor, motion: Tensor) -> State:
+        """Return the state after inputs (B, past, 54), with the true motion (B, past, 198) as history."""
+        return {}
+
+    def needed(self, new: int) -> int:
+        """Return how many of the output's newest frames `remember` looks at."""
+        return 0
+
+    def recall(self, sparse: Tensor, state: State, new: int) -> Past | Recurred | None:
+        """Return what the memory blocks see of the past.
+
+        Args:
+            sparse: inputs (B, past + new, 54) in network space.
+            state: what the last call returned, or `initial_state`.
+            new: how many of the inputs are new.
+        """
+        return None
+
+    def remember(self, motion: Tensor, past: Past | Recurred | None, state: State, new: int) -> State:
+        """Return the state after an output.
+
+        Args:
+            motion: output (B, n, 198), n at least `needed(new)`.
+            past: what `recall` returned.
+            state: the state before the new frames.
+            new: how many of the output's last frames are new.
+        """
+        return {}
+
+    def auxiliary_losses(self, frames: Tensor, normalizer: Normalizer) -> dict[str, Tensor]:
+        """Return the memory's own losses on true world frames (B, T, 252); they add to the network's."""
+        return {}
+
+
+class NoMemory(Memory):
+    """The empty memory: plain blocks, no past, no state.
+
+    Args:
+        hidden: the backbone's d.
+        frames: the backbone's T.
+        depth: the backbone's L; not used here.
+        codes: the frozen VQ-VAE; not used here.
+    """
+
+    settled = True
+
+    def __init__(self, *, hidden: int, frames: int, depth: int, codes: VQVAE | None = None):
+        super().__init__()
+        self.hidden, self.frames = hidden, frames
+        self.shift = 0
+        self.past_frames = frames - 1
+
+    def block(self, layer: int) -> nn.Module:
+        """Make the backbone's block of a layer (1-based)."""
+        return MLPBlock(self.hidden, self.frames)
+
+    def memory_block(self) -> nn.Module:
+        """Raise InputError, since this memory has no memory blocks."""
+        raise InputError("memory=none has no memory blocks: allowed is a predictor without memory")
+
+
+class FeatureMemory(Memory):
+    """A memory that gives some blocks a feature to take in.
+
+    Args:
+        layers: the backbone's layers (1-based) that get a memory feature.
+        width: k, the width of the memory feature.
+        fusion: "residual" or "plain".
+        hidden: the backbone's d.
+        frames: the backbone's T.
+        depth: the backbone's L.
+
+    Raises:
+        InputError: if a layer is not one of the backbone's.
+    """
+
+    def __init__(
+        self, layers: Sequence[int], width: int, fusion: str, *, hidden: int, frames: int, depth: int
+    ):
+        super().__init__()
+        if not set(layers) <= set(range(1, depth + 1)):
+            raise InputError(f"memory.layers: {list(layers)} is not within the backbone's 1..{depth}")
+        self.layers, self.width, self.fusion = tuple(layers), width, FUSIONS[fusion]
+        self.hidden, self.frames = hidden, frames
+
+    def block(self, layer: int) -> nn.Module:
+        """Make the backbone's block of a layer (1-based)."""
+        return self.memory_block() if layer in self.layers else MLPBlock(self.hidden, self.frames)
+
+    def memory_block(self) -> nn.Module:
+        """Make a block that takes in a memory feature."""
+        return MemoryBlock(self.feature(), self.fusion(self.hidden, self.frames, self.width))
+
+    def feature(self) -> nn.Module:
+        """Make the module that computes a block's memory feature from what `recall` returns."""
+        raise NotImplementedError

@@ -1,0 +1,366 @@
+"""Memories of the network's own past, with code-vectors (Sec. 3.2.1) and without (Table 11)."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from memmlp.common import distributed
+from memmlp.motion.body import MOTION_DIM, SPARSE_DIM
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.memory import FeatureMemory, Past, Recall, Recurred
+from memmlp.networks.motion_model import State
+from memmlp.networks.vqvae import VQVAE, straight_through
+
+
+class Projection(nn.Module):
+    """Linear, LayerNorm and SiLU, to the memory's width k (Sec. 3.2.1).
+
+    Args:
+        size: number of inputs.
+        width: k.
+    """
+
+    def __init__(self, size: int, width: int):
+        super().__init__()
+        self.linear = nn.Linear(size, width)
+        self.norm = nn.LayerNorm(width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (B, T, size) to (B, T, k)."""
+        return F.silu(self.norm(self.linear(x)))
+
+
+class Blend(nn.Module):
+    """The coefficient m (reading 7), drawn from U[0, 1] per frame and channel in training.
+
+    Args:
+        value: m at inference, in [0, 1], or "sampled" to draw it at inference too. An exported ONNX file has
+            the mean of such draws instead.
+    """
+
+    MEAN = 0.5
+
+    def __init__(self, value: float | str):
+        super().__init__()
+        self.value = value
+
+    @property
+    def sampled(self) -> bool:
+        """Whether m is drawn at inference too."""
+        return isinstance(self.value, str)
+
+    def forward(self, like: Tensor) -> Tensor | float:
+        """Return m: a number, or draws of the shape (B, T, k) of `like`."""
+        if self.training or isinstance(self.value, str):
+            return distributed.drawn(torch.rand_like, like)
+        return self.value
+
+
+class ProjectedFeature(nn.Module):
+    """A memory feature made of projections; the base of the features with and without code-vectors."""
+
+
+class CodeFeature(ProjectedFeature):
+    """The paper's memory feature Z_l = Z_x + m * Z_theta + (1 - m) * Z_E (Sec. 3.2.1).
+
+    Args:
+        width: k, the width of the feature.
+        code_width: width of a code-vector.
+        blend: the coefficient m.
+    """
+
+    def __init__(self, width: int, code_width: int, blend: Blend):
+        super().__init__()
+        self.sparse = Projection(SPARSE_DIM, width)
+        self.motion = Projection(MOTION_DIM, width)
+        self.codes = Projection(code_width, width)
+        self.blend = blend
+
+    def forward(self, past: Past) -> Tensor:
+        """Return the memory feature (B, T, k)."""
+        motion = self.motion(past.motion)
+        m = self.blend(motion)
+        return self.sparse(past.sparse) + m * motion + (1 - m) * self.codes(past.codes)
+
+
+class NoCodesFeature(ProjectedFeature):
+    """The memory feature without the VQ-VAE, Z_l = Z_x + m * Z_theta (Table 11).
+
+    Args:
+        width: k, the width of the feature.
+        blend: the coefficient m.
+    """
+
+    def __init__(self, width: int, blend: Blend):
+        super().__init__()
+        self.sparse = Projection(SPARSE_DIM, width)
+        self.motion = Projection(MOTION_DIM, width)
+        self.blend = blend
+
+    def forward(self, past: Past) -> Tensor:
+        """Return the memory feature (B, T, k)."""
+        motion = self.motion(past.motion)
+        return self.sparse(past.sparse) + self.blend(motion) * motion
+
+
+class ProjectionsAtOnce(nn.Module):
+    """The projections that several memory blocks make of the same input, computed at once.
+
+    Args:
+        parts: the blocks' projections, all of the same shape.
+    """
+
+    def __init__(self, parts: Sequence[Projection]):
+        super().__init__()
+        self.shape = len(parts), parts[0].norm.normalized_shape[0]
+        self.weight = nn.Parameter(torch.cat([part.linear.weight for part in parts]))
+        self.bias = nn.Parameter(torch.cat([part.linear.bias for part in parts]))
+        self.scale = nn.Parameter(torch.stack([part.norm.weight for part in parts]))
+        self.offset = nn.Parameter(torch.stack([part.norm.bias for part in parts]))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map inputs (n, size) to the projections of all blocks (n, blocks, k)."""
+        y = F.linear(x, self.weight, self.bias).view(-1, *self.shape)
+        return F.silu(F.layer_norm(y, self.shape[1:]) * self.scale + self.offset)
+
+
+class CodeTable(nn.Module):
+    """The projections of all code-vectors, computed in advance and looked up by index.
+
+    Args:
+        parts: the blocks' projections.
+        vectors: the code-vectors (K, width).
+    """
+
+    def __init__(self, parts: Sequence[Projection], vectors: Tensor):
+        super().__init__()
+        self.projected = nn.Parameter(ProjectionsAtOnce(parts)(vectors).detach())
+
+    def forward(self, index: Tensor) -> Tensor:
+        """Map the index (1,) of a code-vector to its projections (1, blocks, k)."""
+        return self.projected.index_select(0, index)
+
+
+class Indices(nn.Module):
+    """A stand-in for a VQ-VAE that gives the index of a frame's code-vector instead of the vector."""
+
+    def __init__(self, codes: VQVAE):
+        super().__init__()
+        self.encoder, self.codebook = codes.encoder, codes.codebook
+
+    def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
+        """Return the index (1, 1) for a frame's inputs (1, 1, 54) and motion (1, 1, 198)."""
+        return self.codebook.indices(self.encoder(torch.cat([sparse[0], motion[0]], -1)))[None]
+
+
+class OwnPast(Recall):
+    """Recall for memories that project the inputs and the network's own motion."""
+
+    def gather(self, features: Sequence[ProjectedFeature]) -> None:
+        """Make one feature module whose projections are those of all blocks."""
+        self.whole = copy.deepcopy(features[0])
+        for name, child in list(self.whole.named_children()):
+            if isinstance(child, Projection):
+                setattr(self.whole, name, self.projections(name, [getattr(f, name) for f in features]))
+
+    def projections(self, name: str, parts: Sequence[Projection]) -> nn.Module:
+        """Join all blocks' projections of the input with the given name: "sparse", "motion" or "codes"."""
+        return ProjectionsAtOnce(parts)
+
+    def feature(self, past: Past) -> Tensor:
+        """Return the features (1, blocks, k) of the frame that enters."""
+        return self.whole(Past(*(part[0] for part in past)))
+
+
+class Coded(OwnPast):
+    """Recall for memories that have code-vectors as well, whose projections are looked up."""
+
+    def gather(self, features: Sequence[ProjectedFeature]) -> None:
+        """Make one feature module whose projections are those of all blocks."""
+        assert isinstance(self.memory, VQMemory)
+        self.vectors = self.memory.codes.codebook.vectors
+        super().gather(features)
+        # In a new dict, since the shallow copy of the memory shares its own with the network's.
+        self.memory._modules = {**self.memory._modules, "codes": Indices(self.memory.codes)}
+
+    def projections(self, name: str, parts: Sequence[Projection]) -> nn.Module:
+        """Join all blocks' projections of the input with the given name; code-vectors get a table."""
+        return CodeTable(parts, self.vectors) if name == "codes" else super().projections(name, parts)
+
+
+class OwnPastMemory(FeatureMemory):
+    """A memory of the network's own past; the base of those with and without code-vectors.
+
+    Args:
+        layers: the backbone's layers (1-based) that get a memory feature.
+        width: k, the width of the memory feature.
+        shift: which past window is recalled: "frame" for the one that ends one frame ago, "window" for the
+            one that ends T frames ago.
+        history: which estimate of a past frame's motion is recalled: "first" for the one made when that frame
+            was the newest, "latest" for the most recent one.
+        fusion: "residual" or "plain".
+        blend: m at inference, in [0, 1], or "sampled"; `memory.blend.value` changes it in a trained network.
+        hidden: the backbone's d.
+        frames: the backbone's T.
+        depth: the backbone's L.
+        codes: the frozen VQ-VAE; not used here.
+    """
+
+    streaming_recall = OwnPast
+
+    def __init__(
+        self,
+        layers: Sequence[int],
+        width: int,
+        shift: str,
+        history: str,
+        fusion: str,
+        blend: float | str,
+        *,
+        hidden: int,
+        frames: int,
+        depth: int,
+        codes: VQVAE | None = None,
+    ):
+        super().__init__(layers, width, fusion, hidden=hidden, frames=frames, depth=depth)
+        self.history, self.blend = history, Blend(blend)
+        self.settled = history == "first"
+        self.shift = {"frame": 1, "window": frames}[shift]
+        self.past_frames = frames + self.shift - 1
+
+    def initial_state(self, batch: int) -> State:
+        """Return zeros as the past motion, the paper's fallback where there is no previous prediction."""
+        return {"motion": torch.zeros(batch, self.past_frames, MOTION_DIM)}
+
+    def true_state(self, sparse: Tensor, motion: Tensor) -> State:
+        """Return the true motion (B, past, 198) as history, for teacher forcing."""
+        return {"motion": motion}
+
+    def needed(self, new: int) -> int:
+        """Return how many of the output's newest frames `remember` looks at."""
+        return self.frames if self.history == "latest" else new
+
+    def recall(self, sparse: Tensor, state: State, new: int) -> Past:
+        """Recall the T frames that end one shift before the newest frame.
+
+        If that window would reach into the new frames, it ends just before the first of them instead.
+
+        Args:
+            sparse: inputs (B, past + new, 54).
+            state: the motion before the new frames (B, past, 198).
+            new: how many of the inputs are new.
+        """
+        # The buffers begin T + shift - 1 frames before the first new one, so the window begins at new - 1,
+        # but not after shift - 1: the motion of the new frames is not known yet.
+        start = min(new, self.shift) - 1
+        view = slice(start, start + self.frames)
+        sparse, motion = sparse[:, view], state["motion"][:, view]
+        return Past(sparse, motion, self.code_vectors(sparse, motion))
+
+    def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
+        """Return code-vectors (B, T, code width) of inputs (B, T, 54) and motion (B, T, 198)."""
+        raise NotImplementedError
+
+    def remember(self, motion: Tensor, past: Past | Recurred | None, state: State, new: int) -> State:
+        """Return the state after an output.
+
+        Args:
+            motion: output (B, n, 198), n at least `needed(new)`.
+            past: not used here.
+            state: the state before the new frames.
+            new: how many of the output's last frames are new.
+        """
+        buffer = torch.cat([state["motion"], motion[:, -new:]], 1)[:, -self.past_frames :]
+        if self.history == "latest":
+            buffer = torch.cat([buffer[:, : self.past_frames - self.frames], motion], 1)
+        return {"motion": buffer}
+
+
+class NoCodesMemory(OwnPastMemory):
+    """A memory of the network's own past without code-vectors (Table 11)."""
+
+    def feature(self) -> nn.Module:
+        """Make the module that computes a block's memory feature."""
+        return NoCodesFeature(self.width, self.blend)
+
+    def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
+        """Return code-vectors of width 0, (B, T, 0), since this memory has none."""
+        return sparse[..., :0]
+
+
+class VQMemory(OwnPastMemory):
+    """A memory of the network's own past with code-vectors (Sec. 3.2.1), from any kind of VQ-VAE.
+
+    Each frame of the past window has one code-vector, shared by all memory blocks (reading 4).
+    """
+
+    streaming_recall = Coded
+    codes: VQVAE
+
+    def feature(self) -> nn.Module:
+        """Make the module that computes a block's memory feature."""
+        return CodeFeature(self.width, self.codes.width, self.blend)
+
+    def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
+        """Return code-vectors (B, T, code width) of inputs (B, T, 54) and motion (B, T, 198)."""
+        return self.codes.code_vectors(sparse, motion)
+
+
+class CodeMemory(VQMemory):
+    """The paper's memory, whose VQ-VAE is trained beforehand and frozen."""
+
+    uses_codes: ClassVar[bool] = True
+
+    def __init__(self, *args, codes: VQVAE | None = None, **kwargs):
+        super().__init__(*args, **kwargs)
+        assert codes is not None
+        self.codes = codes.requires_grad_(False)
+
+    def train(self, mode: bool = True) -> CodeMemory:
+        """Set the training mode of everything but the VQ-VAE, which stays in evaluation mode."""
+        super().train(mode)
+        self.codes.eval()
+        return self
+
+
+class JointCodeMemory(VQMemory):
+    """A memory whose VQ-VAE is trained from scratch with the network (App. A: worse than the frozen one).
+
+    The VQ-VAE's loss, on the true frames of the window, is added with weight 1: it is not one of Eq. 5's
+    terms, and an uncertainty weight on a codebook loss that goes to zero would grow without bound. The
+    network's own loss reaches the encoder by the straight-through gradient of the code-vectors.
+
+    Args:
+        vqvae: makes the VQ-VAE.
+        codes: ignored; there is no frozen VQ-VAE.
+    """
+
+    trains_codes: ClassVar[bool] = True
+
+    def __init__(self, *args, vqvae: Callable[[], VQVAE], codes: VQVAE | None = None, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.codes = vqvae()
+
+    def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
+        """Return code-vectors (B, T, code width) of inputs (B, T, 54) and motion (B, T, 198).
+
+        In training they have the straight-through gradient.
+        """
+        if not self.training:
+            return super().code_vectors(sparse, motion)
+        latent = self.codes.latent(torch.cat([sparse, motion], -1))
+        return straight_through(latent, self.codes.codebook(latent)[0])
+
+    def auxiliary_losses(self, frames: Tensor, normalizer: Normalizer) -> dict[str, Tensor]:
+        """Return the VQ-VAE's losses on true world frames: Eq. 1 of its reconstruction, and the codebook's.
+
+        An EMA codebook learns from this call.
+        """
+        auxiliary_losses, _ = self.codes.loss_terms(normalizer.encode(frames).flatten(0, 1), normalizer)
+        return {f"vqvae_{name}": term for name, term in auxiliary_losses.items()}

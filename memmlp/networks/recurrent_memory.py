@@ -1,0 +1,203 @@
+"""Memories of recurrent layers, which replace the paper's memory (Table 15)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from memmlp.common.float32_regions import in_float32
+from memmlp.motion.body import SPARSE_DIM
+from memmlp.networks.memory import FeatureMemory, Past, Recall, Recurred
+from memmlp.networks.motion_model import State
+from memmlp.networks.streaming import FrameGRU
+from memmlp.networks.vqvae import VQVAE
+
+
+class Recurrence(nn.Module):
+    """LayerNorm of the sparse features, a recurrent layer, SiLU (App. A, reading 19).
+
+    Args:
+        width: k, the layer's hidden size.
+
+    Attributes:
+        kind: the class of the recurrent layer.
+        carried: names of the recurrent layer's states, the hidden one first.
+    """
+
+    kind: ClassVar[Callable[..., nn.RNNBase]]
+    carried: ClassVar[tuple[str, ...]]
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.norm = nn.LayerNorm(SPARSE_DIM)
+        self.first = nn.Linear(SPARSE_DIM, width)
+        self.layer = self.kind(SPARSE_DIM, width, batch_first=True)
+
+    def begin(self, sparse: Tensor) -> Tensor:
+        """Map the input (B, 54) just before a training window to the hidden state (B, k) to start from."""
+        return self.first(self.norm(sparse))
+
+    def forward(self, sparse: Tensor, carried: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
+        """Run over the inputs (B, n, 54) from the carried states, each (B, k).
+
+        Returns:
+            Features (B, n, k), and the states after the last input.
+        """
+        with in_float32(sparse.device):  # not every CPU has an LSTM in bfloat16
+            output, states = self.run(self.norm(sparse), [state.contiguous()[None] for state in carried])
+        return F.silu(output), [state[0] for state in states]
+
+    def run(self, x: Tensor, states: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
+        """Run the recurrent layer over inputs (B, n, 54) from a sequence of states, each (1, B, k)."""
+        raise NotImplementedError
+
+
+class LSTM(Recurrence):
+    """A recurrence with a hidden and a cell state."""
+
+    kind = nn.LSTM
+    carried = ("hidden", "cell")
+
+    def run(self, x: Tensor, states: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
+        """Run the recurrent layer over inputs (B, n, 54) from a sequence of states, each (1, B, k)."""
+        return self.layer(x, tuple(states))
+
+
+class GRU(Recurrence):
+    """A recurrence with a hidden state alone."""
+
+    kind = nn.GRU
+    carried = ("hidden",)
+
+    def run(self, x: Tensor, states: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
+        """Run the recurrent layer over inputs (B, n, 54) from a sequence of one state (1, B, k)."""
+        output, hidden = self.layer(x, states[0])
+        return output, [hidden]
+
+
+class RecurredFeature(nn.Module):
+    """The output of a recurrent memory's layer of the given index."""
+
+    def __init__(self, index: int):
+        super().__init__()
+        self.index = index
+
+    def forward(self, past: Recurred) -> Tensor:
+        """Return the memory feature (B, T, k)."""
+        return past.features[:, self.index]
+
+
+class FromRecurrence(Recall):
+    """Recall for recurrent memories, whose features before the first frame are zeros."""
+
+    def gather(self, features: Sequence[Any]) -> None:
+        """Note the index of each block's recurrent layer, and replace GRUs by plain layers."""
+        self.layers = [feature.index for feature in features]
+        assert isinstance(self.memory, RecurrentMemory)
+        for recurrence in self.memory.recurrences:
+            if isinstance(recurrence.layer, nn.GRU):
+                recurrence.layer = FrameGRU(recurrence.layer)
+
+    def feature(self, past: Recurred) -> Tensor:
+        """Return the features (1, blocks, k) of the frame that enters."""
+        newest = past.features[:, :, -1]
+        return newest.index_select(1, torch.tensor(self.layers, device=newest.device))
+
+    def before(self, first: Tensor) -> Tensor:
+        """Return zeros, since the layers have seen nothing before the first frame."""
+        return torch.zeros_like(first)
+
+
+class RecurrentMemory(FeatureMemory):
+    """A recurrent layer for each memory block in place of the paper's memory (Table 15, reading 19).
+
+    A layer runs once over each frame, and its outputs for the window's older frames are kept beside its
+    states: a stream taken frame by frame is then the same as one taken in larger steps. A training call takes
+    in a whole window. With teacher forcing the hidden state starts from the last input before the window,
+    projected, and the cell at zero (`true_state`); otherwise, and in evaluation, the states are carried from
+    call to call and are zeros at a fresh start.
+
+    Args:
+        layers: the backbone's layers (1-based) that get a memory feature.
+        width: k, the hidden size of the recurrent layers and so the width of the memory feature.
+        fusion: "residual" or "plain".
+        hidden: the backbone's d.
+        frames: the backbone's T.
+        depth: the backbone's L.
+        codes: the frozen VQ-VAE; not used here.
+    """
+
+    streaming_recall = FromRecurrence
+    recurrence: ClassVar[type[Recurrence]]
+    settled = True
+
+    def __init__(
+        self,
+        layers: Sequence[int],
+        width: int,
+        fusion: str,
+        *,
+        hidden: int,
+        frames: int,
+        depth: int,
+        codes: VQVAE | None = None,
+    ):
+        super().__init__(layers, width, fusion, hidden=hidden, frames=frames, depth=depth)
+        self.recurrences = nn.ModuleList()
+        self.shift = frames
+        self.past_frames = frames - 1
+
+    def feature(self) -> nn.Module:
+        """Add one more recurrent layer and make the module that looks up its output."""
+        self.recurrences.append(self.recurrence(self.width))
+        return RecurredFeature(len(self.recurrences) - 1)
+
+    def initial_state(self, batch: int) -> State:
+        """Return zeros: states (B, blocks, k), and the earlier frames' features (B, blocks, T - 1, k)."""
+        blocks = len(self.recurrences)
+        states = {name: torch.zeros(batch, blocks, self.width) for name in self.recurrence.carried}
+        return states | {"features": torch.zeros(batch, blocks, self.frames - 1, self.width)}
+
+    def true_state(self, sparse: Tensor, motion: Tensor) -> State:
+        """Return hidden states projected from the last of the inputs (B, past, 54), for teacher forcing."""
+        hidden = torch.stack([layer.begin(sparse[:, -1]) for layer in self._layers()], 1)
+        return {"hidden": hidden.float()}
+
+    def recall(self, sparse: Tensor, state: State, new: int) -> Recurred:
+        """Run the layers over the `new` last inputs of (B, past + new, 54), and recall the window."""
+        features, states = [], []
+        for index, layer in enumerate(self._layers()):
+            carried = [state[name][:, index] for name in layer.carried]
+            made, after = layer(sparse[:, -new:], carried)
+            features.append(made)
+            states.append(after)
+        window = torch.cat([state["features"], torch.stack(features, 1)], 2)[:, :, -self.frames :]
+        names = self.recurrence.carried
+        carried_on = {
+            name: torch.stack(of, 1) for name, of in zip(names, zip(*states, strict=True), strict=True)
+        }
+        return Recurred(window, carried_on)
+
+    def remember(self, motion: Tensor, past: Past | Recurred | None, state: State, new: int) -> State:
+        """Return the states after the newest frame, and the features of the last T - 1 frames."""
+        assert isinstance(past, Recurred)
+        return past.carried | {"features": past.features[:, :, 1:]}
+
+    def _layers(self) -> list[Recurrence]:
+        return [layer for layer in self.recurrences if isinstance(layer, Recurrence)]
+
+
+class LSTMMemory(RecurrentMemory):
+    """A memory of LSTM layers (Table 15's LSTM-MB)."""
+
+    recurrence = LSTM
+
+
+class GRUMemory(RecurrentMemory):
+    """A memory of GRU layers (Table 15's GRU-MB)."""
+
+    recurrence = GRU

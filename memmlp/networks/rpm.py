@@ -1,0 +1,203 @@
+"""RPM (Rolling Prediction Model, CVPR 2025): each step predicts the next frames anew.
+
+The nearer a predicted frame is, the less a new prediction may change it; the nearest one is shown.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from memmlp.common import distributed
+from memmlp.motion.body import ROTATION, SPARSE_DIM
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel
+from memmlp.networks.transformer import Attention, EncoderLayer
+
+FRESH = 0.25  # of the training windows begin as a live stream does, without a past
+
+
+def sines(length: int, width: int) -> Tensor:
+    """Return the position embeddings (length, d), sines and cosines (Vaswani et al. 2017, Sec. 3.5)."""
+    rates = torch.exp(-math.log(10_000) * torch.arange(0, width, 2) / width)
+    angles = torch.arange(length)[:, None] * rates
+    return torch.stack([angles.sin(), angles.cos()], -1).flatten(-2)[:, :width]
+
+
+def freedom(horizon: int) -> Tensor:
+    """Return how far each of the W predicted frames (W, 1) may change at a step, from almost 0 to 1."""
+    distance = torch.arange(1, horizon + 1) / horizon
+    return (1 - (distance * math.pi / 2).cos())[:, None]
+
+
+class RPMGraph(FrameGraph):
+    """RPM's streaming graph."""
+
+    float32_modules = ("model.motion", "model.sparse", "model.head")
+    model: RPM
+
+
+class RPM(WindowlessModel):
+    """Cross-attention from past and future motion to the newest inputs, then encoder layers.
+
+    It has 9,626,756 parameters at the paper's sizes; the released code has a further layer of 262,656 that
+    nothing uses (9,889,412). Readings: a frame that is predicted for the first time takes the prediction
+    unchanged; a live stream begins with zeros as its past motion, as a quarter of the training windows do,
+    and with its first frame's inputs in place of earlier ones.
+
+    Args:
+        normalizer: converts between the world and network space.
+        frames: T, the frames of a training window: past motion, frames of free running, and predicted frames.
+        width: d, the width of the features.
+        depth: number of encoder layers.
+        heads: number of attention heads; it divides d.
+        feedforward: width of the encoder's hidden layers.
+        dropout: dropout rate of the encoder, while training.
+        context: how many frames of its own past motion the network sees; it sees the inputs of one frame
+            more.
+        horizon: W, how many frames the network predicts.
+        own_dropout: whether the past that it makes itself in training has dropout, too; as published it has
+            none.
+    """
+
+    graph = RPMGraph
+    places: Tensor
+    freedom: Tensor
+
+    def __init__(
+        self,
+        normalizer: Normalizer,
+        *,
+        frames: int,
+        width: int,
+        depth: int,
+        heads: int,
+        feedforward: int,
+        dropout: float,
+        context: int,
+        horizon: int,
+        own_dropout: bool = False,
+    ):
+        super().__init__(normalizer, frames)
+        self.context, self.horizon, self.own_dropout = context, horizon, own_dropout
+        self.motion = nn.Linear(ROTATION.stop, width)
+        self.sparse = nn.Linear(SPARSE_DIM, width)
+        self.attention = Attention(width, heads)
+        self.norm = nn.LayerNorm(width)
+        self.layers = nn.ModuleList(
+            EncoderLayer(width, heads, feedforward, dropout, F.gelu) for _ in range(depth)
+        )
+        self.head = nn.Linear(width, ROTATION.stop)
+        self.register_buffer("places", sines(context + horizon, width), persistent=False)
+        self.register_buffer("freedom", freedom(horizon), persistent=False)
+
+    def initial_state(self, batch: int = 1) -> State:
+        """Return the state of a fresh start, zeros.
+
+        `started` and `predicted` are 1 as soon as `sparse` and `prediction` hold frames.
+        """
+        sizes = {
+            "sparse": (self.context, SPARSE_DIM),
+            "motion": (self.context, ROTATION.stop),
+            "prediction": (self.horizon, ROTATION.stop),
+            "started": (1,),
+            "predicted": (1,),
+        }
+        return {name: torch.zeros(batch, *size).to(self.normalizer.mean) for name, size in sizes.items()}
+
+    def predicted(self, motion: Tensor, encoded: Tensor) -> Tensor:
+        """Predict W frames (B, W, 132) from past motion (B, context, 132) and inputs (B, context + 1, 54)."""
+        future = motion.new_zeros(len(motion), self.horizon, ROTATION.stop)
+        queries = self.motion(torch.cat([motion, future], 1)) + self.places
+        seen = self.sparse(encoded) + self.places[: encoded.shape[1]]
+        attention = self.attention
+        attended = attention.attend(attention.query(queries), attention.key(seen), attention.value(seen))
+        h = self.norm(queries + attended).squeeze(0)  # without a batch axis, a live step has plain layers
+        for layer in self.layers:
+            h = layer(h)
+        return self.head(h[..., -self.horizon :, :]).view(future.shape)
+
+    def rolled(self, encoded: Tensor, state: State) -> tuple[Tensor, State]:
+        """Take in one frame.
+
+        Args:
+            encoded: inputs (B, 1, 54) in network space.
+            state: the state before that frame.
+
+        Returns:
+            The prediction (B, W, 132) that begins with that frame, in network space, and the state after it.
+        """
+        before = torch.where(state["started"][..., None] > 0, state["sparse"], encoded)
+        inputs = torch.cat([before, encoded], 1)
+        made = self.predicted(state["motion"], inputs)
+        known = torch.cat([state["prediction"][:, 1:], made[:, -1:]], 1)
+        known = torch.where(state["predicted"][..., None] > 0, known, made)
+        made = known + self.freedom * (made - known).tanh()
+        return made, {
+            "sparse": inputs[:, 1:],
+            "motion": torch.cat([state["motion"], made[:, :1]], 1)[:, 1:],
+            "prediction": made,
+            "started": torch.ones_like(state["started"]),
+            "predicted": torch.ones_like(state["predicted"]),
+        }
+
+    def encoded(self, sparse: Tensor) -> Tensor:
+        """Map world inputs (..., 54) to network space."""
+        return self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
+
+    def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
+        """Take in the newest frames, one after the other; see MotionModel.
+
+        `newest`: how many of the last frames to return, at most n (the default).
+        """
+        shown = []
+        for frame in self.encoded(sparse).split(1, 1):
+            made, state = self.rolled(frame, state)
+            shown.append(made[:, :1])
+        wanted = sparse.shape[1] if newest is None else newest
+        return self.normalizer.posed(torch.cat(shown[-wanted:], 1), sparse[:, -wanted:]), state
+
+    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
+        """Make a training call: a few frames of free running without gradients, then one step with gradients.
+
+        The number of free-running frames is drawn for each call. The step predicts the window's last W
+        frames.
+
+        Args:
+            sparse: world inputs (B, T, 54).
+            state: a fresh start.
+            true_frames: world frames [X | Theta] (B, T, 252).
+        """
+        now = self.frames - self.horizon
+        begin = now - int(torch.randint(now - self.context + 1, ()))
+        encoded = self.encoded(sparse)
+        past = slice(begin - self.context, begin)
+        state = self.begun(state, encoded[:, past], true_frames[:, past])
+        training = self.training
+        self.train(training and self.own_dropout)
+        with torch.no_grad():
+            for index in range(begin, now):
+                _, state = self.rolled(encoded[:, index : index + 1], state)
+        self.train(training)
+        torch.clear_autocast_cache()  # weights that were cast without a gradient would have none below
+        made, state = self.rolled(encoded[:, now : now + 1], state)
+        return TrainingOutputs(self.normalizer.posed(made, sparse[:, now:]), state, {})
+
+    def begun(self, fresh: State, encoded: Tensor, true_frames: Tensor) -> State:
+        """Return the state after true frames, or a fresh start for a randomly drawn share of the windows.
+
+        Args:
+            fresh: a fresh start.
+            encoded: inputs (B, context, 54) in network space.
+            true_frames: the same frames (B, context, 252) in the world.
+        """
+        motion = self.normalizer.encode(true_frames)[..., SPARSE_DIM:][..., ROTATION]
+        known = (distributed.drawn(torch.rand_like, true_frames[:, :1, 0]) >= FRESH).to(true_frames.dtype)
+        return fresh | {
+            "sparse": known[..., None] * encoded,
+            "motion": known[..., None] * motion,
+            "started": known,
+        }

@@ -1,0 +1,373 @@
+"""The networks of SAGE-Net (Feng et al., CVPR 2024): the body's halves as codes, their diffusion, a decoder.
+
+A VQ-VAE of each half makes latents of a window; one diffusion model makes the upper half's latents from the
+inputs, another makes the lower half's from the inputs and the upper latents; the decoder makes rotations from
+both. The refiner that follows is memmlp.networks.refiner. All latents are (B, T // 2, 384).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from memmlp.common.float32_regions import in_float32
+from memmlp.motion.body import N_JOINTS, ROTATION, TRACKED
+from memmlp.networks.avatar_jlm import JOINT_DIM, tracker_features
+from memmlp.networks.bodiffusion import SINES
+from memmlp.networks.diffusion import TimeEmbedding
+from memmlp.networks.layers import Dropout
+from memmlp.networks.transformer import Attention, DiTBlock
+
+UPPER = (0, 3, 6, 9, *range(12, 22))
+LOWER = (0, 1, 2, 4, 5, 7, 8, 10, 11)
+"""The joints of the body's halves; both have the root."""
+LATENT = 384
+BOOKS, CODES = 8, 64
+DECAY = 0.99  # of how often a code is used
+TEMPERATURE = 0.07  # of the contrastive loss, which is of the first two books
+CONTRASTED = 2
+HIDDEN = 0.01  # what stands in training for joints that are hidden
+
+
+class Mixture(nn.Module):
+    """Mixes the trackers' features into features of joints (a convolution of kernel 1 over the trackers).
+
+    Args:
+        joints: number of joints.
+    """
+
+    def __init__(self, joints: int):
+        super().__init__()
+        self.spread = nn.Linear(len(TRACKED), joints)
+
+    def forward(self, encoded: Tensor) -> Tensor:
+        """Map inputs (..., 54) to features of joints (..., J, 18)."""
+        return self.spread(tracker_features(encoded).transpose(-1, -2)).transpose(-1, -2)
+
+
+class AttentionBlock(nn.Module):
+    """Attention and an MLP of four times the width, both pre-norm and residual.
+
+    Args:
+        width: d, the width of the features.
+        heads: number of attention heads; it divides d.
+        dropout: dropout rate of both parts' outputs, while training.
+    """
+
+    def __init__(self, width: int, heads: int, dropout: float):
+        super().__init__()
+        self.attention_norm, self.attention = nn.LayerNorm(width), Attention(width, heads)
+        self.norm, self.dropout = nn.LayerNorm(width), Dropout(dropout)
+        self.mlp = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width))
+
+    def forward(self, h: Tensor) -> Tensor:
+        """Map features (B, T, d) to (B, T, d)."""
+        return self.newest(h, h.shape[-2])
+
+    def newest(self, h: Tensor, count: int) -> Tensor:
+        """Map features (..., T, d) to those of the newest frames (..., count, d), without the rest."""
+        seen, attention = self.attention_norm(h), self.attention
+        query = attention.query(seen[..., -count:, :])
+        attended = attention.attend(query, attention.key(seen), attention.value(seen))
+        h = h[..., -count:, :] + self.dropout(attended)
+        return h + self.dropout(self.mlp(self.norm(h)))
+
+
+class Stack(nn.Module):
+    """Blocks on features with sine position embeddings; subclasses put layers before and after the blocks.
+
+    Args:
+        width: d, the width of the features.
+        depth: number of blocks.
+        heads: number of attention heads; it divides d.
+        dropout: dropout rate in the blocks, while training.
+    """
+
+    def __init__(self, width: int, depth: int, heads: int, dropout: float):
+        super().__init__()
+        self.blocks = nn.Sequential(*(AttentionBlock(width, heads, dropout) for _ in range(depth)))
+        self.norm, self.head = nn.LayerNorm(width), nn.Linear(width, width, bias=False)
+
+    def before(self, h: Tensor) -> Tensor:
+        """Return the features that the blocks get, made from features (B, T, d); by default unchanged."""
+        return h
+
+    def after(self, h: Tensor) -> Tensor:
+        """Return the features made from the blocks' output (B, T, d); by default unchanged."""
+        return h
+
+    def forward(self, h: Tensor) -> Tensor:
+        """Map features (B, T, d) to features (B, T', d)."""
+        h = self.before(h)
+        return self.head(self.norm(self.after(self.blocks(h + places(h)))))
+
+
+def places(h: Tensor) -> Tensor:
+    """Return position embeddings (T, d) for features (B, T, d), d even (Vaswani et al. 2017, Sec. 3.5).
+
+    They are sines and cosines.
+    """
+    count, width = h.shape[-2:]
+    rates = torch.exp(torch.arange(0, width, 2, device=h.device) * (-math.log(10_000) / width))
+    angles = torch.arange(count, device=h.device)[:, None] * rates
+    return torch.stack([angles.sin(), angles.cos()], -1).flatten(-2).to(h)
+
+
+class Shortened(Stack):
+    """Blocks after a convolution over time and a maximum over every two frames: T to T // 2 frames."""
+
+    def __init__(self, width: int, depth: int, heads: int, dropout: float):
+        super().__init__(width, depth, heads, dropout)
+        self.convolution = nn.Conv1d(width, width, 3, padding=1)
+
+    def before(self, h: Tensor) -> Tensor:
+        """Return features (B, T // 2, d) of features (B, T, d)."""
+        return F.max_pool1d(self.convolution(h.transpose(1, 2)), 2).transpose(1, 2)
+
+
+class Lengthened(Stack):
+    """Blocks, then a transposed convolution over time that doubles the frames (T to 2T)."""
+
+    def __init__(self, width: int, depth: int, heads: int, dropout: float):
+        super().__init__(width, depth, heads, dropout)
+        self.convolution = nn.ConvTranspose1d(width, width, 3, stride=2)
+
+    def after(self, h: Tensor) -> Tensor:
+        """Return features (B, 2 T, d): a transposed convolution doubles the frames of features (B, T, d)."""
+        return self.convolution(h.transpose(1, 2))[..., 1:].transpose(1, 2)
+
+    def last(self, h: Tensor, at: Tensor) -> Tensor:
+        """Map features (T, d) and their position embeddings (T, d) to the last of 2 T frames (1, d) alone."""
+        *earlier, block = self.blocks
+        h = h + at
+        for one in earlier:
+            h = one(h)
+        newest = cast(AttentionBlock, block).newest(h, 1)
+        newest = F.linear(newest, self.convolution.weight[..., -1].T, self.convolution.bias)
+        return self.head(self.norm(newest))
+
+
+class ProductQuantiser(nn.Module):
+    """Eight codebooks of 64 vectors of 48, one for each part of a latent, learned by gradient.
+
+    While training, code-vectors that are hardly used move towards the nearest latents; see `revive`.
+    """
+
+    usage: Tensor
+    of_whole_batch = True  # several processes would each count and move codes by themselves
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.vectors = nn.Parameter(
+            torch.empty(BOOKS, CODES, LATENT // BOOKS).uniform_(-1 / CODES, 1 / CODES)
+        )
+        self.register_buffer("usage", torch.zeros(BOOKS, CODES))
+
+    def forward(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the quantised latents (..., 384), with straight-through gradients, and their loss.
+
+        They are compared with the code-vectors in float32 in a mixed-precision training, too.
+        """
+        with in_float32(z.device):
+            return self.quantised(z.to(self.vectors.dtype))
+
+    def quantised(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what `forward` does, in the precision of the latents (..., 384)."""
+        parts = z.flatten(0, -2).unflatten(-1, (BOOKS, -1)).transpose(0, 1)
+        distance = torch.cdist(parts, self.vectors).square()
+        index = distance.argmin(-1)
+        found = torch.stack([book[chosen] for book, chosen in zip(self.vectors, index, strict=True)], 1)
+        found = found.flatten(-2).view_as(z)
+        loss = (found.detach() - z).square().mean() + (found - z.detach()).square().mean()
+        if self.training:
+            self.revive(parts.detach(), distance.detach(), index)
+            loss = loss + sum(contrast(one) for one in distance[:CONTRASTED])
+        return z + (found - z).detach(), loss
+
+    @torch.no_grad()
+    def revive(self, parts: Tensor, distance: Tensor, index: Tensor) -> None:
+        """Move each code-vector towards its nearest latent, the more the less the code-vector is used.
+
+        Args:
+            parts: the latents' parts (8, N, 48).
+            distance: squared distances (8, N, 64) between parts and code-vectors.
+            index: the index of each part's nearest code-vector (8, N).
+        """
+        share = F.one_hot(index, CODES).to(parts).mean(1)
+        self.usage.lerp_(share, 1 - DECAY)
+        weight = torch.exp(-self.usage * (BOOKS * CODES * 10) / (1 - DECAY) - 1e-3)[..., None]
+        nearest = parts.gather(1, distance.argmin(1)[..., None].expand(-1, -1, parts.shape[-1]))
+        self.vectors.data.lerp_(nearest, weight)  # .data: the losses' gradients are those of before
+
+
+def contrast(distance: Tensor) -> Tensor:
+    """Return a codebook's contrastive loss: near for the latents closest to a code, far for the farther half.
+
+    Args:
+        distance: squared distances (N, 64) between latents and code-vectors.
+    """
+    near = -distance.sort(0, descending=True).values  # the last are the nearest
+    positive = near[-max(1, len(near) // (BOOKS * CODES)) :].mean(0, keepdim=True)
+    scores = torch.cat([positive, near[: len(near) // 2]]).T / TEMPERATURE
+    return F.cross_entropy(scores, torch.zeros(CODES, dtype=torch.long, device=scores.device))
+
+
+class HalfVQVAE(nn.Module):
+    """The VQ-VAE of one half of the body: 7,239,436 parameters for the upper half, 7,200,986 for the lower.
+
+    Args:
+        joints: the joints of the half.
+        width: d, the width of the features.
+        depth: number of blocks of the encoder, and of the decoder.
+        heads: number of attention heads; it divides d.
+        dropout: dropout rate in the blocks, while training.
+    """
+
+    def __init__(
+        self,
+        joints: tuple[int, ...],
+        *,
+        width: int = 256,
+        depth: int = 4,
+        heads: int = 4,
+        dropout: float = 0.1,
+    ):
+        super().__init__()
+        self.joints, count = joints, len(joints)
+        self.mixture = Mixture(count)
+        self.stem = nn.Linear(count * (6 + JOINT_DIM), width)
+        self.encoder = Shortened(width, depth, heads, dropout)
+        self.into, self.out_of = nn.Linear(width, LATENT), nn.Linear(LATENT, width)
+        self.quantiser = ProductQuantiser()
+        self.decoder = Lengthened(width, depth, heads, dropout)
+        self.head = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, count * 6))
+
+    def encode(self, rotation: Tensor, encoded: Tensor) -> tuple[Tensor, Tensor]:
+        """Return quantised latents (B, T // 2, 384) and their loss.
+
+        Args:
+            rotation: rotations (B, T, 132) of all joints, of which only those of this half are used.
+            encoded: inputs (B, T, 54).
+        """
+        own = rotation.unflatten(-1, (N_JOINTS, 6))[..., list(self.joints), :]
+        h = self.stem(torch.cat([own, self.mixture(encoded)], -1).flatten(-2))
+        return self.quantiser(self.into(self.encoder(h)))
+
+    def decode(self, latent: Tensor) -> Tensor:
+        """Map latents (B, T // 2, 384) to the half's rotations (B, T, 6 J)."""
+        return self.head(self.decoder(self.out_of(latent)))
+
+
+class Halved(nn.Module):
+    """Maps a window's inputs to features of half as many frames: mixes them over joints, then over time.
+
+    Args:
+        frames: T, the window's length.
+        width: d, the width of the features.
+    """
+
+    def __init__(self, frames: int, width: int):
+        super().__init__()
+        self.mixture = Mixture(N_JOINTS)
+        self.linear = nn.Linear(N_JOINTS * JOINT_DIM, width)
+        self.time = nn.Linear(frames, frames // 2)
+
+    def forward(self, encoded: Tensor, hidden: Tensor | None = None) -> Tensor:
+        """Map inputs (B, T, 54) to features (B, T // 2, d).
+
+        Args:
+            encoded: inputs (B, T, 54).
+            hidden: which joints (B, 22) are hidden in training; None for none.
+        """
+        mixed = self.mixture(encoded)
+        if hidden is not None:
+            mixed = mixed.masked_fill(hidden[:, None, :, None], HIDDEN)
+        return self.shortened(self.linear(mixed.flatten(-2)))
+
+    def shortened(self, h: Tensor) -> Tensor:
+        """Mix features (..., T, d) over time to (..., T // 2, d)."""
+        return self.time(h.transpose(-1, -2)).transpose(-1, -2)
+
+
+class UpperDenoiser(nn.Module):
+    """Predicts the upper half's clean latents from noisy ones and the inputs; 57,969,432 parameters.
+
+    Args:
+        frames: T, the window's length.
+        width: d, the width of the features.
+        depth: number of blocks.
+        heads: number of attention heads; it divides d.
+    """
+
+    def __init__(self, frames: int = 20, *, width: int = 512, depth: int = 12, heads: int = 8):
+        super().__init__()
+        self.condition = Halved(frames, width)
+        self.time = TimeEmbedding(width, SINES)
+        self.align = nn.Linear(frames // 2, frames // 2)
+        self.stem = nn.Linear(width + LATENT, width)
+        self.blocks = nn.ModuleList(DiTBlock(width, heads, 4) for _ in range(depth))
+        self.head = nn.Linear(width, LATENT)
+
+    def aligned(self, latent: Tensor) -> Tensor:
+        """Mix the frames of latents (B, T // 2, 384)."""
+        return self.align(latent.transpose(-1, -2)).transpose(-1, -2)
+
+    def forward(self, noisy: Tensor, time: Tensor, encoded: Tensor, hidden: Tensor | None = None) -> Tensor:
+        """Map noisy latents (B, T // 2, 384), times (B,) and inputs (B, T, 54) to clean latents.
+
+        In training, `hidden` says which joints (B, 22) are hidden; see Halved.
+        """
+        return self.denoise(noisy, time, self.condition(encoded, hidden))
+
+    def denoise(self, noisy: Tensor, time: Tensor, condition: Tensor) -> Tensor:
+        """Map noisy latents (B, T // 2, 384), times (B,) and a condition (B, T // 2, d) to clean ones."""
+        h = self.stem(torch.cat([condition, self.aligned(noisy)], -1))
+        embedding = F.silu(self.time(time))
+        for block in self.blocks:
+            h = block(h, embedding)
+        return self.head(h)
+
+
+class LowerDenoiser(UpperDenoiser):
+    """Predicts the lower half's clean latents, given the upper half's as well; 58,264,728 parameters."""
+
+    def __init__(self, frames: int = 20, *, width: int = 512, depth: int = 12, heads: int = 8):
+        super().__init__(frames, width=width, depth=depth, heads=heads)
+        self.beside = nn.Linear(2 * LATENT, LATENT)
+
+    def joined(self, noisy: Tensor, upper: Tensor) -> Tensor:
+        """Merge noisy latents (..., 384) and the upper half's latents (..., 384) into one (..., 384)."""
+        return self.beside(torch.cat([upper, noisy], -1))
+
+
+class Decoder(nn.Module):
+    """Makes rotations from both halves' latents and the inputs; 4,035,374 parameters.
+
+    Args:
+        frames: T, the window's length.
+        width: d, the width of the features.
+        depth: number of blocks.
+        heads: number of attention heads; it divides d.
+        dropout: dropout rate in the blocks, while training.
+    """
+
+    def __init__(
+        self, frames: int = 20, *, width: int = 256, depth: int = 4, heads: int = 4, dropout: float = 0.1
+    ):
+        super().__init__()
+        self.condition = Halved(frames, LATENT)
+        self.stem = nn.Linear(3 * LATENT, width)
+        self.stack = Lengthened(width, depth, heads, dropout)
+        sizes = 6, ROTATION.stop - 6
+        self.heads = nn.ModuleList(
+            nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, size)) for size in sizes
+        )
+
+    def forward(self, upper: Tensor, lower: Tensor, encoded: Tensor) -> Tensor:
+        """Map latents of both halves (B, T // 2, 384) and inputs (B, T, 54) to rotations (B, T, 132)."""
+        h = self.stack(self.stem(torch.cat([self.condition(encoded), upper, lower], -1)))
+        return torch.cat([head(h) for head in self.heads], -1)

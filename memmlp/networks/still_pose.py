@@ -1,0 +1,54 @@
+"""One pose for every frame: the error of a network that has learned the average and nothing else.
+
+A number of a table is worth something if it is well below this one. Such floors are usual where motion is
+predicted (a zero-velocity baseline: Martinez et al., CVPR 2017); the papers of this field have none.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from memmlp.motion.body import N_JOINTS, ROTATION
+from memmlp.motion.geometry import matrix_to_sixd
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.motion_model import (
+    FrameGraph,
+    State,
+    WindowlessModel,
+)
+
+
+class StillPoseGraph(FrameGraph):
+    """The streaming graph of one pose, in which nothing can be quantised."""
+
+    float32_modules = ()
+    model: StillPose
+
+
+class StillPose(WindowlessModel):
+    """A learned pose, which the coordinates alone turn and carry along: by default with the head.
+
+    It has 132 parameters: the joints' local rotations, at first those of the normalizer's mean, or none where
+    it has no mean (`normalizer.z_scores=false`).
+
+    Args:
+        normalizer: converts between the world and network space.
+        frames: T, the frames of a training window; each is a pose of its own.
+    """
+
+    graph = StillPoseGraph
+
+    def __init__(self, normalizer: Normalizer, *, frames: int):
+        super().__init__(normalizer, frames)
+        self.pose = nn.Parameter(torch.zeros(ROTATION.stop))
+        if not normalizer.mean.any():  # zeros would be no rotations then, and their gradient has no bound
+            self.pose.data.copy_(matrix_to_sixd(torch.eye(3)).repeat(N_JOINTS))
+
+    def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
+        """Take in the newest frames, each on its own; see MotionModel.
+
+        By default the n new frames are returned, which are the most that this network can make.
+        """
+        seen = sparse if newest is None else sparse[:, -newest:]
+        return self.normalizer.posed(self.pose.expand(*seen.shape[:-1], -1), seen), state

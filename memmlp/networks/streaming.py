@@ -1,0 +1,197 @@
+"""Streaming graphs, from which the live step is exported: a network that computes nothing twice.
+
+What depends on one frame alone is computed when the frame enters the window, and carried in the state. The
+last layers compute only what the newest frame needs.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from memmlp.common.errors import InputError
+from memmlp.motion.body import MOTION_DIM, POSITION, ROTATION, SPARSE_DIM
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.layers import gru_step
+from memmlp.networks.motion_model import MotionModel, State, StreamingGraph, filled
+
+
+def streaming(model: MotionModel) -> StreamingGraph:
+    """Make the streaming graph of a trained network, without changing the network.
+
+    Raises:
+        InputError: if the network has no streaming graph: estimates of past frames change at each step
+            (`memory.history=latest`), so nothing can be carried; frames are made with later ones, so it is no
+            stream; or a custom part has no graph.
+    """
+    if not model.settled:
+        raise InputError(
+            "export.graph=streaming: estimates of past frames change at each step (memory.history=latest, or "
+            "a memory of one's own), which no such graph can carry; allowed is export.graph=naive, or "
+            "memory.history=first"
+        )
+    check_streams(model)
+    if not has_stream(model):
+        raise InputError(
+            "export.graph=streaming: a part of one's own has none; allowed is export.graph=naive"
+        )
+    graph = vars(type(model))["graph"]
+    return graph(model)
+
+
+def check_streams(model: MotionModel) -> None:
+    """Raise InputError for a network that makes frames with later ones: no live step makes its motion."""
+    if not model.is_stream:
+        raise InputError("model.offline=true: makes frames with later ones; allowed is model.offline=false")
+
+
+def has_stream(model: MotionModel) -> bool:
+    """Return whether there is a streaming graph for a network; custom parts may have none."""
+    graph: type[StreamingGraph] | None = vars(type(model)).get("graph")  # an inherited one does not count
+    return graph is not None and model.settled and model.is_stream and graph.fits(model)
+
+
+def linear(weight: Tensor, bias: Tensor | None = None) -> nn.Linear:
+    """Return the linear layer of a weight (m, n) and a bias (m,)."""
+    layer = nn.Linear(weight.shape[1], weight.shape[0], bias is not None).to(weight)
+    layer.weight = nn.Parameter(weight.contiguous())
+    if bias is not None:
+        layer.bias = nn.Parameter(bias)
+    return layer
+
+
+class FrameGRU(nn.Module):
+    """GRU layers for one frame, written as plain layers, since not every runtime has a GRU.
+
+    Args:
+        gru: the layers, batch first.
+    """
+
+    def __init__(self, gru: nn.GRU):
+        super().__init__()
+        self.gru = gru
+
+    def forward(self, x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+        """Map an input (B, 1, n) and states (layers, B, d) to the output (B, 1, d) and the new states."""
+        h, after = x[:, 0], []
+        for weights, state in zip(self.gru.all_weights, hidden.unbind(), strict=True):
+            h = gru_step(weights, h, state)
+            after.append(h)
+        return h[:, None], torch.stack(after)
+
+
+Way = Callable[[Tensor, Tensor], Tensor]
+
+
+class OneFrameNormalizer(Normalizer):
+    """A normalizer of single frames, whose conversions are matrices.
+
+    For a given turn of the coordinates the conversions are linear, and their matrices are linear in the
+    cosine and sine of the heading. So the matrices are found by converting a basis.
+
+    Args:
+        normalizer: the normalizer whose conversions these are.
+    """
+
+    def __init__(self, normalizer: Normalizer):
+        super().__init__(normalizer.coordinates, normalizer.rest, normalizer.mean, normalizer.std)
+        exact = copy.deepcopy(normalizer).double()
+        turns = exact.origin(torch.zeros(1, SPARSE_DIM)).shape[-1] - 3
+
+        def encode(x: Tensor, turn: Tensor) -> Tensor:
+            return exact.encode_sparse(x, torch.cat([exact.origin(x)[..., :3], turn.expand(len(x), -1)], -1))
+
+        def decode(x: Tensor, turn: Tensor) -> Tensor:
+            return exact.decode_motion(
+                x[:, :MOTION_DIM], torch.cat([x[:, MOTION_DIM:], turn.expand(len(x), -1)], -1)
+            )
+
+        def decode_rotations(x: Tensor, turn: Tensor) -> Tensor:
+            padded = F.pad(x, (0, MOTION_DIM + 3 - ROTATION.stop))
+            return decode(padded, turn)[:, ROTATION]
+
+        def turn_rotations(x: Tensor, turn: Tensor) -> Tensor:
+            return exact.rotations_out(x, F.pad(turn.expand(len(x), -1), (3, 0)))
+
+        self.encoder = OneFrame(encode, SPARSE_DIM, turns)
+        self.decoder = OneFrame(decode, MOTION_DIM + 3, turns)
+        self.rotation_decoder = OneFrame(decode_rotations, ROTATION.stop, turns)
+        self.rotation_turner = OneFrame(turn_rotations, ROTATION.stop, turns)
+        self.to(normalizer.mean)
+
+    def encode_sparse(self, sparse: Tensor, origin: Tensor) -> Tensor:
+        """Convert world inputs (1, 54) to network space (1, 54)."""
+        return self.encoder(sparse, origin)
+
+    def decode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
+        """Convert motion (1, 198) in network space to the world (1, 198)."""
+        return self.decoder(torch.cat([motion, origin[:, :3]], -1), origin)
+
+    def rotations_out(self, rotations: Tensor, origin: Tensor) -> Tensor:
+        """Convert joints' global rotations (1, 132), 6D, from the coordinates of an origin to the world."""
+        return self.rotation_turner(rotations, origin)
+
+    def posed(self, rotation: Tensor, sparse: Tensor) -> Tensor:
+        """Make world motion (1, 198) from rotations (1, 132) in network space at world inputs (1, 54)."""
+        world = self.rotation_decoder(rotation, self.origin(sparse))
+        motion = F.pad(world, (0, POSITION.stop - ROTATION.stop))
+        return torch.cat([world, self.pose(motion, sparse).flatten(-2)], -1)
+
+
+class OneFrame(nn.Module):
+    """A conversion of one frame that is linear for any given turn of the coordinates.
+
+    Args:
+        way: the conversion, of vectors (n, in) and a turn (turns,) to vectors (n, out), in float64.
+        size: in.
+        turns: how many numbers a turn has.
+    """
+
+    def __init__(self, way: Way, size: int, turns: int):
+        super().__init__()
+        tried = [torch.zeros(turns).double(), *torch.eye(turns).double()]
+        offsets = torch.stack([way(torch.zeros(1, size).double(), turn) for turn in tried])
+        basis = torch.eye(size).double()
+        matrices = torch.stack(
+            [way(basis, turn) - offset for turn, offset in zip(tried, offsets, strict=True)]
+        )
+        offsets[1:] -= offsets[:1]  # what each of the turn's numbers adds
+        matrices[1:] -= matrices[:1]
+        self.parts, self.out = len(matrices), matrices.shape[-1]
+        self.weight = nn.Parameter(matrices.transpose(1, 2).reshape(self.parts * self.out, size))
+        self.bias = nn.Parameter(offsets.reshape(-1))
+
+    def forward(self, x: Tensor, origin: Tensor) -> Tensor:
+        """Map x (1, in) at an origin (1, 3 or 5): the sum of all products, each times its number."""
+        products = F.linear(x, self.weight, self.bias).view(self.parts, self.out)
+        turn = torch.cat([torch.ones_like(origin[:, :1]), origin[:, 3:]], -1)
+        return turn @ products
+
+
+class AGRoLGraph(StreamingGraph):
+    """The base of the streaming graphs of AGRoL's networks; it carries the stem's outputs."""
+
+    float32_modules: tuple[str, ...] = ("model.stem", "model.head")
+    width: int
+
+    def windows(self) -> State:
+        """Return zeros (T - 1, d): the stem's output for each earlier frame's inputs."""
+        return {"stem": torch.zeros(self.frames - 1, self.width)}
+
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
+        entering = self.entering(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
+        window = torch.cat([filled(state["stem"], entering, fresh), entering])
+        return self.normalizer.posed(self.rotation(window), sparse), {"stem": window[1:]}
+
+    def entering(self, encoded: Tensor) -> Tensor:
+        """Return the stem's output (1, d) for one frame's inputs (1, 54), as it is carried."""
+        raise NotImplementedError
+
+    def rotation(self, window: Tensor) -> Tensor:
+        """Map a window of the stem's carried outputs (T, d) to the rotations (1, 132) of its newest frame."""
+        raise NotImplementedError

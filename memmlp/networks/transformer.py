@@ -1,0 +1,152 @@
+"""The transformer blocks that several networks are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from memmlp.networks.layers import Dropout
+
+GAIN = 0.2  # by which the weights at the beginning are smaller than Kaiming's
+
+
+class Attention(nn.Module):
+    """Multi-head self-attention over the frames of a window (Vaswani et al. 2017, Sec. 3.2).
+
+    Windows without a batch axis are allowed, too.
+
+    Args:
+        width: d, the width of the features.
+        heads: number of heads; it divides d.
+    """
+
+    def __init__(self, width: int, heads: int):
+        super().__init__()
+        self.heads = heads
+        self.query, self.key, self.value = (nn.Linear(width, width) for _ in range(3))
+        self.out = nn.Linear(width, width)
+
+    def forward(self, h: Tensor) -> Tensor:
+        """Map features (B, T, d) to (B, T, d)."""
+        return self.attend(self.query(h), self.key(h), self.value(h))
+
+    def attend(self, *parts: Tensor) -> Tensor:
+        """Attend with queries (B, n, d) to keys (B, T, d) and values (B, T, d), given in this order.
+
+        Returns:
+            (B, n, d).
+        """
+        query, key, value = (part.unflatten(-1, (self.heads, -1)).transpose(-3, -2) for part in parts)
+        scores = query @ key.transpose(-1, -2) * query.shape[-1] ** -0.5
+        return self.out((scores.softmax(-1) @ value).transpose(-3, -2).flatten(-2))
+
+
+class EncoderLayer(nn.Module):
+    """Attention, then a feed-forward of two layers, each added to its input and normalised (post-norm).
+
+    Args:
+        width: d, the width of the features.
+        heads: number of attention heads.
+        feedforward: width of the feed-forward's hidden layer.
+        dropout: dropout rate of both parts' outputs and of the hidden layer.
+        activation: what follows the hidden layer.
+    """
+
+    def __init__(
+        self,
+        width: int,
+        heads: int,
+        feedforward: int,
+        dropout: float,
+        activation: Callable[[Tensor], Tensor] = F.relu,
+    ):
+        super().__init__()
+        self.attention = Attention(width, heads)
+        self.attention_norm = nn.LayerNorm(width)
+        self.widen, self.narrow = nn.Linear(width, feedforward), nn.Linear(feedforward, width)
+        self.norm = nn.LayerNorm(width)
+        self.dropout, self.activation = Dropout(dropout), activation
+
+    def forward(self, h: Tensor) -> Tensor:
+        """Map features (B, T, d) or (T, d) to the same shape."""
+        return self.finish(h, self.attention(h))
+
+    def finish(self, h: Tensor, attended: Tensor) -> Tensor:
+        """Apply what follows the attention, frame by frame, to its inputs and outputs (..., d)."""
+        h = self.attention_norm(h + self.dropout(attended))
+        wide = self.dropout(self.activation(self.widen(h)))
+        return self.norm(h + self.dropout(self.narrow(wide)))
+
+
+@torch.no_grad()
+def draw_weights(part: nn.Module) -> None:
+    """Draw initial weights of linear layers as AvatarPoser's released code, and code derived from it, does.
+
+    They have Kaiming's normal distribution (He et al. 2015, Eq. 10) times 0.2, so that a network begins with
+    small outputs: near the mean pose where there are z-scores. Biases are 0; the released code leaves them as
+    torch draws them, and keeps weights within 0.2. In torch's own attention, queries, keys and values share
+    one matrix, which the released code leaves as torch draws it, by Xavier's uniform distribution (Glorot &
+    Bengio 2010, Eq. 16).
+    """
+    for layer in part.modules():
+        if isinstance(layer, nn.Linear):
+            nn.init.kaiming_normal_(layer.weight).mul_(GAIN)
+            nn.init.zeros_(layer.bias)
+    for attention in part.modules():
+        if isinstance(attention, Attention):
+            layers = (attention.query, attention.key, attention.value)
+            together = nn.init.xavier_uniform_(torch.cat([layer.weight for layer in layers]))
+            for layer, weight in zip(layers, together.chunk(len(layers)), strict=True):
+                layer.weight.copy_(weight)
+
+
+def newest_frame(layers: list[EncoderLayer], h: Tensor) -> Tensor:
+    """Apply encoder layers to features (T, d); the last layer computes the newest frame (1, d) alone."""
+    *earlier, last = layers
+    for layer in earlier:
+        h = layer(h)
+    attention, newest = last.attention, h[-1:]
+    return last.finish(
+        newest, attention.attend(attention.query(newest), attention.key(h), attention.value(h))
+    )
+
+
+class DiTBlock(nn.Module):
+    """Attention and an MLP, shifted, scaled and gated by the diffusion time (Peebles & Xie 2023, adaLN).
+
+    Args:
+        width: d, the width of the features.
+        heads: number of attention heads; it divides d.
+        ratio: the width of the MLP's hidden layer, as a multiple of d.
+    """
+
+    def __init__(self, width: int, heads: int, ratio: int = 1):
+        super().__init__()
+        self.attention_norm = nn.LayerNorm(width, eps=1e-6, elementwise_affine=False)
+        self.attention = Attention(width, heads)
+        self.norm = nn.LayerNorm(width, eps=1e-6, elementwise_affine=False)
+        hidden = ratio * width
+        self.mlp = nn.Sequential(nn.Linear(width, hidden), nn.GELU("tanh"), nn.Linear(hidden, width))
+        self.modulation = nn.Linear(width, 6 * width)
+
+    def forward(self, h: Tensor, time: Tensor) -> Tensor:
+        """Map features (B, T, d) to (B, T, d), given the activated embedding (B, d) of the times."""
+        return self.newest(h, self.modulation(time)[..., None, :].chunk(6, -1), h.shape[-2])
+
+    def newest(self, h: Tensor, modulation: Sequence[Tensor], count: int) -> Tensor:
+        """Map features (..., T, d) to those of the newest frames (..., count, d), without making the others.
+
+        Args:
+            h: features (..., T, d).
+            modulation: shift, scale and gate of the attention and of the MLP, broadcast to the features.
+            count: how many of the newest frames are wanted.
+        """
+        shift, scale, gate, mlp_shift, mlp_scale, mlp_gate = modulation
+        seen, attention = self.attention_norm(h) * (1 + scale) + shift, self.attention
+        query = attention.query(seen[..., -count:, :])
+        attended = attention.attend(query, attention.key(seen), attention.value(seen))
+        h = h[..., -count:, :] + gate * attended
+        return h + mlp_gate * self.mlp(self.norm(h) * (1 + mlp_scale) + mlp_shift)

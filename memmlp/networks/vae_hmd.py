@@ -1,0 +1,168 @@
+"""VAE-HMD (Dittadi et al., ICCV 2021): a variational autoencoder of poses, and an encoder from the trackers.
+
+Its authors published no code; sizes are those of the one public re-implementation. Its two stages, the
+autoencoder and then the encoder from the trackers over its frozen decoder, are trained side by side here:
+about half of a batch's windows are encoded from their true poses, and train the autoencoder; the others are
+encoded from the trackers, and train the encoder from the trackers through the decoder, whose weights they do
+not change.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from memmlp.common import distributed
+from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM, SPARSE_POSITION, SPARSE_ROTATION
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.layers import Dropout
+from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel
+
+POSES = (SPARSE_ROTATION, SPARSE_POSITION)
+TRACKERS = sum(part.stop - part.start for part in POSES)  # no velocities
+
+
+class Residual(nn.Module):
+    """Two linear layers, each after a LeakyReLU; a learned share of their output, at first 0, is added.
+
+    Args:
+        width: d, the width of inputs and outputs.
+        dropout: dropout rate between the layers, while training.
+    """
+
+    def __init__(self, width: int, dropout: float):
+        super().__init__()
+        self.share = nn.Parameter(torch.zeros(()))
+        self.path = nn.Sequential(
+            nn.LeakyReLU(),
+            nn.Linear(width, width),
+            Dropout(dropout),
+            nn.LeakyReLU(),
+            nn.Linear(width, width),
+        )
+
+    def forward(self, h: Tensor) -> Tensor:
+        """Map (..., d) to (..., d)."""
+        return h + self.share * self.path(h)
+
+
+class Perceptron(nn.Module):
+    """A linear layer to a width, residual blocks, and a linear layer to the outputs.
+
+    Args:
+        inputs: number of inputs.
+        outputs: number of outputs.
+        width: d, the width of the blocks.
+        depth: number of blocks.
+        dropout: dropout rate of the blocks, while training.
+    """
+
+    def __init__(self, inputs: int, outputs: int, width: int, depth: int, dropout: float):
+        super().__init__()
+        self.stem = nn.Linear(inputs, width)
+        self.blocks = nn.Sequential(*(Residual(width, dropout) for _ in range(depth)))
+        self.head = nn.Linear(width, outputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (..., inputs) to (..., outputs)."""
+        return self.head(self.blocks(self.stem(x)))
+
+
+def divergence(latent: Tensor) -> Tensor:
+    """Return the KL divergence of latents (..., 2 z), means and log variances, from the standard normal.
+
+    It is summed over the z components and averaged over all other axes.
+    """
+    mean, log_variance = latent.chunk(2, -1)
+    return 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1).mean()
+
+
+def drawn(latent: Tensor) -> Tensor:
+    """Draw samples (..., z) from latents (..., 2 z), which are means and log variances."""
+    mean, log_variance = latent.chunk(2, -1)
+    return mean + (0.5 * log_variance).exp() * distributed.drawn(torch.randn_like, mean)
+
+
+class VAEHMDGraph(FrameGraph):
+    """VAE-HMD's streaming graph."""
+
+    float32_modules = ("model.encoder.stem", "model.decoder.head")
+    model: VAEHMD
+
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
+        """Map world inputs (1, 54) to world motion (1, 198); nothing is carried on."""
+        mean = self.model.latent(sparse).chunk(2, -1)[0]
+        return self.normalizer.posed(self.model.decoder(mean), sparse), {}
+
+
+class VAEHMD(WindowlessModel):
+    """An encoder of a frame's trackers to a latent, whose mean is decoded to the rotations of that frame.
+
+    It has 853,958 parameters at the sizes of its re-implementation. The encoder of whole poses, which
+    training alone uses, is not counted.
+
+    Args:
+        normalizer: converts between the world and network space.
+        frames: T, the frames of a training window; each is a pose of its own.
+        width: d, the width of the hidden layers.
+        depth: number of residual blocks of each part.
+        latent: z, the number of the latent's components.
+        dropout: dropout rate of the blocks, while training.
+        divergence_weight: weight of the KL divergence.
+    """
+
+    graph = VAEHMDGraph
+
+    def __init__(
+        self,
+        normalizer: Normalizer,
+        *,
+        frames: int,
+        width: int,
+        depth: int,
+        latent: int,
+        dropout: float,
+        divergence_weight: float,
+    ):
+        super().__init__(normalizer, frames)
+        self.divergence_weight = divergence_weight
+        self.encoder = Perceptron(TRACKERS, 2 * latent, width, depth, dropout)
+        self.decoder = Perceptron(latent, ROTATION.stop, width, depth, dropout)
+        self.pose_encoder = Perceptron(MOTION_DIM, 2 * latent, width, depth, dropout)
+
+    def count_parameters(self) -> int:
+        """Count the trainable parameters of the network in use, without the encoder of whole poses."""
+        return super().count_parameters() - sum(p.numel() for p in self.pose_encoder.parameters())
+
+    def latent(self, sparse: Tensor) -> Tensor:
+        """Map world inputs (..., 54) to their latents (..., 2 z)."""
+        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
+        return self.encoder(torch.cat([encoded[..., part] for part in POSES], -1))
+
+    def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
+        """Take in the newest frames, each on its own; see MotionModel.
+
+        `newest`: how many of the last frames to return, at most n (the default).
+        """
+        seen = sparse if newest is None else sparse[:, -newest:]
+        return self.normalizer.posed(self.decoder(self.latent(seen).chunk(2, -1)[0]), seen), state
+
+    def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
+        """Make a training call: each window is decoded either from its true poses or from its trackers.
+
+        The one further loss is the latents' KL divergence.
+
+        Args:
+            sparse: world inputs (B, T, 54).
+            state: see `advance`.
+            true_frames: world frames [X | Theta] (B, T, 252).
+        """
+        posed = (distributed.drawn(torch.rand_like, sparse[:, :1, :1]) < 0.5).to(sparse.dtype)
+        of_pose = self.pose_encoder(self.normalizer.encode(true_frames)[..., SPARSE_DIM:])
+        latent = posed * of_pose + (1 - posed) * self.latent(sparse)
+        sample = drawn(latent)
+        frozen = {name: weight.detach() for name, weight in self.decoder.named_parameters()}
+        live, still = self.decoder(sample), functional_call(self.decoder, frozen, (sample,))
+        motion = self.normalizer.posed(posed * live + (1 - posed) * still, sparse)
+        return TrainingOutputs(motion, state, {"divergence": self.divergence_weight * divergence(latent)})

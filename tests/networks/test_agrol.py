@@ -1,0 +1,60 @@
+"""AGRoL's networks, part by part."""
+
+import numpy as np
+import pytest
+import tiny
+import torch
+
+from memmlp.evaluation import modes as evaluation
+from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM
+from memmlp.networks.diffusion import TimeEmbedding
+
+CLIP = tiny.clip(40)
+SPARSE = CLIP[None, :, :SPARSE_DIM]
+
+
+@torch.no_grad()
+def test_agrol_windows_see_nothing_of_other_windows():
+    model, changed = tiny.baseline("agrol_mlp"), CLIP.clone()
+    changed[:7] += 0.5
+    before, after = evaluation.window(model, [CLIP])[0], evaluation.window(model, [changed])[0]
+    assert torch.equal(before[7:], after[7:])
+    assert not torch.allclose(before[6], after[6])
+
+
+def test_the_denoiser_learns_from_the_noised_truth_of_the_window():
+    """The training call gives the denoiser noised true rotations, drawn times and the window's inputs."""
+    model, seen = tiny.baseline("agrol_diffusion"), []
+    denoise = model.denoise
+    model.denoise = lambda *args: (seen.append(args), denoise(*args))[1]
+    truth = tiny.clip(7)[None].expand(64, -1, -1)
+    state = model.true_state(truth[:, :-1])
+    torch.manual_seed(0)
+    motion, *_ = model.training_call(truth[:, -1:, :SPARSE_DIM], state, truth)
+    (noisy, time, encoded), *_ = seen
+    frames = model.normalizer.encode(truth)
+    signal = model.diffusion.signal[time][:, None, None]
+    noise = (noisy - signal.sqrt() * frames[..., SPARSE_DIM:][..., ROTATION]) / (1 - signal).sqrt()
+    assert motion.shape == (64, 7, MOTION_DIM)
+    torch.testing.assert_close(encoded, frames[..., :SPARSE_DIM])
+    assert set(time.tolist()) <= set(range(50))
+    assert len(set(time.tolist())) > 20
+    assert float(noise.mean()) == pytest.approx(0, abs=0.02)
+    assert float(noise.std()) == pytest.approx(1, abs=0.02)
+
+
+def test_time_embedding_is_of_sines_and_cosines():
+    embedding = TimeEmbedding(8)
+    embedding.mlp = torch.nn.Identity()
+    angles = 7 * 10_000 ** -(np.arange(4) / 4)
+    expected = np.concatenate([np.cos(angles), np.sin(angles)])
+    np.testing.assert_allclose(embedding(torch.tensor([7]))[0].numpy(), expected, rtol=1e-5)
+
+
+def test_sampling_draws_nothing():
+    model = tiny.baseline("agrol_diffusion")
+    runs = []
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        runs.append(evaluation.stream(model, [CLIP])[0])
+    assert torch.equal(*runs)

@@ -1,0 +1,166 @@
+"""BoDiffusion, part by part."""
+
+from math import erf, pi, sqrt
+
+import numpy as np
+import pytest
+import tiny
+import torch
+
+from memmlp.common.errors import InputError
+from memmlp.evaluation import modes
+from memmlp.evaluation.evaluation import Evaluation
+from memmlp.evaluation.ik import NoIK
+from memmlp.motion.body import ROTATION, SPARSE_DIM
+from memmlp.networks import diffusion as ancestral
+from memmlp.networks.diffusion import Denoised
+from memmlp.networks.streaming import has_stream, streaming
+from memmlp.networks.transformer import DiTBlock
+
+CLIP = tiny.clip(25)
+TRUTH = tiny.clip(7)[None].expand(64, -1, -1)
+FINER = {"diffusion_steps": 60, "sampling_steps": 52, "depth": 1}
+
+
+@torch.no_grad()
+def test_a_block_is_an_independent_numpy_computation():
+    block, draw = DiTBlock(6, 2).double(), torch.Generator().manual_seed(0)
+    h, time = (torch.randn(*shape, generator=draw).double() for shape in ((1, 5, 6), (1, 6)))
+
+    def linear(layer: torch.nn.Linear, x: np.ndarray) -> np.ndarray:
+        return x @ layer.weight.numpy().T + layer.bias.numpy()
+
+    def normed(x: np.ndarray) -> np.ndarray:
+        return (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-6)
+
+    def gelu(x: np.ndarray) -> np.ndarray:
+        return 0.5 * x * (1 + np.tanh(sqrt(2 / pi) * (x + 0.044715 * x**3)))
+
+    x, found = h[0].numpy(), np.split(linear(block.modulation, time[0].numpy()), 6)
+    seen = normed(x) * (1 + found[1]) + found[0]
+    attended = block.attention(torch.tensor(seen)[None])[0].numpy()
+    x = x + found[2] * attended
+    hidden = gelu(linear(block.mlp[0], normed(x) * (1 + found[4]) + found[3]))
+    np.testing.assert_allclose(block(h, time)[0].numpy(), x + found[5] * linear(block.mlp[2], hidden))
+    assert abs(gelu(np.array(1.0)) - (1 + erf(1 / sqrt(2))) / 2) < 1e-3
+
+
+@torch.no_grad()
+def test_each_joint_gets_a_mixture_of_the_inputs_thirds():
+    model, x = tiny.baseline("bodiffusion"), torch.randn(2, 54)
+    weight = model.spread.weight.numpy()  # joint, third
+    thirds = x.numpy().reshape(2, 3, 18)
+    np.testing.assert_allclose(model.mixed(x).numpy(), np.einsum("jk,bkc->bjc", weight, thirds), rtol=1e-4)
+
+
+def test_the_denoiser_learns_from_the_noised_truth_of_the_window():
+    """The training call's losses are of the noise that was mixed in; they have weights."""
+    found = []
+    for weights in ({}, {"noise_weight": 0.5, "bound_weight": 3.0}):
+        model, seen = tiny.baseline("bodiffusion", **weights), []
+        denoise = model.denoise
+        model.denoise = lambda *args, denoise=denoise, seen=seen: (seen.append(args), denoise(*args))[1]
+        torch.manual_seed(0)
+        motion, _, losses = model.training_call(
+            TRUTH[:, -1:, :SPARSE_DIM], model.true_state(TRUTH[:, :-1]), TRUTH
+        )
+        assert float(motion[..., ROTATION].detach().abs().max()) == pytest.approx(1)  # kept within limits
+        found.append({name: float(term.detach()) for name, term in losses.items()})
+    (noisy, time, encoded), *_ = seen
+    frames = model.normalizer.encode(TRUTH)
+    signal = model.diffusion.signal[time][:, None, None]
+    noise = (noisy - signal.sqrt() * frames[..., SPARSE_DIM:][..., ROTATION]) / (1 - signal).sqrt()
+    torch.testing.assert_close(encoded, frames[..., :SPARSE_DIM])
+    assert len(set(time.tolist())) > 20
+    assert float(noise.std()) == pytest.approx(1, abs=0.02)
+    error = float((denoise(noisy, time, encoded).noise.detach() - noise).square().mean())
+    assert found[0]["noise"] == pytest.approx(error, rel=1e-4)
+    assert found[1] == pytest.approx({"noise": 0.5 * error, "bound": 3 * found[0]["bound"]}, rel=1e-4)
+
+
+@torch.no_grad()
+def test_learning_takes_what_a_perfect_denoiser_would_leave():
+    """With the true noise the motion is the true one, whatever was drawn."""
+    model = tiny.baseline("bodiffusion").double()
+    truth = TRUTH[:4].double()
+    encoded = model.normalizer.encode(truth)[..., SPARSE_DIM:][..., ROTATION]
+
+    def perfect(noisy, time, _):
+        signal = model.diffusion.signal[time][:, None, None]
+        return Denoised((noisy - signal.sqrt() * encoded) / (1 - signal).sqrt(), torch.zeros_like(noisy))
+
+    model.denoise = perfect
+    motion, *_ = model.training_call(truth[:, -1:, :SPARSE_DIM], model.true_state(truth[:, :-1]), truth)
+    true = truth[..., SPARSE_DIM:]
+    torch.testing.assert_close(motion[..., ROTATION], true[..., ROTATION], atol=1e-6, rtol=0)
+
+
+@torch.no_grad()
+def test_windows_are_denoised_together_and_averaged_where_they_overlap(monkeypatch):
+    """Window by window and frame by frame, with steps that add noise."""
+    monkeypatch.setattr(ancestral, "QUIET", 1)
+    model = tiny.baseline("bodiffusion", offline=True, sampling_steps=2, depth=1).double()
+    sparse = CLIP[:, :SPARSE_DIM].double()
+    noise = torch.randn(2, 25, 132, generator=torch.Generator().manual_seed(0)).double()
+    found = model.whole(sparse)
+    encoded = model.normalizer.encode_sparse(sparse, model.normalizer.origin(sparse))
+    x = noise[0]
+    for index in range(2):
+        sums, variances, covered = torch.zeros_like(x), torch.zeros_like(x), torch.zeros(25, 1)
+        for begin in (0, 3, 6, 9, 12, 15, 18):
+            part = slice(begin, begin + 7)
+            mean, variance = model.step(x[None, part], encoded[None, part], index)
+            sums[part] += mean[0]
+            variances[part] += variance[0]
+            covered[part] += 1
+        x = sums / covered + (variances.sqrt() / covered * noise[1] if index == 0 else 0)
+    torch.testing.assert_close(found, model.normalizer.posed(x, sparse), atol=1e-9, rtol=0)
+
+
+@torch.no_grad()
+def test_a_clip_of_one_window_is_that_window():
+    model, stream = tiny.baseline("bodiffusion", offline=True), tiny.baseline("bodiffusion")
+    for length in (7, 5):
+        clips = [CLIP[:length]]
+        torch.testing.assert_close(modes.window(model, clips)[0], modes.window(stream, clips)[0])
+
+
+@torch.no_grad()
+def test_offline_it_is_no_stream():
+    model, clip, changed = tiny.baseline("bodiffusion", offline=True), CLIP[:14], CLIP[:14].clone()
+    changed[-1] += 0.5
+    before, after = (modes.window(model, [one])[0] for one in (clip, changed))
+    assert not torch.allclose(before[4], after[4])  # the windows in between carry it there
+    assert not model.is_stream
+    assert not has_stream(model)
+    with pytest.raises(InputError, match=r"model\.offline=true"):
+        streaming(model)
+    report = Evaluation(["window"], 4, NoIK(), 0).report(model, tiny.frames((20,)), "window")
+    assert report["offline"]
+    assert "offline" not in Evaluation(["window"], 4, NoIK(), 0).report(
+        tiny.baseline("bodiffusion"), tiny.frames((20,)), "window"
+    )
+
+
+@torch.no_grad()
+def test_trained_weights_may_sample_with_more_steps():
+    model = tiny.baseline("bodiffusion", diffusion_steps=60, depth=1)
+    finer = tiny.baseline("bodiffusion", seed=1, **FINER)
+    finer.load_state_dict(model.state_dict())
+    assert (len(model.noises), len(finer.noises)) == (2, 9)
+    window = CLIP[None, :7, :SPARSE_DIM]
+    motions = [one.advance(window, one.initial_state())[0] for one in (model, finer)]
+    assert not torch.allclose(*motions, atol=1e-3)
+    live = streaming(finer.double())
+    expected = finer.advance(window.double()[:, :1], finer.initial_state(), 1)[0]
+    torch.testing.assert_close(live.advance(window.double()[:, :1], live.initial_state())[0], expected)
+
+
+def test_sampling_draws_nothing():
+    for offline in (False, True):
+        model = tiny.baseline("bodiffusion", offline=offline)
+        runs = []
+        for seed in (1, 2):
+            torch.manual_seed(seed)
+            runs.append(modes.window(model, [CLIP])[0])
+        assert torch.equal(*runs)

@@ -1,0 +1,89 @@
+"""HMD-Poser, part by part."""
+
+import numpy as np
+import pytest
+import tiny
+import torch
+
+from memmlp.motion.body import SPARSE_DIM, SPARSE_POSITION
+from memmlp.motion.geometry import sixd_to_matrix
+from memmlp.networks.hmd_poser import NormedLSTM, hands_in_head
+
+CLIP = tiny.clip(20)
+SPARSE = CLIP[None, :, :SPARSE_DIM]
+
+
+def test_hands_in_the_heads_frame_are_those_of_consecutive_frames():
+    """The frame before is found from the velocities; here it is taken from the clip itself."""
+    rotations, turns, positions, velocities = (part[0].double().numpy() for part in hands_in_head(SPARSE))
+    poses = sixd_to_matrix(CLIP[:, :18].unflatten(-1, (3, 6))).double().numpy()
+    places = CLIP[:, SPARSE_POSITION].unflatten(-1, (3, 3)).double().numpy()
+    own = [
+        [(poses[t, 0].T @ poses[t, 1 + h], poses[t, 0].T @ (places[t, 1 + h] - places[t, 0])) for h in (0, 1)]
+        for t in range(20)
+    ]
+    for t in range(1, 20):
+        for h in (0, 1):
+            (now, here), (before, there) = own[t][h], own[t - 1][h]
+            np.testing.assert_allclose(rotations[t, h], now[:, :2].T.flatten(), atol=1e-5)
+            np.testing.assert_allclose(turns[t, h], (before.T @ now)[:, :2].T.flatten(), atol=1e-5)
+            np.testing.assert_allclose(positions[t, h], here, atol=1e-5)
+            np.testing.assert_allclose(velocities[t, h], here - there, atol=1e-5)
+
+
+@torch.no_grad()
+def test_an_lstm_is_torchs_with_weights_of_direction_and_gain():
+    ours, torchs = NormedLSTM(6).double(), torch.nn.LSTM(6, 6, batch_first=True).double()
+    for gain in ours.gains:
+        gain.mul_(1 + torch.rand_like(gain))
+    names = ("weight_ih_l0", "weight_hh_l0")
+    for name, direction, gain in zip(names, ours.directions, ours.gains, strict=True):
+        rows = [row / row.norm() * size for row, size in zip(direction, gain, strict=True)]
+        getattr(torchs, name).copy_(torch.stack(rows))
+    torchs.bias_ih_l0.copy_(ours.biases[0])
+    torchs.bias_hh_l0.copy_(ours.biases[1])
+    x, states = torch.randn(3, 5, 6).double(), torch.randn(2, 3, 6).double()
+    expected, (hidden, cell) = torchs(x, (states[:1], states[1:]))
+    for found, of in zip(ours(x, *states), (expected, hidden[0], cell[0]), strict=True):
+        torch.testing.assert_close(found, of)
+
+
+def test_its_weights_begin_orthogonal_with_gains_that_change_nothing():
+    lstm = NormedLSTM(8)
+    for direction, gain in zip(lstm.directions, lstm.gains, strict=True):
+        torch.testing.assert_close(direction.T @ direction, torch.eye(8), atol=1e-5, rtol=0)
+        torch.testing.assert_close(gain[:, 0], direction.norm(dim=1))
+
+
+@torch.no_grad()
+def test_the_past_counts_without_end_and_the_future_does_not():
+    model, changed = tiny.baseline("hmd_poser").double(), SPARSE.double().clone()
+    changed[:, 5] += 0.5
+    found, other = (model.advance(of, model.initial_state(1))[0] for of in (SPARSE.double(), changed))
+    torch.testing.assert_close(found[:, :5], other[:, :5])
+    assert (found[:, 5:] - other[:, 5:]).abs().amax(-1).min() > 1e-9
+
+
+def test_the_state_of_the_published_network_is_8192_numbers():
+    model = tiny.baseline("hmd_poser", width=256, heads=8, feedforward=8)
+    assert sum(part.numel() for part in model.initial_state(1).values()) == 8192
+
+
+def test_the_shape_is_trained_to_be_the_same_within_a_window():
+    model = tiny.baseline("hmd_poser", shape_weight=0.5)
+    truth = torch.stack([tiny.clip(7, seed) for seed in (1, 2)])
+    motion, _, losses = model.training_call(truth[..., :SPARSE_DIM], model.initial_state(2), truth)
+    torch.testing.assert_close(motion, model.advance(truth[..., :SPARSE_DIM], model.initial_state(2))[0])
+    features = model.features(truth[..., :SPARSE_DIM], model.initial_state(2))[0]
+    shapes = model.shape(features).detach().numpy()
+    expected = 0.5 * np.abs(shapes - shapes.mean(1, keepdims=True)).mean()
+    assert float(losses["shape"].detach()) == pytest.approx(expected, rel=1e-4)
+    plain = tiny.baseline("hmd_poser", shape_weight=0)
+    assert plain.training_call(truth[..., :SPARSE_DIM], plain.initial_state(2), truth).losses == {}
+    assert model.count_parameters() - plain.count_parameters() == 8 * 16 * 16 + 16 + 16 * 16 + 16
+
+
+def test_hands_in_the_heads_frame_are_those_of_float32_in_a_mixed_precision_training():
+    with torch.autocast("cpu", torch.bfloat16):
+        found = hands_in_head(SPARSE)
+    torch.testing.assert_close(found, hands_in_head(SPARSE), rtol=0, atol=0)

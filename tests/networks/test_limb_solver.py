@@ -1,0 +1,152 @@
+"""Limbs in closed form: they reach, they swivel, and the closed forms are what a search finds."""
+
+import math
+
+import numpy as np
+import pytest
+import tiny
+import torch
+
+from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics, sixd_to_matrix
+from memmlp.networks import limb_solver as limbs
+from memmlp.networks.limb_solver import BASES, ENDS, MIDDLES, TOES
+
+REST = tiny.REST.double()
+DRAW = torch.Generator().manual_seed(0)
+
+
+def drawn(*shape: int) -> torch.Tensor:
+    return torch.randn(*shape, generator=DRAW, dtype=torch.double)
+
+
+def unit(*shape: int) -> torch.Tensor:
+    return torch.nn.functional.normalize(drawn(*shape), dim=-1)
+
+
+def person(count: int = 40) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Local and global rotations and joints of people who move moderately."""
+    local = axis_angle_to_matrix(0.3 * drawn(count, 22, 3))
+    return local, *forward_kinematics(local, torch.zeros(count, 3).double(), REST)
+
+
+def reachable(base: torch.Tensor) -> torch.Tensor:
+    """Ends that every limb can reach."""
+    upper, lower, _ = limbs.bones(REST)
+    longest = upper.norm(dim=-1) + lower.norm(dim=-1)
+    share = 0.3 + 0.65 * torch.rand(*base.shape[:2], generator=DRAW).double()
+    return base + unit(*base.shape) * (share * longest)[..., None]
+
+
+@pytest.fixture(scope="module")
+def body() -> dict[str, torch.Tensor]:
+    """Bodies before and after their limbs were solved."""
+    local, turned, joints = person()
+    base = joints[:, list(BASES)]
+    given = {"end": reachable(base), "swivel": unit(40, 4, 2), "hands": sixd_to_matrix(drawn(40, 2, 6))}
+    given["toe"] = drawn(40, 2, 3)
+    made = limbs.solved(local, turned, base, *given.values(), REST)
+    after = forward_kinematics(made, torch.zeros(40, 3).double(), REST)
+    up = turned[:, list(BASES), :, 1]
+    return {"made": made, "turned": after[0], "joints": after[1], "base": base, "up": up, **given}
+
+
+def test_hands_and_ankles_come_to_their_ends_and_feet_point_to_their_toes(body):
+    joints = body["joints"]
+    torch.testing.assert_close(joints[:, list(BASES)], body["base"])
+    torch.testing.assert_close(joints[:, list(ENDS)], body["end"], atol=1e-5, rtol=0)
+    torch.testing.assert_close(body["turned"][:, list(ENDS[:2])], body["hands"])
+    foot = joints[:, list(TOES)] - joints[:, list(ENDS[2:])]
+    wanted = torch.nn.functional.normalize(body["toe"], dim=-1)
+    torch.testing.assert_close(torch.nn.functional.normalize(foot, dim=-1), wanted, atol=1e-6, rtol=0)
+    for rotation in (body["made"], body["turned"]):
+        torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).double().expand(rotation.shape))
+
+
+def test_elbows_and_knees_bend_about_their_axes_and_roll_about_their_forearms(body):
+    """The knee's rotation keeps the axis of flexion; the elbow's is such a bend and then a roll."""
+    _, lower, axis = limbs.bones(REST)
+    knees = body["made"][:, list(MIDDLES[2:])]
+    torch.testing.assert_close(limbs.applied(knees, axis[2:]), axis[2:].expand(40, -1, -1))
+    elbows = body["made"][:, list(MIDDLES[:2])]
+    bent = limbs.flexed(*limbs.bones(REST), (body["end"] - body["base"]).norm(dim=-1, keepdim=True))[:, :2]
+    rolled = bent.mT @ elbows
+    torch.testing.assert_close(
+        limbs.applied(rolled, lower[:2]), lower[:2].expand(40, -1, -1), atol=1e-9, rtol=0
+    )
+
+
+def test_a_middle_is_where_its_swivel_says_unless_its_twist_is_limited(body):
+    """Unlimited bases have the swivel that was asked for; limited ones are at their limits."""
+    back = body["turned"][:, [limbs.PARENTS[joint] for joint in BASES]].mT
+    local = back @ body["turned"][:, list(BASES)]
+    bone = torch.nn.functional.normalize(limbs.bones(REST)[0], dim=-1)
+    cosine, sine = limbs.twist(local, bone.expand(40, -1, -1))
+    found = torch.atan2(sine, cosine)[..., 0].rad2deg().abs()
+    limit = torch.tensor(limbs.TWIST).double()
+    assert (found <= limit + 1e-6).all()
+    free = found < limit - 1e-6
+    assert 20 < int(free.sum()) < 140
+    joints = [body["joints"][:, list(of)] for of in (BASES, MIDDLES, ENDS)]
+    swivel = limbs.swivels(*joints, body["up"])
+    torch.testing.assert_close(swivel[free], body["swivel"][free], atol=0.02, rtol=0)
+    torch.testing.assert_close(found[~free], limit.expand(40, 4)[~free])
+
+
+def test_the_smallest_turn_to_a_limit_is_what_a_search_finds():
+    local, bone, axis = sixd_to_matrix(drawn(6, 4, 6)), unit(4, 3), unit(6, 4, 3)
+    turn = limbs.untwisting(local, bone, axis)
+    tried = torch.linspace(-math.pi, math.pi, 7201).double()[:, None, None, None]
+    every = limbs.about(axis.expand(7201, 6, 4, 3), tried.cos(), tried.sin()) @ local
+    cosine, sine = limbs.twist(every, bone.expand(7201, 6, 4, 3))
+    inside = torch.atan2(sine, cosine)[..., 0].rad2deg().abs() <= torch.tensor(limbs.TWIST) + 0.3
+    least = torch.where(inside, tried[..., 0].abs(), 10.0).amin(0)
+    found = torch.acos(((turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1))
+    assert float(least.max()) < 4
+    torch.testing.assert_close(found, least, atol=0.05, rtol=0)
+    assert 4 < int((least > 0.01).sum()) < 24
+
+
+def test_swivels_are_an_independent_computation():
+    """In NumPy, limb by limb: the angle of the middle about the axis, from below the base's Y axis."""
+    base, middle, end, up = (drawn(5, 4, 3) for _ in range(4))
+    found = limbs.swivels(base, middle, end, up).numpy()
+    lengths = [(one - other).norm(dim=-1, keepdim=True) for one, other in ((base, middle), (middle, end))]
+    again = limbs.middle_at(base, end, up, torch.tensor(found), *lengths)
+    torch.testing.assert_close(again, middle)
+    for index in np.ndindex(5, 4):
+        a, m, e, y = (part.numpy()[index] for part in (base, middle, end, up))
+        n = (e - a) / np.linalg.norm(e - a)
+        down = -(y - (y @ n) * n)
+        away = (m - a) - ((m - a) @ n) * n
+        cosine = down @ away / np.linalg.norm(down) / np.linalg.norm(away)
+        sine = np.cross(down, away) @ -n / np.linalg.norm(down) / np.linalg.norm(away)
+        np.testing.assert_allclose(found[index], [cosine, sine], atol=1e-9)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0, 5.0])
+def test_what_is_out_of_reach_is_a_limb_as_straight_or_bent_as_can_be_with_finite_slopes(share):
+    local, turned, joints = person(3)
+    base = joints[:, list(BASES)]
+    end = (base + share * limbs.bones(REST)[0]).requires_grad_()
+    swivel, toe = unit(3, 4, 2).requires_grad_(), drawn(3, 2, 3).requires_grad_()
+    hands = sixd_to_matrix(drawn(3, 2, 6))
+    made = limbs.solved(local, turned, base, end, swivel, hands, toe, REST)
+    assert torch.isfinite(made).all()
+    (made * drawn(*made.shape)).sum().backward()
+    assert all(torch.isfinite(part.grad).all() for part in (end, swivel, toe))
+    if share == 5:
+        straight = forward_kinematics(made, torch.zeros(3, 3).double(), REST)[1]
+        upper, lower, _ = limbs.bones(REST)
+        reach = (straight[:, list(ENDS)] - base).norm(dim=-1)
+        assert (reach > 0.99 * (upper.norm(dim=-1) + lower.norm(dim=-1))).all()
+
+
+@pytest.mark.slow
+def test_slopes_are_right():
+    local, turned, joints = person(2)
+    base = joints[:, list(BASES)]
+    given = reachable(base), unit(2, 4, 2), sixd_to_matrix(drawn(2, 2, 6)), unit(2, 2, 3)
+    chosen = [part.requires_grad_() for part in (given[0], given[1], given[3])]
+    assert torch.autograd.gradcheck(
+        lambda end, swivel, toe: limbs.solved(local, turned, base, end, swivel, given[2], toe, REST), chosen
+    )

@@ -1,0 +1,217 @@
+"""MANIKIN, part by part."""
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from plain_body import posed
+
+from memmlp.common.errors import InputError
+from memmlp.evaluation.evaluation import Evaluation
+from memmlp.evaluation.ik import NoIK
+from memmlp.motion.body import N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM
+from memmlp.motion.geometry import forward_kinematics, sixd_to_matrix
+from memmlp.motion.network_coordinates import Heading, World
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks import manikin
+from memmlp.networks.limb_solver import BASES, ENDS, MIDDLES
+from memmlp.networks.manikin import KEPT, PLACED, PredictedParts, Truth
+from memmlp.networks.streaming import has_stream, streaming
+
+TRUTH = torch.stack([tiny.clip(7, seed) for seed in (1, 2)]).double()
+SPARSE, MOTION = TRUTH[..., :SPARSE_DIM], TRUTH[..., SPARSE_DIM:]
+NAMES = ("manikin_s", "manikin_l")
+
+
+def outputs() -> torch.Tensor:
+    """What a network should predict of the true motion (2, 7, 86)."""
+    true = Truth(MOTION)
+    turned = posed_globally(MOTION)
+    swivel = manikin.swivels(*true.limbs(), turned[..., list(BASES), :, 1])
+    places = [true.between((15,), (7, 8)), true.between((7, 8), (10, 11))]
+    parts = [true.sixd[..., [0, *KEPT], :], swivel.transpose(-1, -2), *places]
+    return torch.cat([part.flatten(-2) for part in parts], -1)
+
+
+def posed_globally(motion: torch.Tensor) -> torch.Tensor:
+    """Global rotations of motion."""
+    local = sixd_to_matrix(motion[..., ROTATION].unflatten(-1, (22, 6)))
+    return forward_kinematics(local, torch.zeros_like(local[..., 0, :, 0]), tiny.REST.double())[0]
+
+
+@torch.no_grad()
+def test_the_true_parts_make_the_true_trunk_hands_and_ankles():
+    """And the head and wrists have their trackers' rotations; elbows and knees may reach a limit of twist."""
+    normalizer = Normalizer.raw(World(), tiny.REST).double()
+    rotation = PredictedParts.of(outputs(), normalizer).posed(SPARSE, normalizer)
+    motion = normalizer.posed(rotation, SPARSE)
+    made, true = (part[..., POSITION].unflatten(-1, (22, 3)) for part in (motion, MOTION))
+    trunk = [0, 1, 2, 3, 6, 9, 12, 13, 14, 15, 16, 17]
+    torch.testing.assert_close(made[..., trunk, :], true[..., trunk, :], atol=1e-5, rtol=0)
+    off = (made - true)[..., [*ENDS], :].norm(dim=-1)
+    assert float(off.median()) < 1e-5  # a limb that reaches further than one hinge allows comes short
+    assert float(off.max()) < 0.03
+    turned, wanted = posed_globally(motion), posed_globally(MOTION)
+    torch.testing.assert_close(
+        turned[..., [15, 20, 21], :, :], wanted[..., [15, 20, 21], :, :], atol=1e-5, rtol=0
+    )
+    middles = (made - true)[..., [*MIDDLES], :].norm(dim=-1)
+    assert float(middles.quantile(0.1)) < 1e-3
+
+
+def test_joints_whose_ancestors_are_all_predicted():
+    assert PLACED == [0, 1, 2, 3, 4, 5, 6, 9, 12, 13, 14, 15, 16, 17, 18, 19]
+    assert all(PARENTS[joint] in (-1, 0, *KEPT) for joint in PLACED)
+
+
+def filled(sixd: np.ndarray) -> np.ndarray:
+    """The rotations (132,) of a body whose joints that are not predicted are not turned."""
+    rotation = np.tile([1.0, 0, 0, 0, 1, 0], (22, 1))
+    rotation[[0, *KEPT]] = sixd.reshape(11, 6)
+    return rotation.flatten()
+
+
+def test_manikin_s_losses_are_an_independent_computation():
+    """In NumPy, limb by limb, with the weights of its authors."""
+    model = tiny.baseline("manikin_s", World()).double()
+    normalizer = Normalizer.raw(World(), tiny.REST).double()
+    model.normalizer = normalizer
+    made = (
+        outputs()[:, -1:] + 0.1 * torch.randn(2, 1, 86, generator=torch.Generator().manual_seed(1)).double()
+    )
+    found = {name: float(term) for name, term in model.losses_of_parts(made, Truth(MOTION[:, -1:])).items()}
+    raw = made[:, 0].numpy()
+    true = MOTION[:, -1, POSITION].unflatten(-1, (22, 3)).numpy()
+    sixd = MOTION[:, -1, ROTATION].unflatten(-1, (22, 6)).numpy()
+    rotations = [np.abs(raw[b, 6:66].reshape(10, 6) - sixd[b, list(KEPT)]) for b in (0, 1)]
+    bodies = [posed(filled(raw[b, :66])) for b in (0, 1)]
+    rooted = [np.abs(bodies[b] - (true[b] - true[b, 0]))[PLACED] for b in (0, 1)]
+    ankles = [np.abs(raw[b, 74:80].reshape(2, 3) - (true[b, [7, 8]] - true[b, 15])) for b in (0, 1)]
+    toes = [np.abs(raw[b, 80:].reshape(2, 3) - (true[b, [10, 11]] - true[b, [7, 8]])) for b in (0, 1)]
+    swivel, middle = 0.0, 0.0
+    ups = posed_globally(torch.tensor(np.stack([filled(raw[b, :66]) for b in (0, 1)])))
+    for limb, (base, mid, end) in enumerate(zip(BASES, MIDDLES, ENDS, strict=True)):
+        up = ups[:, base, :, 1].numpy()
+        for b in (0, 1):
+            a, m, e = true[b, [base, mid, end]]
+            n = (e - a) / np.linalg.norm(e - a)
+            u = -(up[b] - (up[b] @ n) * n)
+            u /= np.linalg.norm(u)
+            w, away = np.cross(u, n), (m - a) - ((m - a) @ n) * n
+            angle = np.arctan2(away @ w, away @ u)
+            cosine, sine = raw[b, 66 + limb], raw[b, 70 + limb]
+            swivel += (abs(cosine - np.cos(angle)) + abs(sine - np.sin(angle))) / 2
+            size = np.hypot(cosine, sine)
+            place = a + ((m - a) @ n) * n + np.linalg.norm(away) * (cosine * u + sine * w) / size
+            middle += np.abs(place - m).mean() / 2
+    expected = {
+        "trunk_rotation": np.mean(rotations), "trunk_position": 5 * np.mean(rooted), "swivel": 0.1 * swivel,
+        "middle": middle, "ankle": 5 * np.mean(ankles), "toe": 0.3 * np.mean(toes),
+    }  # fmt: skip
+    assert found == pytest.approx(expected, rel=1e-3)
+
+
+def test_manikin_s_standing_legs_teach_without_bound_nothing():
+    """The axis that a swivel is counted from is nearly along a standing leg; none learns by it."""
+    model = tiny.baseline("manikin_s", World())
+    torch.manual_seed(0)
+    made = model.predicted(torch.randn(1, model.frames, SPARSE_DIM)).detach()
+    mean, std = (
+        part[SPARSE_DIM:][ROTATION].unflatten(0, (N_JOINTS, 6))[[0, *KEPT]].flatten()
+        for part in (model.normalizer.mean, model.normalizer.std)
+    )
+    made[..., : len(mean)] = (torch.tensor([1.0, 0, 0, 0, 1, 0]).repeat(1 + len(KEPT)) - mean) / std
+    made.requires_grad_()
+    joints = model.normalizer.rest.new_zeros(1, 1, N_JOINTS, 3)
+    for base, middle, end in zip(BASES, MIDDLES, ENDS, strict=True):
+        joints[..., middle, :] = torch.tensor([0.01, -0.4, 0.02])
+        joints[..., end, :] = torch.tensor([1e-3, -0.8, 5e-4])
+        joints[..., base, :] = 0
+    sixd = torch.tensor([1.0, 0, 0, 0, 1, 0]).repeat(N_JOINTS)
+    motion = torch.cat([sixd.expand(1, 1, -1), joints.flatten(-2)], -1)
+    sum(model.losses_of_parts(made, Truth(motion)).values()).backward()
+    assert made.grad.abs().max() < 10
+
+
+def test_manikin_l_losses_are_nothing_for_the_truth_and_count_angles_the_short_way():
+    model = tiny.baseline("manikin_l", World()).double()
+    model.normalizer = Normalizer.raw(World(), tiny.REST).double()
+    auxiliary = MOTION[..., ROTATION][..., 6:]
+    made = torch.cat([outputs(), auxiliary], -1)
+    true = Truth(MOTION)
+    assert all(float(term) < 1e-5 for term in model.losses_of_parts(made, true).values())
+    turned = made.clone()
+    swivel = made[..., 66:74].unflatten(-1, (2, 4))
+    angle = torch.atan2(swivel[..., 1, :], swivel[..., 0, :]) + 0.3
+    turned[..., 66:74] = 2 * torch.stack([angle.cos(), angle.sin()], -2).flatten(-2)
+    turned[..., 74:77] += 0.1
+    turned[..., 86:] += 0.05
+    found = {name: float(term) for name, term in model.losses_of_parts(turned, true).items()}
+    expected = {"trunk_rotation": 0, "swivel": 0.03, "ankle": 0.25, "toe": 0.25, "auxiliary": 0.1}
+    assert found == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_training_is_on_windows_turned_by_any_heading_and_the_motion_is_turned_back(name, monkeypatch):
+    """Each window by its own; in coordinates of the heading it makes no difference at all."""
+    model, seen = tiny.baseline(name, Heading()).double(), []
+    model.normalizer = Normalizer.raw(Heading(), tiny.REST).double()
+    monkeypatch.setattr(torch, "rand_like", lambda like: torch.tensor([[[0.1]], [[0.7]]]).double())
+    state = model.initial_state(2)
+    expected = model.advance(SPARSE, state)[0]
+    motion, *_ = model.training_call(SPARSE, state, TRUTH)
+    torch.testing.assert_close(motion, expected[:, -motion.shape[1] :], atol=1e-6, rtol=0)
+    world = tiny.baseline(name, World()).double()
+    world.normalizer = Normalizer.raw(World(), tiny.REST).double()
+    predicted = world.predicted
+    world.predicted = lambda encoded: (seen.append(encoded), predicted(encoded))[1]
+    world.training_call(SPARSE, state, TRUTH)
+    heads = [window[..., 36:39][:, -world.frames :] for window in (SPARSE, seen[0])]
+    torch.testing.assert_close(heads[0][..., 2], heads[1][..., 2])
+    torch.testing.assert_close(heads[0][..., :2].norm(dim=-1), heads[1][..., :2].norm(dim=-1))
+    assert not torch.allclose(heads[0], heads[1], atol=1e-3)
+    still = tiny.baseline(name, World(), turned=False).double()
+    still.normalizer = world.normalizer
+    torch.testing.assert_close(
+        still.training_call(SPARSE, state, TRUTH)[0], still.advance(SPARSE, state)[0][:, -motion.shape[1] :]
+    )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_losses_of_the_parts_have_a_weight(name):
+    found = []
+    for weight in (1.0, 0.5):
+        model = tiny.baseline(name, parts_weight=weight, turned=False)
+        losses = model.training_call(SPARSE.float(), model.initial_state(2), TRUTH.float()).losses
+        found.append({key: float(term.detach()) for key, term in losses.items()})
+    parts = found[0].keys() - {"coarse"}
+    assert len(parts) == {"manikin_s": 6, "manikin_l": 5}[name]
+    assert {key: found[1][key] for key in parts} == pytest.approx(
+        {key: found[0][key] / 2 for key in parts}, rel=1e-5
+    )
+
+
+def test_offline_it_is_no_stream():
+    model = tiny.baseline("manikin_l", offline=True)
+    assert not model.is_stream
+    assert not has_stream(model)
+    evaluation = Evaluation(["window"], 4, NoIK(), 0)
+    assert evaluation.report(model, tiny.frames((20,)), "window")["offline"]
+    assert "offline" not in evaluation.report(tiny.baseline("manikin_l"), tiny.frames((20,)), "window")
+    with pytest.raises(InputError, match=r"model\.offline=true"):
+        streaming(model)
+    assert tiny.baseline("manikin_l").is_stream
+
+
+@pytest.mark.parametrize("name", NAMES)
+@torch.no_grad()
+def test_limbs_are_solved_and_compared_in_float32_in_a_mixed_precision_training(name):
+    """A pose and its losses are those of the parts, however the parts were computed."""
+    model, truth = tiny.baseline(name), TRUTH.float()
+    encoded = model.normalizer.encode_sparse(truth[..., :SPARSE_DIM], model.normalizer.origin(truth))
+    made = torch.randn(2, 7, model.regressor[-1].out_features if name == "manikin_l" else 86).bfloat16()
+    with torch.autocast("cpu", torch.bfloat16):
+        posed, losses = model.posed(made, encoded), manikin.Manikin.losses(model, made, truth)
+    torch.testing.assert_close(posed, model.posed(made.float(), encoded), rtol=0, atol=0)
+    expected = manikin.Manikin.losses(model, made.float(), truth)
+    torch.testing.assert_close(losses, expected, rtol=0, atol=0)

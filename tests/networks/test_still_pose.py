@@ -1,0 +1,97 @@
+"""A still pose is one pose, which the head carries along, and at first the average of its training frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import pytest
+import tiny
+import torch
+
+from memmlp.common.errors import InputError
+from memmlp.deploy.block_quantization import quantise_blocks
+from memmlp.deploy.export import export
+from memmlp.deploy.half_precision import halve
+from memmlp.deploy.parity import TOLERANCE, parity
+from memmlp.deploy.quantization import quantise
+from memmlp.evaluation import modes
+from memmlp.motion.body import HEAD, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSITION
+from memmlp.motion.geometry import sixd_to_matrix
+from memmlp.motion.network_coordinates import Heading
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.still_pose import StillPose
+from memmlp.networks.streaming import streaming
+
+CLIP = tiny.clip(40)
+
+
+@pytest.fixture
+def model() -> StillPose:
+    """One that was fitted to a clip and then moved off its average."""
+    model = StillPose(Normalizer.fit(Heading(), tiny.REST, CLIP), frames=7)
+    torch.nn.init.normal_(model.pose, generator=torch.Generator().manual_seed(0))
+    return model.eval()
+
+
+def rotations(motion: torch.Tensor) -> torch.Tensor:
+    return sixd_to_matrix(motion[..., ROTATION].unflatten(-1, (22, 6)))
+
+
+@torch.no_grad()
+def test_the_pose_is_the_same_and_the_head_where_its_tracker_is(model: StillPose):
+    (motion,) = modes.stream(model, [CLIP])
+    local = rotations(motion)
+    torch.testing.assert_close(local[:, 1:], local[:1, 1:].expand(len(CLIP), -1, -1, -1))
+    head = motion[:, POSITION].unflatten(-1, (22, 3))[:, HEAD]
+    torch.testing.assert_close(head, CLIP[:, :SPARSE_DIM][:, SPARSE_POSITION][:, :3], atol=1e-6, rtol=0)
+    assert model.count_parameters() == 132
+
+
+@pytest.mark.parametrize("normalize", [True, False])
+def test_its_first_gradient_is_that_of_rotations(normalize: bool):
+    """Zeros are no rotation, and the gradient of one made of them is 1e12 times that of another."""
+    made = Normalizer.fit(Heading(), tiny.REST, CLIP) if normalize else Normalizer.raw(Heading(), tiny.REST)
+    model = StillPose(made, frames=7)
+    motion = model.training_call(CLIP[None, :7, :SPARSE_DIM], {}, CLIP[None, :7]).motion
+    (rotations(motion) * torch.rand(22, 3, 3)).sum().backward()
+    assert 1e-3 < float(model.pose.grad.norm()) < 1e3
+
+
+@torch.no_grad()
+def test_it_turns_with_the_head_and_with_nothing_else(model: StillPose):
+    """The root's turns are about the vertical, and those of the head's heading."""
+    (motion,) = modes.stream(model, [CLIP])
+    root = rotations(motion)[:, 0]
+    turns = root @ root[0].T
+    torch.testing.assert_close(
+        turns[:, 2], torch.tensor([0.0, 0.0, 1.0]).expand(len(CLIP), -1), atol=1e-5, rtol=0
+    )
+    cos, sin = model.normalizer.origin(CLIP[:, :SPARSE_DIM])[:, 3:].unbind(-1)
+    torch.testing.assert_close(turns[:, 0, 0], cos * cos[0] + sin * sin[0], atol=1e-5, rtol=0)
+    assert turns[:, 0, 0].min() < 1 - 1e-5  # it does turn
+
+
+@torch.no_grad()
+def test_at_first_it_is_the_average():
+    normalizer = Normalizer.fit(Heading(), tiny.REST, CLIP)
+    (motion,) = modes.stream(StillPose(normalizer, frames=7).eval(), [CLIP])
+    mean = CLIP[:, SPARSE_DIM:][:, 6 : ROTATION.stop].mean(0)
+    torch.testing.assert_close(motion[:, 6 : ROTATION.stop], mean.expand(len(CLIP), -1), atol=1e-5, rtol=0)
+
+
+LOWER = [partial(quantise, clips=[CLIP]), quantise_blocks, halve]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("write", LOWER, ids=["int8", "int8_blocks", "fp16"])
+def test_its_file_is_the_network_and_has_nothing_in_a_lower_precision(
+    model: StillPose, tmp_path: Path, write: Callable[[Path, Path, Sequence[str]], None]
+):
+    path, stream = tmp_path / "step.onnx", streaming(model)
+    export(stream, path, "0123456789abcdef")
+    assert parity(model, path, CLIP) <= TOLERANCE
+    with pytest.raises(InputError, match="no layer lies between"):
+        write(path, tmp_path / "lower.onnx", stream.float32_modules)
+    assert {file.name for file in tmp_path.iterdir()} == {"step.onnx"}
