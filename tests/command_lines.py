@@ -9,13 +9,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
-from hydra import version
 
 from memmlp.cli.main import commands
 from memmlp.cli.workers import Workers, split_executor
-from memmlp.config.compose import VERSION_BASE, composed_plain, parse, preflight
+from memmlp.config.compose import composed_plain, parse, preflight
 from memmlp.config.compose_plan import find_sweep
-from memmlp.config.schema import register
 from memmlp.sweep.search.search_file import parse_search
 
 ROOT = Path(__file__).parent.parent
@@ -123,11 +121,9 @@ def composes(overrides: Sequence[str]) -> None:
     """Compose and check the config of every job of `memmlp train OVERRIDES`."""
     if tuple(overrides) in TAKEN:
         return
-    args, _ = parse(list(overrides))
+    args = parse(list(overrides))
     if args.help or args.shell_completion:
         return
-    register()
-    version.setbase(VERSION_BASE)
     preflight(args)
     TAKEN.add(tuple(overrides))
 

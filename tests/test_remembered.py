@@ -31,8 +31,7 @@ REMEMBERED = [
 
 def composed(overrides: list[str]) -> str:
     """What Hydra composes, its own settings included, or its complaint."""
-    args, _ = compose.parse(overrides)
-    compose.register()
+    args = compose.parse(overrides)
     with compose._hydra(args):
         loader = GlobalHydra.instance().config_loader()
         try:

@@ -49,18 +49,13 @@ def demo(overrides: tuple[str, ...]) -> None:
 
 def fit_recurrent_poser(overrides: Sequence[str]) -> bool:
     """Return whether a demo's overrides choose no other network, and can be used for RecurrentPoser, too."""
-    from hydra import version
-
     from memmlp.common.errors import InputError
-    from memmlp.config.compose import VERSION_BASE, parse, preflight
-    from memmlp.config.schema import register
+    from memmlp.config.compose import parse, preflight
 
     if any(word.startswith(("model=", "experiment=", "-")) for word in overrides):
         return False
-    register()
-    version.setbase(VERSION_BASE)
     try:
-        preflight(parse(["data=synth", "profile=small", *overrides, RECURRENT_POSER])[0])
+        preflight(parse(["data=synth", "profile=small", *overrides, RECURRENT_POSER]))
     except InputError:
         return False
     return True

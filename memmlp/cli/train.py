@@ -10,16 +10,23 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import click
-from hydra import version
-from hydra._internal.utils import _run_hydra
+import hydra
 from omegaconf import DictConfig
 
 from memmlp.common import distributed
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
-from memmlp.config.compose import CONFIG, VERSION_BASE, check_words, help_text, parse, preflight
+from memmlp.common.overrides import parse_overrides
+from memmlp.config.compose import (
+    CONFIG,
+    VERSION_BASE,
+    check_overrides,
+    help_text,
+    hydra_arguments,
+    parse,
+    preflight,
+)
 from memmlp.config.config_errors import explain
 from memmlp.config.package_data import packaged
-from memmlp.config.schema import check, register
 
 if TYPE_CHECKING:
     from memmlp.pipeline.run_stages import Outcome
@@ -37,7 +44,7 @@ def command(hydra_arguments: Sequence[str]) -> None:
 
 
 def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None) -> None:
-    """Run Hydra on the arguments of `memmlp train`.
+    """Run the jobs that the arguments of `memmlp train` describe.
 
     Args:
         argv: the arguments.
@@ -47,49 +54,58 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
         InputError: for bad input; of several failed jobs, the last failure is raised and the others are
             printed.
     """
-    args, parser = parse(argv)
-    register()
-    version.setbase(VERSION_BASE)
+    args = parse(argv)
+    shows = any((args.hydra_help, args.cfg, args.info, args.shell_completion))
     if args.help or args.cfg:
-        check_words(args)
+        check_overrides(args)
     if args.help:
         click.echo(help_text(args))
         return
-    jobs = preflight(args) if _runs(args) else []
+    jobs = [] if shows else preflight(args)
     if len(jobs) > 1 and distributed.size() > 1:
-        raise InputError("torchrun: several processes train one run; allowed is no multirun")
+        raise InputError("torchrun: several processes train one run; start it without --multirun")
     _check_predictions(jobs)
     failures: list[Exception] = []
-    with _raising(args.overrides):
-        _run_hydra(
-            args=args,
-            args_parser=parser,
-            task_function=_collecting(job or run_training, failures),
-            config_path=str(packaged("conf")),
-            config_name=CONFIG,
-        )
+    task = _collecting(job or run_training, failures)
+    if shows or _needs_hydra(args):
+        with _raising(args.overrides):
+            _run_hydra(args, task)
+    else:
+        task(jobs[0])
     for failure in failures[:-1]:
         print(f"memmlp: {failure}", file=sys.stderr)
     if failures:
         raise failures[-1]
 
 
-def _runs(args: argparse.Namespace) -> bool:
-    """Return whether the arguments ask to train, rather than only to show something."""
-    shows = (args.help, args.hydra_help, args.cfg, args.info, args.shell_completion)
-    return not any(shows)
+def _needs_hydra(args: argparse.Namespace) -> bool:
+    """Return whether Hydra must run the jobs: for its launchers and for its own keys."""
+    keys = [override.key for override in parse_overrides(args.overrides)]
+    return bool(
+        args.multirun or args.config_name or any(key.startswith(("hydra.", "hydra/")) for key in keys)
+    )
+
+
+def _run_hydra(args: argparse.Namespace, task: Callable[[DictConfig], None]) -> None:
+    """Run or show the jobs by Hydra, which reads its arguments from `sys.argv`."""
+    main = hydra.main(config_path=str(packaged("conf")), config_name=CONFIG, version_base=VERSION_BASE)
+    before, sys.argv = sys.argv, ["memmlp train", *hydra_arguments(args)]
+    try:
+        main(task)()
+    finally:
+        sys.argv = before
 
 
 def _check_predictions(jobs: Sequence[DictConfig]) -> None:
     """Raise InputError for a folder without a name, or one in which several jobs would save predictions."""
     if any(cfg.save_predictions is not None and not cfg.save_predictions.strip() for cfg in jobs):
-        raise InputError("save_predictions=: allowed is a folder, or null to save none")
+        raise InputError("save_predictions=: must be a folder, or null to save none")
     folders = [cfg.save_predictions for cfg in jobs if cfg.save_predictions]
     for folder in folders:
         if folders.count(folder) > 1:
             raise InputError(
-                f"save_predictions={folder}: {folders.count(folder)} jobs would write over each other's; "
-                "allowed is a folder of its own for each, such as predictions/${seed}"
+                f"save_predictions={folder}: {folders.count(folder)} jobs would overwrite each other; "
+                "give each its own folder, such as predictions/${seed}"
             )
 
 
@@ -133,7 +149,7 @@ def _collecting(
 
 
 def run_training(cfg: DictConfig) -> Outcome | None:
-    """Check the config, finish its run, and print and return the results.
+    """Finish the run of a checked config, and print and return the results.
 
     Returns:
         The outcome; None in the processes that trained along.
@@ -143,7 +159,6 @@ def run_training(cfg: DictConfig) -> Outcome | None:
     from memmlp.pipeline.devices import use_threads
     from memmlp.pipeline.run_in_processes import run_in_processes
 
-    check(cfg)
     use_threads(cfg.threads)
     if outcome := run_in_processes(build_experiment(cfg)):
         show(outcome)

@@ -15,6 +15,7 @@ from memmlp.cli.options import outputs_option, plugins_option
 from memmlp.cli.workers import Workers, hire, worker_options
 from memmlp.common.errors import InputError
 from memmlp.common.lease import Lock
+from memmlp.common.overrides import Override
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
@@ -103,7 +104,7 @@ def prepare_search(words: Sequence[str], config_dir: Path | None, outputs: Path)
     from memmlp.sweep.search.search_file import parse_search
 
     activate(named(words))
-    own = [word for word in words if word.lstrip("+~").partition("=")[0].split(".")[0] == "search"]
+    own = [word for word in words if Override.parse(word).group == "search"]
     rest = tuple(word for word in words if word not in own)
     content = _search_config(own, config_dir)
     activate(named(map(str, content.get("base") or ())))
@@ -143,7 +144,7 @@ def _check_space(setup: Setup) -> str:
 
     space = setup.search.space
     for word in setup.words:
-        if word.partition("=")[0].lstrip("+") in {one.key for one in space}:
+        if Override.parse(word).key in {one.key for one in space}:
             raise InputError(f"{word}: is searched; leave it out of the space with search.space....=null")
     experiments = [_experiments(setup, {})[0]]
     for number in range(max(len(one.corners()) for one in space)):

@@ -14,6 +14,7 @@ from uuid import uuid4
 import click
 
 from memmlp.common.errors import InputError
+from memmlp.common.overrides import Override
 
 if TYPE_CHECKING:
     from memmlp.sweep.controller import Fleet
@@ -174,7 +175,8 @@ def split_executor(words: Iterable[str]) -> tuple[str, dict[str, str], tuple[str
     """
     executor, own, rest = "local", [], []
     for word in words:
-        key, _, value = word.partition("=")
+        override = Override.parse(word)
+        key, value = override.key, override.value or ""
         if key == "executor":
             executor = value
         elif key.split(".")[0] in (*SETTINGS, OWN) and "." in key:

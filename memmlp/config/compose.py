@@ -1,81 +1,103 @@
-"""Composes and checks configs from a command line's overrides; every error is explained in one line."""
+"""Composes and checks configs from a command line's overrides; every error becomes one line."""
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import functools
+import itertools
 import pickle
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, NoReturn, cast
 
-from hydra import compose, version
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra._internal.hydra import Hydra
-from hydra._internal.utils import create_config_search_path, get_args_parser
-from hydra.core.config_search_path import ConfigSearchPath, SearchPathQuery
-from hydra.core.default_element import GroupDefault
-from hydra.core.global_hydra import GlobalHydra
+import yaml
+from hydra import compose, initialize_config_dir
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import ChoiceSweep, Override
+from hydra.core.override_parser.types import ChoiceSweep, OverrideType
+from hydra.core.override_parser.types import Override as HydraOverride
 from hydra.core.plugins import Plugins
-from hydra.errors import HydraException
+from hydra.errors import ConfigCompositionException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from memmlp.common.errors import InputError
+from memmlp.common.overrides import Override, parse_overrides
 from memmlp.config import plugins
 from memmlp.config.config_errors import explain
 from memmlp.config.package_data import packaged
-from memmlp.config.schema import check, register
+from memmlp.config.schema import Config, check, register, unknown_key
 from memmlp.runs.identity import flatten
 
 VERSION_BASE = "1.3"
 CONFIG = "train"
 SEARCHPATH = "hydra.searchpath"
 EXPERIMENT = "experiment"
-"""The group whose options set groups and keys all over the config."""
+"""The group whose options set groups and keys in the whole config."""
+
+SWITCHES = {
+    "--help": "-h", "--hydra-help": None, "--resolve": None, "--run": "-r", "--multirun": "-m",
+    "--shell-completion": "-sc",
+}  # fmt: skip
+VALUES = {
+    "--cfg": "-c",
+    "--package": "-p",
+    "--config-path": "-cp",
+    "--config-name": "-cn",
+    "--config-dir": "-cd",
+}
+"""The flags of Hydra's command line and their short forms: those with a value, and those without."""
 
 
-def parse(argv: Sequence[str]) -> tuple[argparse.Namespace, argparse.ArgumentParser]:
-    """Parse Hydra's command line, and import the packages that it names; flags may be among the overrides.
+def parse(argv: Sequence[str]) -> argparse.Namespace:
+    """Parse Hydra's command line, in which flags may be among the overrides; import the packages it names.
 
     Raises:
-        InputError: for flags that Hydra does not know or that are not allowed here.
+        InputError: for an unknown flag, or a package that cannot be imported.
     """
-    parser = get_args_parser()
+    parser = argparse.ArgumentParser(add_help=False)
     parser.error = _refuse  # type: ignore[method-assign]
+    for flag, short in SWITCHES.items():
+        parser.add_argument(*filter(None, (flag, short)), action="store_true")
+    for flag, short in VALUES.items():
+        parser.add_argument(flag, short, choices=("job", "hydra", "all") if flag == "--cfg" else None)
+    parser.add_argument("--info", "-i", nargs="?", const="all")
+    parser.add_argument("overrides", nargs="*")
     args = parser.parse_intermixed_args(list(argv))
-    if args.experimental_rerun:
-        raise InputError("--experimental-rerun: unpickles a file; allowed are overrides")
     plugins.activate(plugins.named(args.overrides))
     Plugins.instance().register(UserConfigs)
-    return args, parser
-
-
-class UserConfigs(SearchPathPlugin):
-    """Makes Hydra search further folders of configs beside memmlp's, wherever it composes."""
-
-    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Add the folders after memmlp's own."""
-        for provider, folder in plugins.folders():
-            search_path.append(provider, f"file://{folder}")
+    register()
+    return args
 
 
 def _refuse(message: str) -> NoReturn:
     raise InputError(f"train: {message} (see memmlp train --help)")
 
 
+def hydra_arguments(args: argparse.Namespace) -> list[str]:
+    """Return parsed arguments as Hydra's own parser expects them: the flags before the overrides."""
+    given = {flag: getattr(args, flag[2:].replace("-", "_")) for flag in (*SWITCHES, *VALUES, "--info")}
+    switches = [flag for flag, value in given.items() if value is True]
+    values = [f"{flag}={value}" for flag, value in given.items() if isinstance(value, str)]
+    return [*switches, *values, *args.overrides]
+
+
+class UserConfigs(SearchPathPlugin):
+    """Makes Hydra search the folders of users' configs after memmlp's, wherever it composes."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Add the folders."""
+        for provider, folder in plugins.folders():
+            search_path.append(provider, f"file://{folder}")
+
+
 def composed(overrides: Sequence[str]) -> DictConfig:
     """Compose and check the config of one job from its overrides."""
-    args, _ = parse(overrides)
-    register()
-    version.setbase(VERSION_BASE)
-    (cfg,) = preflight(args)
+    (cfg,) = preflight(parse(overrides))
     return cfg
 
 
@@ -87,8 +109,7 @@ def composed_plain(name: str, overrides: Sequence[str], folder: Path | None = No
         overrides: the command line's overrides.
         folder: a folder of the user's own configs, searched first.
     """
-    args, _ = parse([*(["--config-dir", str(folder)] if folder else []), *overrides])
-    version.setbase(VERSION_BASE)
+    args = parse([*(["--config-dir", str(folder)] if folder else []), *overrides])
     with _hydra(args), _explained(overrides):
         return cast(dict[str, Any], OmegaConf.to_container(compose(name, args.overrides), resolve=True))
 
@@ -96,61 +117,41 @@ def composed_plain(name: str, overrides: Sequence[str], folder: Path | None = No
 def set_by_experiments(options: Sequence[str], overrides: Sequence[str] = ()) -> set[str]:
     """Return the groups and the dotted keys that options of the group `experiment` set.
 
-    Those that an option sets by the configs in its defaults list, such as another experiment, are included.
+    Those that an option sets through other experiments in its defaults list are included.
 
     Args:
         options: the options; those that do not exist are left out.
-        overrides: what else is chosen, of which only `hydra.searchpath` acts.
+        overrides: further overrides, of which only `hydra.searchpath` has an effect.
     """
-    args, _ = parse([])
-    register()
-    version.setbase(VERSION_BASE)
-    places = [word for word in overrides if word.lstrip("+").startswith(f"{SEARCHPATH}=")]
-    found: set[str] = set()
-    with _hydra(args):
-        loader = GlobalHydra.instance().config_loader()
-        assert isinstance(loader, ConfigLoaderImpl)
-        for option in options:
-            found |= _set_by(f"experiment/{option}", [*places, f"experiment={option}"], loader)
+    folders = [packaged("conf"), *(folder for _, folder in plugins.folders()), *_search_path(overrides)]
+    found, pending, seen = set[str](), list(options), set[str]()
+    while pending:
+        name = pending.pop().removeprefix(f"/{EXPERIMENT}/")
+        paths = (folder / EXPERIMENT / f"{name}.yaml" for folder in folders)
+        if name in seen or (path := next(filter(Path.is_file, paths), None)) is None:
+            continue
+        seen.add(name)
+        content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+        for entry in content.pop("defaults", ()):
+            for group, option in entry.items() if isinstance(entry, dict) else [(EXPERIMENT, entry)]:
+                sign, _, target = str(group).partition("@")[0].rpartition(" ")
+                if sign == "override":
+                    found.add(target.lstrip("/"))
+                elif target.lstrip("/") == EXPERIMENT:
+                    pending += option if isinstance(option, list) else [str(option)]
+        found |= flatten(content).keys()
     return found
 
 
-def _set_by(name: str, words: Sequence[str], loader: ConfigLoaderImpl) -> set[str]:
-    """Return the groups and the dotted keys that a config, and those in its defaults list, set.
-
-    Args:
-        name: the config's name, such as "experiment/paper".
-        words: overrides that choose it.
-        loader: Hydra's loader.
-    """
-    _, files = loader._parse_overrides_and_create_caching_repo(CONFIG, list(words))
-    parents, found = dict[str, str | None](), set[str]()
-    with suppress(HydraException, RecursionError):  # composing says so
-        every = loader.compute_defaults_list(CONFIG, list(words), RunMode.RUN).defaults
-        parents = {str(one.config_path): one.parent for one in every}
-    for config in {name, *(one for one in parents if name in _above(one, parents))}:
-        if file := files.load_config(config):
-            groups = [group for group in file.defaults_list or () if isinstance(group, GroupDefault)]
-            found |= {str(group.group).lstrip("/") for group in groups if group.override}
-            found |= flatten(cast(dict[str, Any], OmegaConf.to_container(file.config))).keys()
-    return found
-
-
-def _above(config: str, parents: Mapping[str, str | None]) -> Iterator[str]:
-    """Yield the configs whose defaults lists lead to a config, the nearest first."""
-    while above := parents.get(config):
-        yield above
-        config = above
-
-
-def check_words(args: argparse.Namespace) -> None:
-    """Raise InputError for what Hydra would leave out without a word: a hidden file, a second experiment."""
+def check_overrides(args: argparse.Namespace) -> None:
+    """Raise InputError for a hidden file or a second experiment, which Hydra would drop silently."""
     _check_hidden(args)
-    _jobs(args)  # refuses a second experiment
+    _jobs(args)  # rejects a second experiment
 
 
 def preflight(args: argparse.Namespace) -> list[DictConfig]:
-    """Compose and check the config of every job, so that a bad one is known before the first job starts."""
+    """Compose and check the config of every job, so that a bad one is reported before any job starts."""
+    _check_first_parts(args)
     configs = []
     with _hydra(args):
         for overrides in _jobs(args):
@@ -163,28 +164,47 @@ def preflight(args: argparse.Namespace) -> list[DictConfig]:
     return configs
 
 
-def _compose(args: argparse.Namespace, overrides: list[str]) -> DictConfig:
-    """Compose the config of one job as Hydra does, but choose the options of groups only once for all jobs.
+def _check_first_parts(args: argparse.Namespace) -> None:
+    """Raise InputError for a key whose first part is not in the config, before the costly composition."""
+    if args.config_name or args.config_path:
+        return
+    keys = [spec.name for spec in dataclasses.fields(Config)]
+    for override in parse_overrides(args.overrides):
+        first = re.split(r"[./@]", override.key)[0]
+        if first.isidentifier() and override.value is not None and first not in (*keys, "hydra", EXPERIMENT):
+            raise InputError(unknown_key(first, keys))
 
-    A sweep has many configs that differ only in values, and reading and merging the files of groups takes
-    nine tenths of the time. Users' own folders may change meanwhile, so they are read each time.
+
+def _compose(args: argparse.Namespace, overrides: list[str]) -> DictConfig:
+    """Compose the config of one job as Hydra does, but the options of groups only once for all jobs.
+
+    Reading and merging the groups' files takes nine tenths of the time, and a sweep's configs often differ in
+    values alone. Users' own folders may change meanwhile, so they are read each time.
     """
     parsed = OverridesParser.create().parse_overrides(overrides)
+    options = [override for override in parsed if _chooses_option(override)]
+    values = [override for override in parsed if override not in options]
     own = args.config_name or args.config_path or args.config_dir or any(plugins.folders())
-    if own or any(override.is_hydra_override() for override in parsed):
+    if own or not all(_sets_value(override) for override in values):
         return compose(args.config_name or CONFIG, overrides)
-    loader = GlobalHydra.instance().config_loader()
-    assert isinstance(loader, ConfigLoaderImpl)
-    loader.validate_sweep_overrides_legal(parsed, RunMode.RUN, from_shell=False)
-    options = [override for override in parsed if _chooses_option(override, loader)]
     cfg = cast(DictConfig, pickle.loads(_with_options(*(str(override.input_line) for override in options))))
-    loader._apply_overrides_to_config([override for override in parsed if override not in options], cfg)
+    for override in values:
+        try:
+            OmegaConf.update(cfg, override.key_or_group, override.value(), merge=True)
+        except OmegaConfBaseException as error:
+            message = f"Error merging override {override.input_line}"
+            raise ConfigCompositionException(message) from error
     return cfg
 
 
-def _chooses_option(override: Override, loader: ConfigLoaderImpl) -> bool:
-    """Return whether an override chooses an option of a group, by Hydra's rule; others only set values."""
-    return not isinstance(override.value(), dict) and loader.repository.group_exists(override.key_or_group)
+def _chooses_option(override: HydraOverride) -> bool:
+    """Return whether an override chooses an option of a group; the others set values."""
+    return not isinstance(override.value(), dict) and (packaged("conf") / override.key_or_group).is_dir()
+
+
+def _sets_value(override: HydraOverride) -> bool:
+    special = override.package or override.is_sweep_override() or override.is_hydra_override()
+    return override.type == OverrideType.CHANGE and not special
 
 
 @functools.lru_cache(maxsize=64)
@@ -194,42 +214,43 @@ def _with_options(*options: str) -> bytes:
 
 
 def _check_plugins(cfg: DictConfig) -> None:
-    """Check that users' packages were known before the config was composed."""
     for name in cfg.plugins:
         if name not in plugins.active():
             raise InputError(
-                f"plugins=[{name}]: a config file tells it too late; allowed is on the command line, "
-                f"in the base of a sweep or search, or {plugins.VARIABLE}={name}"
+                f"plugins=[{name}]: a config file is read too late to name a package; name it on the command "
+                f"line, in the base of a sweep or search, or with {plugins.VARIABLE}={name}"
             )
 
 
 def _check_fractions(cfg: DictConfig, overrides: Sequence[str]) -> None:
-    """Raise InputError for a fraction of the split that changes nothing, as each source has its own."""
+    """Raise InputError for a fraction of the split without effect, since each source has its own."""
     sources = (cfg.data.get("sources") or {}).values()
-    for word in overrides:
-        key = word.partition("=")[0].lstrip("+")
-        part = key.removeprefix("data.split.")
-        own = [one.get(part) for one in sources] if key != part and part in ("test", "val") else [None]
+    for override in parse_overrides(overrides):
+        part = override.key.removeprefix("data.split.")
+        own = [one.get(part) for one in sources] if part in ("test", "val") else [None]
         if own and None not in own:
-            raise InputError(f"{word}: each source has its own; allowed is data.sources.NAME.{part}")
+            raise InputError(f"{override}: each source has its own; set data.sources.NAME.{part}")
 
 
-def _check_texts(cfg: DictConfig, words: Sequence[str]) -> None:
+def _check_texts(cfg: DictConfig, overrides: Sequence[str]) -> None:
     """Raise InputError for a text that Hydra reads as a number or bool and writes in another way.
 
     A folder 2024_11 would be 202411, and 1e3 would be 1000.0.
     """
-    for override in OverridesParser.create().parse_overrides(list(words)):
-        value, kept = override.value(), OmegaConf.select(cfg, override.key_or_group)
+    for parsed in OverridesParser.create().parse_overrides(list(overrides)):
+        value, kept = parsed.value(), OmegaConf.select(cfg, parsed.key_or_group)
         texts = list(kept) if OmegaConf.is_list(kept) else [kept]
+        if not all(isinstance(text, str) for text in texts):
+            continue
+        typed = Override.parse(str(parsed.input_line))
+        parts = re.split(r"[\[\],\s]+", typed.value or "")
         items = (
             value.list if isinstance(value, ChoiceSweep) else value if isinstance(value, list) else [value]
         )
-        word = str(override.input_line)
-        key, _, written = word.partition("=")
-        for item in items if all(isinstance(text, str) for text in texts) else ():
-            if isinstance(item, int | float) and str(item) not in re.split(r"[\[\],\s]+", written):
-                raise InputError(f"{word}: would become {item}; allowed is in quotes, \"{key}='{written}'\"")
+        for item in items:
+            if isinstance(item, int | float) and str(item) not in parts:
+                quoted = f"\"{typed.key}='{typed.value}'\""
+                raise InputError(f"{typed}: would become {item}; put the value in quotes, {quoted}")
 
 
 HELP = """memmlp train trains, evaluates, exports and times one configuration.
@@ -238,88 +259,99 @@ HELP = """memmlp train trains, evaluates, exports and times one configuration.
 Compose your configuration from those groups (group=option)
 
 {groups}
+
 == Config ==
 Override anything in the config (foo.bar=value)
 
 {config}
-memmlp train --hydra-help tells the flags, such as -m for several runs and --config-dir for your own configs.
+memmlp train --hydra-help lists the flags, such as -m for several runs and --config-dir for your own configs.
 """
-NOT_HERE = ("hydra", "schema", "search")  # Hydra's groups, the types of ours, and what memmlp tune searches
 
 
 def help_text(args: argparse.Namespace) -> str:
     """Return the groups with their options, and the config that the arguments compose."""
+    folders = [packaged("conf"), *(folder for _, folder in plugins.folders())]
+    if args.config_dir:
+        folders.append(_folder(args.config_dir, "--config-dir"))
+    options: dict[str, list[str]] = {}
+    for folder in folders:
+        for path in sorted(folder.rglob("*.yaml")):
+            options.setdefault(path.parent.relative_to(folder).as_posix(), []).append(path.stem)
+    groups = [
+        f"{name}: {', '.join(sorted(options[name]))}" for name in sorted(options.keys() - {".", "search"})
+    ]
     with _hydra(args), _explained(args.overrides):
-        hydra = GlobalHydra.instance().hydra
-        assert hydra is not None
-        groups = hydra.format_config_groups(lambda group: group.split("/")[0] not in NOT_HERE)
         config = OmegaConf.to_yaml(compose(args.config_name or CONFIG, args.overrides), resolve=args.resolve)
-    return HELP.format(groups=groups, config=config)
+    return HELP.format(groups="\n".join(groups), config=config)
 
 
 @contextmanager
 def _hydra(args: argparse.Namespace) -> Iterator[None]:
     """Initialise Hydra with the search path that the arguments ask for, as when the jobs run."""
     _check_hidden(args)
-    path = create_config_search_path(str(_folder(args.config_path or packaged("conf"), "--config-path")))
-    if args.config_dir:
-        own = f"file://{_folder(args.config_dir, '--config-dir')}"
-        path.prepend(provider="command-line", path=own, anchor=SearchPathQuery(provider="schema"))
-    Hydra.create_main_hydra2(task_name="train", config_search_path=path)
-    try:
+    main = _folder(args.config_path or packaged("conf"), "--config-path")
+    own = _folder(args.config_dir, "--config-dir") if args.config_dir else None
+    with (
+        plugins.searching(own) if own else nullcontext(),
+        initialize_config_dir(str(main), job_name="train", version_base=VERSION_BASE),
+    ):
         yield
-    finally:
-        GlobalHydra.instance().clear()
 
 
 def _check_hidden(args: argparse.Namespace) -> None:
-    """Raise InputError for a file of the user's that Hydra ignores: an earlier folder has one of its name."""
+    """Raise InputError for a user's file that Hydra ignores, since an earlier folder has one of its name."""
     main = _folder(args.config_path or packaged("conf"), "--config-path")
     before = [main, *(folder for provider, folder in plugins.folders() if provider != plugins.OWN)]
-    for folder in _own_folders(args):
+    own_folders = [_folder(args.config_dir, "--config-dir")] if args.config_dir else []
+    own_folders += [folder for provider, folder in plugins.folders() if provider == plugins.OWN]
+    for folder in [*own_folders, *_search_path(args.overrides)]:
         for other in before:
             for path in sorted(other.rglob("*.yaml")):
                 own = folder / path.relative_to(other)
                 if own.is_file() and own.read_bytes() != path.read_bytes():
-                    raise InputError(f"{own}: {path} is used in its place; allowed is a name of its own")
+                    raise InputError(f"{own}: {path} is used in its place; give it another name")
         before.append(folder)
 
 
-def _own_folders(args: argparse.Namespace) -> Iterator[Path]:
-    """Yield the folders of configs that a command line names, in the order in which Hydra searches them."""
-    if args.config_dir:
-        yield _folder(args.config_dir, "--config-dir")
-    yield from (folder for provider, folder in plugins.folders() if provider == plugins.OWN)
-    words = (word.lstrip("+").partition("=") for word in args.overrides)
-    for value in (value for key, _, value in words if key == SEARCHPATH):
-        for place in value.strip("[] ").split(","):
-            name = place.strip(" '\"")
-            if "://" not in name or name.startswith("file://"):
-                yield Path(name.removeprefix("file://")).absolute()
+def _search_path(overrides: Sequence[str]) -> list[Path]:
+    """Return the folders that overrides of `hydra.searchpath` name."""
+    places = [one for word in parse_overrides(overrides) if word.key == SEARCHPATH for one in word.options]
+    local = [place for place in places if "://" not in place or place.startswith("file://")]
+    return [Path(place.removeprefix("file://")).absolute() for place in local]
 
 
 def _folder(name: str | Path, option: str) -> Path:
-    """Return the absolute path of the folder that an option names. Raises InputError if it does not exist."""
     if not Path(name).is_dir():
-        raise InputError(f"{option} {name}: allowed is an existing folder")
+        raise InputError(f"{option} {name}: must be an existing folder")
     return Path(name).absolute()
 
 
 def _jobs(args: argparse.Namespace) -> list[list[str]]:
-    """Return the overrides of each job: of the single one, or of all jobs of a multirun."""
+    """Return the overrides of each job: of the single one, or of all jobs of a multirun.
+
+    Raises:
+        InputError: for an override that cannot be parsed, or a second choice of experiments, which would
+            replace the first.
+    """
     with _explained(args.overrides):
-        overrides = OverridesParser.create().parse_overrides(args.overrides)
-        _check_experiments([one for one in overrides if one.key_or_group == EXPERIMENT])
+        parsed = OverridesParser.create().parse_overrides(args.overrides)
+        chosen = list(dict.fromkeys(str(one.input_line) for one in parsed if one.key_or_group == EXPERIMENT))
+        if len(chosen) > 1:
+            raise InputError(f"{chosen[-1]}: would replace {chosen[0]}; combine them as {EXPERIMENT}=[A,B]")
         if not args.multirun and "hydra.mode=MULTIRUN" not in args.overrides:
             return [args.overrides]
-        return BasicSweeper.split_arguments(overrides, None)[0]
+        words = {override.get_key_element(): _choices(override) for override in parsed}
+        return [list(job) for job in itertools.product(*words.values())]
 
 
-def _check_experiments(chosen: Sequence[Override]) -> None:
-    """Raise InputError for more than one word that chooses experiments: Hydra takes the last one alone."""
-    words = [str(one.input_line) for one in chosen]
-    if len(set(words)) > 1:
-        raise InputError(f"{words[-1]}: would replace {words[0]}; allowed is one word, {EXPERIMENT}=[A,B]")
+def _choices(override: HydraOverride) -> list[str]:
+    """Return an override of a multirun as one override for each of its values."""
+    key = override.get_key_element()
+    if not override.is_sweep_override():
+        return [f"{key}={override.get_value_element_as_str()}"]
+    if not override.is_discrete_sweep():
+        raise InputError(f"{override.input_line}: must be a list of values, a choice or a range")
+    return [f"{key}={value}" for value in override.sweep_string_iterator()]
 
 
 @contextmanager

@@ -26,6 +26,7 @@ import yaml
 
 from memmlp.common import plugin as known
 from memmlp.common.errors import InputError
+from memmlp.common.overrides import parse_overrides
 from memmlp.common.plugin import Plugin
 from memmlp.config.package_data import packaged
 from memmlp.evaluation.metric_facts import HIGHER, SMALLEST, UNITS
@@ -73,7 +74,7 @@ def split_names(words: str) -> list[str]:
 
 def named(words: Iterable[str]) -> list[str]:
     """Return the packages that overrides such as `plugins=[mine]` name."""
-    values = [value for key, _, value in (word.partition("=") for word in words) if key.lstrip("+") == KEY]
+    values = [one.value or "" for one in parse_overrides(words) if one.key == KEY]
     found: list[str] = []
     for value in values:
         try:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from memmlp.common.errors import InputError
+from memmlp.common.overrides import Override
 from memmlp.evaluation.metric_facts import SMALLEST
 
 MODES = ("stream", "window")
@@ -142,7 +143,7 @@ class Sweep:
                 "save_predictions: a sweep's runs would write over each other's; allowed is memmlp eval RUN "
                 "--save-predictions FOLDER"
             )
-        seeds = [word.partition("=")[2] for word in overrides if key_of(word) == "seed"]
+        seeds = [one.value or "" for one in map(Override.parse, overrides) if one.key == "seed"]
         others = tuple(word for word in overrides if key_of(word) != "seed")
         self._check_keys_of_arms(others)
         chosen = parse_seeds(seeds[-1].split(","), "seed") if seeds else self.seeds
@@ -191,7 +192,7 @@ class Sweep:
 
 def key_of(override: str) -> str:
     """Return the key or group that an override sets, adds (+) or removes (~)."""
-    return override.partition("=")[0].lstrip("+~")
+    return Override.parse(override).key
 
 
 def parse_branch(value: Any, name: str) -> str:

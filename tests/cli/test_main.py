@@ -246,7 +246,7 @@ def test_a_multirun(memmlp: Memmlp, jobs: list[DictConfig], tmp_path: Path, argu
 def test_jobs_that_would_save_predictions_in_one_folder_are_refused(memmlp: Memmlp, jobs: list[DictConfig]):
     ran = memmlp("train", "-m", "seed=0,1", "save_predictions=there")
     assert ran.code == 2
-    assert ran.err.startswith("memmlp: save_predictions=there: 2 jobs would write over each other's")
+    assert ran.err.startswith("memmlp: save_predictions=there: 2 jobs")
     assert jobs == []
     assert memmlp("train", "-m", "seed=0,1", "save_predictions=there/${seed}").code == 0
     assert [cfg.save_predictions for cfg in jobs] == ["there/0", "there/1"]

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 from conftest import Memmlp, one_line
-from hydra import compose, version
+from hydra import compose
 from omegaconf import DictConfig, OmegaConf
 from processes import finished
 
 from memmlp.common.errors import InputError
 from memmlp.config import schema
 from memmlp.config.build import build_experiment
-from memmlp.config.compose import VERSION_BASE, _hydra, composed, parse, preflight
+from memmlp.config.compose import _hydra, composed, parse, preflight
 from memmlp.config.package_data import packaged
 from memmlp.runs.identity import NEUTRAL, flatten
 
@@ -358,7 +358,7 @@ def test_an_option_of_ones_own_that_ours_hides_is_refused(
         "hydra.searchpath": ["train", "hydra.searchpath=[file://mine]", "optim.lr=-1"],
         "sweep": ["sweep", "s.yaml", "--config-dir", "mine", "optim.lr=-1"],
     }[place]
-    assert one_line(memmlp(*words), f"mine/{option}", f"conf/{option} is used in its place", "its own")
+    assert one_line(memmlp(*words), f"mine/{option}", f"conf/{option} is used in its place")
     own.write_bytes((packaged("conf") / option).read_bytes())  # the same is no other
     ran = memmlp(*words)
     assert ran.code == 0 if place == "--cfg" else one_line(ran, "optim.lr=-1")
@@ -412,9 +412,7 @@ def test_a_config_without_the_schema_is_refused(memmlp: Memmlp, tmp_path: Path):
 )
 def test_a_job_is_composed_as_hydra_composes_it(overrides):
     """Options of groups are chosen once for many jobs (twice here), and changes of one job are its own."""
-    args, _ = parse(overrides)
-    schema.register()
-    version.setbase(VERSION_BASE)
+    args = parse(overrides)
     for _ in range(2):
         (own,) = preflight(args)
         with _hydra(args):

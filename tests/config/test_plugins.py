@@ -221,7 +221,7 @@ def test_an_option_hides_no_other(folder: Path):
 
 def test_a_config_file_names_a_package_too_late(folder: Path):
     write(folder, {"mine.py": "", "conf/experiment/own.yaml": "# @package _global_\nplugins: [mine]"})
-    with pytest.raises(InputError, match=r"plugins=\[mine\]: a config file tells it too late"):
+    with pytest.raises(InputError, match=r"plugins=\[mine\]: a config file is read too late"):
         composed(["--config-dir", str(folder / "conf"), "experiment=own"])
 
 

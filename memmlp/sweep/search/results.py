@@ -19,6 +19,7 @@ from optuna.importance import PedAnovaImportanceEvaluator
 from optuna.trial import FrozenTrial, TrialState
 
 from memmlp.common.files import atomic_write
+from memmlp.common.overrides import last_by_key
 from memmlp.sweep.search.search_file import Search
 from memmlp.sweep.search.study import Study, deviations, reason, values
 
@@ -121,7 +122,7 @@ def _words(search: Search, trial: FrozenTrial) -> Iterator[tuple[str, str]]:
     The base's experiment is not among them, since none can choose another.
     """
     words = (*search.base, *search.overrides(values(trial, search)))
-    last = {key.lstrip("+"): value for key, _, value in (word.partition("=") for word in words)}
+    last = {key: override.value or "" for key, override in last_by_key(words).items()}
     yield from ((key, value) for key, value in last.items() if key != "experiment")
 
 

@@ -1,0 +1,57 @@
+"""An override of a config, such as `optim.lr=1e-3` or `+term=mine`, parsed once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+SIGNS = "+~"
+"""What an override may begin with: + and ++ add a key, ~ removes it."""
+
+
+@dataclass(frozen=True)
+class Override:
+    """An override [SIGNS]KEY[=VALUE] as it is typed on a command line.
+
+    Attributes:
+        text: the whole override.
+        signs: "", "+", "++" or "~".
+        key: the dotted key, or the group whose option it chooses.
+        value: the text after the first "="; None for an override without one.
+    """
+
+    text: str
+    signs: str
+    key: str
+    value: str | None
+
+    @classmethod
+    def parse(cls, text: str) -> Override:
+        """Split an override's text; every text is accepted, and Hydra checks the value."""
+        left, equals, value = text.partition("=")
+        key = left.lstrip(SIGNS)
+        return cls(text, left[: len(left) - len(key)], key, value if equals else None)
+
+    @property
+    def group(self) -> str:
+        """The first part of the key: `optim` of `optim.lr`."""
+        return self.key.partition(".")[0]
+
+    @property
+    def options(self) -> list[str]:
+        """The options that a group's override names: one, or those of a list [A,B]; null names no option."""
+        names = [name.strip(" '\"") for name in (self.value or "").strip("[] ").split(",")]
+        return [name for name in names if name not in ("", "null")]
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def parse_overrides(texts: Iterable[str]) -> list[Override]:
+    """Parse several overrides."""
+    return [Override.parse(text) for text in texts]
+
+
+def last_by_key(texts: Iterable[str]) -> dict[str, Override]:
+    """Return the last override of each key, in the order in which the keys first appear."""
+    return {override.key: override for override in parse_overrides(texts)}

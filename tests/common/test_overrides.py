@@ -1,0 +1,34 @@
+"""An override is split once, and everything else reads its parts."""
+
+from __future__ import annotations
+
+import pytest
+
+from memmlp.common.overrides import Override, last_by_key
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("optim.lr=1e-3", ("", "optim.lr", "1e-3", "optim")),
+        ("++term=a=b", ("++", "term", "a=b", "term")),
+        ("~loss.hand", ("~", "loss.hand", None, "loss")),
+        ("seed=", ("", "seed", "", "seed")),
+    ],
+)
+def test_the_parts_of_an_override(text: str, parts: tuple[str, str, str | None, str]):
+    override = Override.parse(text)
+    assert (override.signs, override.key, override.value, override.group) == parts
+    assert str(override) == text
+
+
+@pytest.mark.parametrize(
+    ("text", "options"),
+    [("a=x", ["x"]), ("a=[x, 'y']", ["x", "y"]), ("a=null", []), ("a=", []), ("~a", []), ("a=[]", [])],
+)
+def test_the_options_that_an_override_names(text: str, options: list[str]):
+    assert Override.parse(text).options == options
+
+
+def test_the_last_override_of_a_key_wins_at_the_first_ones_place():
+    assert [str(one) for one in last_by_key(["a=1", "b=2", "+a=3"]).values()] == ["+a=3", "b=2"]
