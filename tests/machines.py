@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import random
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, MutableMapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from memmlp.common import files, lease, lease_claims, lease_fences, liveness
-from memmlp.common.liveness import Changes
+from memmlp.common import files, lease
+from memmlp.common.lease import Changes
 
 
 class Clock:
@@ -32,43 +31,37 @@ class OwnChanges(threading.local):
     """What each machine has seen, by a clock that all of them read."""
 
     def __init__(self, clock: Clock):
-        self.unchanged = Changes(clock).unchanged
+        self.seconds_unchanged = Changes(clock).seconds_unchanged
 
 
-class OwnFences(threading.local):
-    """The fences of each machine."""
+class OwnLeases(threading.local, MutableMapping):
+    """The leases of each machine."""
 
     def __init__(self) -> None:
-        fences: dict[Path, Any] = {}
-        self.get, self.set, self.remove = fences.__getitem__, fences.__setitem__, fences.__delitem__
-        self.has = fences.__contains__
+        self.leases: dict[Path, Any] = {}
 
     def __getitem__(self, key: Path) -> Any:
-        return self.get(key)
+        return self.leases[key]
 
     def __setitem__(self, key: Path, value: Any) -> None:
-        self.set(key, value)
+        self.leases[key] = value
 
     def __delitem__(self, key: Path) -> None:
-        self.remove(key)
+        del self.leases[key]
 
-    def __contains__(self, key: Path) -> bool:
-        return self.has(key)
+    def __iter__(self) -> Iterator[Path]:
+        return iter(self.leases)
 
-
-def without_locks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on a file system whose locks do nothing."""
-    monkeypatch.setattr(fcntl, "flock", lambda *_: None)
+    def __len__(self) -> int:
+        return len(self.leases)
 
 
 def apart(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """Let every thread be a machine. Nothing beats by itself; the clock stands until it is turned."""
     clock = Clock()
-    without_locks(monkeypatch)
-    monkeypatch.setattr(liveness, "place", lambda: threading.current_thread().name)
-    monkeypatch.setattr(lease, "place", lambda: threading.current_thread().name)
+    monkeypatch.setattr(lease, "process_space", lambda: threading.current_thread().name)
     monkeypatch.setattr(lease, "_changes", OwnChanges(clock))
-    monkeypatch.setattr(lease_fences, "_FENCES", OwnFences())
+    monkeypatch.setattr(lease, "_leases", OwnLeases())
     monkeypatch.setattr(lease, "BEAT", 1e6)
     return clock
 
@@ -106,7 +99,7 @@ class Machine:
 class Scheduler:
     """Lets one of several threads go at a time, from system call to system call, in an order drawn by lot."""
 
-    CALLS = ("listdir", "open", "write", "link", "utime", "replace")
+    CALLS = ("listdir", "open", "write", "utime", "replace")
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, clock: Clock, dice: random.Random, pause: float):
         self.clock, self.dice, self.pause = clock, dice, pause
@@ -115,9 +108,10 @@ class Scheduler:
         calls = {name: self._stepping(getattr(os, name)) for name in self.CALLS}
         plain = {name: getattr(os, name) for name in dir(os) if not name.startswith("_")}
         proxy = SimpleNamespace(**{**plain, **calls, "fsync": lambda handle: None})
-        for module in (lease_claims, lease, lease_fences, files):
+        for module in (lease, files):
             monkeypatch.setattr(module, "os", proxy)
-        monkeypatch.setattr(Path, "unlink", self._stepping(Path.unlink))
+        for name in ("unlink", "rename"):
+            monkeypatch.setattr(Path, name, self._stepping(getattr(Path, name)))
         monkeypatch.setattr(files, "sync_folder", lambda folder: None)
 
     def _stepping(self, call: Callable[..., Any]) -> Callable[..., Any]:
@@ -162,3 +156,14 @@ def taken(lock: lease.Lock) -> Iterator[lease.Lease]:
     with lock.hold(wait=False) as found:
         assert found is not None
         yield found
+
+
+@contextlib.contextmanager
+def fenced(folder: Path, fence: Any) -> Iterator[None]:
+    """Let an object with `number` and `check` stand for this process' lease on a folder."""
+    key = lease._resolved(folder)
+    lease._leases[key] = fence
+    try:
+        yield
+    finally:
+        del lease._leases[key]

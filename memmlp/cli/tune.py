@@ -60,7 +60,7 @@ def tune(
     lock.settle()
     with lock.hold(wait=False) as mine:
         if not mine:
-            raise InputError(f"search {setup.folder.name}: another process is at it; --status shows it")
+            raise InputError(f"search {setup.folder.name}: in use by {lock.holder}; --status shows it")
         write_json(setup.folder / "search.json", asdict(setup.search))
         study = Study.opened(setup.search, setup.folder.name, setup.folder)
         search(setup, study, workers)

@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from memmlp.common.lease_fences import publish, temporary
+from memmlp.common.lease import publish, temporary
 
 
 def now() -> str:

@@ -23,7 +23,7 @@ from onnxscript.optimizer import fold_constants
 from torch import Tensor, nn
 
 from memmlp import __version__
-from memmlp.common.lease_fences import publish, temporary
+from memmlp.common.lease import publish, temporary
 from memmlp.deploy.opsets import NATIVE, converted
 from memmlp.deploy.parity import deterministic
 from memmlp.motion.body import FEATURES, FPS, JOINTS, N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM

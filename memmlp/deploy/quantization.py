@@ -19,7 +19,7 @@ from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantTy
 from torch import Tensor
 
 from memmlp.common.errors import InputError
-from memmlp.common.lease_fences import publish, temporary
+from memmlp.common.lease import publish, temporary
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.motion.body import SPARSE_DIM
 

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from memmlp.common.errors import InputError
-from memmlp.common.lease import Lock
-from memmlp.common.lease_fences import publish, temporary
+from memmlp.common.lease import Lock, publish, temporary
 from memmlp.motion.preparing.cache import ClipFolder, finished_cache, prepare
 from memmlp.motion.preparing.find_clips import FoundFiles, clip_name
 from memmlp.motion.preparing.manifest import Manifest

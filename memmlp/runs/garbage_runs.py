@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from memmlp.common.files import read_json
-from memmlp.common.liveness import lives
+from memmlp.common.lease import is_alive
 from memmlp.runs.identity import NETWORK
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.notes import read_notes
@@ -101,7 +101,7 @@ def _plans(outputs: Path) -> Iterator[Path]:
     """Yield the plan files of sweeps, and those on which a living process, such as a search, works."""
     yield from outputs.glob("sweeps/*/plan.json")
     for path in outputs.glob("*/*/controllers/*.process"):
-        if (process := read_json(path)) and lives(process) is not False:
+        if (process := read_json(path)) and is_alive(process) is not False:
             yield path.with_suffix(".json")
 
 

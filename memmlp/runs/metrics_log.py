@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from memmlp.common import lease_fences
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, plain
+from memmlp.common.lease import check_owner
 
 
 class LogRecord(NamedTuple):
@@ -52,15 +52,13 @@ class MetricsLog:
             LeaseLost: if the run has another owner now.
             OSError: if the disk is full; the log is then unchanged.
         """
-        lease_fences.check_owner(self.path)
+        check_owner(self.path)
         if not self._whole:
             self.repair()
         entry = {"step": step, "phase": phase, "time": round(time.time(), 3), "values": dict(values)}
         line = json.dumps(plain(entry), allow_nan=False).encode() + b"\n"
         with open(self.path, "ab", buffering=0) as file:
-            lease_fences.check_owner(
-                self.path
-            )  # who is frozen from here on writes to a file that `repair` replaced
+            check_owner(self.path)  # after opening: `repair` gives the next owner another file
             self._whole = False
             if file.write(line) < len(line):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))

@@ -17,7 +17,6 @@ from typing import Any
 
 import yaml
 
-from memmlp.common import lease_fences
 from memmlp.common.errors import InputError
 from memmlp.common.files import (
     atomic_write,
@@ -27,7 +26,7 @@ from memmlp.common.files import (
     sync_folder,
     write_json,
 )
-from memmlp.common.lease import Lease, Lock
+from memmlp.common.lease import Lease, Lock, check_owner
 from memmlp.runs import deployment_folder
 from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.environment import changed, changes, code_digests, environment, host
@@ -293,7 +292,7 @@ class Run:
         """Forget the failure, and the attempts that led to it."""
         if self.failure:
             self.forgive()
-        lease_fences.check_owner(self.folder)
+        check_owner(self.folder)
         (self.folder / "FAILED").unlink(missing_ok=True)
 
     def forgive(self) -> None:
@@ -467,7 +466,7 @@ class Run:
         """Remove the run's own files, with the marker first, and nothing else."""
         if not self.folder.exists():
             return
-        lease_fences.check_owner(self.folder)
+        check_owner(self.folder)
         self.marker.unlink(missing_ok=True)
         sync_folder(self.folder)
         self._remove((*self.FILES, self.marker.name))
@@ -477,7 +476,7 @@ class Run:
         self._remove(self.STAGES)
 
     def _remove(self, names: Iterable[str]) -> None:
-        lease_fences.check_owner(self.folder)
+        check_owner(self.folder)
         for name in names:
             temporary = str(Path(name).with_name(f".{Path(name).name}.*.tmp"))
             for path in (*self.folder.glob(name), *self.folder.glob(temporary)):

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged, of_the_disk
 from memmlp.common.files import read_json, write_json
-from memmlp.common.liveness import Changes, lives, myself
+from memmlp.common.lease import Changes, current_process, is_alive
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan, RunTask
 
@@ -61,7 +61,7 @@ def directed(path: Path) -> bool:
     """
     if not Plan.load(path).open:
         return True
-    return _changes.unchanged(path, lambda: path.stat().st_mtime_ns) < ABANDONED
+    return _changes.seconds_unchanged(path, lambda: path.stat().st_mtime_ns) < ABANDONED
 
 
 def attempt(plan: Plan, task: RunTask, perform: Perform) -> bool:
@@ -133,10 +133,10 @@ class Presence:
     def __init__(self, path: Path):
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
-        write_json(path, myself())
+        write_json(path, current_process())
 
     @staticmethod
     def of(path: Path) -> bool:
         """Return whether the process that made the file is alive, or may be alive on another machine."""
         process = read_json(path)
-        return bool(process) and lives(process) is not False
+        return bool(process) and is_alive(process) is not False

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import json
+import os
 import re
 import shlex
 import shutil
@@ -12,12 +14,12 @@ from types import SimpleNamespace
 import pytest
 from command_line import BRIEF, run_apart
 from command_line import run as command
-from filelock import FileLock
 
 from memmlp.cli.bench.chaos import examine
 from memmlp.cli.tune import _makes, _tasks, prepare_search, search, training, write_results
 from memmlp.cli.workers import Workers
 from memmlp.common.errors import InputError
+from memmlp.common.lease import current_process
 from memmlp.runs.recipe_versions import RECIPES
 from memmlp.runs.run import Run
 from memmlp.sweep.search import director as director_module
@@ -92,9 +94,13 @@ def test_a_trial_of_two_seeds_goes_on_from_a_search_of_one(home: Path, tmp_path:
 
 
 def test_a_second_owner_is_refused(home: Path):
-    with FileLock(folder_of(home) / ".lock"):
+    claim = json.dumps({**current_process(), "since": "now"})
+    (mine := folder_of(home) / ".lease-1000").write_text(claim)  # of another thread, as it were
+    try:
         said = command(home, "tune", *TINY, "search.n_trials=4", code=2)
-    assert "another process is at it; --status shows it" in said
+    finally:
+        mine.unlink()
+    assert f"in use by process {os.getpid()} since now; --status shows it" in said
 
 
 @pytest.mark.parametrize(

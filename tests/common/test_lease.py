@@ -1,11 +1,11 @@
-"""A folder belongs to one process at a time, whatever the file system's locks are worth."""
+"""A folder belongs to one process at a time, and who lost it publishes nothing there."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import itertools
+import json
 import os
 import random
 import subprocess
@@ -16,32 +16,43 @@ from pathlib import Path
 from typing import ClassVar
 
 import pytest
-from machines import Clock, Machine, Scheduler, apart, taken, without_locks
-from processes import started
+from begun_runs import complete
+from machines import Clock, Machine, Scheduler, apart, taken
+from processes import started, until
 
-from memmlp.common import lease, lease_fences
+from memmlp.common import lease
 from memmlp.common.errors import LeaseLost
-from memmlp.common.files import atomic_write
-from memmlp.common.lease import LEASE, Lease, Lock
-from memmlp.common.liveness import myself
+from memmlp.common.files import atomic_write, write_json
+from memmlp.common.lease import (
+    LEASE,
+    Changes,
+    Lease,
+    Lock,
+    check_owner,
+    current_process,
+    is_alive,
+    publish,
+    temporary,
+)
+from memmlp.runs.evaluation_file import write_report
+from memmlp.runs.run import Run
 
 HOLD = """
-import sys
+import json, sys
 from pathlib import Path
-from memmlp.common.lease import Lock
+from memmlp.common.lease import Lock, current_process
 with Lock(Path(sys.argv[1])).hold():
-    print("held", flush=True)
+    print(json.dumps(current_process()), flush=True)
     sys.stdin.read()
 """
 
 
 @contextlib.contextmanager
-def holding(folder: Path) -> Iterator[subprocess.Popen]:
-    """A process that holds the folder until its input ends."""
+def holding(folder: Path) -> Iterator[tuple[subprocess.Popen, dict]]:
+    """A process that holds the folder until its input ends, with its description."""
     line = [sys.executable, "-c", HOLD, str(folder)]
     with started(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
-        assert holder.stdout.readline() == b"held\n"
-        yield holder
+        yield holder, json.loads(holder.stdout.readline())
 
 
 class Holder:
@@ -70,9 +81,37 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[Clock]:
         Holder.every.pop().let_go()
 
 
+@pytest.fixture
+def pair(tmp_path: Path, clock: Clock) -> tuple[Holder, Holder]:
+    """Two machines, the first of which holds the folder."""
+    one, two = Holder("one", tmp_path), Holder("two", tmp_path)
+    assert one.take().number == 1
+    assert two.take() is None
+    return one, two
+
+
+def test_this_process_is_alive_and_an_earlier_one_with_its_number_is_not(monkeypatch: pytest.MonkeyPatch):
+    here = current_process()
+    assert is_alive(here) is True
+    assert is_alive(here | {"born": "1"}) is False
+    monkeypatch.setattr(lease, "process_space", lambda: "elsewhere")
+    assert is_alive(here) is None
+
+
+def test_what_changes_is_as_young_as_its_last_change():
+    clock, values = Clock(), iter("aabbb")
+    changes = Changes(clock)
+    ages = []
+    for _ in range(5):
+        ages.append(changes.seconds_unchanged("it", lambda: next(values)))
+        clock.now += 10
+    assert ages == [0, 10, 0, 10, 20]
+    assert changes.seconds_unchanged("another", lambda: "b") == 0
+
+
 def test_another_process_waits_and_says_for_whom(tmp_path: Path):
     said: list[str] = []
-    with holding(tmp_path) as holder:
+    with holding(tmp_path) as (holder, _):
 
         def waiting(line: str) -> None:
             said.append(line)
@@ -83,18 +122,16 @@ def test_another_process_waits_and_says_for_whom(tmp_path: Path):
     assert f"process {holder.pid} since" in said[0]
 
 
-@pytest.mark.parametrize("locks", [True, False])
-def test_a_killed_holder_of_this_machine_is_followed_at_once(tmp_path: Path, monkeypatch, locks: bool):
-    if not locks:
-        without_locks(monkeypatch)
+def test_a_killed_holder_of_this_machine_is_followed_at_once(tmp_path: Path):
     lock = Lock(tmp_path)
-    with holding(tmp_path) as holder:
+    with holding(tmp_path) as (holder, process):
         assert lock.held
         with lock.hold(wait=False) as mine:
             assert mine is None
         holder.kill()
-        assert lock.held is False or holder.wait()  # it may take a moment to die
-        holder.wait()
+        until(lambda: is_alive(process) is False, "it is dead, though its parent has not asked for its end")
+        os.kill(holder.pid, 0)  # its number is still taken
+        assert lock.held is False
         with taken(lock) as mine:
             assert mine.number == 2
             assert lock.held
@@ -102,51 +139,44 @@ def test_a_killed_holder_of_this_machine_is_followed_at_once(tmp_path: Path, mon
 
 def test_numbers_grow_and_one_claim_stays(tmp_path: Path):
     lock = Lock(tmp_path)
-    for turn in range(3):
+    for other in (".other.lease-7", ".lease-x", ".lease-", ".lease-3.tmp"):
+        (tmp_path / other).touch()
+    for turn in range(6):
         with taken(lock) as outer, taken(Lock(tmp_path)) as inner:
             assert inner is outer
             assert outer.number == 2 * turn + 1
         assert lock.held is None
-        assert [path.name for path in tmp_path.glob(".lease-*")] == [f".lease-{2 * turn + 2}"]
+        assert [path.name for _, path in lock.claims()] == [f".lease-{2 * turn + 2}-free"]
+    assert len(list(tmp_path.iterdir())) == 5  # the other files stay
 
 
-def test_a_process_number_that_another_process_got_is_dead(tmp_path: Path):
-    lock = Lock(tmp_path)
-    lock.claims.make(1, {**myself(), "born": "1", "since": "now"})
-    assert lock.held is False
-    with taken(lock) as mine:
-        assert mine.number == 2
-
-
-def test_a_dead_holder_of_another_machine_is_followed_after_its_lease(tmp_path: Path, clock: Clock):
-    one, two = Holder("one", tmp_path), Holder("two", tmp_path)
-    assert one.take().number == 1
-    for _ in range(5):
+def test_a_dead_holder_of_another_machine_is_followed_after_its_lease(pair, clock: Clock):
+    _, two = pair
+    for _ in range(4):
+        clock.now += LEASE / 4
         assert two.take() is None
         assert two(lambda: two.lock.held) is True
-        clock.now += LEASE / 4
+    clock.now += LEASE / 4
     assert two(lambda: two.lock.held) is False
     assert two.take().number == 2
 
 
-def test_a_holder_that_shows_life_keeps_its_folder(tmp_path: Path, clock: Clock):
-    one, two = Holder("one", tmp_path), Holder("two", tmp_path)
-    mine = one.take()
+def test_a_holder_that_shows_life_keeps_its_folder(pair, clock: Clock):
+    one, two = pair
+    mine = one.lock
     for _ in range(10):
         assert two.take() is None
-        one(mine.check)
+        one(lambda: check_owner(mine.folder / "any"))
         clock.now += LEASE * 0.9
 
 
 @pytest.mark.parametrize("hours", [-5, 5])
-def test_clocks_of_other_machines_count_for_nothing(tmp_path: Path, clock: Clock, hours: int):
+def test_clocks_of_other_machines_count_for_nothing(pair, clock: Clock, hours: int):
     """The times of the file system's files are hours off, and jump while the holder lives."""
-    one, two = Holder("one", tmp_path), Holder("two", tmp_path)
-    mine = one.take()
-    claim = mine.claims.path(mine.number)
+    one, two = pair
     times = itertools.cycle([1e9, 1e9 + 3600 * hours])
     for _ in range(6):
-        os.utime(claim, (moment := next(times), moment))
+        os.utime(one.lock.folder / ".lease-1", (moment := next(times), moment))
         assert two.take() is None
         clock.now += LEASE * 0.9
     assert two.take() is None  # the last sign of life is not yet old enough
@@ -154,36 +184,32 @@ def test_clocks_of_other_machines_count_for_nothing(tmp_path: Path, clock: Clock
     assert two.take().number == 2
 
 
-def test_an_observer_that_was_frozen_itself_takes_nothing(tmp_path: Path, clock: Clock, monkeypatch):
+def test_an_observer_that_was_frozen_itself_takes_nothing(pair, clock: Clock, monkeypatch):
     """It slept between its look at the holder, who lives, and what it made of it."""
-    one, two = Holder("one", tmp_path), Holder("two", tmp_path)
-    mine = one.take()
-    assert two.take() is None
-    last = two.lock.claims.last
+    one, two = pair
+    last = two.lock._last
 
     def sleepily() -> object:
         seen = last()
         clock.now += 10 * LEASE
-        one(mine.check)
+        one(lambda: check_owner(one.lock.folder / "any"))
         return seen
 
-    monkeypatch.setattr(two.lock.claims, "last", sleepily)
+    monkeypatch.setattr(two.lock, "_last", sleepily)
     assert two.take() is None
     assert two.take() is None
 
 
-def test_who_wakes_up_superseded_publishes_nothing(tmp_path: Path, clock: Clock):
-    one, two = Holder("one", tmp_path), Holder("two", tmp_path)
+def test_who_wakes_up_superseded_publishes_nothing(pair, tmp_path: Path, clock: Clock):
+    one, two = pair
     result = tmp_path / "evaluations" / "stream.json"
     result.parent.mkdir()
-    mine = one.take()
     one(atomic_write, result, "one's")
     assert two.take() is None
     clock.now += LEASE + 1
     assert two.take().number == 2
-    with pytest.raises(LeaseLost, match="took it over, for this one stood still for longer than 60 s"):
+    with pytest.raises(LeaseLost, match="60 s"):
         one(atomic_write, result, "one's, late")
-    assert mine.lost
     two(atomic_write, result, "two's")
     one.let_go()
     assert two(lambda: two.lock.held) is True  # what the other let go was no longer its own
@@ -191,20 +217,12 @@ def test_who_wakes_up_superseded_publishes_nothing(tmp_path: Path, clock: Clock)
     two.let_go()
     assert result.read_text() == "two's, too"
     assert two.lock.held is None
-    atomic_write(result, "nobody's")  # who holds nothing is not fenced
+    atomic_write(result, "nobody's")  # who holds nothing is not checked
 
 
-def test_a_later_claim_counts_before_its_maker_did_anything(tmp_path: Path, clock: Clock):
-    one = Holder("one", tmp_path)
-    one.take()
-    Lock(tmp_path).claims.make(2, {"since": "now"})
-    with pytest.raises(LeaseLost):
-        one(atomic_write, tmp_path / "DONE", "late")
-
-
-def test_a_freeze_between_check_and_rename_publishes_nothing(tmp_path: Path, clock: Clock, monkeypatch):
-    one, two = Holder("one", tmp_path), Holder("two", tmp_path)
-    result, replace, taken_over = tmp_path / "DONE", os.replace, []
+def test_a_freeze_between_check_and_rename_publishes_nothing(pair, tmp_path: Path, clock: Clock, monkeypatch):
+    one, two = pair
+    replace, taken_over = os.replace, []
 
     def frozen(unfinished: Path, path: Path) -> None:
         if not taken_over:
@@ -213,50 +231,35 @@ def test_a_freeze_between_check_and_rename_publishes_nothing(tmp_path: Path, clo
             taken_over.append(two.take())
         replace(unfinished, path)
 
-    one.take()
-    monkeypatch.setattr("memmlp.common.lease_fences.os.replace", frozen)
+    monkeypatch.setattr("memmlp.common.lease.os.replace", frozen)
     with pytest.raises(LeaseLost):
-        one(atomic_write, result, "late")
+        one(atomic_write, tmp_path / "DONE", "late")
     assert taken_over[0].number == 2
-    assert not result.exists()
+    assert not (tmp_path / "DONE").exists()
     assert not list(tmp_path.glob(".*.tmp"))
 
 
 def test_a_claim_that_was_decided_on_long_ago_is_given_up(tmp_path: Path, clock: Clock, monkeypatch):
     """A process sees a free folder, and sleeps while others have it, one after another."""
     one, two = Holder("one", tmp_path), Holder("two", tmp_path)
-    make = one.lock.claims.make
+    watch = one.lock._watch
 
-    def late(number: int, owner: dict) -> bool:
+    def late() -> object:
+        seen = watch()
         assert two.take().number == 1
         two.let_go()
         assert two.take().number == 3
-        return make(number, owner)
+        return seen
 
-    monkeypatch.setattr(one.lock.claims, "make", late)
+    monkeypatch.setattr(one.lock, "_watch", late)
     assert one.take() is None
     two(atomic_write, tmp_path / "DONE", "two's")
     assert [path.name for path in tmp_path.glob(".lease-*")] == [".lease-3"]
 
 
-def test_a_claim_whose_maker_died_before_it_wrote_it_is_nobodys(tmp_path: Path, clock: Clock):
-    (tmp_path / ".lease-4").touch()
-    assert Holder("two", tmp_path).take().number == 5
-
-
-@pytest.mark.parametrize("name", ["", "data"])
-def test_the_next_owner_removes_claims_in_the_making(tmp_path: Path, name: str):
-    lock = Lock(tmp_path, name)
-    draft = lock.claims._draft(1)
-    lock.claims.make(1)
-    draft.touch()
-    with taken(lock) as mine:
-        assert mine.number == 2
-        assert not draft.exists()
-
-
-@pytest.mark.parametrize("text", ['{"pid": 1', "[]", "7"])
+@pytest.mark.parametrize("text", ["", '{"pid": 1', "[]", "7"])
 def test_a_claim_that_cannot_be_read_expires(tmp_path: Path, clock: Clock, text: str):
+    """Its maker may be about to write it, or may have died before it did."""
     (tmp_path / ".lease-4").write_text(text)
     two = Holder("two", tmp_path)
     assert two.take() is None
@@ -264,49 +267,45 @@ def test_a_claim_that_cannot_be_read_expires(tmp_path: Path, clock: Clock, text:
     assert two.take().number == 5
 
 
-@pytest.mark.parametrize("code", [errno.ENOSYS, errno.ENOLCK])
-def test_file_systems_without_locks_will_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int):
-    def refuse(*_: object) -> None:
-        raise OSError(code, os.strerror(code))
-
-    monkeypatch.setattr(fcntl, "flock", refuse)
-    with taken(Lock(tmp_path)) as mine:
-        assert mine.number == 1
-
-
-def test_the_kernels_lock_alone_keeps_others_away(tmp_path: Path):
-    """Of a process of an earlier version, which made no claims."""
-    with open(tmp_path / ".lock", "wb") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        with Lock(tmp_path).hold(wait=False) as mine:
-            assert mine is None
-    with taken(Lock(tmp_path)) as mine:
-        assert mine.number == 1
-
-
-def test_a_full_disk_lets_go_by_the_lease(tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch):
-    one, two = Holder("one", tmp_path), Holder("two", tmp_path)
-    one.take()
+def test_a_full_disk_refuses_a_claim_and_leaves_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     with monkeypatch.context() as full:
 
-        def refuse(*_: object) -> bool:
+        def refuse(*_: object) -> int:
             raise OSError(errno.ENOSPC, "No space left on device")
 
-        full.setattr(one.lock.claims, "make", refuse)
+        full.setattr("memmlp.common.lease.os.write", refuse)
+        with pytest.raises(OSError, match="No space"), taken(Lock(tmp_path)):
+            pass
+    with taken(Lock(tmp_path)) as mine:
+        assert mine.number == 1
+
+
+def test_a_disk_that_refuses_the_release_lets_the_lease_expire(pair, clock: Clock, monkeypatch):
+    one, two = pair
+    with monkeypatch.context() as readonly:
+
+        def refuse(*_: object) -> Path:
+            raise OSError(errno.EROFS, "Read-only file system")
+
+        readonly.setattr(Path, "rename", refuse)
         one.let_go()
     assert two.take() is None
     clock.now += LEASE + 1
     assert two.take().number == 2
 
 
-def test_who_settles_waits_until_the_holder_shows_life_or_its_lease_is_over(tmp_path, clock, monkeypatch):
-    one, two, said = Holder("one", tmp_path), Holder("two", tmp_path), []
-    mine = one.take()
+def test_settling_waits_until_the_holder_shows_life_or_its_lease_is_over(pair, clock, monkeypatch):
+    one, two = pair
+    said: list[str] = []
     pauses: list[float] = []
-    monkeypatch.setattr(lease.time, "sleep", lambda s: (pauses.append(s), one(mine.check)))
+
+    def show_life(seconds: float) -> None:
+        pauses.append(seconds)
+        one(lambda: check_owner(one.lock.folder / "any"))
+
+    monkeypatch.setattr(lease.time, "sleep", show_life)
     two(two.lock.settle, said.append)
     assert len(pauses) == 1
-    assert "looking whether process" in said[0]
     assert "of another machine since" in said[0]
     assert two.take() is None
     monkeypatch.setattr(lease.time, "sleep", lambda s: setattr(clock, "now", clock.now + 7))
@@ -320,7 +319,7 @@ def test_a_folder_beside_its_lock(tmp_path: Path, clock: Clock):
     one.lock, two.lock = Lock(tmp_path, "data"), Lock(tmp_path, "data")
 
     def begin() -> Path:
-        unfinished = lease_fences.temporary(place)
+        unfinished = temporary(place)
         unfinished.mkdir()
         (unfinished / "half").touch()
         return unfinished
@@ -332,12 +331,12 @@ def test_a_folder_beside_its_lock(tmp_path: Path, clock: Clock):
     assert two.take()
     assert not left.exists()
     with pytest.raises(LeaseLost):
-        one(lease_fences.publish, left, place)
-    two(lease_fences.publish, two(begin), place)
+        one(publish, left, place)
+    two(publish, two(begin), place)
     assert (place / "half").exists()
 
 
-@pytest.mark.parametrize("seed", range(16))
+@pytest.mark.parametrize("seed", range(12))
 def test_whatever_the_order_nothing_is_published_by_an_earlier_owner(tmp_path, clock, monkeypatch, seed: int):
     """Machines that are frozen at any system call, for longer than a lease or not."""
     dice = random.Random(seed)
@@ -345,14 +344,14 @@ def test_whatever_the_order_nothing_is_published_by_an_earlier_owner(tmp_path, c
     published: list[tuple[int, int]] = []
     result = tmp_path / "result"
     scheduler = Scheduler(monkeypatch, clock, dice, pause=LEASE / 2)
-    replace = lease_fences.os.replace
+    replace = lease.os.replace
 
     def recorded(unfinished: Path, path: Path) -> None:
         replace(unfinished, path)
         if path == result:
-            published.append((lease_fences._FENCES[tmp_path].number, max(begun)))
+            published.append((lease._leases[tmp_path].number, max(begun)))
 
-    monkeypatch.setattr(lease_fences.os, "replace", recorded)
+    monkeypatch.setattr(lease.os, "replace", recorded)
 
     def work() -> None:
         for _ in range(12):
@@ -367,3 +366,77 @@ def test_whatever_the_order_nothing_is_published_by_an_earlier_owner(tmp_path, c
     assert published
     assert all(owner == newest for owner, newest in published)
     assert not list(tmp_path.glob(".*.tmp"))
+
+
+WAYS: dict[str, Callable[[Run], object]] = {
+    "checkpoint": lambda run: atomic_write(run.checkpoint, b"late"),
+    "DONE": lambda run: run.finish(["model.safetensors"]),
+    "manifest": lambda run: run.write_manifest({"late": True}),
+    "begin": lambda run: run.begin("memmlp", {}, data="d", upstream=None),
+    "FAILED": lambda run: run.fail("late"),
+    "retry": Run.retry,
+    "evaluation": lambda run: write_report(run.evaluation("late-0"), {"mean": {}}),
+    "deployment": lambda run: run.deployment("int8-0").finish({"late": True}),
+    "log": lambda run: run.log(9, {"loss": 9.0}),
+    "picture": lambda run: publish(run.model, run.picture),
+    "reset": Run.reset,
+    "clear_stages": Run.clear_stages,
+}
+
+
+@contextlib.contextmanager
+def losing(folder: Path) -> Iterator[None]:
+    """A context in which this process has lost a folder that it held."""
+    with Lock(folder).hold() as mine:
+        (folder / f".lease-{mine.number + 1}").write_text(json.dumps({"pid": 1, "place": "elsewhere"}))
+        try:
+            yield
+        finally:
+            (folder / f".lease-{mine.number + 1}").unlink()
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    paths = (path for path in folder.rglob("*") if path.is_file() and ".lease-" not in path.name)
+    return {path: path.read_bytes() for path in paths}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_nothing_of_a_lost_run_changes(tmp_path: Path, way: str):
+    run = complete(tmp_path)
+    before = contents(run.folder)
+    with losing(run.folder):
+        with pytest.raises(LeaseLost):
+            WAYS[way](Run(run.folder))
+        assert contents(run.folder) == before
+
+
+def test_folders_beside_a_lost_one_are_free(tmp_path: Path):
+    with losing(tmp_path / "mine"):
+        write_json(tmp_path / "mine too.json", {})
+        with pytest.raises(LeaseLost):
+            write_json(tmp_path / "mine" / "a.json", {})
+    write_json(tmp_path / "mine" / "a.json", {})
+
+
+def test_a_folder_is_the_same_by_its_other_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "mine")
+    monkeypatch.chdir(tmp_path)
+    with losing(Path("mine")):
+        for path in (tmp_path / "link" / "a", Path("link/a"), Path("other/../mine/a")):
+            assert ".lease-1." in temporary(path).name
+            with pytest.raises(LeaseLost):
+                publish(tmp_path / "none", path)
+
+
+def test_only_what_earlier_owners_left_unfinished_is_removed(tmp_path: Path):
+    folder = tmp_path / "run"
+    (folder / "evaluations").mkdir(parents=True)
+    with taken(Lock(folder)):
+        left = [temporary(folder / "evaluations" / "a"), temporary(folder / "DONE"), temporary(folder)]
+    others = [temporary(folder / "notes"), folder / ".mine.tmp"]
+    for path in (*left, *others):
+        path.touch()
+    with taken(Lock(folder)):
+        assert not any(path.exists() for path in left)
+        assert all(path.exists() for path in others)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 import shutil
 import signal
@@ -13,8 +14,7 @@ from command_line import SMALL, run
 from kills.storms import forked_controllers
 
 from memmlp.cli.bench.chaos import check, compare, storm
-from memmlp.common.lease import Lock
-from memmlp.common.liveness import myself
+from memmlp.common.lease import current_process
 from memmlp.runs.run import Run
 
 
@@ -63,7 +63,8 @@ def test_every_kind_of_difference_is_found(tmp_path: Path):
     finished(stormy, "f")
     finished(stormy, "b", b"other")
     Run.of(stormy, "c" * 16).marker.unlink()
-    Lock(Run.of(stormy, "d" * 16).folder).claims.make(1, {**myself(), "since": "now"})
+    claim = {**current_process(), "since": "now"}
+    (Run.of(stormy, "d" * 16).folder / ".lease-1").write_text(json.dumps(claim))
     Run.of(stormy, "e" * 16).model.write_bytes(b"damaged")
     said = "\n".join(compare(calm, stormy))
     for line in (

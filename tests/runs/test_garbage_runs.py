@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from memmlp.common.files import write_json
-from memmlp.common.liveness import myself
+from memmlp.common.lease import current_process
 from memmlp.runs.garbage_runs import delete, garbage
 from memmlp.runs.notes import add_tags
 from memmlp.runs.recipe_versions import RECIPES
@@ -116,7 +116,7 @@ def test_a_finished_vqvae_of_a_search_under_way_stays(outputs: Path):
     folder.mkdir(parents=True)
     write_json(folder / "one.json", {"entries": [], "tasks": [{"id": CODES}]})
     assert CODES in found(outputs)
-    write_json(folder / "one.process", myself())
+    write_json(folder / "one.process", current_process())
     assert CODES not in found(outputs)
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import os
 from pathlib import Path
 
 import pytest
-from begun_runs import CONFIG, begun
+from begun_runs import CONFIG, begun, complete
+from machines import fenced
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
@@ -68,3 +71,49 @@ def test_a_log_may_go_on_after_a_reset(tmp_path: Path):
     run.begin("memmlp", CONFIG, data="d", upstream=None)
     run.log(2, {"loss": 1.0})
     assert [entry.step for entry in run.metrics()] == [2]
+
+
+def test_a_line_that_is_written_late_goes_to_the_old_file(tmp_path: Path):
+    """The process is frozen between opening and writing, and the run's next owner begins meanwhile."""
+    run = complete(tmp_path)
+    run.log(1, {"loss": 1.0})
+
+    class Frozen:
+        number, thread, awake = 3, None, True
+
+        def check(self) -> None:
+            if self.awake and (run.folder / "now").exists():
+                self.awake = False
+                Run(run.folder).log(1, {"loss": 0.5})
+
+    with fenced(run.folder, Frozen()):
+        run.log(2, {"loss": 2.0})
+        (run.folder / "now").touch()
+        run.log(3, {"loss": 3.0})
+    assert [entry.values for entry in run.metrics()] == [{"loss": 0.5}, {"loss": 2.0}]
+
+
+def test_a_line_that_is_half_written_is_an_error_and_then_gone(tmp_path: Path, monkeypatch):
+    run = complete(tmp_path)
+    run.log(1, {"loss": 1.0})
+    with monkeypatch.context() as full:
+        real = open
+
+        class Short:
+            def __init__(self, file):
+                self.file = file
+
+            def write(self, line: bytes) -> int:
+                return self.file.write(line[:9])
+
+            def __enter__(self):
+                return self
+
+            def __exit__(self, *_):
+                self.file.close()
+
+        full.setattr("builtins.open", lambda path, mode, **options: Short(real(path, mode, **options)))
+        with pytest.raises(OSError, match=os.strerror(errno.ENOSPC)):
+            run.log(2, {"loss": 2.0})
+    run.log(3, {"loss": 3.0})
+    assert [entry.step for entry in run.metrics()] == [1, 3]

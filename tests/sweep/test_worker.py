@@ -16,13 +16,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from machines import Clock, apart, without_locks
+from machines import Clock, apart
 from processes import PATIENCE, forked, started, until
 
 from memmlp.common import lease
 from memmlp.common.errors import InputError, TrainingDiverged
-from memmlp.common.lease import Lock
-from memmlp.common.liveness import Changes
+from memmlp.common.lease import Changes, Lock
 from memmlp.config.worker_process import check_wanted
 from memmlp.runs.run import Run
 from memmlp.sweep import worker
@@ -312,7 +311,7 @@ def test_a_worker_that_is_stopped_for_longer_than_its_lease_goes_on_elsewhere(tm
     assert set(Plan.load(path).states().values()) == {"done"}
 
 
-@pytest.mark.parametrize("where", [without_locks, apart])
+@pytest.mark.parametrize("where", [lambda monkeypatch: None, apart])
 def test_workers_do_each_task_once_where_locks_do_nothing(tmp_path: Path, monkeypatch, where: Callable):
     """On one machine, and on several that share the folder."""
     where(monkeypatch)

@@ -23,8 +23,7 @@ import click
 import yaml
 
 from memmlp.common.files import file_digest
-from memmlp.common.lease import Lock
-from memmlp.common.liveness import lives
+from memmlp.common.lease import Lock, is_alive
 from memmlp.runs.identity import NETWORK
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
@@ -200,7 +199,7 @@ def await_release(outputs: Path) -> None:
 def choose(processes: Sequence[subprocess.Popen[bytes]], outputs: Path, dice: random.Random) -> int | None:
     """Choose a process to kill: a controller, or a worker that holds a run; None if there is none."""
     owners = [Lock(folder).owner for folder in sorted(outputs.glob("runs/*/"))]
-    workers = [int(owner["pid"]) for owner in owners if owner and lives(owner)]
+    workers = [int(owner["pid"]) for owner in owners if owner and is_alive(owner)]
     victims = [*(process.pid for process in processes if process.poll() is None), *workers]
     return dice.choice(victims) if victims else None
 

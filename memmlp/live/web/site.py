@@ -18,7 +18,7 @@ from torch import Tensor
 from memmlp import __version__
 from memmlp.common.errors import InputError
 from memmlp.common.files import file_digest, now, read_json
-from memmlp.common.lease_fences import publish, temporary
+from memmlp.common.lease import publish, temporary
 from memmlp.deploy.latency import yardstick
 from memmlp.live.session.loop import TOP
 from memmlp.live.web.clips import SiteClip, write_clips

@@ -21,8 +21,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.common.lease import Lock
-from memmlp.common.lease_fences import check_owner, publish, temporary
+from memmlp.common.lease import Lock, check_owner, publish, temporary
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS, FRAME_DIM, load_rest_joints
 from memmlp.motion.clip import INTERPOLATED, LINES, SPLINES, Clip, resample

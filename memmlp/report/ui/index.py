@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import json
 import os
+import re
 import sqlite3
 import threading
 from collections.abc import Iterator
@@ -105,9 +106,9 @@ def _status(folder: Path) -> str:
 
 
 def _claimed(folder: Path) -> bool:
-    """Return whether a process may be working on a run, as the last claim of its folder is not empty."""
+    """Return whether a process may be working on a run, as its folder has a claim that is not free."""
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
-        return any(entry.name.startswith(".lease-") and entry.stat().st_size for entry in entries)
+        return any(re.fullmatch(r"\.lease-\d+", entry.name) for entry in entries)
     return False
 
 

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from optuna.trial import Trial, TrialState
 
-from memmlp.common import lease_fences
 from memmlp.common.errors import InputError
+from memmlp.common.lease import check_owner
 from memmlp.runs.identity import inference
 from memmlp.runs.metrics_log import LogRecord
 from memmlp.runs.run import Run
@@ -221,7 +221,7 @@ def direct(director: Director, fleet: Fleet, board: SearchBoard, path: Path) -> 
     try:
         with board:
             while plan is None or director.going:
-                lease_fences.check_owner(path)
+                check_owner(path)
                 before, plan = plan, director.look(fleet.size)
                 if plan != before:
                     plan.save(path)

@@ -25,9 +25,9 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, Trial, TrialState
 
-from memmlp.common import lease_fences
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
+from memmlp.common.lease import check_owner
 from memmlp.sweep.search.search_file import Range, Search, Value
 
 BEGINNING = b'{"op_code":'  # how every line of a journal begins
@@ -163,7 +163,7 @@ class FencedJournal(JournalFileBackend):
         """Append lines to the journal. Raises LeaseLost if its folder has another owner now."""
         lines = "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs)
         with open(self.path, "ab") as file:
-            lease_fences.check_owner(self.path)  # after opening: `mend` gave a later owner another file
+            check_owner(self.path)  # after opening: `mend` gave a later owner another file
             file.write(lines.encode())
             file.flush()
             os.fsync(file.fileno())

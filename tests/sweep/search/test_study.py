@@ -13,9 +13,9 @@ from fake_search import (
     search,
     to_the_end,
 )
+from machines import fenced
 
 from memmlp.common.errors import InputError, LeaseLost
-from memmlp.common.lease_fences import fenced
 from memmlp.sweep.search.study import Study, journal, mend
 
 
