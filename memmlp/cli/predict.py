@@ -67,7 +67,7 @@ def predict(
     from memmlp.config.open_run import OpenedRun, data_of, experiment_of, trained_network
     from memmlp.evaluation.predictions import ClipPredictor
     from memmlp.motion.exporting.export_folder import plan_export
-    from memmlp.motion.preparing.imported_body import check_networks_body
+    from memmlp.motion.preparing.imported_body import check_imported_body
     from memmlp.runs.lookup import find_run
 
     found = find_run(outputs, run)
@@ -79,8 +79,7 @@ def predict(
     )
     if Path(source).exists():
         plan = plan_export(Path(source), out, format_)
-        if body := found.manifest.get("body"):  # which early runs did not record
-            check_networks_body([target.source for target in plan.targets], body)
+        check_imported_body([target.source for target in plan.targets], predictor.rest, "the network")
         report = predictor.export(plan, strict=strict)
     else:
         opened = OpenedRun(found, experiment, data_of(found, experiment))

@@ -15,7 +15,7 @@ from memmlp.config.instantiate import built, located
 from memmlp.motion.clip import LINES
 from memmlp.motion.motion_source import MotionSource
 from memmlp.motion.preparing.cache import ClipFolder
-from memmlp.motion.preparing.several_folders import Folders, Root
+from memmlp.motion.preparing.find_clips import Folders, Root
 from memmlp.motion.preparing.splits import MixedSplit, SeededSplit, Split
 from memmlp.runs.recipe_versions import RECIPES
 

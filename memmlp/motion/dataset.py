@@ -12,8 +12,8 @@ from torch import Tensor
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import FRAME_DIM
+from memmlp.motion.preparing.find_clips import source_of
 from memmlp.motion.preparing.manifest import Manifest
-from memmlp.motion.preparing.several_folders import source_of
 from memmlp.motion.preparing.splits import PARTS
 
 DRAWN_BY = ("frames", "clips")

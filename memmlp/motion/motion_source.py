@@ -11,10 +11,8 @@ from typing import TYPE_CHECKING, NamedTuple
 from memmlp.common.errors import InputError
 from memmlp.common.lease import Lock, publish, temporary
 from memmlp.motion.preparing.cache import ClipFolder, finished_cache, prepare
-from memmlp.motion.preparing.find_clips import FoundFiles, clip_name
-from memmlp.motion.preparing.manifest import Manifest
-from memmlp.motion.preparing.several_folders import find_all
-from memmlp.motion.preparing.split_coverage import Coverage
+from memmlp.motion.preparing.find_clips import FoundFiles, clip_name, find_clips
+from memmlp.motion.preparing.manifest import Coverage, Manifest
 
 if TYPE_CHECKING:
     from memmlp.motion.dataset import MotionDataset
@@ -103,7 +101,7 @@ class MotionSource:
     def _listed(self) -> Coverage:
         """Return how many entries of the split have a file, whatever the file contains."""
         split = self.clips.split
-        found = find_all(self.clips.root) if split.listed else FoundFiles()
+        found = find_clips(self.clips.root) if split.listed else FoundFiles()
         names = [clip_name(file) for file in (*found.files, *found.links)]
         return Coverage.of(split.listed, split.missing(names))
 

@@ -9,9 +9,8 @@ from memmlp.motion.body import FPS
 from memmlp.motion.clip import LINES, Skipped
 from memmlp.motion.motion_source import Prepared
 from memmlp.motion.preparing.amass_names import absent_subsets
-from memmlp.motion.preparing.groups import unfitting
 from memmlp.motion.preparing.manifest import ClipRecord, Manifest
-from memmlp.motion.preparing.split_leaks import divided_remark
+from memmlp.motion.preparing.split_remarks import divided_remark, unmatched_patterns_remark
 from memmlp.pipeline.experiment import Experiment
 
 SLOW = 0.99  # of the network's rate, below which a recording lacks frames: 59.94 Hz is as good as 60
@@ -25,7 +24,7 @@ def data_remarks(data: Prepared) -> list[str]:
         unusual_remark(manifest.unusual),
         low_rates_remark(manifest, manifest.clips, "clips"),
         divided_remark(manifest),
-        unfitting(manifest.split, [clip.name for clip in manifest.clips]),
+        unmatched_patterns_remark(manifest.split, [clip.name for clip in manifest.clips]),
     )
     return list(filter(None, every))
 

@@ -162,7 +162,7 @@ class Measured:
             patterns: regular expressions, as those of `data.split.groups`.
         """
         grouping = Grouping(tuple(patterns), {clip: self.group(clip) for clip in self.clips})
-        groups = grouping.tied({clip: clip for clip in self.clips})
+        groups = grouping.tie({clip: clip for clip in self.clips})
         return replace(self, groups={clip: group[0] for group in groups for clip in group})
 
     def by_source(self) -> dict[str, Measured]:

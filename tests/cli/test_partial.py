@@ -28,7 +28,7 @@ TINY = [
 ]
 S1 = ["data=amass_s1", "data.root=amass", "data.split.folder=lists"]
 PART = "amass_s1, 87 % of the list (7 of 8 entries), 2 of 3 subsets (without BioMotionLab_NTroje)"
-REFUSED = "data.root: 1 of 8 entries of the split's list have no clip (MPI_HDM05 1 of 4) below amass"
+REFUSED = "data.root=amass: 1 of 8 entries of the split's list have no clip (MPI_HDM05 1 of 4)"
 
 
 @pytest.fixture
@@ -56,7 +56,7 @@ def home(tmp_path: Path) -> Path:
 )
 def test_a_missing_clip_stops_whatever_trains_with_one_line(home, command):
     said = run(home, *command, *S1, code=2)
-    assert said == f"memmlp: {REFUSED}; data.partial=true takes the part there is\n"
+    assert said.startswith(f"memmlp: {REFUSED}; data.partial=true")
     assert not list_runs(home / "outputs")
 
 

@@ -17,8 +17,8 @@ def inspect(path: Path) -> None:
 
     PATH is a cache, whose splits are shown too, or a folder of npz files.
     """
-    from memmlp.motion.preparing.folder_survey import survey
     from memmlp.motion.preparing.manifest import MANIFEST, Manifest
+    from memmlp.motion.preparing.survey import survey
 
     if (path / MANIFEST).is_file():
         show_manifest(Manifest.load(path))

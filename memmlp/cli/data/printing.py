@@ -13,9 +13,8 @@ from rich.table import Table
 from memmlp.common.errors import one_line
 from memmlp.motion.body import FPS
 from memmlp.motion.clip import INTERPOLATED
-from memmlp.motion.preparing.groups import unfitting
-from memmlp.motion.preparing.several_folders import source_of
-from memmlp.motion.preparing.split_leaks import divided_remark
+from memmlp.motion.preparing.find_clips import source_of
+from memmlp.motion.preparing.split_remarks import divided_remark, unmatched_patterns_remark
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -46,7 +45,7 @@ def show_manifest(manifest: Manifest) -> None:
         f"listed but missing {len(manifest.missing)}; body {manifest.body}"
     )
     names = [clip.name for clip in manifest.clips]
-    for said in filter(None, (divided_remark(manifest), unfitting(manifest.split, names))):
+    for said in filter(None, (divided_remark(manifest), unmatched_patterns_remark(manifest.split, names))):
         click.echo(said)
     if not manifest.coverage.whole:
         click.echo(f"{manifest.coverage}: {manifest.coverage.gaps}")

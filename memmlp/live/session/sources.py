@@ -134,10 +134,10 @@ def npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
     from memmlp.motion.features import motion_frames
     from memmlp.motion.formats.npz import read_clip
     from memmlp.motion.plausibility import check_plausible, unusual
-    from memmlp.motion.preparing.imported_body import check_networks_joints
+    from memmlp.motion.preparing.imported_body import check_imported_body
 
     recorded = read_clip(path, path.stem)
-    check_networks_joints([path], rest)
+    check_imported_body([path], rest, "the network")
     check_plausible(path, recorded)
     if reason := unusual(recorded):
         remark(f"{path}: unusual, {reason}")

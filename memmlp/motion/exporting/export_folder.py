@@ -208,7 +208,7 @@ def export(
     """
     rest = load_rest_joints(body)
     if plan.format.has_bones:
-        check_imported_body([target.source for target in plan.targets], str(body), rest, "--body")
+        check_imported_body([target.source for target in plan.targets], rest, f"--body {body}")
     written: list[Path] = []
     skipped, odd = list(plan.skipped), dict[str, str]()
     seconds = 0.0

@@ -1,10 +1,10 @@
-"""AMASS: the names of its clips, which differ between its releases, and what the names tell.
+"""The names of AMASS' clips, which differ between its releases.
 
 Three namings are known. The first SMPL+H release has folders like `BioMotionLab_NTroje` and `MPI_HDM05`, and
 files that end in `_poses`. Later downloads name the folders `BMLrub` and `HDM05`. The SMPL-X release has
 those folders, files that end in `_stageii`, and `_` in place of blanks. BABEL's paths, and archives that are
-unpacked each into a folder of its own, have the subset's folder twice, as in
-`BMLrub/BioMotionLab_NTroje/...`, or in a folder of any other name, as in `archive-1/CMU/...`.
+each unpacked into a folder, have another folder in front, as in `BMLrub/BioMotionLab_NTroje/...` or
+`archive-1/CMU/...`.
 """
 
 from __future__ import annotations
@@ -49,10 +49,22 @@ FOLDERS = frozenset((
     "DFaust_67", "DFaust", "DanceDB", "SSM_synced", "SSM", "TCD_handMocap", "TCDHands", "BMLhandball", "CNRS",
     "GRAB", "HUMAN4D", "MOYO", "SOMA", "WEIZMANN",
 ))  # fmt: skip
-"""The subsets' folders as the releases spell them, by which one is told in a folder of another name."""
+"""The subsets' folders as the releases spell them."""
 
-AMASS = frozenset(map(subset, FOLDERS))
-"""The subsets as `subset` names them."""
+SUBSETS = frozenset(map(subset, FOLDERS))
+
+PROTOCOLS = {"amass_s1": S1, "amass_s3": (*S2_TRAIN, *S2_TEST)}
+"""Option of `data` -> the subsets that it must have to be complete."""
+
+PEOPLE = (
+    r"(?i)^ACCAD/((?:fe)?male\d)",
+    r"(?i)^(?:DFaust|DFaust_67|MoSh|MPI_mosh|PosePrior|MPI_Limits|SSM|SSM_synced)/(?:\d{8}_)?(\d{5})/",
+)
+"""Patterns of people with several folders, for `data.split.groups`.
+
+ACCAD has a folder for each kind of motion, such as `Female1Running_c3d`. The sets recorded at the MPI use the
+same number for a person.
+"""
 
 
 def unpacked(name: str) -> str:
@@ -71,43 +83,32 @@ def clip_key(name: str) -> str:
     return f"{subset(unpacked(name))}/{SUFFIX.sub('', rest.replace(' ', '_'))}"
 
 
-PROTOCOLS = {"amass_s1": S1, "amass_s3": (*S2_TRAIN, *S2_TEST)}
-"""Option of `data` -> subsets that it is not whole without; S3 has all that a release has, and so these."""
+def present_subsets(names: Iterable[str]) -> set[str]:
+    """Return the subsets of clips, or of folders of subsets, by their names."""
+    return {subset(one) for name in names for one in (name, unpacked(name))}
 
 
 def absent_subsets(data: str, names: Iterable[str]) -> str:
-    """Say which subsets of a protocol are absent, as in "1 of 3 subsets (without CMU, MPI_HDM05)", or "".
+    """Describe the absent subsets of a protocol, as in "1 of 3 subsets (without CMU, MPI_HDM05)", or "".
 
     Args:
-        data: the option of `data`; only of those in `PROTOCOLS` there is something to say.
+        data: the option of `data`; the text is empty for any that is not in `PROTOCOLS`.
         names: names of clips or of folders of subsets.
     """
-    wanted = PROTOCOLS.get(data, ())
-    present = {subset(one) for name in names for one in (name, unpacked(name))}
-    absent = [name for name in wanted if subset(name) not in present]
+    protocol, present = PROTOCOLS.get(data, ()), present_subsets(names)
+    absent = [name for name in protocol if subset(name) not in present]
     if not absent:
         return ""
     more = f" and {len(absent) - 3} more" if len(absent) > 3 else ""
-    there = f"{len(wanted) - len(absent)} of {len(wanted)} subsets"
-    return f"{there} (without {', '.join(absent[:3])}{more})"
-
-
-PEOPLE = (
-    r"(?i)^ACCAD/((?:fe)?male\d)",
-    r"(?i)^(?:DFaust|DFaust_67|MoSh|MPI_mosh|PosePrior|MPI_Limits|SSM|SSM_synced)/(?:\d{8}_)?(\d{5})/",
-)
-"""Patterns of people with several folders, for `data.split.groups`.
-
-ACCAD has one for each kind of motion, such as `Female1Running_c3d`, and the sets recorded at the MPI have the
-same number for a person.
-"""
+    count = f"{len(protocol) - len(absent)} of {len(protocol)} subsets"
+    return f"{count} (without {', '.join(absent[:3])}{more})"
 
 
 def divided_subjects(parts: Iterable[tuple[str, str]]) -> list[str]:
     """Return the AMASS subjects, SUBSET/SUBJECT, that have clips in both training and test.
 
-    A subject is the same one under all names that the subset ever had, and in all folders of one person
-    (`PEOPLE`), and is given by the first that occurs.
+    A subject is the same one under all names of the subset, and in all folders of one person (`PEOPLE`); the
+    first name that occurs is returned.
 
     Args:
         parts: clips' names and parts.
@@ -116,13 +117,12 @@ def divided_subjects(parts: Iterable[tuple[str, str]]) -> list[str]:
     found: dict[str, set[str]] = defaultdict(set)
     for name, part in parts:
         folders = unpacked(name).split("/")[:-1]
-        if len(folders) >= 2 and subset(folders[0]) in AMASS:
-            found[names.setdefault(_subject(folders), "/".join(folders[:2]))].add(part)
+        if len(folders) >= 2 and subset(folders[0]) in SUBSETS:
+            found[names.setdefault(_subject_key(folders), "/".join(folders[:2]))].add(part)
     return sorted(subject for subject, of in found.items() if {"train", "test"} <= of)
 
 
-def _subject(folders: Sequence[str]) -> tuple[str, str]:
-    """Return a key of the person whose clips are in a folder, SUBSET, SUBJECT and those below it."""
+def _subject_key(folders: Sequence[str]) -> tuple[str, str]:
     for pattern in PEOPLE:
         if match := re.search(pattern, "/".join(folders) + "/"):
             return pattern, match[1].lower()

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -26,26 +26,22 @@ from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS, FRAME_DIM, load_rest_joints
 from memmlp.motion.clip import INTERPOLATED, LINES, SPLINES, Clip, resample
 from memmlp.motion.formats.npz import read_clip
-from memmlp.motion.preparing.duplicates import assign
-from memmlp.motion.preparing.find_clips import clip_name
-from memmlp.motion.preparing.folder_survey import Survey, survey
+from memmlp.motion.preparing.duplicates import assign_parts
+from memmlp.motion.preparing.find_clips import Folders, Root, clip_name, find_clips
 from memmlp.motion.preparing.imported_body import body_name, check_imported_body
-from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manifest, write_manifest
-from memmlp.motion.preparing.several_folders import Folders, Root, find_all
+from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manifest
 from memmlp.motion.preparing.splits import PARTS, Split
+from memmlp.motion.preparing.survey import survey
 from memmlp.motion.torch_threads import one_thread
 from memmlp.runs.recipe_versions import RECIPES
 
-FRAMES_VERSION = (
-    1  # number of a frame's content; a new one changes every digest, and so makes every run again
-)
+FRAMES_VERSION = 1  # number of a frame's content; a new one changes every digest, and so repeats every run
 CHUNK = 4096  # frames turned into features at a time
-ITEM_BYTES = FRAME_DIM * 4
 
 
 @dataclass(frozen=True)
 class ClipFolder:
-    """What a cache is made from: the clips below a folder or several, and the settings.
+    """The source of a cache: the clips below a folder or several, and the settings.
 
     Attributes:
         root: folder of npz files, at any depth, or several of them by name.
@@ -74,19 +70,21 @@ def prepare(source: ClipFolder, out: Path) -> Manifest:
     source = replace(source, body=str(source.body))
     if source.min_frames < 2:
         raise InputError(
-            f"data.min_frames: {source.min_frames}; allowed: 2 or more (one frame has no velocity)"
+            f"data.min_frames={source.min_frames}: must be 2 or more, as one frame has no velocity"
         )
     rest = load_rest_joints(source.body)
-    clips = [source.root / file for file in find_all(source.root).files]
-    check_imported_body(clips, source.body, rest)
+    clips = [source.root / file for file in find_clips(source.root).files]
+    check_imported_body(clips, rest, f"data.body={source.body}")
     try:
         out.mkdir(parents=True, exist_ok=True)
         with Lock(out).hold():
-            request = _request(source, rest)
-            found = _finished(out, request)
+            request = _request_digest(source, rest)
+            found = _load_finished(out, request)
             if found and not (source.strict and found.skipped):
                 return found
-            return _make(source, rest, request, out)
+            manifest = _plan(source, rest, request)
+            _write(source, rest, manifest, out)
+            return manifest
     except OSError as error:
         raise InputError(f"{out}: cannot write the cache there ({error.strerror or error})") from error
 
@@ -94,26 +92,35 @@ def prepare(source: ClipFolder, out: Path) -> Manifest:
 def finished_cache(source: ClipFolder, out: Path) -> Manifest | None:
     """Return the manifest of a finished, up-to-date cache of the source in `out`, or None."""
     try:
-        return _finished(out, _request(source, load_rest_joints(str(source.body))))
+        return _load_finished(out, _request_digest(source, load_rest_joints(str(source.body))))
     except InputError:
         return None
 
 
-def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Manifest:
-    """Read the sources, split them, and write the cache."""
-    found = survey(source.root, source.min_frames, source.strict)
+def _plan(source: ClipFolder, rest: np.ndarray, request: str) -> Manifest:
+    """Read the sources and split them; return the manifest of the cache to be written."""
+    found, split = survey(source.root, source.min_frames, source.strict), source.split
     if not found.clips:
-        raise InputError(_no_clips(source.root, found))
-    names, split = [clip.name for clip in found.clips], source.split
-    parts, groups, duplicates = assign(split, found.clips)
-    every = [*names, *found.short, *found.damaged, *_other_names(found, parts)]
+        first = f"; the first: {found.skipped[0].file}: {found.skipped[0].reason}" if found.skipped else ""
+        raise InputError(
+            f"data.root={source.root}: no usable clip ({len(found.skipped)} bad, {found.ignored} without "
+            f"poses{first}); expected AMASS npz files"
+        )
+    names = [clip.name for clip in found.clips]
+    parts, groups, duplicates = assign_parts(split, found.clips)
+    linked = [clip_name(path) for path, file in found.found.links.items() if parts.get(clip_name(file))]
+    every = [*names, *found.short, *found.damaged, *linked]
     split.check_groups([name for name, part in parts.items() if part], every)
     missing = split.missing(every)
     clips = _place(found.clips, parts, groups)
     if not any(clip.split == "train" for clip in clips):
-        raise InputError(f"{source.root}: no clip for training (data.root, data.split); give it other data")
-    manifest = Manifest(
-        digest=_digest(clips, rest, source),
+        raise InputError(f"data.root={source.root}: no clip for training; check data.split")
+    left_out = [n for n, part in sorted(parts.items()) if part is None and n not in duplicates]
+    interpolated = source.interpolation != LINES and any(clip.resampling == INTERPOLATED for clip in clips)
+    frames = [(clip.name, clip.split, clip.sha256) for clip in clips]
+    content = [FRAMES_VERSION, source.min_frames, rest.tolist(), frames]
+    return Manifest(
+        digest=_hash([*content, *([source.interpolation] if interpolated else [])]),
         request=request,
         body=body_name(source.body, rest),
         rest_joints=tuple(map(tuple, rest.tolist())),
@@ -123,7 +130,7 @@ def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Mani
         clips=clips,
         skipped=found.skipped,
         ignored=found.ignored,
-        left_out=_left_out({name: part for name, part in parts.items() if name not in duplicates}),
+        left_out=dict(Counter(name.split("/")[0] for name in left_out)),
         listed=dict(split.listed),
         missing=missing,
         damaged=tuple(sorted(set(split.missing([*names, *found.short])) - set(missing))),
@@ -134,65 +141,6 @@ def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Mani
         passed_over=dict(found.found.passed_over),
         sources=tuple(source.root.sources) if isinstance(source.root, Folders) else (),
     )
-    _write(source, rest, manifest, out)
-    return manifest
-
-
-def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) -> None:
-    """Write the arrays under temporary names, then rename them, then write the manifest."""
-    check_owner(out)
-    (out / MANIFEST).unlink(missing_ok=True)
-    frames = {part: int(manifest.totals[part]["frames"]) for part in PARTS}
-    _check_space(out, sum(frames.values()) * ITEM_BYTES)
-    unfinished = {part: temporary(out / f"{part}.npy") for part in PARTS}
-    try:
-        _write_frames(source, rest, manifest, unfinished)
-        if _request(source, rest) != manifest.request:
-            raise InputError(f"{source.root}: data.root changed while it was being prepared; run it again")
-        for part, path in unfinished.items():
-            publish(path, out / f"{part}.npy")
-    finally:
-        for path in unfinished.values():
-            path.unlink(missing_ok=True)
-    write_manifest(manifest, out)
-
-
-def _write_frames(
-    source: ClipFolder, rest: np.ndarray, manifest: Manifest, paths: Mapping[str, Path]
-) -> None:
-    """Write the frames of each part into its file."""
-    frames = {part: int(manifest.totals[part]["frames"]) for part in PARTS}
-    with ExitStack() as stack:
-        stack.enter_context(one_thread())
-        files = {part: stack.enter_context(open(path, "wb")) for part, path in paths.items()}
-        for part, file in files.items():
-            header = {"descr": "<f4", "fortran_order": False, "shape": (frames[part], FRAME_DIM)}
-            np.lib.format.write_array_header_1_0(file, header)
-        for record in progress_bar(manifest.clips, "writing"):
-            clip, _ = resample(
-                read_clip(source.root / record.file, record.name), interpolation=source.interpolation
-            )
-            for block in frame_blocks(clip, rest):
-                files[record.split].write(block.tobytes())
-        for file in files.values():
-            _sync(file)
-
-
-def _sync(file: BinaryIO) -> None:
-    file.flush()
-    os.fsync(file.fileno())
-
-
-def frame_blocks(clip: Clip, rest: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the frames of a 60 Hz clip in blocks (<= CHUNK, 252), float32, computed in float64."""
-    import torch  # takes seconds to import, and finding a finished cache does not need it
-
-    from memmlp.motion.features import motion_frames
-
-    poses, trans, joints = (torch.from_numpy(np.ascontiguousarray(x)) for x in (clip.poses, clip.trans, rest))
-    for start in range(0, len(clip) - 1, CHUNK):
-        block = slice(start, start + CHUNK + 1)  # one frame more than comes out, as the first has no velocity
-        yield motion_frames(poses[block], trans[block], joints).numpy().astype("<f4")
 
 
 def _place(
@@ -209,42 +157,72 @@ def _place(
     return tuple(placed)
 
 
-def _other_names(found: Survey, parts: Mapping[str, str | None]) -> list[str]:
-    """Return the names that links give to clips that have a part."""
-    return [clip_name(path) for path, file in found.found.links.items() if parts.get(clip_name(file))]
-
-
-def _left_out(parts: Mapping[str, str | None]) -> dict[str, int]:
-    """Count the clips without a part by top-level folder."""
-    return dict(Counter(name.split("/")[0] for name, part in sorted(parts.items()) if part is None))
-
-
 def _total(clips: Sequence[ClipRecord], part: str) -> dict[str, float]:
     lengths = [clip.length for clip in clips if clip.split == part]
     return {"clips": len(lengths), "frames": sum(lengths), "hours": sum(lengths) / FPS / 3600}
 
 
-def _digest(clips: Sequence[ClipRecord], rest: np.ndarray, source: ClipFolder) -> str:
-    sources = [(clip.name, clip.split, clip.sha256) for clip in clips]
-    # Data from before there was a choice was made with lines, and keeps its digest.
-    other = source.interpolation != LINES and any(clip.resampling == INTERPOLATED for clip in clips)
-    interpolation = [source.interpolation] if other else []
-    return _hash([FRAMES_VERSION, source.min_frames, rest.tolist(), sources, *interpolation])
+def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) -> None:
+    """Write the arrays under temporary names, then rename them, then write the manifest."""
+    check_owner(out)
+    (out / MANIFEST).unlink(missing_ok=True)
+    _check_space(out, sum(int(manifest.totals[part]["frames"]) for part in PARTS) * FRAME_DIM * 4)
+    unfinished = {part: temporary(out / f"{part}.npy") for part in PARTS}
+    try:
+        _write_frames(source, rest, manifest, unfinished)
+        if _request_digest(source, rest) != manifest.request:
+            raise InputError(f"data.root={source.root}: changed while it was being prepared; run it again")
+        for part, path in unfinished.items():
+            publish(path, out / f"{part}.npy")
+    finally:
+        for path in unfinished.values():
+            path.unlink(missing_ok=True)
+    manifest.write(out)
 
 
-def _request(source: ClipFolder, rest: np.ndarray) -> str:
+def _write_frames(
+    source: ClipFolder, rest: np.ndarray, manifest: Manifest, paths: Mapping[str, Path]
+) -> None:
+    with ExitStack() as stack:
+        stack.enter_context(one_thread())
+        files = {part: stack.enter_context(open(path, "wb")) for part, path in paths.items()}
+        for part, file in files.items():
+            shape = (int(manifest.totals[part]["frames"]), FRAME_DIM)
+            header = {"descr": "<f4", "fortran_order": False, "shape": shape}
+            np.lib.format.write_array_header_1_0(file, header)
+        for record in progress_bar(manifest.clips, "writing"):
+            clip = read_clip(source.root / record.file, record.name)
+            for block in frame_blocks(resample(clip, interpolation=source.interpolation)[0], rest):
+                files[record.split].write(block.tobytes())
+        for file in files.values():
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def frame_blocks(clip: Clip, rest: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield the frames of a 60 Hz clip in blocks (<= CHUNK, 252), float32, computed in float64."""
+    import torch  # takes seconds to import, and finding a finished cache does not need it
+
+    from memmlp.motion.features import motion_frames
+
+    poses, trans, joints = (torch.from_numpy(np.ascontiguousarray(x)) for x in (clip.poses, clip.trans, rest))
+    for start in range(0, len(clip) - 1, CHUNK):
+        block = slice(start, start + CHUNK + 1)  # one frame more than comes out, as the first has no velocity
+        yield motion_frames(poses[block], trans[block], joints).numpy().astype("<f4")
+
+
+def _request_digest(source: ClipFolder, rest: np.ndarray) -> str:
     """Return a digest of the settings and of each source's path, size and times, without opening any file."""
-    files = [(file, *_stamp(source.root / file)) for file in find_all(source.root).files]
+    files = [(file, *_stamp(source.root / file)) for file in find_clips(source.root).files]
     code = [FORMAT, FRAMES_VERSION, RECIPES["features"]]
-    return _hash(
-        [*code, source.min_frames, source.interpolation, rest.tolist(), source.split.describe(), files]
-    )
+    settings = [source.min_frames, source.interpolation, rest.tolist(), source.split.describe()]
+    return _hash([*code, *settings, files])
 
 
 def _stamp(path: Path) -> tuple[int, int, int]:
     """Return size and times of a file; zeros for a dangling link, which reading will skip.
 
-    Its time may have been set, as archives do, to the same for every file; that of its last change cannot be.
+    Archives may set the modification time; the time of the last change cannot be set.
     """
     try:
         stat = path.stat()
@@ -257,35 +235,20 @@ def _hash(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
-def _finished(out: Path, request: str) -> Manifest | None:
+def _load_finished(out: Path, request: str) -> Manifest | None:
     """Return the manifest in `out` if it matches the request and its arrays are complete, else None."""
     try:
         manifest = Manifest.load(out)
-        whole = all(_array_frames(out, part) == manifest.totals[part]["frames"] for part in PARTS)
+        # Opening an array raises ValueError if its size contradicts its header.
+        lengths = {part: len(np.lib.format.open_memmap(out / f"{part}.npy", mode="r")) for part in PARTS}
+        whole = all(lengths[part] == manifest.totals[part]["frames"] for part in PARTS)
     except (InputError, OSError, ValueError, KeyError):
         return None
     return manifest if whole and manifest.request == request else None
 
 
-def _array_frames(out: Path, part: str) -> int:
-    """Return the number of frames in a part's array; raise ValueError if its size contradicts its header."""
-    return len(np.lib.format.open_memmap(out / f"{part}.npy", mode="r"))
-
-
 def _check_space(out: Path, needed: int) -> None:
     free = shutil.disk_usage(out).free
     if needed > free:
-        raise InputError(f"{out}: the cache needs {_size(needed)}, and {_size(free)} are free")
-
-
-def _size(count: int) -> str:
-    """Return a number of bytes in GB, or in MB where it is less than one GB."""
-    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.1f} MB"
-
-
-def _no_clips(root: Root, found: Survey) -> str:
-    first = f"; the first: {found.skipped[0].file}: {found.skipped[0].reason}" if found.skipped else ""
-    return (
-        f"data.root: no usable clip below {root} ({len(found.skipped)} bad, {found.ignored} without poses"
-        f"{first}); give it AMASS npz files"
-    )
+        size, left = (f"{n / 1e9:.1f} GB" if n >= 1e9 else f"{n / 1e6:.1f} MB" for n in (needed, free))
+        raise InputError(f"{out}: the cache needs {size}, but only {left} are free")

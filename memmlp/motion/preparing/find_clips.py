@@ -1,15 +1,59 @@
-"""Finds the npz files of a folder, each once however many paths lead to it, and reports what it ignores."""
+"""Finds the npz files of one or more folders: each file once, however many paths lead to it."""
 
 from __future__ import annotations
 
 import os
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from memmlp.common.errors import InputError
 
-SUFFIX = ".npz"  # in any case
+SUFFIX = ".npz"  # in any letter case
+
+
+@dataclass(frozen=True)
+class Folders:
+    """Named folders of clips, used in place of one folder's path: `folders / "cmu/salsa/01.npz"`.
+
+    Attributes:
+        sources: name -> folder.
+    """
+
+    sources: Mapping[str, Path]
+
+    @classmethod
+    def of(cls, paths: Sequence[Path]) -> Folders:
+        """Name folders after their own last parts. Raises InputError if two have the same name."""
+        sources = {path.resolve().name: path for path in paths}
+        if len(sources) < len(paths):
+            raise InputError(
+                f"data.root={', '.join(map(str, paths))}: two folders have the same name; "
+                "give them names in data.sources"
+            )
+        return cls(sources)
+
+    def __truediv__(self, file: str) -> Path:
+        """Return the path of a file below one of the folders."""
+        source, _, rest = file.partition("/")
+        return self.sources[source] / rest
+
+    def __str__(self) -> str:
+        return ", ".join(map(str, self.sources.values()))
+
+    @property
+    def name(self) -> str:
+        """The names of all sources."""
+        return "-".join(self.sources)
+
+    def resolve(self) -> Folders:
+        """Return the folders with absolute paths."""
+        return Folders({name: path.resolve() for name, path in self.sources.items()})
+
+
+Root = Path | Folders
+"""Where clips are."""
 
 
 @dataclass
@@ -20,7 +64,7 @@ class FoundFiles:
         files: the npz files, sorted, each by the path that is nearest to the folder, real before linked.
         links: other paths of the same files or folders (symbolic or hard links) -> the path that is used.
         unreadable: folders that cannot be listed -> why.
-        passed_over: number of files that are no npz, by suffix.
+        passed_over: number of other files by suffix.
     """
 
     files: list[str] = field(default_factory=list)
@@ -29,19 +73,43 @@ class FoundFiles:
     passed_over: Counter[str] = field(default_factory=Counter)
 
 
-def find_clips(root: Path) -> FoundFiles:
-    """Find the npz files below a folder, also behind links, each file and each folder once.
+def find_clips(root: Root) -> FoundFiles:
+    """Find the npz files below one folder or several, also behind links. Hidden files are ignored.
 
     Raises:
-        InputError: if there is no such folder, or no npz in it.
+        InputError: if a folder does not exist or has no npz.
     """
+    if isinstance(root, Path):
+        return _find_in_folder(root)
+    result = FoundFiles()
+    for source, folder in root.sources.items():
+        found = _find_in_folder(folder)
+        result.files += [f"{source}/{file}" for file in found.files]
+        result.links |= {f"{source}/{path}": f"{source}/{file}" for path, file in found.links.items()}
+        result.unreadable |= {f"{source}/{path}": why for path, why in found.unreadable.items()}
+        result.passed_over += found.passed_over
+    result.files.sort()
+    return result
+
+
+def clip_name(file: str) -> str:
+    """Return a clip's name: its path without the suffix."""
+    return file[: -len(SUFFIX)] if file.lower().endswith(SUFFIX) else file
+
+
+def source_of(clip: str) -> str:
+    """Return the source of a clip: if there are several sources, its name begins with the source's name."""
+    return clip.split("/")[0]
+
+
+def _find_in_folder(root: Path) -> FoundFiles:
     if not root.is_dir():
-        raise InputError(f"data.root: {root} is no folder; give it the folder with your npz clips")
+        raise InputError(f"data.root={root}: no such folder; expected the folder with your npz clips")
     found, files = FoundFiles(), dict[object, str]()
     folders: dict[object, str] = {_identity(root): "."}
     level = [""]
     while level:  # one depth after the other, so that of two paths the shorter one counts
-        entries = [entry for folder in level for entry in _entries(root, folder, found)]
+        entries = [entry for folder in level for entry in _list_folder(root, folder, found)]
         level = []
         for path, is_folder in entries:
             if not is_folder and Path(path).suffix.lower() != SUFFIX:
@@ -54,20 +122,12 @@ def find_clips(root: Path) -> FoundFiles:
                 level.append(path)
     found.files = sorted(files.values())
     if not found.files:
-        raise InputError(f"data.root: no npz below {root}; make some with memmlp data synth or data import")
+        raise InputError(f"data.root={root}: no npz in it; make some with memmlp data synth or data import")
     return found
 
 
-def clip_name(file: str) -> str:
-    """Return a clip's name: its path without the suffix."""
-    return file[: -len(SUFFIX)] if file.lower().endswith(SUFFIX) else file
-
-
-def _entries(root: Path, folder: str, found: FoundFiles) -> list[tuple[str, bool]]:
-    """Return the paths in a folder with whether each is a folder itself: sorted, real ones before links.
-
-    Hidden ones are left out: an import that was killed leaves its unfinished clips in a hidden folder.
-    """
+def _list_folder(root: Path, folder: str, found: FoundFiles) -> list[tuple[str, bool]]:
+    """Return the visible paths in a folder, real ones before links, and whether each is a folder itself."""
     try:
         with os.scandir(root / folder) as listing:
             shown = [entry for entry in listing if not entry.name.startswith(".")]

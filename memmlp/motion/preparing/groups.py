@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.motion.preparing.amass_names import unpacked
 
 COLUMNS = ("clip", "group")
 KEY = "data.split.groups_file"
@@ -65,81 +64,46 @@ class Grouping:
         """
         if self.rows is None:
             return
-        for what, found in (
-            ("has no row for", set(names) - set(self.rows)),
-            ("names, but data.root has not,", set(self.rows) - set(files)),
+        for problem, clips in (
+            ("has no row for clip", set(names) - set(self.rows)),
+            ("has a row for a clip that is not below data.root:", set(self.rows) - set(files)),
         ):
-            if found:
-                more = f" and {len(found) - 1} more" if len(found) > 1 else ""
-                raise InputError(f"{KEY}: {self.file} {what} clip {min(found)}{more}")
+            if clips:
+                more = f" and {len(clips) - 1} more" if len(clips) > 1 else ""
+                raise InputError(f"{KEY}={self.file}: {problem} {min(clips)}{more}")
 
-    def tied(self, seen: Mapping[str, str]) -> list[list[str]]:
-        """Return clips in groups; ties are transitive (union-find over names and ties).
+    def tie(self, seen: Mapping[str, str]) -> list[list[str]]:
+        """Return clips in groups; ties are transitive.
 
         Args:
             seen: clip name -> the name that patterns, and the order within a group, use.
 
         Raises:
-            InputError: if a pattern is no regular expression.
+            InputError: if a pattern is not a regular expression.
         """
         try:
             compiled = [re.compile(pattern) for pattern in self.patterns]
         except re.error as error:
             raise InputError(
-                f"data.split.groups: {error.pattern!r} is no regular expression ({error})"
+                f"data.split.groups={error.pattern!r}: not a regular expression ({error})"
             ) from error
         order = sorted(seen, key=lambda name: seen[name])
-        parent: dict[object, object] = {}
+        parents: dict[Any, Any] = {}
         for name in order:
             for index, pattern in enumerate(compiled):
                 if match := pattern.search(seen[name]):
-                    parent[_find(parent, name)] = _find(parent, (index, match.groups()))
+                    parents[find_root(parents, name)] = find_root(parents, (index, match.groups()))
             if self.rows and name in self.rows:
-                parent[_find(parent, name)] = _find(parent, (KEY, self.rows[name]))
+                parents[find_root(parents, name)] = find_root(parents, (KEY, self.rows[name]))
         groups: dict[object, list[str]] = {}
         for name in order:
-            groups.setdefault(_find(parent, name), []).append(name)
+            groups.setdefault(find_root(parents, name), []).append(name)
         return list(groups.values())
 
     def names(self, seen: Mapping[str, str]) -> dict[str, str]:
         """Map each clip to its group's name: the column file's, else the name of the group's first clip."""
         rows = self.rows or {}
-        return {name: rows.get(group[0], group[0]) for group in self.tied(seen) for name in group}
-
-
-def untied(split: Mapping[str, Any], name: str) -> bool:
-    """Whether none of a split's patterns of groups fits a clip, so that none ties it to other clips.
-
-    Args:
-        split: the split's settings (`Split.describe`).
-        name: the clip's name.
-    """
-    for source, own in split.get("sources", {}).items():
-        if name.startswith(f"{source}/"):
-            return untied(own, name.removeprefix(f"{source}/"))
-    return not any(re.search(pattern, unpacked(name)) for pattern in split.get("groups", ()))
-
-
-def unfitting(split: Mapping[str, Any], names: Collection[str]) -> str:
-    """Return a warning if a split has patterns of groups and none of them matches a clip; empty otherwise.
-
-    Args:
-        split: the split's settings (`Split.describe`).
-        names: clips' names.
-    """
-    said = []
-    for source, own in split.get("sources", {}).items():
-        below = [name.removeprefix(f"{source}/") for name in names if name.startswith(f"{source}/")]
-        said += [f"{source}: {one}"] if (one := unfitting(own, below)) else []
-    patterns = split.get("groups", ())
-    if patterns and all(untied(split, name) for name in names):
-        said += [
-            "each clip counts as independent of all others, and clips of one person may lie in training and "
-            f"in test: no clip's name fits the {len(patterns)} patterns of data.split.groups that tie clips "
-            f"together (the first is {patterns[0]}); data/grouping@data.split=NAME has those of other "
-            "collections, and data.split.groups_file can list who is in which clip"
-        ]
-    return "; ".join(said)
+        return {name: rows.get(group[0], group[0]) for group in self.tie(seen) for name in group}
 
 
 def read_groups(file: Path) -> dict[str, str]:
@@ -156,23 +120,23 @@ def read_groups(file: Path) -> dict[str, str]:
             columns = table.fieldnames or ()
             rows = [(table.line_num, row) for row in table]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{KEY}: {file}: not a readable CSV file ({error})") from error
+        raise InputError(f"{KEY}={file}: not a readable CSV file ({error})") from error
     if missing := [name for name in COLUMNS if name not in columns]:
-        raise InputError(f"{KEY}: {file}: no column {missing[0]}; its first line has to name clip and group")
+        raise InputError(f"{KEY}={file}: no column {missing[0]}; the first line must name clip and group")
     groups: dict[str, str] = {}
     for line, row in rows:
         clip, group = ((row[name] or "").strip() for name in COLUMNS)
         clip = clip.removeprefix("./").removesuffix(".npz")
         if not clip or not group:
-            raise InputError(f"{KEY}: {file}: line {line} lacks a clip or a group")
+            raise InputError(f"{KEY}={file}: line {line} lacks a clip or a group")
         if groups.setdefault(clip, group) != group:
-            raise InputError(f"{KEY}: {file}: line {line} gives {clip} another group than before")
+            raise InputError(f"{KEY}={file}: line {line} gives {clip} a second group")
     return groups
 
 
-def _find(parent: dict[object, object], node: object) -> object:
-    """Return the root of a node, halving the path on the way."""
-    while parent.setdefault(node, node) != node:
-        parent[node] = parent[parent[node]]
-        node = parent[node]
+def find_root(parents: dict[Any, Any], node: Any) -> Any:
+    """Return the root of a node in a union-find forest (node -> parent), halving the path on the way."""
+    while parents.setdefault(node, node) != node:
+        parents[node] = parents[parents[node]]
+        node = parents[node]
     return node

@@ -1,8 +1,10 @@
-"""What a cache holds: its clips, the outcome for every file, and the split."""
+"""The manifest of a cache: its clips, the outcome for every file, and the split."""
 
 from __future__ import annotations
 
 import json
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +15,7 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
 from memmlp.motion.clip import Skipped
-from memmlp.motion.preparing.split_coverage import Coverage
+from memmlp.motion.preparing.find_clips import Root
 
 FORMAT = 8  # number of the cache's format; a new one makes every cache again
 MANIFEST = "manifest.json"
@@ -32,9 +34,8 @@ class ClipRecord:
         start: the clip's first frame in its part's array.
         length: the clip's number of frames in that array.
         sha256: digest of the source file.
-        content: digest of the frames in single precision, the same for every copy of the clip, at another
-            frame rate, too, and for every clip that has some of its frames; `STILL` for a clip without
-            motion.
+        content: digest of the frames in single precision, the same for every copy of the clip and for every
+            clip that shares motion with it (`duplicates`); `STILL` for a clip without motion.
         fps: frame rate of the source, Hz.
         resampling: how the clip was resampled to 60 Hz.
     """
@@ -52,8 +53,53 @@ class ClipRecord:
 
 
 @dataclass(frozen=True)
+class Coverage:
+    """The number of entries of a split (list entries, subsets) that have a clip.
+
+    Attributes:
+        listed: number of entries by subset; empty for a split that divides all clips in the folder.
+        absent: number of entries without a clip by subset; complete subsets are left out.
+    """
+
+    listed: Mapping[str, int]
+    absent: Mapping[str, int]
+
+    @classmethod
+    def of(cls, listed: Mapping[str, int], absent: Iterable[str]) -> Coverage:
+        """Return the coverage of a split, given its entries without a clip."""
+        return cls(listed, dict(Counter(entry.split("/")[0] for entry in sorted(absent))))
+
+    @property
+    def whole(self) -> bool:
+        """Whether every entry has a clip."""
+        return not self.absent
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """The number of entries that have a clip, and the number of all entries."""
+        every = sum(self.listed.values())
+        return every - sum(self.absent.values()), every
+
+    def __str__(self) -> str:
+        present, every = self.counts
+        return f"{100 * present // max(every, 1)} % of the list ({present} of {every} entries)"
+
+    @property
+    def gaps(self) -> str:
+        """A description of the missing entries: the number of all, and of those of each subset."""
+        present, every = self.counts
+        each = [f"{name} {count} of {self.listed[name]}" for name, count in self.absent.items()]
+        return f"{every - present} of {every} entries of the split's list have no clip ({', '.join(each)})"
+
+    def check(self, root: Root) -> None:
+        """Raise InputError unless every entry has a clip below the data's root."""
+        if not self.whole:
+            raise InputError(f"data.root={root}: {self.gaps}; data.partial=true accepts an incomplete list")
+
+
+@dataclass(frozen=True)
 class Manifest:
-    """What a cache holds; the content of `manifest.json`.
+    """The content of `manifest.json` in a cache.
 
     Attributes:
         digest: sha256 over everything that determines the frames and their split. Groups are not included,
@@ -69,16 +115,14 @@ class Manifest:
         skipped: bad files.
         ignored: number of npz files without poses (shape.npz and the like).
         left_out: number of sound clips without a part in the split, by top-level folder.
-        listed: number of the split's entries (list entries, subsets) by subset; empty if the split has no
-            list.
+        listed: number of the split's entries (list entries, subsets) by subset; empty without a list.
         missing: entries of the split for which there is no file.
-        damaged: entries of the split whose file is no sound clip; a clip that is too short is not among them.
+        damaged: entries of the split whose file is not a sound clip; clips that are too short do not count.
         totals: part -> clips, frames, hours.
-        duplicates: clip that was left out -> the clip with the same frames, or some of them, in another part,
-            which was kept.
+        duplicates: clip that was left out -> the clip that shares motion with it in another part, and stays.
         links: other path of a file or folder -> the path by which it was read.
         unusual: clip -> what is odd about it, though it may be sound.
-        passed_over: number of files that are no npz, by suffix.
+        passed_over: number of files with other suffixes, by suffix.
         sources: names of the sources; every clip's name begins with one of them. Empty for one folder.
         format: format number of the cache.
     """
@@ -128,6 +172,10 @@ class Manifest:
         except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as error:
             raise InputError(f"{path}: not a cache's manifest ({error}); prepare the data again") from error
 
+    def write(self, out: Path) -> None:
+        """Write the manifest into the folder of a cache, which marks the cache as finished."""
+        atomic_write(out / MANIFEST, json.dumps(asdict(self), indent=1))
+
     @cached_property
     def rest(self) -> np.ndarray:
         """Rest positions (22, 3), metres, float64."""
@@ -140,14 +188,9 @@ class Manifest:
 
     @property
     def coverage(self) -> Coverage:
-        """How many of the split's entries have a clip."""
+        """The number of the split's entries that have a clip."""
         return Coverage.of(self.listed, (*self.missing, *self.damaged))
 
     def part(self, part: str) -> list[ClipRecord]:
         """Return the clips of a part, in the order of its array."""
         return [clip for clip in self.clips if clip.split == part]
-
-
-def write_manifest(manifest: Manifest, out: Path) -> None:
-    """Write the manifest of a cache, which marks the cache as finished."""
-    atomic_write(out / MANIFEST, json.dumps(asdict(manifest), indent=1))

@@ -63,7 +63,7 @@ def test_a_cache_has_the_clips_of_training(
     ("words", "said"),
     [
         (["--split", "s3"], "--split s3: no such split; allowed: seeded, s2, lists:FOLDER"),
-        (["--val", "2"], "2.0 is no fraction; allowed: 0 <= val < 1"),
+        (["--val", "2"], "data.val=2.0"),
     ],
     ids=str,
 )

@@ -1,45 +1,65 @@
-"""Clips of the same frames: in one part, and one group."""
+"""Clips that share motion: in one part, and one group."""
 
+from __future__ import annotations
+
+import functools
 from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from unittest import mock
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from memmlp.motion.preparing.duplicates import assign, one_part_each, tied
+from memmlp.motion.body import SWAPPED
+from memmlp.motion.clip import Clip, resample
+from memmlp.motion.formats.npz import write_clip
+from memmlp.motion.preparing import survey as survey_module
+from memmlp.motion.preparing.cache import ClipFolder, prepare
+from memmlp.motion.preparing.duplicates import (
+    REACH,
+    assign_parts,
+    keep_one_part,
+    local_turns,
+    mark_frames,
+    merge_groups,
+    mirror_turns,
+)
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
-from memmlp.motion.preparing.splits import Assignment, MixedSplit, SeededSplit
+from memmlp.motion.preparing.splits import Assignment, ListSplit, MixedSplit, SeededSplit
+from memmlp.motion.preparing.survey import survey
+from memmlp.motion.synthetic import synthesize_clip
 
 CONTENTS = {"a": "x", "b": "y", "c": "x", "d": "x", "e": "y", "f": "z", "g": STILL, "h": STILL}
+ACTIVITIES = ("walking", "running", "waving", "sitting", "punching", "squatting")
 
 
-def clips() -> list[ClipRecord]:
-    return [ClipRecord(name, "", "", "", 0, 9, "", of, 60.0, "kept") for name, of in CONTENTS.items()]
+def records(contents: dict[str, str]) -> list[ClipRecord]:
+    return [ClipRecord(name, "", "", "", 0, 9, "", of, 60.0, "kept") for name, of in contents.items()]
 
 
 def test_training_gives_way_to_validation_and_both_to_testing():
     parts = {"a": "train", "b": "val", "c": "test", "d": "val", "e": "train", "f": "train"}
-    kept, gave_way = one_part_each(clips(), parts | {"g": "train", "h": "test"})
+    kept, gave_way = keep_one_part(records(CONTENTS), parts | {"g": "train", "h": "test"})
     assert kept == parts | {"a": None, "d": None, "e": None, "g": "train", "h": "test"}
     assert gave_way == {"a": "c", "d": "c", "e": "b"}
+    one = dict.fromkeys(CONTENTS, "train") | {"c": None}
+    assert keep_one_part(records(CONTENTS), one) == (one, {})
 
 
-def test_copies_in_one_part_stay_and_what_has_no_part_gets_none():
-    parts = dict.fromkeys(CONTENTS, "train") | {"c": None}
-    assert one_part_each(clips(), parts) == (parts, {})
-
-
-def test_groups_with_copies_are_one():
+def test_groups_with_copies_are_merged():
     groups = {"a": "a", "b": "b", "c": "c", "d": "d", "e": "d", "f": "f", "g": "c", "h": "h"}
-    assert tied(clips(), groups) == {
+    assert merge_groups(records(CONTENTS), groups) == {
         "a": "a", "b": "a", "c": "a", "d": "a", "e": "a", "f": "f", "g": "a", "h": "h",
     }  # fmt: skip
 
 
 def test_a_published_list_is_kept_although_copies_join_its_groups():
-    """A copy on the other side is left out; nothing is drawn anew."""
     given = Assignment(dict.fromkeys(CONTENTS, "train") | {"c": "test"}, {name: name for name in CONTENTS})
     split = mock.Mock(listed={"CMU": 8}, assign=mock.Mock(return_value=given))
-    parts, groups, gave_way = assign(split, clips())
+    parts, groups, gave_way = assign_parts(split, records(CONTENTS))
     assert parts == given.parts | {"a": None, "d": None}
     assert gave_way == {"a": "c", "d": "c"}
     assert groups["d"] == "a"
@@ -54,11 +74,180 @@ def test_a_copy_leaves_the_limit_of_clips_of_a_group(source: str, copy: bool):
     contents = {name: name for name in names}
     if copy:
         contents[names[10]] = names[0]
-    records = [ClipRecord(name, "", "", "", 0, 9, "", of, 60.0, "kept") for name, of in contents.items()]
     own = SeededSplit(0.2, 0.2, 0, ["(take..)/"], per_group=2)
-    parts, groups, gave_way = assign(MixedSplit({"cmu": own}) if source else own, records)
+    split = MixedSplit({"cmu": own}) if source else own
+    parts, groups, gave_way = assign_parts(split, records(contents))
     held_out = Counter((groups[name], part) for name, part in parts.items() if part in ("val", "test"))
     assert {part for _, part in held_out} == {"val", "test"}
     assert set(held_out.values()) == {2}
     assert groups[names[10]] == (groups[names[0]] if copy else names[10])
     assert gave_way == {}
+
+
+# Changed copies
+
+
+@functools.cache
+def recorded(activity: str, seed: int = 1, fps: float = 60.0) -> Clip:
+    return synthesize_clip(activity, seed, seconds=5.0 if fps == 60 else 2.0, fps=fps)
+
+
+def cut(clip: Clip, start: int, end: int | None = None) -> Clip:
+    return replace(clip, poses=clip.poses[start:end], trans=clip.trans[start:end])
+
+
+def rounded(clip: Clip) -> Clip:
+    """As a text file has it, with three decimals."""
+    return replace(clip, poses=clip.poses.round(3), trans=clip.trans.round(3))
+
+
+def mirrored(clip: Clip) -> Clip:
+    """As data sets ship it: left and right joints change places, and rotation vectors keep their x alone."""
+    poses = clip.poses[:, list(SWAPPED)] * np.array([1, -1, -1])
+    return replace(clip, poses=poses, trans=clip.trans * np.array([-1, 1, 1], np.float32))
+
+
+def elsewhere(clip: Clip) -> Clip:
+    """Turned about the vertical and moved away, with a drift."""
+    turn = Rotation.from_euler("z", 70, degrees=True)
+    poses = clip.poses.copy()
+    poses[:, 0] = (turn * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
+    drift = np.linspace(0, 0.2, len(clip))[:, None]
+    place = turn.apply(clip.trans) + np.array([1, 2, 0]) + drift
+    return replace(clip, poses=poses, trans=place.astype(np.float32))
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    for activity in ACTIVITIES:
+        write_clip(tmp_path / "clips" / "a" / f"{activity}.npz", recorded(activity))
+    return tmp_path / "clips"
+
+
+def at_120_hz(root: Path) -> Path:
+    for activity in ACTIVITIES:
+        write_clip(root / "a" / f"{activity}.npz", recorded(activity, fps=120.0))
+    return root
+
+
+@pytest.mark.parametrize("fps", [20.0, 119.88])
+@pytest.mark.parametrize("change", [lambda clip: clip, mirrored], ids=["plain", "mirrored"])
+def test_a_copy_at_another_rate_is_found(
+    root: Path, monkeypatch: pytest.MonkeyPatch, fps: float, change: Callable[[Clip], Clip]
+):
+    monkeypatch.setattr(survey_module, "find_shared_stretches", lambda *_: [])
+    at_120_hz(root)
+    for activity in ACTIVITIES:
+        again = resample(recorded(activity, fps=120.0), fps)[0]
+        write_clip(root / "b" / f"{activity}_again.npz", change(again))
+    found = survey(root)
+    assert found.duplicates == {f"b/{activity}_again": f"a/{activity}" for activity in ACTIVITIES}
+    assert len(found.clips) == 2 * len(ACTIVITIES)
+
+
+def test_copies_of_copies_are_one(root: Path):
+    for fps in (24.0, 60.0, 90.0):
+        write_clip(root / "b" / f"{fps:g}.npz", resample(recorded("walking", fps=120.0), fps)[0])
+    write_clip(root / "a" / "walking.npz", recorded("walking", fps=120.0))
+    write_clip(root / "c.npz", recorded("walking", fps=120.0))
+    assert set(survey(root).duplicates.values()) == {"a/walking"}
+    assert len(survey(root).duplicates) == 4
+
+
+def test_a_clip_that_only_begins_like_another_is_not_a_copy(root: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(survey_module, "find_shared_stretches", lambda *_: [])
+    at_120_hz(root)
+    clip, run = (resample(recorded(name, fps=120.0), 60.0)[0] for name in ("walking", "running"))
+    write_clip(root / "b" / "turns.npz", replace(clip, poses=np.concatenate([clip.poses[:1], run.poses[1:]])))
+    write_clip(root / "b" / "part.npz", cut(clip, 0, 60))
+    slope = np.linspace(0, 0.1, len(clip))[:, None] * [1, 0, 0]
+    write_clip(root / "b" / "drifts.npz", replace(clip, trans=clip.trans + slope))
+    assert survey(root).duplicates == {}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        rounded,
+        elsewhere,
+        lambda clip: rounded(cut(clip, 97, 230)),
+        lambda clip: rounded(cut(mirrored(clip), 97, 230)),
+        lambda clip: elsewhere(mirrored(clip)),
+    ],
+    ids=["precision", "place", "middle", "mirrored middle", "mirrored elsewhere"],
+)
+def test_a_clip_that_shares_a_stretch_is_found(root: Path, change: Callable[[Clip], Clip]):
+    for activity in ACTIVITIES:
+        write_clip(root / "b" / f"{activity}.npz", change(recorded(activity)))
+    assert survey(root).duplicates == {f"b/{activity}": f"a/{activity}" for activity in ACTIVITIES}
+
+
+def test_mirrored_rotations_are_those_of_mirrored_frames():
+    clip = recorded("waving")
+    np.testing.assert_allclose(mirror_turns(local_turns(clip)), local_turns(mirrored(clip)), atol=1e-6)
+
+
+def test_overlapping_windows_of_a_recording_are_one_group(root: Path):
+    """Each overlaps the next by two seconds, and the first and the last have nothing in common."""
+    recording = synthesize_clip("reaching", 5, seconds=14.0)
+    for start in range(0, 600, 120):
+        write_clip(root / f"window_{start:03}.npz", cut(recording, start, start + 240))
+    assert set(survey(root).duplicates.values()) == {"window_000"}
+    assert len(survey(root).duplicates) == 4
+
+
+def test_a_cut_at_another_rate_is_found(root: Path):
+    recording = synthesize_clip("walking", 3, seconds=6.0, fps=120.0)
+    write_clip(root / "a.npz", recording)
+    write_clip(root / "b.npz", resample(cut(recording, 120, 600), 60.0)[0])
+    assert survey(root).duplicates == {"b": "a"}
+
+
+def test_repetitions_and_cuts_without_common_frames_are_different(root: Path):
+    recording = synthesize_clip("reaching", 5, seconds=10.0)
+    for activity in ACTIVITIES:
+        write_clip(root / f"{activity}_again.npz", recorded(activity, 2))
+    for name, (start, end) in {"first": (0, 300), "second": (300, 600)}.items():
+        write_clip(root / f"{name}.npz", cut(recording, start, end))
+    assert survey(root).duplicates == {}
+
+
+def test_a_common_rest_pose_is_not_a_shared_stretch(root: Path):
+    for activity in ("walking", "waving"):
+        clip = synthesize_clip(activity, 7, seconds=4.0)
+        still = np.zeros((180, 22, 3), np.float32)
+        place = np.repeat(clip.trans[:1], 180, 0)
+        poses, trans = np.concatenate([still, clip.poses]), np.concatenate([place, clip.trans])
+        write_clip(root / f"{activity}_late.npz", replace(clip, poses=poses, trans=trans))
+    assert survey(root).duplicates == {}
+
+
+@pytest.mark.parametrize("frames", [1, 2 * REACH, 2 * REACH + 1])
+def test_a_clip_too_short_for_a_stretch_has_no_marks_beyond_its_middle(frames: int):
+    for marks in mark_frames(cut(recorded("walking"), 0, frames)):
+        assert set(marks.frames) <= {REACH}
+        assert marks.signatures.shape == (len(marks.frames), 24)
+
+
+def test_copies_are_drawn_together(root: Path, tmp_path: Path):
+    for activity in ACTIVITIES:
+        again = cut(recorded(activity), 60)
+        write_clip(root / "b" / f"{activity}.npz", again if activity < "s" else resample(again, 30.0)[0])
+    for seed in range(3):
+        manifest = prepare(ClipFolder(root, SeededSplit(0.3, 0.3, seed=seed)), tmp_path / "cache")
+        parts = {clip.name: clip.split for clip in manifest.clips}
+        assert set(parts.values()) == {"train", "val", "test"}
+        assert all(parts[f"a/{activity}"] == parts[f"b/{activity}"] for activity in ACTIVITIES)
+        assert len({clip.group for clip in manifest.clips}) == len(ACTIVITIES)
+
+
+def test_the_training_part_of_a_list_gives_way_to_its_test_part(root: Path, tmp_path: Path):
+    write_clip(root / "b" / "cut.npz", cut(recorded("running"), 90))
+    for part, names in (("train", [f"a/{name}" for name in ACTIVITIES]), ("test", ["b/cut"])):
+        lists = tmp_path / "lists" / names[0].split("/")[0]
+        lists.mkdir(parents=True)
+        for phase in ("train", "test"):
+            (lists / f"{phase}_split.txt").touch()
+        (lists / f"{part}_split.txt").write_text("".join(f"{name}.npz\n" for name in names))
+    manifest = prepare(ClipFolder(root, ListSplit(tmp_path / "lists", val=0)), tmp_path / "cache")
+    assert manifest.duplicates == {"a/running": "b/cut"}

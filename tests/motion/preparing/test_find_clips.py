@@ -1,12 +1,19 @@
-"""Folders: links, suffixes, and what is passed over."""
+"""Folders: links, suffixes, other files, and several folders as one."""
 
 import os
+import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.motion.preparing.find_clips import clip_name, find_clips
+from memmlp.motion.clip import Clip
+from memmlp.motion.dataset import MotionDataset, WindowSampler
+from memmlp.motion.formats.npz import write_clip
+from memmlp.motion.preparing.cache import ClipFolder, prepare
+from memmlp.motion.preparing.find_clips import Folders, clip_name, find_clips
+from memmlp.motion.preparing.splits import MixedSplit, SeededSplit
 
 
 @pytest.fixture
@@ -26,7 +33,6 @@ def test_any_case_of_the_suffix_is_found_and_the_rest_is_counted(root):
 
 
 def test_hidden_folders_and_files_are_no_data(root):
-    """Such as the unfinished clips of an import that was killed, and a server's snapshots."""
     hidden = root / ".cmu-4stpviek" / "clips"
     hidden.mkdir(parents=True)
     (hidden / "1.npz").write_text("unfinished")
@@ -65,3 +71,89 @@ def test_a_folder_without_clips_is_one_line(tmp_path):
     for where in (tmp_path, tmp_path / "none"):
         with pytest.raises(InputError, match=r"data\.root"):
             find_clips(where)
+
+
+# Several folders
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    """Two folders, of 6 clips of 50 frames and 4 of 80; in the second, pairs belong together."""
+    for folder, count, length in (("one", 6, 50), ("two", 8, 80)):
+        rng = np.random.default_rng(length)
+        for n in range(count):
+            poses = 0.05 * np.cumsum(rng.normal(size=(length, 22, 3)), 0)
+            clip = Clip("", poses, np.zeros((length, 3)), 60.0)
+            write_clip(tmp_path / folder / f"take{n // 2}" / f"{n}.npz", clip)
+    return tmp_path
+
+
+def mixed(home: Path, **names: str) -> ClipFolder:
+    split = SeededSplit(0.3, 0.3)
+    paired = SeededSplit(0.3, 0.3, groups=["^(take[0-9])/"])
+    splits = {name: paired if folder == "two" else split for name, folder in names.items()}
+    return ClipFolder(Folders({name: home / names[name] for name in names}), MixedSplit(splits))
+
+
+def test_each_source_is_split_as_it_is_alone(home):
+    manifest = prepare(mixed(home, a="one", b="two"), home / "cache")
+    assert manifest.sources == ("a", "b")
+    parts = {clip.name: clip.split for clip in manifest.clips}
+    alone = prepare(ClipFolder(home / "one", SeededSplit(0.3, 0.3)), home / "alone")
+    assert alone.sources == ()
+    assert {f"a/{clip.name}": clip.split for clip in alone.clips}.items() <= parts.items()
+    assert [name for name in parts if name.startswith("b/")] == [f"b/take{n // 2}/{n}" for n in range(8)]
+    for source in ("a", "b"):
+        assert {parts[name] for name in parts if name.startswith(source)} == {"train", "val", "test"}
+    assert manifest.groups["a/take0/1"] == "a/take0/1"
+    assert manifest.groups["b/take0/1"] == "b/take0/0"
+    assert all(parts[f"b/take{n}/{2 * n}"] == parts[f"b/take{n}/{2 * n + 1}"] for n in range(4))
+    assert prepare(mixed(home, a="one", c="two"), home / "other").digest != manifest.digest
+
+
+def test_a_dataset_knows_the_source_of_each_clip(home):
+    prepare(mixed(home, a="one", b="two"), home / "cache")
+    dataset = MotionDataset.open(home / "cache", "test").to("cpu")
+    assert dataset.sources == [name.split("/")[0] for name in dataset.names]
+    prepare(ClipFolder(home / "one", SeededSplit(0.3, 0.3)), home / "alone")
+    assert MotionDataset.open(home / "alone", "test").sources is None
+
+
+def test_links_and_copies_are_known_across_sources(home):
+    (home / "one" / "link.npz").symlink_to(home / "one" / "take0" / "0.npz")
+    shutil.copy(home / "one" / "take1" / "2.npz", home / "two" / "take9.npz")
+    manifest = prepare(mixed(home, a="one", b="two"), home / "cache")
+    assert manifest.links == {"a/take0/0.npz": "a/link.npz"}  # the nearer path counts
+    assert manifest.groups["b/take9"] == manifest.groups["a/take1/2"]
+    assert len({clip.split for clip in manifest.clips if clip.name in ("b/take9", "a/take1/2")}) == 1
+
+
+def test_errors_name_the_source(home):
+    shutil.rmtree(home / "one" / "take0")
+    shutil.rmtree(home / "one" / "take1")
+    with pytest.raises(InputError, match=r"data\.sources\.a"):
+        prepare(mixed(home, a="one", b="two"), home / "cache")
+    with pytest.raises(InputError, match=r"data\.root"):
+        Folders.of([home / "x" / "clips", home / "y" / "clips"])
+    with pytest.raises(InputError, match=r"data\.root=.*none"):
+        prepare(mixed(home, a="none", b="two"), home / "cache")
+
+
+@pytest.mark.parametrize("drawn_by", ["frames", "clips"])
+def test_shares_say_how_often_a_window_is_of_each_source(home, drawn_by):
+    prepare(mixed(home, a="one", b="two"), home / "cache")
+    dataset = MotionDataset.open(home / "cache", "train")
+    sources = np.array(dataset.sources)
+
+    def drawn(shares):
+        sampler = WindowSampler(dataset, 4000, 41, 0, drawn_by, shares)
+        return np.bincount(sampler.draw(0)[0].numpy(), minlength=len(dataset)) / 4000
+
+    even = drawn(None)
+    for shares in ({"a": 1.0, "b": 1.0}, {"a": 3.0, "b": 1.0}):
+        found = drawn(shares)
+        for source, share in shares.items():
+            assert found[sources == source].sum() == pytest.approx(share / sum(shares.values()), abs=0.03)
+            own = found[sources == source] / found[sources == source].sum()
+            assert own == pytest.approx(even[sources == source] / even[sources == source].sum(), abs=0.05)
+    assert abs(even[sources == "a"].sum() - 0.75) > 0.1

@@ -1,4 +1,4 @@
-"""The body that clips were imported onto, beside the one that a network was trained on."""
+"""The body that clips were imported onto, compared with the one that uses them."""
 
 from __future__ import annotations
 
@@ -10,67 +10,32 @@ import pytest
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.motion.body import builtin_rest_joints
-from memmlp.motion.preparing.imported_body import (
-    RECORD,
-    body_name,
-    body_record,
-    check_networks_body,
-    check_networks_joints,
-)
+from memmlp.motion.preparing.imported_body import RECORD, body_name, body_record, check_imported_body
 
-BODIES = {
-    "builtin": builtin_rest_joints(), "a/model.npz": np.ones((22, 3)), "b/model.npz": np.full((22, 3), 2.0)
-}  # fmt: skip
+BUILTIN, OTHER = builtin_rest_joints(), 1.1 * builtin_rest_joints()
 
 
-@pytest.mark.parametrize("imported", BODIES)
-@pytest.mark.parametrize("trained", BODIES)
-def test_clips_of_an_import_are_predicted_on_its_body(tmp_path: Path, imported: str, trained: str):
-    clips = [tmp_path / "walk" / "one.npz", tmp_path / "two.npz"]
-    name = body_name(trained, BODIES[trained])
-    check_networks_body(clips, name)  # of nobody's import
-    (tmp_path / "walk").mkdir()
-    write_json(tmp_path / RECORD, body_record(imported, BODIES[imported]))
-    if imported == trained:
-        check_networks_body(clips, name)
-    else:
-        with pytest.raises(InputError, match=f"imported onto the body .*trained on {name}; allowed"):
-            check_networks_body(clips, name)
+@pytest.mark.parametrize("folder", [".", "walk", "walk/deep"])
+def test_clips_of_an_import_are_used_on_its_body(tmp_path: Path, folder: str):
+    clips = [tmp_path / "walk" / "deep" / "one.npz", tmp_path / "two.npz"]
+    (tmp_path / "walk" / "deep").mkdir(parents=True)
+    record = tmp_path / folder / RECORD
+    for rest in (BUILTIN, OTHER):
+        check_imported_body(clips, rest, "data.body")  # nobody's import
+    write_json(record, body_record("model.npz", OTHER))
+    check_imported_body(clips, OTHER.astype(np.float32).astype(np.float64), "data.body")
+    with pytest.raises(InputError, match=r"model\.npz.*data\.body"):
+        check_imported_body(clips, BUILTIN, "data.body")
 
 
-def test_an_import_that_recorded_a_name_alone_has_that_body(tmp_path: Path):
-    write_json(tmp_path / RECORD, {"body": "model.npz"})
-    check_networks_body([tmp_path / "one.npz"], "model.npz 01234567")
-    with pytest.raises(InputError, match=r"imported onto the body model\.npz"):
-        check_networks_body([tmp_path / "one.npz"], "builtin")
-    (tmp_path / RECORD).write_text("[")
-    check_networks_body([tmp_path / "one.npz"], "builtin")
+@pytest.mark.parametrize("text", ["[", "[]", "{}", '{"body": "x", "joints": [[0.0], [1.0, 2.0]]}'])
+def test_records_of_other_programs_are_ignored(tmp_path: Path, text: str):
+    (tmp_path / RECORD).write_text(text)
+    check_imported_body([tmp_path / "one.npz"], BUILTIN, "data.body")
 
 
-@pytest.mark.parametrize("imported", BODIES)
-@pytest.mark.parametrize("trained", BODIES)
-def test_a_network_without_a_name_of_its_body_is_known_by_its_joints(
-    tmp_path: Path, imported: str, trained: str
-):
-    clips, rest = [tmp_path / "one.npz"], BODIES[trained].astype(np.float32).astype(np.float64)
-    check_networks_joints(clips, rest)  # of nobody's import
-    record = body_record(imported, BODIES[imported])
-    write_json(tmp_path / RECORD, record)
-    if imported == trained:
-        check_networks_joints(clips, rest)
-    else:
-        with pytest.raises(InputError, match=r"imported onto the body .*trained on another; allowed"):
-            check_networks_joints(clips, rest)
-    write_json(tmp_path / RECORD, {**record, "joints": [[0.0], [1.0, 2.0]]})
-    if imported != "builtin":
-        with pytest.raises(InputError, match="trained on another"):
-            check_networks_joints(clips, rest)
-
-
-def test_an_earlier_import_without_joints_is_told_from_the_built_in_body_alone(tmp_path: Path):
-    write_json(tmp_path / RECORD, {"body": "model.npz", "rest_joints": "0123456789abcdef"})
-    check_networks_joints([tmp_path / "one.npz"], BODIES["a/model.npz"])
-    with pytest.raises(InputError, match=r"imported onto the body model\.npz"):
-        check_networks_joints([tmp_path / "one.npz"], builtin_rest_joints())
-    write_json(tmp_path / RECORD, {"time": 1.0})
-    check_networks_joints([tmp_path / "one.npz"], builtin_rest_joints())
+def test_bodies_of_models_are_told_apart_by_a_digest():
+    assert body_name("builtin", BUILTIN) == "builtin"
+    names = {body_name("a/model.npz", BUILTIN), body_name("b/model.npz", OTHER)}
+    assert len(names) == 2
+    assert all(name.startswith("model.npz ") for name in names)

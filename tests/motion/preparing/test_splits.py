@@ -74,12 +74,6 @@ def test_no_more_than_some_clips_of_a_group_are_held_out():
     assert SeededSplit(per_group=2).describe()["per_group"] == 2
 
 
-def test_a_fraction_says_so_of_itself():
-    """All is what there was before there were fractions; what was prepared then stays."""
-    assert "train_fraction" not in SeededSplit().describe()
-    assert SeededSplit(train_fraction=0.5).describe()["train_fraction"] == 0.5
-
-
 def test_a_fraction_of_lists_and_subsets(tmp_path):
     names = [f"{subset}/{n}" for subset in (*S2_TRAIN, *S2_TEST) for n in range(10)]
     parts = SubsetSplit(S2_TRAIN, S2_TEST, val=0.1, train_fraction=0.5).assign(names).parts
@@ -103,7 +97,6 @@ def test_lists_in_agrols_format(tmp_path):
     assert found.parts["CMU/03/unlisted_poses"] is None
     assert list(found.parts.values()).count("val") == 2
     assert list(found.parts.values()).count("train") == 6
-    assert len(found.missing) == 1
     (tmp_path / "CMU" / "test_split.txt").write_text("CMU/01/1_poses.npz\n")
     with pytest.raises(InputError, match="CMU/01/1_poses"):
         ListSplit(tmp_path)
@@ -118,7 +111,7 @@ def test_a_list_without_its_counterpart_is_refused(tmp_path, gone):
         (tmp_path / subset / "test_split.txt").write_text(f"{subset}/02/1_poses.npz\n")
     list_ = tmp_path / "MPI_HDM05" / f"{gone}_split.txt"
     list_.unlink()
-    with pytest.raises(InputError, match=rf"no {gone}_split.txt in .*MPI_HDM05, .*one may be empty"):
+    with pytest.raises(InputError, match=rf"MPI_HDM05 lacks {gone}_split.txt"):
         ListSplit(tmp_path)
     list_.write_text("")
     assert ListSplit(tmp_path).listed == {"CMU": 2, "MPI_HDM05": 1}
@@ -155,7 +148,7 @@ def test_bad_patterns_lists_and_subsets(tmp_path):
         SeededSplit(groups=["("]).assign(NAMES)
     with pytest.raises(InputError):
         ListSplit(tmp_path / "none")
-    with pytest.raises(InputError, match="both"):
+    with pytest.raises(InputError, match=r"data\.split"):
         SubsetSplit(["CMU"], ["cmu"])
 
 
@@ -194,7 +187,6 @@ def write_lists(folder, names=OLD):
 def test_lists_divide_every_release_of_amass_alike(tmp_path, write, groups):
     split = ListSplit(write_lists(tmp_path), val=0.3, groups=groups)
     expected, found = split.assign(OLD), split.assign([*map(write, OLD), "BMLrub/rub009/other_stageii"])
-    assert (expected.missing, found.missing) == ((), ())
     assert set(expected.parts.values()) == {"train", "val", "test"}
     assert found.parts == {write(name): part for name, part in expected.parts.items()} | {
         "BMLrub/rub009/other_stageii": None
@@ -205,7 +197,7 @@ def test_lists_divide_every_release_of_amass_alike(tmp_path, write, groups):
 
 def test_lists_of_a_later_release_fit_the_first_one(tmp_path):
     split = ListSplit(write_lists(tmp_path, [stage_two(name) for name in OLD]))
-    assert split.assign(OLD).missing == ()
+    assert None not in split.assign(OLD).parts.values()
     assert split.missing(OLD[1:]) == (stage_two(OLD[0]),)
     assert split.listed == {"BMLrub": 8, "CMU": 4, "HDM05": 3}
 
@@ -214,7 +206,7 @@ def test_an_entry_is_the_file_of_its_name_and_two_others_are_refused(tmp_path):
     split = ListSplit(write_lists(tmp_path))
     both = [*OLD, stage_two(OLD[0])]
     assert split.assign(both).parts[stage_two(OLD[0])] is None
-    with pytest.raises(InputError, match=r"1 clips.*BMLrub/.*_poses.npz and BMLrub/.*_stageii.npz"):
+    with pytest.raises(InputError, match=r"BMLrub/.*_poses.npz and BMLrub/.*_stageii.npz"):
         split.assign([renamed(OLD[0]), stage_two(OLD[0]), *OLD[1:]])
 
 
@@ -222,11 +214,10 @@ def test_subsets_under_every_name_but_once():
     split = SubsetSplit(["BioMotionLab_NTroje", "CMU"], ["MPI_HDM05"], groups=["^([^/]+/[^/]+)/"])
     for write in (renamed, stage_two, in_archives, str.lower):
         found = split.assign([write(name) for name in OLD])
-        assert found.missing == ()
         assert None not in found.parts.values()
         assert len(set(found.groups.values())) == 6
     assert split.missing(OLD[:8]) == ("CMU", "MPI_HDM05")
-    with pytest.raises(InputError, match="keep one release"):
+    with pytest.raises(InputError, match=r"data\.root"):
         split.assign([*OLD, stage_two(OLD[0])])
 
 
@@ -260,8 +251,8 @@ def test_subsets_are_found_within_archives_and_by_folders_of_ones_own():
     split = SubsetSplit(["CMU", "mine"], ["MPI_HDM05"])
     names = ["amass-1/CMU/01/a", "amass-2/MPI_HDM05/dg/b", "mine/CMU/01/c", "other/CMU/d"]
     found = split.assign(names)
-    assert (found.missing, split.missing(names)) == ((), ())
+    assert split.missing(names) == ()
     assert [part is None for part in found.parts.values()] == [False, False, False, True]
     assert found.parts["amass-2/MPI_HDM05/dg/b"] == "test"
-    with pytest.raises(InputError, match=r"data\.split: CMU/01 is no subset"):
+    with pytest.raises(InputError, match=r"data\.split.*CMU/01"):
         SubsetSplit(["KIT"], ["CMU/01"])

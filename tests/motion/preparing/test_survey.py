@@ -9,9 +9,9 @@ import pytest
 
 from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.preparing.cache import ClipFolder, prepare
-from memmlp.motion.preparing.folder_survey import survey
 from memmlp.motion.preparing.manifest import Manifest
 from memmlp.motion.preparing.splits import ListSplit, SeededSplit
+from memmlp.motion.preparing.survey import survey
 from memmlp.motion.synthetic import synthesize_clip
 
 
@@ -42,7 +42,7 @@ def test_one_bad_file_never_stops_a_folder(root):
     assert {file.file: file.reason.split(";")[0] for file in found.skipped} == {
         "text.npz": "no zip, so no npz (memmlp data import makes one of BVH)",
         "dangling.npz": "cannot be read (No such file or directory)",
-        "pipe.npz": "no regular file",
+        "pipe.npz": "not a regular file",
         r"line\nfeed.npz": "line feeds or other control characters in its name",
         "a/1.npz": "a/1.NPZ has the same name",
     }

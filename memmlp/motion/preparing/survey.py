@@ -15,12 +15,16 @@ from memmlp.motion.body import FPS
 from memmlp.motion.clip import LINES, Clip, Skipped, resample
 from memmlp.motion.formats.npz import NoMotion, read_clip
 from memmlp.motion.plausibility import check_plausible, unusual
-from memmlp.motion.preparing.duplicates import one_content
-from memmlp.motion.preparing.find_clips import FoundFiles, clip_name
+from memmlp.motion.preparing.duplicates import (
+    Marks,
+    find_resampled_copies,
+    find_shared_stretches,
+    first_frames,
+    mark_frames,
+    merge_contents,
+)
+from memmlp.motion.preparing.find_clips import FoundFiles, Root, clip_name, find_clips
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
-from memmlp.motion.preparing.resampled_duplicates import first_frames, resampled_copies
-from memmlp.motion.preparing.several_folders import Root, find_all
-from memmlp.motion.preparing.shared_stretches import Marks, marks, sharing
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,7 @@ class Survey:
 
     @property
     def duplicates(self) -> dict[str, str]:
-        """Clip -> the first clip with the same frames, or some of them, at whatever rate."""
+        """Clip -> the first clip that shares motion with it."""
         firsts: dict[str, str] = {}
         moving = [clip for clip in self.clips if clip.content != STILL]
         pairs = {clip.name: firsts.setdefault(clip.content, clip.name) for clip in moving}
@@ -69,29 +73,35 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
     """
     clips: dict[str, ClipRecord] = {}
     firsts: dict[str, np.ndarray] = {}
-    marked: dict[str, Marks] = {}
+    marks: dict[str, tuple[Marks, Marks]] = {}
     odd: dict[str, str] = {}
-    short, ignored, found = [], 0, find_all(root)
+    short, ignored, found = [], 0, find_clips(root)
     skipped = [Skipped(folder, reason) for folder, reason in found.unreadable.items()]
     for file in progress_bar(found.files, "reading"):
-        name = clip_name(file)
+        path, name = root / file, clip_name(file)
         try:
-            _check_name(root / file, file, clips)
-            clip = read_clip(root / file, name)
-            clips[name], resampled = _inspect(root / file, file, clip, min_frames)
+            _check_name(path, file, clips)
+            clip = read_clip(path, name)
+            check_plausible(path, clip)
+            resampled, how = resample(clip, interpolation=LINES)  # the survey is the same with either
+            if len(resampled) < min_frames:
+                few = f"{len(resampled)} frames at {FPS} Hz"
+                raise TooShort(f"{path}: {few}, fewer than data.min_frames={min_frames}")
         except NoMotion:
             ignored += 1
         except InputError as error:
             if strict:
                 raise
-            skipped.append(Skipped(one_line(file), str(error).removeprefix(one_line(f"{root / file}: "))))
+            skipped.append(Skipped(one_line(file), str(error).removeprefix(one_line(f"{path}: "))))
             short += [name] if isinstance(error, TooShort) else []
         else:
-            firsts[name], marked[name] = first_frames(clip), marks(resampled)
+            digests = file_digest(path), _content_digest(clip)
+            clips[name] = ClipRecord(name, file, "", "", 0, len(resampled) - 1, *digests, clip.fps, how)
+            firsts[name], marks[name] = first_frames(clip), mark_frames(resampled)
             odd |= {name: reason} if (reason := unusual(clip)) else {}
     records = list(clips.values())
-    records = one_content(records, resampled_copies(root, records, firsts))
-    records = one_content(records, sharing(root, records, marked))
+    records = merge_contents(records, find_resampled_copies(root, records, firsts))
+    records = merge_contents(records, find_shared_stretches(root, records, marks))
     return Survey(tuple(records), tuple(skipped), ignored, tuple(short), odd, found)
 
 
@@ -102,25 +112,10 @@ def _check_name(path: Path, file: str, clips: dict[str, ClipRecord]) -> None:
     if clip_name(file) in clips:
         raise InputError(f"{path}: {clips[clip_name(file)].file} has the same name; rename one of them")
     if path.exists() and not path.is_file():
-        raise InputError(f"{path}: no regular file")
+        raise InputError(f"{path}: not a regular file")
 
 
-def _inspect(path: Path, file: str, clip: Clip, min_frames: int) -> tuple[ClipRecord, Clip]:
-    """Return the record of a sound clip, without split and start, and the clip at 60 Hz.
-
-    Raises:
-        InputError: for any other clip.
-    """
-    check_plausible(path, clip)
-    resampled, how = resample(clip, interpolation=LINES)  # what is surveyed is the same with either
-    if len(resampled) < min_frames:
-        few = f"{len(resampled)} frames at {FPS} Hz"
-        raise TooShort(f"{path}: {few}, fewer than {min_frames} (data.min_frames)")
-    length, digests = len(resampled) - 1, (file_digest(path), _content(clip))
-    return ClipRecord(clip.name, file, "", "", 0, length, *digests, clip.fps, how), resampled
-
-
-def _content(clip: Clip) -> str:
+def _content_digest(clip: Clip) -> str:
     """Return a digest of the frames in single precision, whatever their saved type and stated frame rate."""
     numbers = np.concatenate(
         [clip.poses.reshape(len(clip), -1), clip.trans], 1, dtype="<f4", casting="same_kind"
