@@ -136,7 +136,7 @@ def _sweeps(parsed: dict[str, Any]) -> None:
     if name.isupper() or name == "all" or OWN.fullmatch(name):  # a reader's, or many
         composes([word for word in rest if not word.startswith("seed=")])
         return
-    found = find_sweep(name).with_overrides(rest).arm_seeds()
+    found = find_sweep(name).with_overrides(rest).variant_seeds()
     for one in (found[0], found[-1]):
         composes(one.overrides)
 

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from memmlp.runs.run import Run
-from memmlp.sweep.definition import MODES, Arm, Sweep
+from memmlp.sweep.definition import MODES, Sweep, Variant
 from memmlp.tables.build_table import finished_runs, make_table
 from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.measured_run import Measured, load
 from memmlp.tables.table import Table
 
-Find = Callable[[Arm, int], Run | None]
+Find = Callable[[Variant, int], Run | None]
 BASE = {
     "MPJRE": 4.15, "geodesic": 6.9, "MPJPE": 6.5, "Hand PE": 2.1, "Upper PE": 3.3, "Lower PE": 9.6,
     "Root PE": 5.0, "MPJVE": 38.0, "Jitter": 11.0, "GT Jitter": 7.1,
@@ -89,22 +89,22 @@ def _write(path: Path, text: str) -> None:
 def fake_sweep(
     outputs: Path, sweep: Sweep, effects: Mapping[str, float] | None = None, **settings: Any
 ) -> Find:
-    """Runs of all arms and seeds; `effects` are factors on the errors by label. Returns what finds them."""
+    """Runs of all variants and seeds; `effects` are factors on the errors by label. Returns a finder."""
     runs = {
-        (arm.label, seed): fake_run(
+        (variant.label, seed): fake_run(
             outputs,
-            f"{sweep.name} {arm.label}",
+            f"{sweep.name} {variant.label}",
             seed,
-            (effects or {}).get(arm.label, 1.0),
-            config={"overrides": list(arm.overrides or ())},
+            (effects or {}).get(variant.label, 1.0),
+            config={"overrides": list(variant.overrides or ())},
             **settings,
         )
-        for arm in sweep.runnable()
+        for variant in sweep.runnable()
         for seed in sweep.seeds
     }
 
-    def find(arm: Arm, seed: int) -> Run | None:
-        return runs.get((arm.label, seed))
+    def find(variant: Variant, seed: int) -> Run | None:
+        return runs.get((variant.label, seed))
 
     return find
 
@@ -112,8 +112,8 @@ def fake_sweep(
 def runs_of(sweep: Sweep, find: Find, read: Callable[[Path], Measured] = load) -> dict[str, RunsBySeed]:
     """The finished ones of the runs that are found."""
 
-    def measured(arm: Arm, seed: int) -> Measured | None:
-        run = find(arm, seed)
+    def measured(variant: Variant, seed: int) -> Measured | None:
+        run = find(variant, seed)
         return read(run.folder) if run is not None and run.done else None
 
     return finished_runs(sweep, measured)
@@ -122,14 +122,14 @@ def runs_of(sweep: Sweep, find: Find, read: Callable[[Path], Measured] = load) -
 def table_of(sweep: Sweep, find: Find, command: str | None = None, modes: Sequence[str] = MODES) -> Table:
     """The table of the runs that are found."""
 
-    def state(arm: Arm, seed: int) -> str | None:
-        run = find(arm, seed)
+    def state(variant: Variant, seed: int) -> str | None:
+        run = find(variant, seed)
         return None if run is None or run.done else run.status
 
     return make_table(sweep, runs_of(sweep, find), modes, command, state)
 
 
-def nothing(arm: Arm, seed: int) -> None:
+def nothing(variant: Variant, seed: int) -> None:
     """Finds no run."""
 
 

@@ -18,7 +18,7 @@ FILE = {
     "seeds": [0, 1, 2],
     "control": "full_model",
     "metrics": ["MPJRE", "MPJPE", "Jitter", "FLOPs", "ms"],
-    "arms": {
+    "variants": {
         "a system": {"overrides": None, "paper": {"MPJPE": 4.0}},
         "no | memory": {"overrides": ["memory=none"], "paper": {"MPJRE": 2.76, "MPJPE": 3.0, "Jitter": 7.0}},
         "by position": {"branch": "position", "overrides": ["a=b"], "note": "as <printed>"},

@@ -125,7 +125,7 @@ def test_it_works_outside_the_checkout(bin_folder: Path, tmp_path: Path):
     assert memmlp.__version__ in run(command, "--version", folder=tmp_path)
     run(command, "demo", *TINY, folder=tmp_path)
     assert "runs" in run(command, "sweep", "14", "profile=tiny", "--dry-run", folder=tmp_path)
-    (tmp_path / "mine.yaml").write_text("arms: {without: [memory=none]}")
+    (tmp_path / "mine.yaml").write_text("variants: {without: [memory=none]}")
     said = run(command, "sweep", "mine.yaml", *TINY, "export.graph=off", folder=tmp_path)
     assert "1 of 1 runs done" in said
     made = sorted(map(str, (tmp_path / "outputs/runs").glob("*/deployments/*/step.onnx")))

@@ -225,7 +225,7 @@ def test_the_sweep_of_the_guide_loads(tmp_path: Path):
     path.write_text(examples("sweeps", "yaml")[0])
     sweep = load_sweep(path)
     assert sweep.control == "2, 4, 6, 8"
-    for one in sweep.arm_seeds():
+    for one in sweep.variant_seeds():
         composed(one.overrides)
 
 

@@ -25,7 +25,7 @@ def current_rounds(sweep: Sweep, outputs: Path, most: int | None) -> Rounds:
     Args:
         sweep: the sweep as it is now.
         outputs: the folder of runs and caches.
-        most: the largest number of seeds of an arm (--max-seeds); None for that of the kept rounds, or the
+        most: the largest number of seeds of a variant (--max-seeds); None for that of the kept rounds, or the
             default.
 
     Raises:
@@ -117,7 +117,7 @@ def look(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
 
 
 def names(rounds: Rounds, sweep: Sweep, plan: Plan) -> dict[str, str]:
-    """Return, by label, a digest of the runs that each arm's next look will compare."""
+    """Return, by label, a digest of the runs that each variant's next look will compare."""
     from memmlp.tables.seed_rounds_file import name_of
 
     looks = {label: rounds.looks[number] for label, number in rounds.next_looks(sweep).items()}
@@ -133,23 +133,25 @@ def schedule(rounds: Rounds) -> str:
 
 
 def progress_lines(rounds: Rounds, sweep: Sweep, last: Look | None = None) -> list[str]:
-    """Describe each arm's progress: comparisons decided and open, seeds so far, and its next look."""
+    """Describe each variant's progress: its verdicts, seeds so far, and its next look."""
     from memmlp.tables.seed_rounds import standings
 
-    arms = standings(rounds, sweep)
-    decided = sum(arm.decided for arm in arms)
+    variants = standings(rounds, sweep)
+    decided = sum(variant.decided for variant in variants)
     head = f"look at {last.seeds} seeds ({100 * last.level:.2g} %): " if last else ""
-    rows = [("arm", "decided", "open", "seeds", "next")]
-    for arm in arms:
-        following = f"look at {arm.next}" if arm.next else ""
-        rows.append((arm.label, str(arm.decided), str(arm.open), str(arm.seeds), following))
+    rows = [("variant", "decided", "inconclusive", "seeds", "next")]
+    for variant in variants:
+        following = f"look at {variant.next}" if variant.next else ""
+        rows.append(
+            (variant.label, str(variant.decided), str(variant.inconclusive), str(variant.seeds), following)
+        )
     return [f"{head}{decided} of {len(rounds.family(sweep))} comparisons decided", *_lined(rows)]
 
 
 def closing(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> list[str]:
     """Say why the rounds ended, what more seeds could do, and how many runs were spent."""
     latest = [finding for finding, _ in rounds.latest().values()]
-    still = [finding for finding in latest if finding.verdict == "open"]
+    still = [finding for finding in latest if finding.verdict == "inconclusive"]
     evaluated = {mode for found in runs.values() for run in found.values() for mode in run.means}
     unseen = Counter(key.label for key in rounds.unseen(sweep) if key.mode in evaluated)
     lines = [] if still or unseen or rounds.next_looks(sweep) else ["all verdicts are decided"]
@@ -163,27 +165,30 @@ def closing(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> lis
 
 
 def _outlooks(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> list[str]:
-    """Return a line for each arm that has open comparisons and no next look."""
+    """Return a line for each variant that has inconclusive comparisons and no next look."""
     from memmlp.tables.seed_rounds import outlook
 
-    arms: dict[str, list[int | None]] = {}
+    variants: dict[str, list[int | None]] = {}
     for key, number in outlook(rounds, sweep, runs).items():
-        arms.setdefault(key.label, []).append(number)
+        variants.setdefault(key.label, []).append(number)
     lines = []
-    for label, numbers in arms.items():
+    for label, numbers in variants.items():
         some = [number for number in numbers if number is not None]
         words = [f"{len(some)} would take about {max(some)} seeds"] if some else []
         if len(some) < len(numbers):
             words.append(f"{len(numbers) - len(some)} no number of seeds: the groups of clips are too few")
-        lines.append(f"open of '{label}', if its effects are as measured: {'; '.join(words)}")
+        lines.append(f"inconclusive of '{label}', if its effects are as measured: {'; '.join(words)}")
     return lines
 
 
 def _spent(rounds: Rounds, sweep: Sweep) -> str:
     """Say how many runs were spent, and how many a fixed number of seeds would have taken."""
-    used, arms = sum(rounds.counts(sweep).values()), len(sweep.runnable())
+    used, variants = sum(rounds.counts(sweep).values()), len(sweep.runnable())
     last = max((look.seeds for look in rounds.taken), default=rounds.looks[0])
-    fixed = [f"{arms * seeds} with {seeds} seeds for every arm" for seeds in sorted({last, rounds.looks[-1]})]
+    fixed = [
+        f"{variants * seeds} with {seeds} seeds for every variant"
+        for seeds in sorted({last, rounds.looks[-1]})
+    ]
     return f"{used} runs were spent; {', '.join(fixed)}"
 
 

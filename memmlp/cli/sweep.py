@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 @click.argument("name")
 @click.argument("overrides", nargs=-1)
 @click.option(
-    "--arm",
-    "arms",
+    "--variant",
+    "variants",
     metavar="LABEL",
     multiple=True,
-    help="Run this arm alone, with what it builds on; may be given again.",
+    help="Run this variant alone, with what it builds on; may be given again.",
 )
 @worker_options
 @click.option("--status", is_flag=True, help="Show how far the sweep is, and run nothing.")
@@ -42,10 +42,10 @@ if TYPE_CHECKING:
 )
 @click.option("--fail-fast", is_flag=True, help="End the sweep with the first run that fails.")
 @click.option(
-    "--until-decided", is_flag=True, help="Add seeds in rounds, to arms whose verdicts are open alone."
+    "--until-decided", is_flag=True, help="Add seeds in rounds, to variants whose verdicts are inconclusive."
 )
 @click.option(
-    "--max-seeds", type=int, help="Most seeds that an arm may get, with --until-decided.  [default: 13]"
+    "--max-seeds", type=int, help="Most seeds that a variant may get, with --until-decided.  [default: 13]"
 )
 @click.option("--yes", is_flag=True, hidden=True)
 @config_dir_option
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 def sweep(
     name: str,
     overrides: tuple[str, ...],
-    arms: tuple[str, ...],
+    variants: tuple[str, ...],
     workers: Workers,
     status: bool,
     dry_run: bool,
@@ -68,12 +68,12 @@ def sweep(
 ) -> None:
     """Run what is missing of a sweep: NAME is a file's path, a shipped sweep, or a table's number.
 
-    OVERRIDES are those of `memmlp train`, for all arms; `seed=0,1` sets the seeds. The workers are processes
-    of this machine, which share out its GPUs, jobs of Slurm (`executor=slurm slurm.partition=P
+    OVERRIDES are those of `memmlp train`, for all variants; `seed=0,1` sets the seeds. The workers are
+    processes of this machine, which share out its GPUs, jobs of Slurm (`executor=slurm slurm.partition=P
     slurm.time=10:00:00 slurm.gpus=1`, and any option of sbatch), or tasks of Ray (`executor=ray
     ray.num_gpus=1`) or Dask (`executor=dask`).
 
-    With --until-decided all arms get three seeds first. Then only those with open verdicts, and their
+    With --until-decided all variants get three seeds first. Then only those with open verdicts, and their
     controls, get more, up to --max-seeds.
     """
     from memmlp.cli import seed_rounds
@@ -83,15 +83,15 @@ def sweep(
     seed_rounds.check(overrides, until_decided, max_seeds)
     if again and (until_decided or status or dry_run):
         raise InputError("--again: allowed is without --until-decided, --status and --dry-run")
-    if arms and until_decided:
-        raise InputError("--arm: allowed is without --until-decided, which chooses arms itself")
+    if variants and until_decided:
+        raise InputError("--variant: allowed is without --until-decided, which chooses variants itself")
     chosen = find_sweep(name, overrides)
-    labels = chosen.labels_of(arms)
+    labels = chosen.labels_of(variants)
     outputs = outputs.absolute()
     rounds = seed_rounds.current_rounds(chosen, outputs, max_seeds) if until_decided else None
     spent = rounds.spent(chosen) if rounds else chosen
     plan = kept_or_new_plan(spent, outputs, prepare=not (status or dry_run))
-    wanted = plan.of_arms(labels)
+    wanted = plan.of_variants(labels)
     if status or dry_run:
         show(spent, plan, labels)
         if rounds:
@@ -149,7 +149,7 @@ def show(chosen: Sweep, plan: Plan, labels: Collection[str]) -> None:
     Args:
         chosen: the sweep.
         plan: its plan.
-        labels: the labels of the arms that are shown.
+        labels: the labels of the variants that are shown.
     """
     from rich.console import Console
 
@@ -157,7 +157,7 @@ def show(chosen: Sweep, plan: Plan, labels: Collection[str]) -> None:
     from memmlp.sweep.progress_table import render
     from memmlp.tables.flags_of_code import older_code
 
-    shown = plan.of_arms(labels)
+    shown = plan.of_variants(labels)
     click.echo(f"overrides: {' '.join(chosen.command_line) or 'none'}")  # others are another sweep
     if shown.entries:
         states = shown.states()
@@ -172,8 +172,8 @@ def show(chosen: Sweep, plan: Plan, labels: Collection[str]) -> None:
 
 
 def unprepared(chosen: Sweep, plan: Plan, labels: Collection[str]) -> int:
-    """Return how many runs of these arms their plan lacks because their data is not prepared yet."""
-    return sum(one.label in labels for one in chosen.arm_seeds()) - len(plan.entries)
+    """Return how many runs of these variants their plan lacks because their data is not prepared yet."""
+    return sum(one.label in labels for one in chosen.variant_seeds()) - len(plan.entries)
 
 
 def show_forecast(chosen: Sweep, plan: Plan, labels: Collection[str], workers: int) -> None:
@@ -191,14 +191,16 @@ def show_forecast(chosen: Sweep, plan: Plan, labels: Collection[str], workers: i
             f": about {found.seconds / workers / 60:.0f} min, judged by its {found.finished} finished runs"
         )
         if found.unlike:
-            line += f" ({found.unlike} runs are of arms without a finished one, and judged by other arms)"
+            line += (
+                f" ({found.unlike} runs are of variants without a finished one, and judged by other variants)"
+            )
     click.echo(line)
 
 
 def show_outcome(shown: ShownSweep, words: Sequence[str], chosen: Sweep, labels: Collection[str]) -> None:
     """Print the table, finished and failed runs, and the next command.
 
-    Exits with 1 if something failed that the arms with these labels need.
+    Exits with 1 if something failed that the variants with these labels need.
     """
     from memmlp.cli.loggers import show_in_loggers
     from memmlp.cli.seed_rounds import closing
@@ -209,7 +211,7 @@ def show_outcome(shown: ShownSweep, words: Sequence[str], chosen: Sweep, labels:
 
     plan, rounds, words = shown.plan, shown.rounds, [*words, *plugins.config_dir_words()]
     states = plan.states()
-    failed = [task for task in plan.of_arms(labels).tasks if states[task.key] in ("failed", "blocked")]
+    failed = [task for task in plan.of_variants(labels).tasks if states[task.key] in ("failed", "blocked")]
     command = " ".join(["memmlp sweep", *words])
     found = table_of_plan(shown, SHOWN_MODES["both"], command, load)
     show_in_loggers(plan, sweep_folder(chosen, plan.outputs), found.table)

@@ -139,7 +139,7 @@ class TableSelection(NamedTuple):
     """What of a sweep's results its table shows.
 
     Attributes:
-        branch: the branch to show in place of the arms' own; None for the arms' own.
+        branch: the branch to show in place of the variants' own; None for the variants' own.
         source: the only source whose test clips are shown; None for all.
         together: patterns of test clips that count as one group, beside the groups of the data.
         untrained: whether to measure the costs of networks without a run, with random weights.
@@ -155,7 +155,7 @@ WHOLE = TableSelection()
 
 
 class SweepTable(NamedTuple):
-    """A sweep, the finished runs of its arms by seed, and its table."""
+    """A sweep, the finished runs of its variants by seed, and its table."""
 
     sweep: Sweep
     runs: dict[str, RunsBySeed]
@@ -204,7 +204,7 @@ def gathered(
         except InputError as error:
             failures.append(error)
             table = without_runs(sweep, modes, f"nothing measured: {error}")
-            found.append(SweepTable(sweep, {arm.label: {} for arm in sweep.runnable()}, table))
+            found.append(SweepTable(sweep, {variant.label: {} for variant in sweep.runnable()}, table))
     asked = overrides or selection.source or selection.together or found[0].sweep.table is None
     if failures and asked and len(failures) == len(found):
         raise failures[0]
@@ -281,13 +281,15 @@ def seeds_on_screen(found: Sequence[SweepTable], modes: Sequence[str]) -> None:
         if wanted:
             click.echo(_needed(wanted))
         else:
-            click.echo("no arm with an effect that the paper prints has two seeds and two groups of clips")
+            click.echo(
+                "no variant with an effect that the paper prints has two seeds and two groups of clips"
+            )
         click.echo()
 
 
 def _needed(wanted: Sequence[Need]) -> str:
     """Return a line for each comparison, and a note on how to read them."""
-    rows = [("arm", "mode", "metric", "paper", "here", "seeds", "needed")]
+    rows = [("variant", "mode", "metric", "paper", "here", "seeds", "needed")]
     for need in wanted:
         differences = (f"{need.paper:+.2f}", f"{need.measured:+.2f}")
         number = "no number" if need.seeds is None else str(need.seeds)
@@ -302,7 +304,7 @@ def _needed(wanted: Sequence[Need]) -> str:
     ]
     note = (
         "needed: seeds for an effect of the paper's size to be significant with 80 % power, after Holm's "
-        "correction over this table, with these test clips; no number: the clips alone leave too much open"
+        "correction over this table, with these test clips; no number: the clips alone are too uncertain"
     )
     return "\n".join([*lines, note])
 

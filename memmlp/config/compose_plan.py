@@ -19,7 +19,7 @@ from memmlp.common.files import digest, read_json, write_json
 from memmlp.config.package_data import packaged
 from memmlp.config.plugins import activate, named, texts_outside_memmlp
 from memmlp.runs.former_keys import with_former_keys
-from memmlp.sweep.definition import Arm, Sweep, key_of
+from memmlp.sweep.definition import Sweep, Variant, key_of
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
 from memmlp.sweep.sweep_file import load_sweep
 from memmlp.sweep.sweep_json import keep_sweep
@@ -49,7 +49,7 @@ def find_sweep(name: str, overrides: Sequence[str] = ()) -> Sweep:
     return sweep
 
 
-def check_preset(sweep: Sweep, arm: Arm) -> None:
+def check_preset(sweep: Sweep, arm: Variant) -> None:
     """Check that an arm's `experiment=NAME` sets all that it should, and replaces no other experiment.
 
     Hydra lets a group or key on the command line win over an experiment's, wherever it stands, and the last
@@ -68,7 +68,7 @@ def check_preset(sweep: Sweep, arm: Arm) -> None:
     around = {key_of(word): word for word in (*sweep.base, *sweep.command_line)}
     around = {key: word for key, word in around.items() if key not in own or key == EXPERIMENT}
     before, options = _options(around.pop(EXPERIMENT, "")), _options(chosen)
-    where = f"sweep {sweep.name}, arm '{arm.label}': {chosen}"
+    where = f"sweep {sweep.name}, variant '{arm.label}': {chosen}"
     if options and (lost := [option for option in before if option not in options]):
         both = ",".join(dict.fromkeys([*before, *options]))
         raise InputError(f"{where} would replace {EXPERIMENT}={lost[0]}; allowed is {EXPERIMENT}=[{both}]")
@@ -160,7 +160,7 @@ def kept_or_new_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan
 
 def _has_all(sweep: Sweep, plan: Plan, path: Path) -> bool:
     """Return whether a plan has all entries of the kept plan, except those of arms that are gone."""
-    labels = {arm.label for arm in sweep.arms}
+    labels = {arm.label for arm in sweep.variants}
     cells = {(one.get("label"), one.get("seed")) for one in read_json(path).get("entries", ())}
     return {cell for cell in cells if cell[0] in labels} <= {(one.label, one.seed) for one in plan.entries}
 
@@ -180,7 +180,7 @@ def orphans(sweep: Sweep, plan: Plan) -> list[Entry]:
     Their arm's label is gone, or the arm has another config now.
     """
     recorded = read_json(sweep_folder(sweep, plan.outputs) / "entries.json").get("entries", [])
-    labels = {arm.label for arm in sweep.arms}
+    labels = {arm.label for arm in sweep.variants}
     now = {(entry.label, entry.seed): entry.id for entry in plan.entries}
     used = set(now.values())
     entries = [Entry(entry["label"], entry["seed"], entry["id"]) for entry in recorded]
@@ -211,7 +211,7 @@ def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[s
     return plan, list(data.values()) if complete else None
 
 
-def _experiments(sweep: Sweep, arm: Arm, outputs: Path) -> Iterable[tuple[int, Experiment]]:
+def _experiments(sweep: Sweep, arm: Variant, outputs: Path) -> Iterable[tuple[int, Experiment]]:
     """Yield the checked experiments of an arm, with their seeds."""
     from memmlp.config.build import build_experiment
     from memmlp.config.compose import composed
@@ -224,7 +224,7 @@ def _experiments(sweep: Sweep, arm: Arm, outputs: Path) -> Iterable[tuple[int, E
             cfg.seed, cfg.paths.outputs = seed, str(outputs)
             yield seed, build_experiment(cfg, elsewhere=True)
     except InputError as error:
-        raise InputError(f"sweep {sweep.name}, arm '{arm.label}': {error}") from None
+        raise InputError(f"sweep {sweep.name}, variant '{arm.label}': {error}") from None
 
 
 def tasks_of(experiment: Experiment, data: str) -> list[RunTask]:

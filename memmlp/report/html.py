@@ -110,9 +110,9 @@ def published(accuracies: Sweep, latencies: Sweep) -> list[SpeedAndError]:
 
     The two are in different tables, in which only the beginnings of a system's names agree.
     """
-    errors = {arm.label.casefold(): (arm.paper or {}).get(ERROR) for arm in accuracies.arms}
+    errors = {arm.label.casefold(): (arm.paper or {}).get(ERROR) for arm in accuracies.variants}
     points = []
-    for arm in latencies.arms:
+    for arm in latencies.variants:
         fps = (arm.paper or {}).get("FPS")
         error = next((e for label, e in errors.items() if label.startswith(arm.label.casefold())), None)
         if fps is not None and error is not None:
@@ -193,7 +193,7 @@ def _distributions(chapters: Iterable[Chapter]) -> list[str]:
 def _robust(found: Mapping[str, Sequence[Distribution]]) -> str:
     """Return a table of interquartile means and probabilities of improvement, with a row for each arm."""
     metrics = list(found)
-    head = ["arm", *(f"{metric}: {what}" for metric in metrics for what in ("IQM", "P(better)"))]
+    head = ["variant", *(f"{metric}: {what}" for metric in metrics for what in ("IQM", "P(better)"))]
     rows = [
         [one.label, *(word for metric in metrics for word in _robust_words(found[metric][place]))]
         for place, one in enumerate(found[metrics[0]])

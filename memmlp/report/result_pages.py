@@ -159,7 +159,7 @@ class Placeholders:
         return name in self.sources
 
     def effect(self, name: str, arm: str, mode: str, metric: str) -> str:
-        """Return a measured difference with its interval and verdict: `+1.17 [0.40, 2.23], open`."""
+        """Return a measured difference with its interval and verdict: `+1.17 [0.40, 2.23], inconclusive`."""
         cell = self._cell(name, arm, mode, metric)
         words = effect_words(cell, metric)
         number = " ".join(word.replace("*", "") for word in words[:2])
@@ -213,7 +213,7 @@ class Placeholders:
         lines = [
             f"In {mode} mode:",
             "",
-            f"| arm | compared with | {' | '.join(metrics)} |",
+            f"| variant | compared with | {' | '.join(metrics)} |",
             f"| --- | --- |{' --- |' * len(metrics)}",
         ]
         for row in table.rows:
@@ -241,7 +241,7 @@ class Placeholders:
         lines = [
             f"Of {counts.total()} effects with a sign in the paper, in {mode} mode: {said}.",
             "",
-            f"| table | arm | compared with | {' | '.join(metrics)} |",
+            f"| table | variant | compared with | {' | '.join(metrics)} |",
             f"| --- | --- | --- |{' --- |' * len(metrics)}",
         ]
         for (name, row), cells in zip(rows, words, strict=True):
@@ -293,12 +293,12 @@ class Placeholders:
             table = together(patterns)
         cells = (cell for row in table.rows for metrics in row.cells.values() for cell in metrics.values())
         found = Counter(cell.effect.verdict for cell in cells if cell.effect and cell.effect.verdict)
-        return f"{found.total() - found[Verdict.OPEN] - found[Verdict.EQUIVALENT]} of {found.total()}"
+        return f"{found.total() - found[Verdict.INCONCLUSIVE] - found[Verdict.EQUIVALENT]} of {found.total()}"
 
     def _costs(self, name: str) -> str:
         table = self._table(name)
         heads = [with_unit(metric) for metric in table.metrics]
-        lines = [f"| arm | {' | '.join(map(escaped, heads))} |", f"| --- |{' --- |' * len(heads)}"]
+        lines = [f"| variant | {' | '.join(map(escaped, heads))} |", f"| --- |{' --- |' * len(heads)}"]
         for row in (row for row in table.rows if row.found):
             costs = row.cells[table.modes[0]]
             cells = [self.value(name, row.label, table.modes[0], metric) for metric in table.metrics]

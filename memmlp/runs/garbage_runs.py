@@ -112,7 +112,7 @@ def _left(folder: Path) -> Iterator[str]:
     absent.
     """
     now = {(one.get("label"), one.get("seed")): one["id"] for one in _listed(folder / "plan.json", "entries")}
-    arms = read_json(folder / "sweep.json").get("arms")
+    arms = read_json(folder / "sweep.json").get("variants")
     labels = {arm.get("label") for arm in arms} if arms else None
     for one in _listed(folder / "entries.json", "entries"):
         gone = labels is not None and one.get("label") not in labels

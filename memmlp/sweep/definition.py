@@ -1,4 +1,4 @@
-"""What a sweep is: arms, seeds, the overrides that train each arm (files: memmlp.sweep.sweep_file)."""
+"""A sweep: variants, seeds, and the overrides that train each variant (files: memmlp.sweep.sweep_file)."""
 
 from __future__ import annotations
 
@@ -25,20 +25,21 @@ Their units: GFLOP, GMAC, millions, MB, ms, multiples of the yardstick's time, a
 
 
 @dataclass(frozen=True)
-class Arm:
+class Variant:
     """A row of a table.
 
     Attributes:
-        label: the arm's name in the table.
-        overrides: the arm's overrides of the base; None if the row has only the paper's values (a system that
-            is not built here).
+        label: the variant's name in the table.
+        overrides: the variant's overrides of the base; None if the row has only the paper's values (a system
+            that is not built here).
         branch: whose errors the row shows: rotation, position, or combined (after inverse kinematics).
         paper: the paper's values by metric, as printed.
         note: a remark shown under the table.
-        against: the label of the arm that this one is compared with; None for the sweep's control.
-        fixed: whether the file gives the arm a branch of its own.
-        seeds: the arm's own seeds, if seeds are added only to arms with open verdicts; None for the sweep's.
-        series: the arm's label in the file, which is the same in all cells of the axes.
+        against: the label of the variant that this one is compared with; None for the sweep's control.
+        fixed: whether the file gives the variant a branch of its own.
+        seeds: the variant's own seeds, if seeds are added only to variants with open verdicts; None for the
+            sweep's.
+        series: the variant's label in the file, which is the same in all cells of the axes.
         cell: the overrides that the axes add, one per key; empty without axes.
     """
 
@@ -55,13 +56,13 @@ class Arm:
 
     @property
     def own_overrides(self) -> tuple[str, ...]:
-        """The arm's overrides without those of its cell."""
+        """The variant's overrides without those of its cell."""
         return tuple(word for word in self.overrides or () if word not in self.cell)
 
 
 @dataclass(frozen=True)
-class ArmSeed:
-    """One training: an arm with a seed, as overrides of `memmlp train`."""
+class VariantSeed:
+    """One training: a variant with a seed, as overrides of `memmlp train`."""
 
     label: str
     seed: int
@@ -77,10 +78,10 @@ class Sweep:
         title: the table's title.
         table: the table's number in the paper; None for a custom sweep.
         notes: remarks shown under the table.
-        base: overrides that all arms share.
-        seeds: the seeds of each arm.
-        arms: the rows in order.
-        control: the label of the arm with which the others are compared.
+        base: overrides that all variants share.
+        seeds: the seeds of each variant.
+        variants: the rows in order.
+        control: the label of the variant with which the others are compared.
         metrics: the columns.
         command_line: overrides given on the command line.
         branch_source: how we know which branch the paper's values belong to; None if the file does not say.
@@ -93,7 +94,7 @@ class Sweep:
     notes: tuple[str, ...]
     base: tuple[str, ...]
     seeds: tuple[int, ...]
-    arms: tuple[Arm, ...]
+    variants: tuple[Variant, ...]
     control: str
     metrics: tuple[str, ...]
     command_line: tuple[str, ...] = ()
@@ -101,40 +102,41 @@ class Sweep:
     smallest: Mapping[str, float] = field(default_factory=lambda: SMALLEST)
 
     def with_branch(self, branch: str) -> Sweep:
-        """Return the same sweep with its arms showing another branch.
+        """Return the same sweep with its variants showing another branch.
 
-        An arm with a branch of its own in the file keeps it. The paper's values belong to the branch for
-        which they were printed, so arms whose branch changes lose them.
+        A variant with a branch of its own in the file keeps it. The paper's values belong to the branch for
+        which they were printed, so variants whose branch changes lose them.
 
         Raises:
             InputError: for an unknown branch.
         """
         name = parse_branch(branch, "branch")
-        arms = tuple(
-            arm if arm.fixed or arm.branch == name else replace(arm, branch=name, paper={})
-            for arm in self.arms
+        variants = tuple(
+            variant if variant.fixed or variant.branch == name else replace(variant, branch=name, paper={})
+            for variant in self.variants
         )
-        return self if arms == self.arms else replace(self, arms=arms, branch_source=None)
+        return self if variants == self.variants else replace(self, variants=variants, branch_source=None)
 
-    def control_of(self, arm: Arm) -> str | None:
-        """Return the label of an arm's control arm: the arm's own `against`, or else the sweep's control.
+    def control_of(self, variant: Variant) -> str | None:
+        """Return the label of a variant's control variant: the variant's own `against`, or else the sweep's
+        control.
 
-        It is None for the sweep's control itself, unless that arm has an `against`, too.
+        It is None for the sweep's control itself, unless that variant has an `against`, too.
         """
-        return arm.against or (self.control if arm.label != self.control else None)
+        return variant.against or (self.control if variant.label != self.control else None)
 
-    def seeds_of(self, arm: Arm) -> tuple[int, ...]:
-        """Return the seeds of an arm: its own if it has any, else the sweep's."""
-        return self.seeds if arm.seeds is None else arm.seeds
+    def seeds_of(self, variant: Variant) -> tuple[int, ...]:
+        """Return the seeds of a variant: its own if it has any, else the sweep's."""
+        return self.seeds if variant.seeds is None else variant.seeds
 
     def with_overrides(self, overrides: Sequence[str]) -> Sweep:
-        """Return the same sweep with further overrides, applied after its base and before the arms' own.
+        """Return the same sweep with further overrides, applied after its base and before the variants' own.
 
         `seed=0,1` or `seed=0` sets the seeds.
 
         Raises:
             InputError: for an override of the outputs folder, which an option of the command sets, and for a
-                key that an arm sets itself, since the arm's value would win.
+                key that a variant sets itself, since the variant's value would win.
         """
         if any(key_of(word) == "paths.outputs" for word in overrides):
             raise InputError("paths.outputs: allowed here is --outputs FOLDER, or MEMMLP_OUTPUTS")
@@ -145,48 +147,50 @@ class Sweep:
             )
         seeds = [one.value or "" for one in map(Override.parse, overrides) if one.key == "seed"]
         others = tuple(word for word in overrides if key_of(word) != "seed")
-        self._check_keys_of_arms(others)
+        self._check_keys_of_variants(others)
         chosen = parse_seeds(seeds[-1].split(","), "seed") if seeds else self.seeds
         return replace(self, command_line=(*self.command_line, *others), seeds=chosen)
 
-    def _check_keys_of_arms(self, overrides: Iterable[str]) -> None:
-        """Raise InputError for an override of a key that an arm sets itself."""
-        setters = {key_of(word): arm.label for arm in self.runnable() for word in arm.overrides or ()}
+    def _check_keys_of_variants(self, overrides: Iterable[str]) -> None:
+        """Raise InputError for an override of a key that a variant sets itself."""
+        setters = {
+            key_of(word): variant.label for variant in self.runnable() for word in variant.overrides or ()
+        }
         for word in overrides:
             if (key := key_of(word)) in setters:
                 raise InputError(
-                    f"{word}: arm '{setters[key]}' of sweep {self.name} sets {key} itself; "
-                    "allowed are keys that no arm sets"
+                    f"{word}: variant '{setters[key]}' of sweep {self.name} sets {key} itself; "
+                    "allowed are keys that no variant sets"
                 )
 
-    def all_overrides(self, arm: Arm) -> tuple[str, ...]:
-        """Return an arm's overrides: the base's, the command line's, its own; the last one of a key wins."""
-        words = (*self.base, *self.command_line, *(arm.overrides or ()))
+    def all_overrides(self, variant: Variant) -> tuple[str, ...]:
+        """Return a variant's overrides: base, command line, its own; the last one of a key wins."""
+        words = (*self.base, *self.command_line, *(variant.overrides or ()))
         return tuple({key_of(word): word for word in words}.values())
 
-    def runnable(self) -> tuple[Arm, ...]:
-        """Return the arms that can be run: all except those with only the paper's values."""
-        return tuple(arm for arm in self.arms if arm.overrides is not None)
+    def runnable(self) -> tuple[Variant, ...]:
+        """Return the variants that can be run: all except those with only the paper's values."""
+        return tuple(variant for variant in self.variants if variant.overrides is not None)
 
     def labels_of(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Return the labels of the arms that are named, of all that can be run if none is.
+        """Return the labels of the variants that are named, of all that can be run if none is.
 
         Raises:
-            InputError: for a name that no arm has, or an arm with only the paper's values.
+            InputError: for a name that no variant has, or a variant with only the paper's values.
         """
-        known = [arm.label for arm in self.runnable()]
+        known = [variant.label for variant in self.runnable()]
         if missing := [name for name in names if name not in known]:
             raise InputError(
-                f"sweep {self.name}: no arm '{missing[0]}' that can be run; allowed are {', '.join(known)}"
+                f"sweep {self.name}: no variant '{missing[0]}' can be run; expected {', '.join(known)}"
             )
         return tuple(names) or tuple(known)
 
-    def arm_seeds(self) -> list[ArmSeed]:
-        """Return the trainings that the sweep needs, arm by arm."""
+    def variant_seeds(self) -> list[VariantSeed]:
+        """Return the trainings that the sweep needs, variant by variant."""
         return [
-            ArmSeed(arm.label, seed, (*self.all_overrides(arm), f"seed={seed}"))
-            for arm in self.runnable()
-            for seed in self.seeds_of(arm)
+            VariantSeed(variant.label, seed, (*self.all_overrides(variant), f"seed={seed}"))
+            for variant in self.runnable()
+            for seed in self.seeds_of(variant)
         ]
 
 

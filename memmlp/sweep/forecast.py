@@ -16,8 +16,8 @@ class Forecast(NamedTuple):
     Attributes:
         seconds: the time, seconds.
         finished: how many finished runs the estimate comes from.
-        unlike: how many remaining runs belong to arms without a finished run, and are estimated from other
-            arms.
+        unlike: how many remaining runs belong to variants without a finished run, and are estimated from
+            other variants.
     """
 
     seconds: float
@@ -26,7 +26,7 @@ class Forecast(NamedTuple):
 
 
 def forecast(plan: Plan) -> Forecast | None:
-    """Estimate each remaining run from the finished runs of its arm, else from those of its kind.
+    """Estimate each remaining run from the finished runs of its variant, else from those of its kind.
 
     Returns:
         None if nothing is left, or if no run of the kinds that are left has finished.
@@ -42,12 +42,12 @@ def forecast(plan: Plan) -> Forecast | None:
             kinds[task.kind].append(task.id)
     if not left or not all(kinds[task.kind] for task in left):
         return None
-    arms = [_arm(plan, task) for task in left]
-    judged = [arm & took.keys() or kinds[task.kind] for arm, task in zip(arms, left, strict=True)]
+    variants = [_variant(plan, task) for task in left]
+    judged = [variant & took.keys() or kinds[task.kind] for variant, task in zip(variants, left, strict=True)]
     return Forecast(
         seconds=sum(fmean(took[name] for name in names) for names in judged),
         finished=len({name for names in judged for name in names}),
-        unlike=sum(bool(arm) and not arm & took.keys() for arm in arms),
+        unlike=sum(bool(variant) and not variant & took.keys() for variant in variants),
     )
 
 
@@ -57,7 +57,7 @@ def seconds(run: Run) -> float | None:
     return sum(found.values()) if isinstance(found, dict) else found
 
 
-def _arm(plan: Plan, task: RunTask) -> set[str]:
-    """Return the ids of all seeds' runs of the arms that use a task's run; none for an upstream run."""
+def _variant(plan: Plan, task: RunTask) -> set[str]:
+    """Return the ids of all seeds' runs of the variants that use a task's run; none for an upstream run."""
     labels = {entry.label for entry in plan.entries if entry.id == task.id}
     return {entry.id for entry in plan.entries if entry.label in labels}

@@ -1,4 +1,4 @@
-"""A plan: the runs that a sweep's arms and seeds need, and their progress.
+"""A plan: the runs that a sweep's variants and seeds need, and their progress.
 
 A plan holds only the runs' identities; their progress is read from the run folders. Plans are made in
 `config/compose_plan.py`, since that composes configs.
@@ -47,7 +47,7 @@ class RunTask:
 
 @dataclass(frozen=True)
 class Entry:
-    """An entry of a sweep: the run of an arm with a seed, and its stages after training."""
+    """An entry of a sweep: the run of a variant with a seed, and its stages after training."""
 
     label: str
     seed: int
@@ -67,7 +67,7 @@ class Plan:
     Attributes:
         name: the sweep's name.
         outputs: the folder of runs and caches.
-        entries: the runs of the sweep's arms and seeds.
+        entries: the runs of the sweep's variants and seeds.
         tasks: the runs to be made.
         open: whether tasks may be added, so that workers stay (a search); a sweep's plan is closed.
         cancelled: ids of runs that workers must not go on with.
@@ -82,8 +82,8 @@ class Plan:
     cancelled: tuple[str, ...] = ()
     fail_fast: bool = False
 
-    def of_arms(self, labels: Iterable[str]) -> Plan:
-        """Return the part of the plan that arms with these labels need: their runs, and those upstream."""
+    def of_variants(self, labels: Iterable[str]) -> Plan:
+        """Return the part of the plan that variants with these labels need, with their prerequisites."""
         chosen = set(labels)
         entries = tuple(entry for entry in self.entries if entry.label in chosen)
         wanted = {entry.key for entry in entries}
@@ -93,7 +93,7 @@ class Plan:
         return replace(self, entries=entries, tasks=tuple(task for task in self.tasks if task.key in wanted))
 
     def run(self, label: str, seed: int) -> Run | None:
-        """Return the run of an arm with a seed, finished or not; None if its identity is not known."""
+        """Return the run of a variant with a seed, finished or not; None if its identity is not known."""
         found = self._by_entry.get((label, seed))
         return Run.of(self.outputs, found) if found else None
 

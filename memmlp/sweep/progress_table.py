@@ -1,4 +1,4 @@
-"""The live table of a sweep: arms by seeds, what is done, running and waiting, and why runs failed."""
+"""The live table of a sweep: variants by seeds, what is done, running and waiting, and why runs failed."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ WORDS = {
 }  # fmt: skip
 
 
-ARM_WIDTH = 20  # columns that an arm's name has at least, or as many as it needs
+VARIANT_WIDTH = 20  # columns that a variant's name has at least, or as many as it needs
 
 
 QUIET = 300.0  # seconds without a line, in a log, after which the progress of what runs is told
@@ -79,7 +79,7 @@ class Screen:
 
 
 class Board(Screen):
-    """Shows the state of a plan: arms by seeds."""
+    """Shows the state of a plan: variants by seeds."""
 
     before: Mapping[str, str] | None = None
 
@@ -116,7 +116,7 @@ def _change(plan: Plan, task: RunTask, state: str) -> str:
 
 
 def name(plan: Plan, task: RunTask) -> str:
-    """Return the task's readable name: arm and seed, or the kind of run and the seeds whose runs need it."""
+    """Return the task's readable name: variant and seed, or kind of run and the seeds that need it."""
     names = [f"{entry.label} seed {entry.seed}" for entry in plan.entries if entry.key == task.key]
     return names[0] if names else f"{kind_words(task.kind)} {task.id}{_seeds(plan, task)}"
 
@@ -131,12 +131,14 @@ def _seeds(plan: Plan, upstream: RunTask) -> str:
 
 
 def render(plan: Plan, states: Mapping[str, str]) -> Group:
-    """Draw arms by seeds, the runs upstream of them, the counts of states, and the reasons of failures."""
+    """Draw variants by seeds, prerequisite runs, the counts of states, and the reasons of failures."""
     tasks = {task.key: task for task in plan.tasks}
     seeds = sorted({entry.seed for entry in plan.entries})
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=f"sweep {plan.name}", title_justify="left")
     labels = list(dict.fromkeys(entry.label for entry in plan.entries))
-    table.add_column("arm", overflow="fold", min_width=min(ARM_WIDTH, max(map(len, labels), default=0)))
+    table.add_column(
+        "variant", overflow="fold", min_width=min(VARIANT_WIDTH, max(map(len, labels), default=0))
+    )
     for seed in seeds:
         table.add_column(f"seed {seed}")
     for label in labels:

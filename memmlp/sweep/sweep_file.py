@@ -1,19 +1,19 @@
-"""Sweep files: arms (each with a label and overrides of the base), seeds, and the paper's values.
+"""Sweep files: variants (each with a label and overrides of the base), seeds, and the paper's values.
 
 title: Placement of memory blocks in the backbone
 table: 14                          # the number in the paper; left out in sweeps of your own
-base: [experiment=paper]           # overrides that all arms share
+base: [experiment=paper]           # overrides that all variants share
 seeds: [0, 1, 2]
-control: 2, 4, 6, 8                # the arm that the others are compared with; the first one by default
+control: 2, 4, 6, 8                # the variant that the others are compared with; the first one by default
 metrics: [MPJRE, MPJPE, MPJVE, Jitter]
 branch: combined                   # whose errors the rows show: rotation (the default), position or combined
 branch_source: its last row is Table 6's after inverse kinematics    # how we know the paper's branch
 smallest: {MPJPE: 0.1}             # the smallest effect of interest by metric; SMALLEST has the defaults
-arms:
+variants:
   2, 4, 6, 8: {overrides: [], paper: {MPJRE: 2.57}}
   "2": {overrides: ['memory.layers=[2]'], paper: {MPJRE: 2.63}, note: as printed}
   "4": {overrides: ['memory.layers=[4]'], branch: rotation, against: "2"}     # its own branch and control
-axes: {model.frames: [11, 21], seed: [0, 1, 2]}      # a grid, instead of arms or over each of them
+axes: {model.frames: [11, 21], seed: [0, 1, 2]}      # a grid, instead of variants or over each of them
 axes: [{optim.steps: [500, 2000]}, {model.frames: [11]}]           # or a list of grids: the cells of all
 """
 
@@ -35,8 +35,8 @@ from memmlp.evaluation.metric_facts import SMALLEST, UNITS
 from memmlp.sweep.definition import (
     BRANCHES,
     COSTS,
-    Arm,
     Sweep,
+    Variant,
     key_of,
     parse_branch,
     parse_seeds,
@@ -44,10 +44,10 @@ from memmlp.sweep.definition import (
 
 KEYS = (
     "title", "table", "notes", "base", "seeds", "control", "metrics", "branch", "branch_source", "smallest",
-    "arms", "axes",
+    "variants", "axes",
 )  # fmt: skip
-ARM_KEYS = ("overrides", "branch", "against", "paper", "note")
-BASE = "base"  # the arm of a sweep that has only seeds
+VARIANT_KEYS = ("overrides", "branch", "against", "paper", "note")
+BASE = "base"  # the variant of a sweep that has only seeds
 
 
 class UniqueKeys(yaml.SafeLoader):
@@ -91,18 +91,20 @@ def parse_sweep(name: str, content: Any) -> Sweep:
     """Return the sweep that a file's content describes. Raises InputError, which names the key."""
     content = _mapping(content, "the file", KEYS)
     branch = parse_branch(content.get("branch", BRANCHES[0]), "branch")
-    arms = [_arm(label, value, branch) for label, value in _labelled(content.get("arms", {})).items()]
+    variants = [
+        _variant(label, value, branch) for label, value in _labelled(content.get("variants", {})).items()
+    ]
     grids, seeds = _axes(content)
-    if "axes" in content and not arms:
-        arms = [Arm("" if grids else BASE, branch=branch)]  # axes of seeds alone
-    arms = list(_over_cells(arms, _cells(grids))) if grids else arms
-    runnable = [arm.label for arm in arms if arm.overrides is not None]
+    if "axes" in content and not variants:
+        variants = [Variant("" if grids else BASE, branch=branch)]  # axes of seeds alone
+    variants = list(_over_cells(variants, _cells(grids))) if grids else variants
+    runnable = [variant.label for variant in variants if variant.overrides is not None]
     if not runnable:
-        raise InputError("arms: none to run; allowed is at least one arm with overrides, or axes")
+        raise InputError("variants: none to run; allowed is at least one variant with overrides, or axes")
     control = str(content.get("control", runnable[0]))
     if control not in runnable:
-        raise InputError(f"control: '{control}' is no arm; allowed are {', '.join(map(repr, runnable))}")
-    _check_controls(arms, runnable)
+        raise InputError(f"control: '{control}' is no variant; allowed are {', '.join(map(repr, runnable))}")
+    _check_controls(variants, runnable)
     source = content.get("branch_source")
     return Sweep(
         name=name,
@@ -111,7 +113,7 @@ def parse_sweep(name: str, content: Any) -> Sweep:
         notes=tuple(_texts(content.get("notes", []), "notes")),
         base=tuple(_overrides(content.get("base", []), "base")),
         seeds=seeds,
-        arms=tuple(arms),
+        variants=tuple(variants),
         control=control,
         metrics=_metrics(content.get("metrics", ["MPJRE", "MPJPE", "MPJVE", "Jitter"])),
         branch_source=None if source is None else _text(source, "branch_source"),
@@ -119,14 +121,14 @@ def parse_sweep(name: str, content: Any) -> Sweep:
     )
 
 
-def _arm(label: str, value: Any, branch: str) -> Arm:
-    """Return an arm from its mapping, or from a bare list of its overrides; `branch` is the sweep's."""
-    name = f"arms.{label}"
+def _variant(label: str, value: Any, branch: str) -> Variant:
+    """Return a variant from its mapping, or from a bare list of its overrides; `branch` is the sweep's."""
+    name = f"variants.{label}"
     if isinstance(value, list):
-        return Arm(label, tuple(_overrides(value, name)), branch)
-    value = _mapping(value or {}, name, ARM_KEYS)
+        return Variant(label, tuple(_overrides(value, name)), branch)
+    value = _mapping(value or {}, name, VARIANT_KEYS)
     overrides = value.get("overrides", [])
-    return Arm(
+    return Variant(
         label,
         None if overrides is None else tuple(_overrides(overrides, f"{name}.overrides")),
         parse_branch(value.get("branch", branch), f"{name}.branch"),
@@ -137,13 +139,13 @@ def _arm(label: str, value: Any, branch: str) -> Arm:
     )
 
 
-def _check_controls(arms: Sequence[Arm], runnable: Sequence[str]) -> None:
-    """Raise InputError for an arm that is compared with itself, or with an arm that is not run."""
-    for arm in arms:
-        others = [label for label in runnable if label != arm.label]
-        if arm.against is not None and arm.against not in others:
+def _check_controls(variants: Sequence[Variant], runnable: Sequence[str]) -> None:
+    """Raise InputError for a variant that is compared with itself, or with a variant that is not run."""
+    for variant in variants:
+        others = [label for label in runnable if label != variant.label]
+        if variant.against is not None and variant.against not in others:
             raise InputError(
-                f"arms.{arm.label}.against: '{arm.against}' is no other arm; "
+                f"variants.{variant.label}.against: '{variant.against}' is no other variant; "
                 f"allowed are {', '.join(map(repr, others))}"
             )
 
@@ -187,32 +189,34 @@ def _cells(grids: Sequence[Mapping[str, Sequence[Any]]]) -> list[tuple[str, ...]
     return list(found.values())
 
 
-def _over_cells(arms: Sequence[Arm], cells: Sequence[tuple[str, ...]]) -> Iterable[Arm]:
-    """Yield every arm in every cell.
+def _over_cells(variants: Sequence[Variant], cells: Sequence[tuple[str, ...]]) -> Iterable[Variant]:
+    """Yield every variant in every cell.
 
-    The paper's own arms stay as they are. An arm without a label gets its cell's overrides as label. An arm
-    with a control of its own is compared with that control in the same cell.
+    The paper's own variants stay as they are. A variant without a label gets its cell's overrides as label. A
+    variant with a control of its own is compared with that control in the same cell.
     """
-    for arm in arms:
-        if arm.overrides is None:
-            yield arm
+    for variant in variants:
+        if variant.overrides is None:
+            yield variant
             continue
-        _check_free(arm, cells)
+        _check_free(variant, cells)
         for words in cells:
-            label = ", ".join([arm.label, *words] if arm.label else words)
-            control = f"{arm.against}, {', '.join(words)}" if arm.against else None
-            overrides = (*arm.overrides, *words)
+            label = ", ".join([variant.label, *words] if variant.label else words)
+            control = f"{variant.against}, {', '.join(words)}" if variant.against else None
+            overrides = (*variant.overrides, *words)
             yield replace(
-                arm, label=label, overrides=overrides, against=control, series=arm.label, cell=words
+                variant, label=label, overrides=overrides, against=control, series=variant.label, cell=words
             )
 
 
-def _check_free(arm: Arm, cells: Iterable[Sequence[str]]) -> None:
-    """Raise InputError if an arm sets a key of an axis, whose values would win over the arm's."""
-    own = {key_of(word) for word in arm.overrides or ()}
+def _check_free(variant: Variant, cells: Iterable[Sequence[str]]) -> None:
+    """Raise InputError if a variant sets a key of an axis, whose values would win over the variant's."""
+    own = {key_of(word) for word in variant.overrides or ()}
     axes = {key_of(word) for words in cells for word in words}
     if both := sorted(own & axes):
-        raise InputError(f"arm '{arm.label}': sets {both[0]}, which is an axis; allowed is one of both")
+        raise InputError(
+            f"variant '{variant.label}': sets {both[0]}, which is an axis; allowed is one of both"
+        )
 
 
 def _positive(number: Any) -> bool:
@@ -245,14 +249,14 @@ def _mapping(value: Any, name: str, keys: Sequence[str] = ()) -> Mapping[str, An
 
 
 def _labelled(value: Any) -> dict[str, Any]:
-    """Return the arms by label; a label that YAML reads as a number becomes text."""
-    arms = {str(label): arm for label, arm in _mapping(value, "arms").items()}
-    if len(arms) < len(value):
-        raise InputError("arms: two have the same label")
-    for label in arms:
+    """Return the variants by label; a label that YAML reads as a number becomes text."""
+    variants = {str(label): variant for label, variant in _mapping(value, "variants").items()}
+    if len(variants) < len(value):
+        raise InputError("variants: two have the same label")
+    for label in variants:
         if not label.isprintable():
-            raise InputError(f"arms: {label!r}; allowed is a label of one line")
-    return arms
+            raise InputError(f"variants: {label!r}; allowed is a label of one line")
+    return variants
 
 
 def _overrides(value: Any, name: str) -> list[str]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import plain, read_json, write_json
-from memmlp.sweep.definition import Arm, Sweep
+from memmlp.sweep.definition import Sweep, Variant
 
 NAME = "sweep.json"
 
@@ -29,10 +29,12 @@ def kept_sweep(folder: Path) -> Sweep | None:
         return None
     try:
         content = json.loads(path.read_bytes())
-        content["arms"] = tuple(
-            Arm(**_with_tuples(fields, ("overrides", "seeds", "cell"))) for fields in content["arms"]
+        content["variants"] = tuple(
+            Variant(**_with_tuples(fields, ("overrides", "seeds", "cell"))) for fields in content["variants"]
         )
-        return Sweep(**_with_tuples(content, ("notes", "base", "seeds", "arms", "metrics", "command_line")))
+        return Sweep(
+            **_with_tuples(content, ("notes", "base", "seeds", "variants", "metrics", "command_line"))
+        )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: not a sweep ({error}); start the sweep again") from None
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from memmlp.common.errors import InputError
-from memmlp.sweep.definition import COSTS, MODES, Arm, Sweep
-from memmlp.tables.effects import RunsBySeed, control_arm, effects, paper_effect, with_existing_branches
+from memmlp.sweep.definition import COSTS, MODES, Sweep, Variant
+from memmlp.tables.effects import RunsBySeed, control_variant, effects, paper_effect, with_existing_branches
 from memmlp.tables.flags_of_runs import DescribeRun, early_looks, flags, silent
 from memmlp.tables.measured_run import Measured
 from memmlp.tables.table import Cell, Effect, Key, Row, Table
@@ -17,14 +17,16 @@ from memmlp.tables.undisturbed_times import measured_for
 if TYPE_CHECKING:
     from memmlp.tables.seed_rounds import Rounds
 
-Find = Callable[[Arm, int], Measured | None]
+Find = Callable[[Variant, int], Measured | None]
 
 
 def finished_runs(sweep: Sweep, find: Find) -> dict[str, RunsBySeed]:
-    """Return the finished runs of each runnable arm, by seed."""
+    """Return the finished runs of each runnable variant, by seed."""
     return {
-        arm.label: {seed: run for seed in sweep.seeds_of(arm) if (run := find(arm, seed)) is not None}
-        for arm in sweep.runnable()
+        variant.label: {
+            seed: run for seed in sweep.seeds_of(variant) if (run := find(variant, seed)) is not None
+        }
+        for variant in sweep.runnable()
     }
 
 
@@ -41,11 +43,11 @@ def make_table(
 
     Args:
         sweep: the sweep; if seeds were spent in rounds, `rounds.spent(sweep)`.
-        runs: the finished runs of every runnable arm, by seed (`finished_runs`).
+        runs: the finished runs of every runnable variant, by seed (`finished_runs`).
         modes: the modes of evaluation to show ("stream", "window"); a mode that no run has is left out, if
             runs have another one.
         command: the command that makes missing runs; `memmlp sweep` with the sweep's name by default.
-        state: describes in a word the state of an arm's and seed's unfinished run, or returns None.
+        state: describes in a word the state of a variant's and seed's unfinished run, or returns None.
         older: names the run with an earlier recipe that exists in place of a missing one, or returns None.
         rounds: the rounds that decided the verdicts; None for verdicts from a fixed number of seeds.
     """
@@ -68,8 +70,11 @@ def make_table(
         branch_source=sweep.branch_source,
         smallest=dict(sweep.smallest),
         comparisons=compared,
-        rows=tuple(_row(seen, arm, runs.get(arm.label), shown, found) for arm in seen.arms),
-        notes=(*sweep.notes, *(f"{arm.label}: {arm.note}" for arm in sweep.arms if arm.note)),
+        rows=tuple(_row(seen, variant, runs.get(variant.label), shown, found) for variant in seen.variants),
+        notes=(
+            *sweep.notes,
+            *(f"{variant.label}: {variant.note}" for variant in sweep.variants if variant.note),
+        ),
         flags=(*flagged, *(() if rounds else early_looks(seen, runs))),
         looks=tuple((look.seeds, look.level) for look in rounds.taken) if rounds else (),
     )
@@ -85,9 +90,9 @@ class OnSource(NamedTuple):
     """A sweep and its finished runs on the test clips of one source of motion.
 
     Attributes:
-        sweep: the sweep without the arms whose runs have no test clip from the source.
-        runs: the runs of the remaining arms, by seed, evaluated on these clips alone.
-        flags: a line that names the arms left out.
+        sweep: the sweep without the variants whose runs have no test clip from the source.
+        runs: the runs of the remaining variants, by seed, evaluated on these clips alone.
+        flags: a line that names the variants left out.
     """
 
     sweep: Sweep
@@ -98,7 +103,7 @@ class OnSource(NamedTuple):
 def on_source(sweep: Sweep, runs: Mapping[str, RunsBySeed], source: str) -> OnSource:
     """Restrict a sweep and its finished runs to one source's test clips.
 
-    If the control has no such clips, the first arm that has some becomes the control.
+    If the control has no such clips, the first variant that has some becomes the control.
 
     Raises:
         InputError: if no run has a test clip from the source.
@@ -114,15 +119,17 @@ def on_source(sweep: Sweep, runs: Mapping[str, RunsBySeed], source: str) -> OnSo
         allowed = f"allowed is {', '.join(known)}" if known else "allowed with several sources"
         raise InputError(f"--source {source}: no finished run has a test clip of it; {allowed}")
     without = {label for label, seeds in runs.items() if seeds and not own[label]}
-    arms = [arm for arm in sweep.arms if arm.label not in without]
-    arms = [replace(arm, against=None) if arm.against in without else arm for arm in arms]
+    variants = [variant for variant in sweep.variants if variant.label not in without]
+    variants = [
+        replace(variant, against=None) if variant.against in without else variant for variant in variants
+    ]
     left = {label: seeds for label, seeds in own.items() if label not in without}
     control = (
         next(label for label, seeds in left.items() if seeds) if sweep.control in without else sweep.control
     )
-    quoted = ", ".join(f"'{arm.label}'" for arm in sweep.arms if arm.label in without)
+    quoted = ", ".join(f"'{variant.label}'" for variant in sweep.variants if variant.label in without)
     flags = (f"no test clip of {source}, so left out: {quoted}",) if without else ()
-    return OnSource(replace(sweep, arms=tuple(arms), control=control), left, flags)
+    return OnSource(replace(sweep, variants=tuple(variants), control=control), left, flags)
 
 
 def titled(table: Table, source: str) -> Table:
@@ -134,7 +141,7 @@ class Together(NamedTuple):
     """Finished runs whose test clips are in coarser groups than their data's.
 
     Attributes:
-        runs: the runs of the arms, by seed.
+        runs: the runs of the variants, by seed.
         flags: a line that says which clips are together, and how many groups there are.
     """
 
@@ -148,7 +155,7 @@ def together(runs: Mapping[str, RunsBySeed], patterns: Sequence[str]) -> Togethe
     Statistics count groups, so this shows what of a table hangs on their choice.
 
     Args:
-        runs: the finished runs of a sweep's arms, by seed.
+        runs: the finished runs of a sweep's variants, by seed.
         patterns: regular expressions, as those of `data.split.groups`.
 
     Raises:
@@ -183,25 +190,27 @@ def _group_count(runs: Mapping[str, RunsBySeed]) -> int:
 
 def without_runs(sweep: Sweep, modes: Sequence[str], reason: str) -> Table:
     """Make the table of a sweep whose runs can't be identified: the paper's values, and the reason."""
-    return replace(make_table(sweep, {arm.label: {} for arm in sweep.runnable()}, modes), flags=(reason,))
+    return replace(
+        make_table(sweep, {variant.label: {} for variant in sweep.runnable()}, modes), flags=(reason,)
+    )
 
 
 def _row(
-    sweep: Sweep, arm: Arm, runs: RunsBySeed | None, modes: Sequence[str], found: Mapping[Key, Effect]
+    sweep: Sweep, variant: Variant, runs: RunsBySeed | None, modes: Sequence[str], found: Mapping[Key, Effect]
 ) -> Row:
-    """Return an arm's row; `runs` is None for a row with only the paper's values."""
+    """Return a variant's row; `runs` is None for a row with only the paper's values."""
 
     def cell(mode: str, metric: str) -> Cell:
         counted = measured_for(metric, runs or {})
-        numbers = {seed: run.value(mode, arm.branch, metric) for seed, run in counted.items()}
+        numbers = {seed: run.value(mode, variant.branch, metric) for seed, run in counted.items()}
         values = {seed: value for seed, value in numbers.items() if value is not None}
-        effect = found.get(Key(arm.label, mode, metric))
-        return Cell(values, (arm.paper or {}).get(metric), effect, paper_effect(sweep, arm, metric))
+        effect = found.get(Key(variant.label, mode, metric))
+        return Cell(values, (variant.paper or {}).get(metric), effect, paper_effect(sweep, variant, metric))
 
     cells = {mode: {metric: cell(mode, metric) for metric in sweep.metrics} for mode in modes}
-    wanted = sweep.seeds_of(arm) if runs is not None else ()
-    against = control_arm(sweep, arm)
+    wanted = sweep.seeds_of(variant) if runs is not None else ()
+    against = control_variant(sweep, variant)
     other = against.label if against else None
-    in_cell = against is not None and arm.cell and against.cell == arm.cell
-    pairing = f"'{arm.series}' from '{against.series}' in the same cell" if against and in_cell else ""
-    return Row(arm.label, arm.branch, other, arm.note, tuple(runs or ()), wanted, cells, pairing)
+    in_cell = against is not None and variant.cell and against.cell == variant.cell
+    pairing = f"'{variant.series}' from '{against.series}' in the same cell" if against and in_cell else ""
+    return Row(variant.label, variant.branch, other, variant.note, tuple(runs or ()), wanted, cells, pairing)

@@ -1,4 +1,4 @@
-"""Differences of a table's arms from their controls, with intervals and verdicts."""
+"""Differences of a table's variants from their controls, with intervals and verdicts."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from memmlp.sweep.definition import COSTS, TIMES, Arm, Sweep
+from memmlp.sweep.definition import COSTS, TIMES, Sweep, Variant
 from memmlp.tables.measured_run import SHARED, Measured
 from memmlp.tables.statistics import detectable, equivalence_p, holm, paired_effects, verdict
 from memmlp.tables.table import STEADY, Effect, Key
 from memmlp.tables.undisturbed_times import measured_for
 
-RunsBySeed = Mapping[int, Measured]  # an arm's finished runs by seed
+RunsBySeed = Mapping[int, Measured]  # a variant's finished runs by seed
 
 
 class SharedClips(NamedTuple):
-    """The seeds and clips that an arm's runs share with those of its control.
+    """The seeds and clips that a variant's runs share with those of its control.
 
     Attributes:
-        seeds: the seeds that both arms have (S).
+        seeds: the seeds that both variants have (S).
         clips: the names of the clips that all runs have (C).
         group_names: the names of the clips' groups (C).
         groups: the groups' numbers (C,).
@@ -38,10 +38,10 @@ class SharedClips(NamedTuple):
 
 
 class Paired(NamedTuple):
-    """An arm's differences from its control.
+    """A variant's differences from its control.
 
     Attributes:
-        matrix: the arm's errors minus the control's (S, C), by seed and clip.
+        matrix: the variant's errors minus the control's (S, C), by seed and clip.
         groups: the number of each clip's group (C,).
         clips: the names of these clips (C).
         group_names: the names of their groups (C).
@@ -63,16 +63,16 @@ class Paired(NamedTuple):
         return len(self.matrix) > 1 and len(set(self.groups)) > 1 and not self.diverged
 
 
-def control_arm(sweep: Sweep, arm: Arm) -> Arm | None:
-    """Return an arm's control arm; None for the sweep's control and for rows with only the paper's values."""
-    label = sweep.control_of(arm) if arm.overrides is not None else None
-    return next((other for other in sweep.arms if other.label == label), None)
+def control_variant(sweep: Sweep, variant: Variant) -> Variant | None:
+    """Return a variant's control; None for the sweep's control and for rows with only the paper's values."""
+    label = sweep.control_of(variant) if variant.overrides is not None else None
+    return next((other for other in sweep.variants if other.label == label), None)
 
 
-def paper_effect(sweep: Sweep, arm: Arm, metric: str) -> float | None:
+def paper_effect(sweep: Sweep, variant: Variant, metric: str) -> float | None:
     """Return the paper's difference from the control, from printed values; None if one is not printed."""
-    other = control_arm(sweep, arm)
-    ours = (arm.paper or {}).get(metric)
+    other = control_variant(sweep, variant)
+    ours = (variant.paper or {}).get(metric)
     theirs = (other.paper or {}).get(metric) if other else None
     return None if ours is None or theirs is None else round(ours - theirs, 6)
 
@@ -80,21 +80,23 @@ def paper_effect(sweep: Sweep, arm: Arm, metric: str) -> float | None:
 def paired(
     sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str], labels: Container[str] | None = None
 ) -> dict[Key, Paired]:
-    """Return the differences in all known error metrics for all arms, or for those with the given labels."""
+    """Return the differences in all error metrics for all variants, or for those with the given labels."""
     found = {}
-    for arm, other in _compared(sweep):
-        if labels is not None and arm.label not in labels:
+    for variant, other in _compared(sweep):
+        if labels is not None and variant.label not in labels:
             continue
-        ours, theirs = runs[arm.label], runs[other.label]
-        if one_and_the_same(arm, other, ours, theirs):
+        ours, theirs = runs[variant.label], runs[other.label]
+        if one_and_the_same(variant, other, ours, theirs):
             continue
         shared = _shared(ours, theirs)
         every = [runs[seed] for runs in (ours, theirs) for seed in shared.seeds]
         seen = [mode for mode in modes if all(_has_mode(run, mode) for run in every)]
         for mode, metric in itertools.product(seen, sweep.metrics):
             if metric not in COSTS:
-                branches = (arm.branch, other.branch)
-                found[Key(arm.label, mode, metric)] = _paired(ours, theirs, shared, branches, mode, metric)
+                branches = (variant.branch, other.branch)
+                found[Key(variant.label, mode, metric)] = _paired(
+                    ours, theirs, shared, branches, mode, metric
+                )
     return {key: pair for key, pair in found.items() if pair.matrix.size}
 
 
@@ -104,38 +106,40 @@ def _has_mode(run: Measured, mode: str) -> bool:
 
 
 def effects(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -> dict[Key, Effect]:
-    """Return the effects of all arms, with p-values corrected over all of them.
+    """Return the effects of all variants, with p-values corrected over all of them.
 
     For costs there are only the differences, without p-values.
     """
     printed = {
-        Key(arm.label, mode, metric): paper_effect(sweep, arm, metric)
-        for arm, mode, metric in itertools.product(sweep.runnable(), modes, sweep.metrics)
+        Key(variant.label, mode, metric): paper_effect(sweep, variant, metric)
+        for variant, mode, metric in itertools.product(sweep.runnable(), modes, sweep.metrics)
     }
     return _costs(sweep, runs, modes) | _judged(
         tested(paired(sweep, runs, modes), sweep.smallest, sensitivity=True), sweep.smallest, printed
     )
 
 
-def one_and_the_same(arm: Arm, other: Arm, ours: RunsBySeed, theirs: RunsBySeed) -> bool:
-    """Return whether two arms show the same errors of the same run, so that there is nothing to compare.
+def one_and_the_same(variant: Variant, other: Variant, ours: RunsBySeed, theirs: RunsBySeed) -> bool:
+    """Return whether two variants show the same errors of the same run, so that there is nothing to compare.
 
     One run may have several kinds of errors, such as those after two kinds of inverse kinematics.
     """
 
     def same(one: Measured, two: Measured) -> bool:
-        return one.id == two.id and str(one.shown(arm.branch)) == str(two.shown(other.branch))  # NaN is NaN
+        return one.id == two.id and str(one.shown(variant.branch)) == str(
+            two.shown(other.branch)
+        )  # NaN is NaN
 
     shared = any(same(ours[seed], theirs[seed]) for seed in ours.keys() & theirs.keys())
-    return shared and arm.branch == other.branch
+    return shared and variant.branch == other.branch
 
 
-def _compared(sweep: Sweep) -> Iterator[tuple[Arm, Arm]]:
-    """Yield each arm that has a control, with its control."""
-    for arm in sweep.runnable():
-        other = control_arm(sweep, arm)
+def _compared(sweep: Sweep) -> Iterator[tuple[Variant, Variant]]:
+    """Yield each variant that has a control, with its control."""
+    for variant in sweep.runnable():
+        other = control_variant(sweep, variant)
         if other is not None:
-            yield arm, other
+            yield variant, other
 
 
 def _paired(
@@ -181,7 +185,7 @@ def _diverged(values: np.ndarray, positions: np.ndarray) -> bool:
 
 
 def _shared(ours: RunsBySeed, theirs: RunsBySeed) -> SharedClips:
-    """Return the seeds and clips that an arm and its control share."""
+    """Return the seeds and clips that a variant and its control share."""
     seeds = [seed for seed in ours if seed in theirs]
     known = [runs[seed].clips for runs in (ours, theirs) for seed in seeds]
     clips = [name for name in known[0] if all(name in other for other in known)] if known else []
@@ -260,12 +264,12 @@ def _costs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -
     Of times it is said whether they differ beyond what they do by themselves.
     """
     found = {}
-    for arm, other in _compared(sweep):
+    for variant, other in _compared(sweep):
         for mode, metric in itertools.product(modes, set(sweep.metrics) & set(COSTS)):
-            sides = [_mean_cost(runs[one.label], metric) for one in (arm, other)]
+            sides = [_mean_cost(runs[one.label], metric) for one in (variant, other)]
             if not any(math.isnan(side) for side in sides):
                 noise = metric in TIMES and max(sides) < STEADY * min(sides)
-                found[Key(arm.label, mode, metric)] = Effect(sides[0] - sides[1], within_noise=noise)
+                found[Key(variant.label, mode, metric)] = Effect(sides[0] - sides[1], within_noise=noise)
     return found
 
 
@@ -285,15 +289,17 @@ def or_nan(number: float | None) -> float:
 
 
 def with_existing_branches(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Sweep:
-    """Return the sweep with the rotation branch for arms whose networks have no other.
+    """Return the sweep with the rotation branch for variants whose networks have no other.
 
     A network without a position branch may still have been evaluated after inverse kinematics.
     """
 
-    def single(arm: Arm) -> bool:
-        found = runs.get(arm.label, {}).values()
-        solved = arm.branch == "combined" and all(run.has("combined") for run in found)
+    def single(variant: Variant) -> bool:
+        found = runs.get(variant.label, {}).values()
+        solved = variant.branch == "combined" and all(run.has("combined") for run in found)
         return bool(found) and not solved and all(run.one_branch for run in found)
 
-    arms = tuple(replace(arm, branch="rotation") if single(arm) else arm for arm in sweep.arms)
-    return replace(sweep, arms=arms)
+    variants = tuple(
+        replace(variant, branch="rotation") if single(variant) else variant for variant in sweep.variants
+    )
+    return replace(sweep, variants=variants)

@@ -8,20 +8,21 @@ from typing import NamedTuple
 import numpy as np
 
 from memmlp.evaluation.metric_facts import HIGHER
-from memmlp.sweep.definition import COSTS, Arm, Sweep
-from memmlp.tables.effects import RunsBySeed, control_arm, with_existing_branches
+from memmlp.sweep.definition import COSTS, Sweep, Variant
+from memmlp.tables.effects import RunsBySeed, control_variant, with_existing_branches
 from memmlp.tables.statistics import interquartile_mean, probability_of_improvement
 
 
 class Distribution(NamedTuple):
-    """An arm's errors in one metric.
+    """A variant's errors in one metric.
 
     Attributes:
-        label: the arm's label.
+        label: the variant's label.
         errors: the errors (S, C) by seed and clip, infinite where the network diverged; empty if there are
             none.
         middle: the errors' interquartile mean; None if there are none.
-        improvement: the probability that a run of the arm has a better value than one of its control on the
+        improvement: the probability that a run of the variant has a better value than one of its control on
+            the
             same clip: a smaller error, or a larger value of a metric for which higher is better; None without
             a control or a shared clip.
     """
@@ -33,10 +34,10 @@ class Distribution(NamedTuple):
 
 
 def distributions(sweep: Sweep, runs: Mapping[str, RunsBySeed], mode: str) -> dict[str, list[Distribution]]:
-    """Return the distributions of every arm, by metric, over the clips that all runs have.
+    """Return the distributions of every variant, by metric, over the clips that all runs have.
 
     A clip for which a run has no number, while another run has one, is one on which its network diverged: its
-    error counts as infinite, for otherwise an arm that diverges on hard clips would look better for it.
+    error counts as infinite, for otherwise a variant that diverges on hard clips would look better for it.
     Metrics that no run has are left out.
     """
     seen = with_existing_branches(sweep, runs)
@@ -44,31 +45,41 @@ def distributions(sweep: Sweep, runs: Mapping[str, RunsBySeed], mode: str) -> di
     clips = [clip for clip in every[0].clips if all(clip in run.clips for run in every)] if every else []
     metrics = [metric for metric in sweep.metrics if metric not in COSTS]
     found = {metric: _of_metric(seen, runs, clips, mode, metric) for metric in metrics}
-    return {metric: arms for metric, arms in found.items() if any(arm.errors.size for arm in arms)}
+    return {
+        metric: variants
+        for metric, variants in found.items()
+        if any(variant.errors.size for variant in variants)
+    }
 
 
 def _of_metric(
     sweep: Sweep, runs: Mapping[str, RunsBySeed], clips: list[str], mode: str, metric: str
 ) -> list[Distribution]:
-    arms = [arm for arm in sweep.runnable() if runs[arm.label]]
+    variants = [variant for variant in sweep.runnable() if runs[variant.label]]
     sign = -1 if metric in HIGHER else 1
-    errors = {arm.label: _errors(runs[arm.label], clips, mode, arm, metric) for arm in arms}
+    errors = {
+        variant.label: _errors(runs[variant.label], clips, mode, variant, metric) for variant in variants
+    }
     long_enough = np.isfinite(np.concatenate([*errors.values(), np.empty((0, len(clips)))])).any(0)
     for label, found in errors.items():
         known = found[:, long_enough]
         errors[label] = np.where(np.isfinite(known), known, sign * np.inf)
-    return [_distribution(arm.label, errors, control_arm(sweep, arm), sign) for arm in arms]
+    return [
+        _distribution(variant.label, errors, control_variant(sweep, variant), sign) for variant in variants
+    ]
 
 
-def _errors(runs: RunsBySeed, clips: list[str], mode: str, arm: Arm, metric: str) -> np.ndarray:
+def _errors(runs: RunsBySeed, clips: list[str], mode: str, variant: Variant, metric: str) -> np.ndarray:
     """Return the errors (S, C) of the runs that have the metric, with NaN for clips without a number."""
-    having = [run for run in runs.values() if run.value(mode, arm.branch, metric) is not None]
-    found = [run.by_clip(clips, mode, arm.branch, metric) for run in having]
+    having = [run for run in runs.values() if run.value(mode, variant.branch, metric) is not None]
+    found = [run.by_clip(clips, mode, variant.branch, metric) for run in having]
     return np.array(found).reshape(len(found), len(clips))
 
 
-def _distribution(label: str, errors: Mapping[str, np.ndarray], other: Arm | None, sign: int) -> Distribution:
-    """Return an arm's distribution from the errors (S, C) of all arms; `sign` is -1 if larger is better."""
+def _distribution(
+    label: str, errors: Mapping[str, np.ndarray], other: Variant | None, sign: int
+) -> Distribution:
+    """Return a variant's distribution from all errors (S, C); `sign` is -1 if larger is better."""
     ours, theirs = errors[label], errors.get(other.label) if other else None
     middle = interquartile_mean(ours) if ours.size else None
     if theirs is None or not ours.size or not theirs.size:

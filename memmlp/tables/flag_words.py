@@ -1,4 +1,4 @@
-"""Wording helpers for flags: which property differs, and between which arms."""
+"""Wording helpers for flags: which property differs, and between which variants."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Iterable, Sequence
 
 
 def flags_of_difference(what: str, found: Iterable[tuple[str, str]]) -> Iterable[str]:
-    """Flag a property in which arms differ, and name the arms that have each value.
+    """Flag a property in which variants differ, and name the variants that have each value.
 
-    `found` has pairs of a value and an arm's label.
+    `found` has pairs of a value and a variant's label.
     """
     groups: dict[str, list[str]] = defaultdict(list)
     for value, label in found:

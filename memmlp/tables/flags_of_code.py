@@ -15,7 +15,7 @@ FILES = 5  # names of files that a flag has at most
 
 
 def recipes(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Flag components that several arms use, but with different recipe versions."""
+    """Flag components that several variants use, but with different recipe versions."""
     versions = [(run.origin.every_recipe, label) for label, run in every]
     for name in sorted({name for known, _ in versions for name in known}):
         having = [(str(known[name]), label) for known, label in versions if name in known]
@@ -23,7 +23,7 @@ def recipes(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
 
 
 def other_files(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Flag files of memmlp whose code differs between arms, be it of one commit.
+    """Flag files of memmlp whose code differs between variants, be it of one commit.
 
     Users' packages are left to `own_code`. Kept results have no digests of files, and are left out.
     """
@@ -46,8 +46,8 @@ def older_code(runs: Iterable[tuple[str, Mapping[str, str], Iterable[str]]]) -> 
     """Flag runs that were made before code changed, though no recipe version was raised.
 
     Args:
-        runs: for each run its arm's label, the digests of its code (`code_digests`; empty where these are not
-            known), and the users' packages that it uses.
+        runs: for each run its variant's label, the digests of its code (`code_digests`; empty where these are
+            not known), and the users' packages that it uses.
     """
     today = functools.cache(code_digests)
     found = [(label, changed(code, today(tuple(packages)))) for label, code, packages in runs if code]
@@ -69,7 +69,7 @@ def upstream_weights(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
 
 
 def own_code(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Flag users' packages of which arms use different versions or code."""
+    """Flag users' packages of which variants use different versions or code."""
     for name in sorted({name for _, run in every for name in run.origin.plugins}):
         having = [(run.origin.plugins[name], label) for label, run in every if name in run.origin.plugins]
         yield from flags_of_difference(f"code of {name}", having)

@@ -11,17 +11,17 @@ import numpy as np
 
 from memmlp.common.thread_core_share import LEAST_CORE_SHARE
 from memmlp.runs.motion_seen import hardly_trained
-from memmlp.sweep.definition import COSTS, TIMES, Arm, Sweep
+from memmlp.sweep.definition import COSTS, TIMES, Sweep, Variant
 from memmlp.tables import flags_of_code
-from memmlp.tables.effects import RunsBySeed, control_arm, one_and_the_same
+from memmlp.tables.effects import RunsBySeed, control_variant, one_and_the_same
 from memmlp.tables.flag_words import flags_of_difference, had_core, listed, quoted, unique
 from memmlp.tables.measured_run import SHARED, UNKNOWN, Measured
 from memmlp.tables.table import STEADY
 from memmlp.tables.undisturbed_times import core_share, undisturbed
 
-DescribeRun = Callable[[Arm, int], str | None]
+DescribeRun = Callable[[Variant, int], str | None]
 BUILT_IN = "builtin"
-ALIKE = 1.1  # how many times the frames of its control an arm may see in training before a flag says so
+ALIKE = 1.1  # how many times the frames of its control a variant may see in training before a flag says so
 UNTIED = 0.75  # share of test clips that are groups of their own from which on a flag asks for groups
 SMPLH = (1, 2, 3)  # the paper's tables on AMASS, on the rest joints of SMPL-H bodies
 ORIGIN = {
@@ -30,7 +30,7 @@ ORIGIN = {
 }  # fmt: skip
 
 
-def silent(arm: Arm, seed: int) -> None:
+def silent(variant: Variant, seed: int) -> None:
     """Return None, as there is nothing to say about a run: the default for a `DescribeRun`."""
 
 
@@ -46,13 +46,13 @@ def flags(
 
     Args:
         sweep: the sweep as it is shown.
-        asked: the sweep before arms without the wanted branch fell back to another branch.
-        runs: the finished runs of every runnable arm, by seed.
+        asked: the sweep before variants without the wanted branch fell back to another branch.
+        runs: the finished runs of every runnable variant, by seed.
         command: the command that makes missing runs.
-        state: describes in a word the state of an arm's and seed's unfinished run.
+        state: describes in a word the state of a variant's and seed's unfinished run.
         older: names the run with an earlier recipe that exists in place of a missing one.
     """
-    every = [(arm.label, run) for arm in sweep.runnable() for run in runs[arm.label].values()]
+    every = [(variant.label, run) for variant in sweep.runnable() for run in runs[variant.label].values()]
     yield from _other_data(sweep)
     yield from _missing(sweep, runs, command, state)
     yield from _older(sweep, runs, older)
@@ -99,7 +99,7 @@ def flags(
 
 
 def _less_precise(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Flag arms whose size and times come from another file than the network that was evaluated."""
+    """Flag variants whose size and times come from another file than the network that was evaluated."""
     found = [label for label, run in every if run.origin.deployed != "fp32"]
     if found:
         yield f"size and times are of a file of less precision, errors of float32: {quoted(found)}"
@@ -118,37 +118,41 @@ def _other_data(sweep: Sweep) -> Iterable[str]:
 def _missing(sweep: Sweep, runs: Mapping[str, RunsBySeed], command: str, state: DescribeRun) -> Iterable[str]:
     """Flag the missing runs, with their states, and the command that makes them."""
     lacking: dict[str, str] = {}
-    for arm in sweep.runnable():
-        seeds = gaps(sweep, arm, runs)
+    for variant in sweep.runnable():
+        seeds = gaps(sweep, variant, runs)
         if seeds:
-            states = unique(word for seed in seeds if (word := state(arm, seed)))
+            states = unique(word for seed in seeds if (word := state(variant, seed)))
             words = f" ({', '.join(states)})" if states else ""
-            lacking[arm.label] = f"seed {', '.join(map(str, seeds))}{words}"
+            lacking[variant.label] = f"seed {', '.join(map(str, seeds))}{words}"
     alike = 1 < len(sweep.runnable()) == len(lacking) and len(set(lacking.values())) == 1
     told = [f"'{label}' {gap}" for label, gap in lacking.items()]
     if lacking:
-        every = f"every arm's {next(iter(lacking.values()))}"
+        every = f"every variant's {next(iter(lacking.values()))}"
         yield f"missing: {every if alike else listed(told)}; fill with: {command}"
 
 
 def _older(sweep: Sweep, runs: Mapping[str, RunsBySeed], older: DescribeRun) -> Iterable[str]:
     """Flag missing runs for which a run with an earlier recipe exists."""
     found = [
-        f"'{arm.label}' seed {seed} ({run})"
-        for arm in sweep.runnable()
-        for seed in gaps(sweep, arm, runs)
-        if (run := older(arm, seed))
+        f"'{variant.label}' seed {seed} ({run})"
+        for variant in sweep.runnable()
+        for seed in gaps(sweep, variant, runs)
+        if (run := older(variant, seed))
     ]
     if found:
         yield f"made by an earlier recipe, left out and made again by the sweep: {listed(found)}"
 
 
 def early_looks(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
-    """Flag arms whose planned seeds are only partly finished.
+    """Flag variants whose planned seeds are only partly finished.
 
     Testing them now and again later inflates the false-positive rate.
     """
-    early = [arm.label for arm in sweep.runnable() if len(runs[arm.label]) > 1 and gaps(sweep, arm, runs)]
+    early = [
+        variant.label
+        for variant in sweep.runnable()
+        if len(runs[variant.label]) > 1 and gaps(sweep, variant, runs)
+    ]
     if early:
         yield (
             "not all seeds are there: a table that is looked at again as they come has a star by chance more "
@@ -156,17 +160,20 @@ def early_looks(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
         )
 
 
-def gaps(sweep: Sweep, arm: Arm, runs: Mapping[str, RunsBySeed]) -> list[int]:
-    """Return the seeds of an arm for which there is no run."""
-    return [seed for seed in sweep.seeds_of(arm) if seed not in runs[arm.label]]
+def gaps(sweep: Sweep, variant: Variant, runs: Mapping[str, RunsBySeed]) -> list[int]:
+    """Return the seeds of a variant for which there is no run."""
+    return [seed for seed in sweep.seeds_of(variant) if seed not in runs[variant.label]]
 
 
 def _branches(sweep: Sweep, asked: Sweep, runs: Mapping[str, RunsBySeed], command: str) -> Iterable[str]:
     """Flag rows that show another branch than the table, and rows that were not evaluated in their branch."""
-    wanted = {arm.label: arm.branch for arm in asked.arms}
-    fallen = [arm for arm in sweep.runnable() if arm.branch != wanted[arm.label]]
+    wanted = {variant.label: variant.branch for variant in asked.variants}
+    fallen = [variant for variant in sweep.runnable() if variant.branch != wanted[variant.label]]
     if fallen:
-        labels, branches = quoted(arm.label for arm in fallen), listed(unique(a.branch for a in fallen))
+        labels, branches = (
+            quoted(variant.label for variant in fallen),
+            listed(unique(a.branch for a in fallen)),
+        )
         yield f"the network has no other branch, so the row shows {branches}: {labels}"
     lacking = [a for a in sweep.runnable() if any(not run.has(a.branch) for run in runs[a.label].values())]
     if lacking:
@@ -182,17 +189,17 @@ def _offline(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
 
 
 def _unequal_clips(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
-    """Flag arms whose test clips differ from those of their controls."""
-    for arm in sweep.runnable():
-        other = control_arm(sweep, arm)
+    """Flag variants whose test clips differ from those of their controls."""
+    for variant in sweep.runnable():
+        other = control_variant(sweep, variant)
         if other is None:
             continue
-        sides = [run.clips.keys() for one in (arm, other) for run in runs[one.label].values()]
+        sides = [run.clips.keys() for one in (variant, other) for run in runs[one.label].values()]
         every: set[str] = set().union(*sides)
         shared = every.intersection(*sides)
-        if len(shared) < len(every) and runs[arm.label] and runs[other.label]:
+        if len(shared) < len(every) and runs[variant.label] and runs[other.label]:
             yield (
-                f"unequal test clips: '{arm.label}' and '{other.label}' share {len(shared)} of "
+                f"unequal test clips: '{variant.label}' and '{other.label}' share {len(shared)} of "
                 f"{len(every)}; only those are compared, the means are over all"
             )
 
@@ -209,15 +216,15 @@ def _unequal_groups(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
 
 
 def _fewer_seeds(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
-    """Flag runs that were not measured by a metric in which other seeds of their arm were."""
+    """Flag runs that were not measured by a metric in which other seeds of their variant were."""
     lacking: dict[tuple[str, int], list[str]] = defaultdict(list)
-    for arm in sweep.runnable():
-        found = runs[arm.label]
+    for variant in sweep.runnable():
+        found = runs[variant.label]
         modes = sorted({mode for run in found.values() for mode in run.means}) or [""]
         for metric, mode in itertools.product(sweep.metrics, modes):
-            without = [seed for seed, run in found.items() if run.value(mode, arm.branch, metric) is None]
+            without = [seed for seed, run in found.items() if run.value(mode, variant.branch, metric) is None]
             for seed in without if len(without) < len(found) else ():
-                lacking[arm.label, seed].append(metric)
+                lacking[variant.label, seed].append(metric)
     if lacking:
         words = [f"'{label}' seed {seed} ({listed(unique(m))})" for (label, seed), m in lacking.items()]
         yield f"not measured, so that the mean is of the other seeds: {listed(words)}"
@@ -229,26 +236,28 @@ def _no_numbers(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
     A clip for which no run has a number is too short for the metric, unless it has no position error either.
     """
     lost: dict[tuple[str, int], set[str]] = defaultdict(set)
-    every = [(arm, seed, run) for arm in sweep.runnable() for seed, run in runs[arm.label].items()]
+    every = [
+        (variant, seed, run) for variant in sweep.runnable() for seed, run in runs[variant.label].items()
+    ]
     modes = {mode for _, _, run in every for mode in run.means}
     for mode, metric in itertools.product(modes, set(sweep.metrics) - set(COSTS)):
         lacking = {
-            (arm.label, seed): _lacking(run, mode, arm.branch, metric)
-            for arm, seed, run in every
-            if run.value(mode, arm.branch, metric) is not None
+            (variant.label, seed): _lacking(run, mode, variant.branch, metric)
+            for variant, seed, run in every
+            if run.value(mode, variant.branch, metric) is not None
         }
         short = set.intersection(*lacking.values()) if lacking else set()
         short -= {
             clip
-            for arm, _, run in every
-            if run.value(mode, arm.branch, SHARED) is not None
-            for clip in _lacking(run, mode, arm.branch, SHARED)
+            for variant, _, run in every
+            if run.value(mode, variant.branch, SHARED) is not None
+            for clip in _lacking(run, mode, variant.branch, SHARED)
         }
         for cell, clips in lacking.items():
             lost[cell] |= clips - short
     found = [f"'{label}' seed {seed} ({len(clips)} clips)" for (label, seed), clips in lost.items() if clips]
     if found:
-        left = "of clips that are left out of differences, whose verdicts so stay open"
+        left = "of clips that are left out of differences, whose verdicts so stay inconclusive"
         yield f"errors that are no numbers, {left}: {listed(found)}"
 
 
@@ -262,50 +271,50 @@ def _lacking(run: Measured, mode: str, branch: str, metric: str) -> set[str]:
 
 
 def _calmer_than_truth(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
-    """Flag arms whose motion has less jitter than the true one, as when a network hardly follows at all.
+    """Flag variants whose motion has less jitter than the true one, as when a network hardly follows at all.
 
-    Arms that were tested on other clips have another truth, and a line of their own.
+    Variants that were tested on other clips have another truth, and a line of their own.
     """
     calmer: dict[tuple[str, str], list[str]] = defaultdict(list)
-    for arm in sweep.runnable():
-        found = list(runs[arm.label].values())
+    for variant in sweep.runnable():
+        found = list(runs[variant.label].values())
         for mode in sorted({mode for run in found for mode in run.means}):
             made, true = (
-                [value for run in found if (value := run.value(mode, arm.branch, metric)) is not None]
+                [value for run in found if (value := run.value(mode, variant.branch, metric)) is not None]
                 for metric in ("Jitter", "GT Jitter")
             )
             made, true = (list(filter(math.isfinite, values)) for values in (made, true))
             if made and true and np.mean(made) < np.mean(true):
-                calmer[mode, f"{np.mean(true):.2f}"].append(f"'{arm.label}' {np.mean(made):.2f}")
-    for (mode, truth), arms in calmer.items():
-        less = f"Jitter below the truth's {truth} ({mode}): {listed(arms)}"
+                calmer[mode, f"{np.mean(true):.2f}"].append(f"'{variant.label}' {np.mean(made):.2f}")
+    for (mode, truth), variants in calmer.items():
+        less = f"Jitter below the truth's {truth} ({mode}): {listed(variants)}"
         yield f"{less}; calmer than the motion itself is no better"
 
 
 def _hardly_trained(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Flag arms whose networks saw so little motion that their errors are those of the first weights."""
+    """Flag variants whose networks saw so little motion that their errors are those of the first weights."""
     found = [(label, hardly_trained(run.training.get("frames", 0.0))) for label, run in every]
     for said in unique(said for _, said in found):
         labels = unique(label for label, one in found if one == said)
         if said:
-            which = "every arm" if len(labels) == len({label for label, _ in every}) else quoted(labels)
+            which = "every variant" if len(labels) == len({label for label, _ in every}) else quoted(labels)
             yield f"{said}: {which}"
 
 
 def _seen(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
-    """Flag arms that saw more or fewer frames in training than their controls, for whatever reason."""
+    """Flag variants that saw more or fewer frames in training than their controls, for whatever reason."""
     frames = {
         label: sorted(number for run in found.values() if (number := run.training.get("frames")))
         for label, found in runs.items()
     }
     unequal = []
-    for arm in sweep.runnable():
-        other = control_arm(sweep, arm)
-        if other and frames[arm.label] and frames[other.label]:
-            every = frames[arm.label] + frames[other.label]
+    for variant in sweep.runnable():
+        other = control_variant(sweep, variant)
+        if other and frames[variant.label] and frames[other.label]:
+            every = frames[variant.label] + frames[other.label]
             if max(every) > ALIKE * min(every):
-                own, controls = (_in_millions(frames[one.label]) for one in (arm, other))
-                unequal.append(f"'{arm.label}' {own} M to '{other.label}' {controls} M")
+                own, controls = (_in_millions(frames[one.label]) for one in (variant, other))
+                unequal.append(f"'{variant.label}' {own} M to '{other.label}' {controls} M")
     if unequal:
         yield f"number of frames seen in training differs: {listed(unequal)}"
 
@@ -322,18 +331,18 @@ def _timed(every: Sequence[tuple[str, Measured]]) -> list[tuple[str, str]]:
 
 
 def _busy(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
-    """Flag arms whose times were measured while other work ran on the machine."""
+    """Flag variants whose times were measured while other work ran on the machine."""
     found, fewer = [], []
-    for arm in sweep.runnable():
-        counted = undisturbed(runs[arm.label])
+    for variant in sweep.runnable():
+        counted = undisturbed(runs[variant.label])
         shares = [share for run in counted.values() if (share := core_share(run)) is not None]
         ratios = [run.costs["ratio"] for run in counted.values() if "ratio" in run.costs]
         if shares and min(shares) < LEAST_CORE_SHARE:
-            found.append(had_core(arm.label, min(shares)))
+            found.append(had_core(variant.label, min(shares)))
         elif ratios and max(ratios) > STEADY * min(ratios):
-            found.append(f"'{arm.label}' (ratio {min(ratios):.3g} to {max(ratios):.3g} over seeds)")
-        if len(counted) < len(runs[arm.label]):
-            fewer.append(f"'{arm.label}' ({len(counted)} of {len(runs[arm.label])})")
+            found.append(f"'{variant.label}' (ratio {min(ratios):.3g} to {max(ratios):.3g} over seeds)")
+        if len(counted) < len(runs[variant.label]):
+            fewer.append(f"'{variant.label}' ({len(counted)} of {len(runs[variant.label])})")
     if found:
         yield f"timed on a busy machine, so that other work is in the times: {listed(found)}"
     if fewer:
@@ -361,9 +370,9 @@ def _replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
     groups = [len({run.group(clip) for clip in run.clips}) for run in every]
     one_seed, one_group = max(map(len, measured.values())) == 1, max(groups) == 1
     if one_seed and one_group:
-        yield "one seed an arm and one group of test clips: no interval, and nothing is starred"
+        yield "one seed a variant and one group of test clips: no interval, and nothing is starred"
     elif one_seed:
-        yield "one seed an arm: the intervals speak of other clips, not of other seeds; nothing is starred"
+        yield "one seed a variant: the intervals speak of other clips, not of other seeds; nothing is starred"
     else:
         yield from _single(sweep, runs, one_group)
     if max(groups) > 1 and all(_alone(run) >= UNTIED * len(run.clips) for run in every):
@@ -384,27 +393,31 @@ def _alone(run: Measured) -> int:
 
 
 def _same(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
-    """Flag arms that are the same run, because nothing distinguishes them under these overrides."""
-    for arm in sweep.runnable():
-        other = control_arm(sweep, arm)
-        if other and one_and_the_same(arm, other, runs[arm.label], runs[other.label]):
-            said = _apart(runs[arm.label], runs[other.label])
-            yield f"'{arm.label}' and '{other.label}' are one run: {said}"
+    """Flag variants that are the same run, because nothing distinguishes them under these overrides."""
+    for variant in sweep.runnable():
+        other = control_variant(sweep, variant)
+        if other and one_and_the_same(variant, other, runs[variant.label], runs[other.label]):
+            said = _apart(runs[variant.label], runs[other.label])
+            yield f"'{variant.label}' and '{other.label}' are one run: {said}"
 
 
 def _apart(ours: RunsBySeed, theirs: RunsBySeed) -> str:
-    """Say in what two arms differ whose runs and errors are the same: in costs, or in nothing."""
+    """Say in what two variants differ whose runs and errors are the same: in costs, or in nothing."""
     if any(ours[seed].costs != theirs[seed].costs for seed in ours.keys() & theirs.keys()):
         return "they differ in how it is deployed, and in nothing but costs"
     return "what tells them apart has no effect here"
 
 
 def _single(sweep: Sweep, runs: Mapping[str, RunsBySeed], one_group: bool) -> Iterable[str]:
-    """Flag comparisons over one seed where arms have more.
+    """Flag comparisons over one seed where variants have more.
 
     They have an interval only if there are several groups of clips.
     """
-    pairs = [(arm.label, other.label) for arm in sweep.runnable() if (other := control_arm(sweep, arm))]
+    pairs = [
+        (variant.label, other.label)
+        for variant in sweep.runnable()
+        if (other := control_variant(sweep, variant))
+    ]
     shared = {one: len(runs[one].keys() & runs[two].keys()) for one, two in pairs}
     few = [label for label, number in shared.items() if number == 1]
     if few:

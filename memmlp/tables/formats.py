@@ -16,10 +16,10 @@ from rich.console import Console
 from memmlp.common.files import plain
 from memmlp.tables.statistics import Verdict
 from memmlp.tables.table import Table
-from memmlp.tables.table_text import MINUS, ArmLine, Grid, caption, grids, legend
+from memmlp.tables.table_text import MINUS, Grid, VariantLine, caption, grids, legend
 
 GAP = "  "  # stands between columns on a terminal
-LABEL = 18  # the largest width of the arms' column on a terminal, characters
+LABEL = 18  # the largest width of the variants' column on a terminal, characters
 TEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{",
     "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$", MINUS: "$-$",
@@ -97,7 +97,7 @@ FORMATS: dict[str, Callable[[Table], str]] = {
 }  # fmt: skip
 
 
-def _all(grid: Grid) -> Iterator[ArmLine]:
+def _all(grid: Grid) -> Iterator[VariantLine]:
     return (line for group in grid.groups for line in group)
 
 
@@ -110,7 +110,7 @@ def _tex(text: str) -> str:
     return "".join(TEX.get(letter, letter) for letter in text)
 
 
-def _tex_line(line: ArmLine) -> str:
+def _tex_line(line: VariantLine) -> str:
     words = [*line.head, *map(" ".join, line.cells)]
     return " & ".join(map(_tex, words)) + r" \\"
 
@@ -125,8 +125,8 @@ def _html_head(name: str) -> str:
     return "<br>".join([metric, *(f"<small>{word}</small>" for word in unit)])
 
 
-def _html_group(group: Sequence[ArmLine]) -> str:
-    """Return the HTML of an arm's rows, headed by its label."""
+def _html_group(group: Sequence[VariantLine]) -> str:
+    """Return the HTML of a variant's rows, headed by its label."""
     label = f'<th scope="rowgroup" rowspan="{len(group)}">{_html(group[0].head[0])}</th>'
     heads = [label, *[""] * (len(group) - 1)]
     rows = [
@@ -136,7 +136,7 @@ def _html_group(group: Sequence[ArmLine]) -> str:
     return f"<tbody>{''.join(rows)}</tbody>"
 
 
-def _html_line(line: ArmLine) -> str:
+def _html_line(line: VariantLine) -> str:
     cells = "".join(f"<td>{'<br>'.join(map(_html_mark, cell))}</td>" for cell in line.cells)
     return f'<td class="seeds">{_html(line.head[1])}</td>{cells}'
 
@@ -159,7 +159,7 @@ def _html_mark(text: str) -> str:
 def _fitting(grid: Grid, width: int) -> list[list[int]]:
     """Divide the metrics' columns into as few groups of nearly equal size as fit the width.
 
-    The arms' two columns are repeated before each group.
+    The variants' two columns are repeated before each group.
     """
     columns = range(2, len(grid.header))
     widths = [
@@ -174,7 +174,7 @@ def _fitting(grid: Grid, width: int) -> list[list[int]]:
 
 
 def _lined(grid: Grid, columns: Sequence[int]) -> Iterator[str]:
-    """Yield some columns of a grid as lines. (Rich's own table would take seconds for hundreds of arms.)"""
+    """Yield some columns of a grid as lines. (Rich's table takes seconds for hundreds of variants.)"""
     blocks = [[block[i] for i in (0, 1, *columns)] for block in _blocks(grid)]
     widths = [_width(block[i] for block in blocks) for i in range(len(columns) + 2)]
     for number, block in enumerate(blocks):
@@ -194,12 +194,12 @@ def _width(parts: Iterable[Sequence[str]]) -> int:
 
 
 def _blocks(grid: Grid) -> list[list[Sequence[str]]]:
-    """Return the head and each arm as a block: the lines of each of its columns."""
+    """Return the head and each variant as a block: the lines of each of its columns."""
     return [[*map(_header, grid.header)], *map(_block, grid.groups)]
 
 
-def _block(group: Sequence[ArmLine]) -> list[Sequence[str]]:
-    """Return an arm's columns as lines, with its label wrapped beside them."""
+def _block(group: Sequence[VariantLine]) -> list[Sequence[str]]:
+    """Return a variant's columns as lines, with its label wrapped beside them."""
     columns: list[list[str]] = [[] for _ in (0, *group[0].cells)]
     for line in group:
         height = max(map(len, line.cells))

@@ -1,7 +1,7 @@
 """What a table gets from the runs of a planned sweep: results, states, and older runs.
 
-A table never trains. It knows from the plan which identity the run of each arm and seed has, and reads the
-folder outputs/runs/<id>/, whichever command made it.
+A table never trains. It knows from the plan which identity the run of each variant and seed has, and reads
+the folder outputs/runs/<id>/, whichever command made it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.recipe_versions import outdated
 from memmlp.runs.run import Run
-from memmlp.sweep.definition import Arm
+from memmlp.sweep.definition import Variant
 from memmlp.sweep.plan import Plan
 from memmlp.tables.build_table import Find
 from memmlp.tables.flags_of_runs import DescribeRun
@@ -23,12 +23,12 @@ Read = Callable[[Path, tuple[str, ...]], Measured]
 
 
 def run_finder(plan: Plan, read: Read) -> Find:
-    """Return a function that finds the results of the plan's finished run for an arm and a seed."""
+    """Return a function that finds the results of the plan's finished run for a variant and a seed."""
 
     entries = {(entry.label, entry.seed): entry for entry in plan.entries}
 
-    def find(arm: Arm, seed: int) -> Measured | None:
-        entry = entries.get((arm.label, seed))
+    def find(variant: Variant, seed: int) -> Measured | None:
+        entry = entries.get((variant.label, seed))
         complete = entry is not None and plan.complete(entry)
         return read(plan.run_of(entry).folder, entry.stages) if entry and complete else None
 
@@ -40,8 +40,8 @@ def state_finder(plan: Plan) -> DescribeRun:
 
     entries = {(entry.label, entry.seed): entry for entry in plan.entries}
 
-    def state(arm: Arm, seed: int) -> str | None:
-        entry = entries.get((arm.label, seed))
+    def state(variant: Variant, seed: int) -> str | None:
+        entry = entries.get((variant.label, seed))
         if entry is None:
             return None
         run = plan.run_of(entry)
@@ -62,8 +62,8 @@ def older_run_finder(plan: Plan) -> DescribeRun:
     def known() -> dict[str, Run]:
         return {run.manifest.get("what", ""): run for run in list_runs(plan.outputs) if run.done}
 
-    def say(arm: Arm, seed: int) -> str | None:
-        entry = entries.get((arm.label, seed))
+    def say(variant: Variant, seed: int) -> str | None:
+        entry = entries.get((variant.label, seed))
         run = known().get(whats.get(entry.key, "?")) if entry else None
         if entry is None or run is None or run.id == entry.id:
             return None

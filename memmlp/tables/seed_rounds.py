@@ -1,11 +1,11 @@
-"""Rounds of seeds for arms with open verdicts: looks that are fixed in advance, and what they decided.
+"""Rounds of seeds for variants with open verdicts: looks that are fixed in advance, and what they decided.
 
-Every arm goes through the same looks (interim analyses), each at a number of seeds that was fixed at the
-start. An arm whose comparisons are all decided gets no further looks. A look uses the first seeds of an arm
-and of its control, whatever other seeds exist, and what it decides is final. It spends its level over all
-comparisons of the sweep about which nothing has been claimed, including those of arms that are at another
-look. So the levels add up to 5 % for either family of claims, even if an arm is late because its runs failed
-(docs/statistics.md).
+Every variant goes through the same looks (interim analyses), each at a number of seeds that was fixed at the
+start. A variant whose comparisons are all decided gets no further looks. A look uses the first seeds of a
+variant and of its control, whatever other seeds exist, and what it decides is final. It spends its level over
+all comparisons of the sweep about which nothing has been claimed, including those of variants that are at
+another look. So the levels add up to 5 % for either family of claims, even if a variant is late because its
+runs failed (docs/statistics.md).
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from memmlp.sweep.definition import COSTS, MODES, Arm, Sweep
+from memmlp.sweep.definition import COSTS, MODES, Sweep, Variant
 from memmlp.tables.effects import (
     RunsBySeed,
-    control_arm,
+    control_variant,
     or_nan,
     or_none,
     paired,
@@ -32,7 +32,7 @@ from memmlp.tables.effects import (
 from memmlp.tables.statistics import Verdict, looks, seeds_needed, sequential, spending, verdict
 from memmlp.tables.table import Effect, Key
 
-MOST = 13  # the largest number of seeds of an arm by default
+MOST = 13  # the largest number of seeds of a variant by default
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Finding:
 
     Attributes:
         label, mode, metric: which comparison it is.
-        verdict: the verdict, final unless it is open.
+        verdict: the verdict, final unless it is inconclusive.
         mean: the mean difference.
         p: its p-value; None with one group of clips, or where a network diverged on a clip: no number of
             seeds can decide the comparison.
@@ -64,12 +64,12 @@ class Finding:
         return Key(self.label, self.mode, self.metric)
 
     @property
-    def open(self) -> bool:
-        """Whether more seeds can decide the comparison: it is open, and was tested.
+    def inconclusive(self) -> bool:
+        """Whether more seeds can decide the comparison: it is inconclusive, and was tested.
 
-        A comparison without a p-value, such as that of an arm with too few runs, waits for other reasons.
+        A comparison without a p-value, such as that of a variant with too few runs, waits for other reasons.
         """
-        return self.verdict is Verdict.OPEN and self.p is not None
+        return self.verdict is Verdict.INCONCLUSIVE and self.p is not None
 
 
 @dataclass(frozen=True)
@@ -77,10 +77,11 @@ class Look:
     """A look that was taken.
 
     Attributes:
-        seeds: how many seeds of each arm were looked at.
+        seeds: how many seeds of each variant were looked at.
         level: the level that the look spent.
-        runs: by the label of each arm that was looked at, a digest of the arm's runs and its control's.
-        found: the findings on the comparisons that were open before.
+        runs: by the label of each variant that was looked at, a digest of the variant's runs and its
+            control's.
+        found: the findings on the comparisons that were inconclusive before.
     """
 
     seeds: int
@@ -108,7 +109,7 @@ class Rounds:
     taken: tuple[Look, ...] = ()
 
     def position(self, label: str) -> int:
-        """Return how many looks an arm has been through."""
+        """Return how many looks a variant has been through."""
         return sum(label in look.runs for look in self.taken)
 
     def latest(self) -> dict[Key, tuple[Finding, Look]]:
@@ -116,12 +117,13 @@ class Rounds:
         return {finding.key: (finding, look) for look in self.taken for finding in look.found}
 
     def next_looks(self, sweep: Sweep) -> dict[str, int]:
-        """Return, by label, the number (from 0) of the next look of each arm that has one.
+        """Return, by label, the number (from 0) of the next look of each variant that has one.
 
-        An arm has a next look while looks are left, and it has an open comparison or had no look yet.
+        A variant has a next look while looks are left, and it has an inconclusive comparison or had no look
+        yet.
         """
-        going = {finding.label for finding, _ in self.latest().values() if finding.open}
-        found = {arm.label: self.position(arm.label) for arm, _ in _compared(sweep)}
+        going = {finding.label for finding, _ in self.latest().values() if finding.inconclusive}
+        found = {variant.label: self.position(variant.label) for variant, _ in _compared(sweep)}
         return {
             label: number
             for label, number in found.items()
@@ -129,40 +131,44 @@ class Rounds:
         }
 
     def counts(self, sweep: Sweep) -> dict[str, int]:
-        """Return how many seeds each arm is to be trained with.
+        """Return how many seeds each variant is to be trained with.
 
-        This is the number of its latest or next look, or of such a look of an arm that is compared with it,
-        whichever is larger.
+        This is the number of its latest or next look, or of such a look of a variant that is compared with
+        it, whichever is larger.
         """
         ahead = self.next_looks(sweep)
-        found = {arm.label: self.looks[0] for arm in sweep.runnable()}
-        for arm, other in _compared(sweep):
-            number = ahead.get(arm.label, self.position(arm.label) - 1)
-            for label in (arm.label, other.label):
+        found = {variant.label: self.looks[0] for variant in sweep.runnable()}
+        for variant, other in _compared(sweep):
+            number = ahead.get(variant.label, self.position(variant.label) - 1)
+            for label in (variant.label, other.label):
                 found[label] = max(found[label], self.looks[number])
         return found
 
     def spent(self, sweep: Sweep) -> Sweep:
-        """Return the sweep with seeds for each arm: those spent so far and those of its next look."""
+        """Return the sweep with seeds for each variant: those spent so far and those of its next look."""
         counts = self.counts(sweep)
-        arms = tuple(
-            replace(arm, seeds=self.seeds[: counts[arm.label]]) if arm.label in counts else arm
-            for arm in sweep.arms
+        variants = tuple(
+            replace(variant, seeds=self.seeds[: counts[variant.label]])
+            if variant.label in counts
+            else variant
+            for variant in sweep.variants
         )
-        return replace(sweep, arms=arms, seeds=self.seeds[: max(counts.values())])
+        return replace(sweep, variants=variants, seeds=self.seeds[: max(counts.values())])
 
     def family(self, sweep: Sweep) -> list[Key]:
-        """Return all comparisons: those with findings and, for arms without a look, all possible ones."""
-        new = [arm for arm, _ in _compared(sweep) if not self.position(arm.label)]
-        return list(dict.fromkeys([*self.latest(), *(key for arm in new for key in _keys(sweep, arm))]))
+        """Return all comparisons: those with findings and, for variants without a look, all possible ones."""
+        new = [variant for variant, _ in _compared(sweep) if not self.position(variant.label)]
+        return list(
+            dict.fromkeys([*self.latest(), *(key for variant in new for key in _keys(sweep, variant))])
+        )
 
     def unseen(self, sweep: Sweep) -> list[Key]:
-        """Return the comparisons without findings, for arms that were looked at.
+        """Return the comparisons without findings, for variants that were looked at.
 
         Their runs have no numbers, or are one and the same.
         """
-        looked = [arm for arm, _ in _compared(sweep) if self.position(arm.label)]
-        return [key for arm in looked for key in _keys(sweep, arm) if key not in self.latest()]
+        looked = [variant for variant, _ in _compared(sweep) if self.position(variant.label)]
+        return [key for variant in looked for key in _keys(sweep, variant) if key not in self.latest()]
 
     def judged(self, effects: Mapping[Key, Effect]) -> dict[Key, Effect]:
         """Return the effects with the looks' verdicts in place of verdicts from a fixed number of seeds."""
@@ -176,13 +182,13 @@ class Rounds:
 def subject(sweep: Sweep) -> dict[str, Any]:
     """Return what the verdicts depend on, in types for JSON; it must not change between two looks."""
     return {
-        "arms": {
-            arm.label: {
-                "branch": arm.branch,
-                "against": sweep.control_of(arm),
-                "paper": {metric: paper_effect(sweep, arm, metric) for metric in sweep.metrics},
+        "variants": {
+            variant.label: {
+                "branch": variant.branch,
+                "against": sweep.control_of(variant),
+                "paper": {metric: paper_effect(sweep, variant, metric) for metric in sweep.metrics},
             }
-            for arm in sweep.runnable()
+            for variant in sweep.runnable()
         },
         "metrics": list(sweep.metrics),
         "smallest": {name: sweep.smallest[name] for name in sweep.metrics if name in sweep.smallest},
@@ -205,14 +211,14 @@ def advanced(
 ) -> Rounds:
     """Return the rounds after the next look that can be taken; the same rounds if none can be.
 
-    A look at an arm can be taken when the arm and its control have all seeds of its next look. If runs
-    failed, arms may be at different looks; arms at an earlier look then come first.
+    A look at a variant can be taken when the variant and its control have all seeds of its next look. If runs
+    failed, variants may be at different looks; variants at an earlier look then come first.
 
     Args:
         rounds: the rounds so far.
         sweep: the sweep with which the rounds began.
         runs: the finished runs by label and seed.
-        named: by label, a digest of the runs of an arm and its control up to its next look.
+        named: by label, a digest of the runs of a variant and its control up to its next look.
     """
     numbers = rounds.next_looks(sweep)
     ready = [label for label, number in numbers.items() if _ready(rounds, sweep, runs, label, number)]
@@ -226,15 +232,15 @@ def advanced(
 
 
 def outlook(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> dict[Key, int | None]:
-    """Return how many seeds would decide each open comparison of arms that have no next look.
+    """Return how many seeds would decide each inconclusive comparison of variants that have no next look.
 
     The numbers are for 80 % power, if the effect is as measured, at a single look, with a correction over all
     comparisons without a claim. None means that no number of seeds would be enough with these clips.
     """
     latest, ahead = rounds.latest(), rounds.next_looks(sweep)
-    still = [key for key, (finding, _) in latest.items() if finding.open and key.label not in ahead]
+    still = [key for key, (finding, _) in latest.items() if finding.inconclusive and key.label not in ahead]
     unclaimed = sum(
-        key not in latest or latest[key][0].verdict is Verdict.OPEN for key in rounds.family(sweep)
+        key not in latest or latest[key][0].verdict is Verdict.INCONCLUSIVE for key in rounds.family(sweep)
     )
     found = {}
     for key, pair in paired(with_existing_branches(sweep, runs), runs, MODES).items():
@@ -246,25 +252,25 @@ def outlook(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> dic
 
 
 @dataclass(frozen=True)
-class ArmProgress:
-    """An arm's progress through the rounds.
+class VariantProgress:
+    """A variant's progress through the rounds.
 
     Attributes:
-        label: the arm's label.
-        decided, open: how many of its comparisons are decided and open.
+        label: the variant's label.
+        decided, inconclusive: how many of its comparisons are decided and inconclusive.
         seeds: the number of seeds spent on it, or needed for its next look.
         next: the number of seeds of its next look; None if it has none.
     """
 
     label: str
     decided: int
-    open: int
+    inconclusive: int
     seeds: int
     next: int | None
 
 
-def standings(rounds: Rounds, sweep: Sweep) -> list[ArmProgress]:
-    """Return each arm's progress through the rounds."""
+def standings(rounds: Rounds, sweep: Sweep) -> list[VariantProgress]:
+    """Return each variant's progress through the rounds."""
     ahead = rounds.next_looks(sweep)
     found: dict[str, list[Verdict]] = {}
     for finding, _ in rounds.latest().values():
@@ -272,9 +278,9 @@ def standings(rounds: Rounds, sweep: Sweep) -> list[ArmProgress]:
     standing = []
     for label, seeds in rounds.counts(sweep).items():
         verdicts = found.get(label, [])
-        still = verdicts.count(Verdict.OPEN)
+        still = verdicts.count(Verdict.INCONCLUSIVE)
         following = rounds.looks[ahead[label]] if label in ahead else None
-        standing.append(ArmProgress(label, len(verdicts) - still, still, seeds, following))
+        standing.append(VariantProgress(label, len(verdicts) - still, still, seeds, following))
     return standing
 
 
@@ -298,53 +304,55 @@ def of_json(content: Mapping[str, Any]) -> Rounds:
     return Rounds(content["subject"], **words, taken=tuple(taken))
 
 
-def _compared(sweep: Sweep) -> Iterator[tuple[Arm, Arm]]:
-    """Yield the arms that have a control and metrics to compare, with their controls."""
-    for arm in sweep.runnable():
-        other = control_arm(sweep, arm)
+def _compared(sweep: Sweep) -> Iterator[tuple[Variant, Variant]]:
+    """Yield the variants that have a control and metrics to compare, with their controls."""
+    for variant in sweep.runnable():
+        other = control_variant(sweep, variant)
         if other is not None and set(sweep.metrics) - set(COSTS):
-            yield arm, other
+            yield variant, other
 
 
-def _keys(sweep: Sweep, arm: Arm) -> list[Key]:
-    """Return all comparisons that an arm may have."""
+def _keys(sweep: Sweep, variant: Variant) -> list[Key]:
+    """Return all comparisons that a variant may have."""
     metrics = [metric for metric in sweep.metrics if metric not in COSTS]
-    return [Key(arm.label, mode, metric) for mode, metric in itertools.product(MODES, metrics)]
+    return [Key(variant.label, mode, metric) for mode, metric in itertools.product(MODES, metrics)]
 
 
 def _ready(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed], label: str, number: int) -> bool:
-    """Return whether all runs that an arm's look needs are finished."""
+    """Return whether all runs that a variant's look needs are finished."""
     wanted = set(rounds.seeds[: rounds.looks[number]])
     return all(wanted <= set(runs[one]) for one in pair_of(sweep, label))
 
 
 def pair_of(sweep: Sweep, label: str) -> tuple[str, str]:
-    """Return the labels of an arm and its control."""
-    return next((arm.label, other.label) for arm, other in _compared(sweep) if arm.label == label)
+    """Return the labels of a variant and its control."""
+    return next((variant.label, other.label) for variant, other in _compared(sweep) if variant.label == label)
 
 
 def _found(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed], look: Look) -> list[Finding]:
-    """Return a look's findings on those comparisons of its arms that are not decided yet."""
+    """Return a look's findings on those comparisons of its variants that are not decided yet."""
     before = {key: finding.verdict for key, (finding, _) in rounds.latest().items()}
     seen = _seen(rounds, sweep, runs, look)
-    fresh = {key: e for key, e in seen.items() if before.get(key, Verdict.OPEN) is Verdict.OPEN}
+    fresh = {
+        key: e for key, e in seen.items() if before.get(key, Verdict.INCONCLUSIVE) is Verdict.INCONCLUSIVE
+    }
     elsewhere = [
-        before.get(key, Verdict.OPEN)
+        before.get(key, Verdict.INCONCLUSIVE)
         for key in rounds.family(sweep)
         if key not in fresh and (key in before or key.label not in look.runs)
     ]
     different, equal = _corrected(list(fresh.values()), elsewhere, look.level)
-    arms = {arm.label: arm for arm in sweep.arms}
+    variants = {variant.label: variant for variant in sweep.variants}
     found = []
     for (key, effect), p, q in zip(fresh.items(), different, equal, strict=True):
-        paper = paper_effect(sweep, arms[key.label], key.metric)
+        paper = paper_effect(sweep, variants[key.label], key.metric)
         said = verdict(float(p), float(q), effect.mean, paper, look.level)
         found.append(Finding(*key, said, effect.mean, effect.p, or_none(p), or_none(q)))
     return found
 
 
 def _seen(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed], look: Look) -> dict[Key, Effect]:
-    """Return all comparisons of a look's arms, over exactly the look's seeds."""
+    """Return all comparisons of a look's variants, over exactly the look's seeds."""
     seeds = rounds.seeds[: look.seeds]
     cut = {label: {s: found[s] for s in seeds if s in found} for label, found in runs.items()}
     pairs = paired(with_existing_branches(sweep, cut), cut, MODES, look.runs)
@@ -358,13 +366,15 @@ def _corrected(
 
     Args:
         fresh: the comparisons (K) that the look can decide.
-        elsewhere: the verdicts of the other comparisons: decided before, or open because their arms are at
-            another look.
+        elsewhere: the verdicts of the other comparisons: decided before, or inconclusive because their
+            variants are at another look.
         level: the level that the look spends.
     """
-    none = [Verdict.OPEN] * len(fresh)
+    none = [Verdict.INCONCLUSIVE] * len(fresh)
     same = np.array([said is Verdict.EQUIVALENT for said in [*none, *elsewhere]], bool)
-    differ = np.array([said not in (Verdict.EQUIVALENT, Verdict.OPEN) for said in [*none, *elsewhere]], bool)
+    differ = np.array(
+        [said not in (Verdict.EQUIVALENT, Verdict.INCONCLUSIVE) for said in [*none, *elsewhere]], bool
+    )
     away = np.arange(len(same)) >= len(fresh)
     p, q = (
         np.array([or_nan(getattr(effect, name)) for effect in fresh] + [math.nan] * len(elsewhere))
@@ -376,10 +386,10 @@ def _corrected(
 
 
 def _as_found(effect: Effect, finding: Finding | None, look: Look | None) -> Effect:
-    """Return the effect with the finding of its last look; open if there was no look."""
+    """Return the effect with the finding of its last look; inconclusive if there was no look."""
     if finding is None or look is None:
-        return replace(effect, holm=None, equal=None, verdict=Verdict.OPEN)
-    decided = None if finding.verdict is Verdict.OPEN else look.seeds
+        return replace(effect, holm=None, equal=None, verdict=Verdict.INCONCLUSIVE)
+    decided = None if finding.verdict is Verdict.INCONCLUSIVE else look.seeds
     return replace(
         effect,
         holm=finding.holm,

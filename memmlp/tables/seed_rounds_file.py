@@ -25,7 +25,7 @@ def read(path: Path) -> Rounds | None:
 
 
 def name_of(rounds: Rounds, sweep: Sweep, plan: Plan, label: str, seeds: int) -> str:
-    """Return a digest of the identities of an arm's and its control's runs with the first `seeds` seeds.
+    """Return a digest of the identities of a variant's and its control's runs with the first `seeds` seeds.
 
     The identities include the evaluations that the sweep shows.
     """
@@ -35,7 +35,7 @@ def name_of(rounds: Rounds, sweep: Sweep, plan: Plan, label: str, seeds: int) ->
 
 
 def same_runs(rounds: Rounds, sweep: Sweep, plan: Plan, path: Path) -> None:
-    """Check that past looks compared the same runs that the sweep's arms have now.
+    """Check that past looks compared the same runs that the sweep's variants have now.
 
     Raises:
         InputError: if a look compared other runs, because data, configs or recipes have changed since.

@@ -31,21 +31,21 @@ class Need(NamedTuple):
 
 
 def needs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str] = MODES) -> list[Need]:
-    """Return the needs of all arms and metrics whose effects the paper prints, in the table's order.
+    """Return the needs of all variants and metrics whose effects the paper prints, in the table's order.
 
     The correction is over the comparisons that the runs allow today, in both modes, as a table's is. A
-    comparison without a p-value, such as that of an arm with one seed, is left out.
+    comparison without a p-value, such as that of a variant with one seed, is left out.
 
     Args:
         sweep: the sweep.
-        runs: the finished runs of every runnable arm, by seed.
+        runs: the finished runs of every runnable variant, by seed.
         modes: the modes of evaluation whose comparisons are returned.
     """
     seen = with_existing_branches(sweep, runs)
-    pairs, arms = paired(seen, runs, MODES), {arm.label: arm for arm in seen.arms}
+    pairs, variants = paired(seen, runs, MODES), {variant.label: variant for variant in seen.variants}
     found, comparisons = [], testable(pairs)
     for key, pair in pairs.items():
-        effect = paper_effect(seen, arms[key.label], key.metric)
+        effect = paper_effect(seen, variants[key.label], key.metric)
         if effect and key.mode in modes and pair.testable:
             number = seeds_needed(pair.matrix, effect, comparisons, pair.groups)
             found.append(Need(*key, effect, float(pair.matrix.mean()), len(pair.matrix), number))

@@ -45,7 +45,7 @@ def _status(plan: Plan) -> str:
 
 
 def _labels(plan: Plan) -> dict[str, str]:
-    """Return the labels of each begun run: of all arms that are this run, used or shown in different ways."""
+    """Return the labels of each started run: all variants that use this run."""
     labels: dict[str, dict[str, None]] = {}
     for entry in plan.entries:
         if plan.run_of(entry).manifest:

@@ -1,4 +1,4 @@
-"""The content of a table: rows of arms, cells of metrics, effects with verdicts."""
+"""The content of a table: rows of variants, cells of metrics, effects with verdicts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STEADY = 1.25  # how many times a measured time may be another of the same work
 
 
 class Key(NamedTuple):
-    """The key of a table's cell: its arm, mode of evaluation and metric."""
+    """The key of a table's cell: its variant, mode of evaluation and metric."""
 
     label: str
     mode: str
@@ -25,7 +25,7 @@ class Key(NamedTuple):
 
 @dataclass(frozen=True)
 class Effect:
-    """An arm's difference from its control, over the seeds and clips that both have.
+    """A variant's difference from its control, over the seeds and clips that both have.
 
     Fields that a comparison does not have are None; costs have only the mean, and whether it is noise.
 
@@ -66,7 +66,7 @@ class Effect:
 
 @dataclass(frozen=True)
 class Cell:
-    """A metric of an arm: its values by seed, the paper's value, and both differences from the control."""
+    """A metric of a variant: its values by seed, the paper's value, and both differences from the control."""
 
     values: Mapping[int, float]
     paper: float | None = None
@@ -96,15 +96,15 @@ class Cell:
             return None
         if not self.effect.seeds:
             return (self.effect.mean > 0) == (self.paper_effect > 0)
-        return {Verdict.HOLDS: True, Verdict.OPPOSITE: False}.get(self.effect.verdict or Verdict.OPEN)
+        return {Verdict.HOLDS: True, Verdict.OPPOSITE: False}.get(self.effect.verdict or Verdict.INCONCLUSIVE)
 
 
 @dataclass(frozen=True)
 class Row:
-    """An arm of a table.
+    """A variant of a table.
 
     Attributes:
-        label: the arm's label.
+        label: the variant's label.
         branch: whose errors are shown.
         against: the label of its control; None for the sweep's control and for rows with only the paper's
             values.
@@ -112,7 +112,7 @@ class Row:
         found: the seeds of its finished runs.
         wanted: the seeds that it should have; empty for a row with only the paper's values.
         cells: its cells by mode and metric.
-        pairing: in words, which arm is its control in every cell of the axes; empty if it has a single
+        pairing: in words, which variant is its control in every cell of the axes; empty if it has a single
             control.
     """
 
@@ -133,7 +133,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """A sweep's arms side by side.
+    """A sweep's variants side by side.
 
     Attributes:
         name: the sweep's name.
@@ -141,11 +141,11 @@ class Table:
         number: the table's number in the paper; None if it is not the paper's.
         modes: the modes of evaluation; a single one if only costs are shown.
         metrics: the columns.
-        control: the label of the arm with which arms are compared that name no other control.
+        control: the label of the variant with which variants are compared that name no other control.
         branch_source: how we know which branch the paper's values belong to; None if it prints none.
         smallest: the smallest effect of interest by metric.
         comparisons: the number of p-values in the correction.
-        rows: the arms.
+        rows: the variants.
         notes: remarks on the paper's values.
         flags: what a reader has to know about these runs.
         looks: pairs of the number of seeds and the level of each look; empty for a fixed number of seeds.
@@ -195,7 +195,7 @@ class Table:
         return max(known, default=None)
 
     def blind(self, mode: str, metric: str) -> list[str]:
-        """Return the labels of the arms whose comparison could not have found any difference."""
+        """Return the labels of the variants whose comparison could not have found any difference."""
         return [
             row.label
             for row in self.rows

@@ -28,12 +28,12 @@ ARROWS = {"lower": "↓", "higher": "↑"}
 
 
 @dataclass(frozen=True)
-class ArmLine:
-    """A line of an arm.
+class VariantLine:
+    """A line of a variant.
 
     Attributes:
         kind: "measured", "difference" (from the control) or "paper".
-        head: the words of the line's first two columns, arm and seeds.
+        head: the words of the line's first two columns, variant and seeds.
         cells: one cell for each metric, each with one to three parts.
     """
 
@@ -44,11 +44,11 @@ class ArmLine:
 
 @dataclass(frozen=True)
 class Grid:
-    """The lines of one mode of evaluation, arm by arm; `mode` is None if it makes no difference."""
+    """The lines of one mode of evaluation, variant by variant; `mode` is None if it makes no difference."""
 
     mode: str | None
     header: tuple[str, ...]
-    groups: tuple[tuple[ArmLine, ...], ...]
+    groups: tuple[tuple[VariantLine, ...], ...]
 
 
 def grids(table: Table) -> list[Grid]:
@@ -57,7 +57,7 @@ def grids(table: Table) -> list[Grid]:
     There is a single grid without a mode if all modes would show the same: costs alone, or nothing measured.
     """
     timeless = set(table.metrics) <= set(COSTS) or not any(row.found for row in table.rows)
-    header = ("arm", "seeds", *map(heading, table.metrics))
+    header = ("variant", "seeds", *map(heading, table.metrics))
     return [
         Grid(
             None if timeless else mode,
@@ -130,7 +130,7 @@ def _branches(table: Table) -> list[str]:
 
 
 def _differences(table: Table) -> str:
-    """Explain the lines of differences, and which control each arm has."""
+    """Explain the lines of differences, and which control each variant has."""
     own = [
         row.pairing or f"'{row.label}' from '{row.against}'"
         for row in table.rows
@@ -155,7 +155,7 @@ def _meanings(table: Table) -> str:
     return (
         "verdicts: holds (significant, with the paper's sign), opposite (significant, with the other sign), "
         "higher or lower (significant, where the paper prints no difference), equivalent (nearer to 0 than "
-        f"the smallest effect of interest: {', '.join(margins)}), open (none of these)"
+        f"the smallest effect of interest: {', '.join(margins)}), inconclusive (none of these)"
     )
 
 
@@ -165,8 +165,8 @@ def _looks(table: Table) -> list[str]:
     if not words:
         return []
     return [
-        f"seeds were spent in rounds, where verdicts were open: looks at {', '.join(words)} seeds, each with "
-        "its part of 5 %; (3): decided at 3 seeds, and final; means and intervals are of all the arm's seeds"
+        f"seeds were added where verdicts were inconclusive, with interim analyses at {', '.join(words)} "
+        "seeds, which share the 5 %; (3): decided at 3 seeds, and final; means and intervals use all seeds"
     ]
 
 
@@ -184,17 +184,17 @@ def _power(table: Table) -> list[str]:
             what = f"{' or '.join(words)} {unit(metric)}"
             blind = dict.fromkeys(label for mode in seen for label in table.blind(mode, metric))
             but = f" but {', '.join(repr(label) for label in blind)}" if blind else ""
-            found = f"{metric}: a true difference of {what} would have been found in every arm{but}"
+            found = f"{metric}: a true difference of {what} would have been found in every variant{but}"
             lines.append(f"{found} with 80 % power, a smaller one perhaps not")
         elif seen:
             lines.append(
-                f"{metric}: too few seeds, in some arm even a difference as large as the values may be missed"
+                f"{metric}: too few seeds, a difference as large as the values can be missed in some variant"
             )
     return lines
 
 
 def _largest(table: Table, mode: str, metric: str) -> float:
-    """Return the largest finite mean of a metric among the arms that are compared; 0 without one."""
+    """Return the largest finite mean of a metric among the variants that are compared; 0 without one."""
     means = [cell.mean for _, name, cell, _ in table.effects(mode) if name == metric]
     return max((mean for mean in means if mean is not None and math.isfinite(mean)), default=0.0)
 
@@ -216,25 +216,25 @@ def _has_noise(table: Table) -> bool:
     return any(cell.paper_effect and cell.effect and cell.effect.within_noise for cell in cells)
 
 
-def _lines(table: Table, row: Row, mode: str) -> Iterable[ArmLine]:
-    """Yield an arm's lines: measured values, their difference from the control, and the paper's values.
+def _lines(table: Table, row: Row, mode: str) -> Iterable[VariantLine]:
+    """Yield a variant's lines: measured values, their difference from the control, and the paper's values.
 
     A row with only the paper's values has just the last line.
     """
     cells = [(row.cells[mode][metric], metric) for metric in table.metrics]
     paper = tuple((paper_words(cell, metric),) for cell, metric in cells)
     if row.paper_only:
-        yield ArmLine("paper", (row.label, "paper"), paper)
+        yield VariantLine("paper", (row.label, "paper"), paper)
         return
     seeds = f"{len(row.found)}/{len(row.wanted)}"
-    yield ArmLine(
+    yield VariantLine(
         "measured", (row.label, seeds), tuple((value_words(cell, metric),) for cell, metric in cells)
     )
     if any(cell.effect for cell, _ in cells):
         effects = tuple(effect_words(cell, metric) for cell, metric in cells)
-        yield ArmLine("difference", ("", "diff."), effects)
+        yield VariantLine("difference", ("", "diff."), effects)
     if any(cell.paper is not None for cell, _ in cells):
-        yield ArmLine("paper", ("", "paper"), paper)
+        yield VariantLine("paper", ("", "paper"), paper)
 
 
 def value_words(cell: Cell, metric: str) -> str:

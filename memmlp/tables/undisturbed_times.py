@@ -1,4 +1,4 @@
-"""Which runs of an arm were timed without other work on the machine: the times of tables are of these."""
+"""Which runs of a variant were timed without other work on the machine: the times of tables are of these."""
 
 from __future__ import annotations
 

@@ -171,8 +171,8 @@ def draw(rng: np.random.Generator, cell: SimulationSetting, comparisons: int) ->
 
 
 SEEDS, CLIPS, SIZES = (2, 3, 5, 10), (4, 10, 40, 536), (1, 2, 10)
-ARMS, METRICS = 6, 4
-TABLE = ARMS * METRICS  # comparisons of a table
+VARIANTS, METRICS = 6, 4
+TABLE = VARIANTS * METRICS  # comparisons of a table
 CHUNK = 4_000_000  # numbers that are drawn at once, which bounds the memory
 
 ERROR, LEAST, MOST = 0.06, 0.93, 0.995
@@ -183,7 +183,7 @@ also a coverage of at most MOST, so that intervals are not too wide.
 """
 
 MARGIN, EFFECT = 8.0, 16.0
-"""The smallest effect of interest, and the effect that half of the arms have in simulated campaigns.
+"""The smallest effect of interest, and the effect that half of the variants have in simulated campaigns.
 
 Both are in standard errors.
 """
@@ -258,7 +258,7 @@ class Campaign(NamedTuple):
     """Outcomes in simulated tables that spend seeds until everything is decided.
 
     Attributes:
-        seeds: the number of seeds that each arm spent (T, ARMS).
+        seeds: the number of seeds that each variant spent (T, VARIANTS).
         decided: whether each comparison was decided in looks (T, TABLE).
         at_once: whether each is decided with all seeds at once (T, TABLE).
         false: whether a table made any false claim in looks (T,).
@@ -271,16 +271,16 @@ class Campaign(NamedTuple):
 
 
 def campaign(sample: Simulated, shares: Shares) -> Campaign:
-    """Simulate tables that are looked at with more and more seeds; half of the arms differ by EFFECT.
+    """Simulate tables that are looked at with more and more seeds; half of the variants differ by EFFECT.
 
-    An arm stops when all of its comparisons are decided.
+    A variant stops when all of its comparisons are decided.
     """
     tables = len(sample.seeds) // TABLE
-    truth = np.repeat(np.arange(ARMS) % 2 * EFFECT, METRICS)
+    truth = np.repeat(np.arange(VARIANTS) % 2 * EFFECT, METRICS)
     differ, same = np.zeros((2, tables, TABLE), bool)
-    seeds = np.zeros((tables, ARMS), int)
+    seeds = np.zeros((tables, VARIANTS), int)
     for number, level in spent(sample):
-        seeds[~(differ | same).reshape(tables, ARMS, METRICS).all(2)] = number
+        seeds[~(differ | same).reshape(tables, VARIANTS, METRICS).all(2)] = number
         known, mean = sample.mixed(shares, number)
         means = mean.reshape(tables, TABLE) + truth
         p, q = (known.level(d.ravel()).reshape(means.shape) for d in (np.abs(means), MARGIN - np.abs(means)))
@@ -395,7 +395,7 @@ def remarks(rows: Sequence[dict[str, Any]], seed: int) -> list[str]:
         "looks: the same, where seeds are added in looks; the worst of many cells is above its true rate",
         "power: in %, of an effect that an oracle, who knows the variances, finds in 80 %; effect: found in "
         "80 %, over the oracle's; both with equal shares, at Holm's first step",
-        f"seeds: of an arm, in looks, with equal shares, where every other arm differs by {EFFECT:.0f} "
+        f"seeds: of a variant, in looks, with equal shares; every other variant differs by {EFFECT:.0f} "
         f"standard errors and {MARGIN:.0f} are of interest; decided: comparisons, in %, so / at once",
     ]
 

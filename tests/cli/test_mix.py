@@ -26,7 +26,7 @@ def home(tmp_path: Path) -> Path:
             poses = 0.05 * np.cumsum(rng.normal(size=(90, 22, 3)), 0)
             write_clip(tmp_path / folder / f"{n}.npz", Clip("", poses, np.zeros((90, 3)), 60.0))
     base = ["data=mocap", "data.root=[one,two]"]
-    (tmp_path / "both.yaml").write_text(yaml.safe_dump({"arms": {"none": []}, "base": base}))
+    (tmp_path / "both.yaml").write_text(yaml.safe_dump({"variants": {"none": []}, "base": base}))
     return tmp_path
 
 

@@ -46,7 +46,7 @@ def home(tmp_path: Path) -> Path:
             clip = Clip("", poses, 0.01 * np.cumsum(rng.normal(size=(90, 3)), 0), 60.0)
             write_clip(tmp_path / "amass" / now / f"0{n}" / "take_stageii.npz", clip)
     (tmp_path / "amass" / "HDM05" / "02" / "take_stageii.npz").unlink()
-    (tmp_path / "s1.yaml").write_text(yaml.safe_dump({"arms": {"none": []}, "base": ["memory=none"]}))
+    (tmp_path / "s1.yaml").write_text(yaml.safe_dump({"variants": {"none": []}, "base": ["memory=none"]}))
     return tmp_path
 
 

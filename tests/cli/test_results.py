@@ -44,7 +44,7 @@ def test_kept_results_become_pages(memmlp: Memmlp, planned: None):
     assert memmlp("results", "docs", "--check").out == "docs/results: 2 pages, 0 differ\n"
     page = Path("docs/results/table14.md")
     assert page.read_text().count("| 3/3 |") == 8
-    assert ", open" in Path("docs/results/README.md").read_text()
+    assert ", inconclusive" in Path("docs/results/README.md").read_text()
 
 
 def test_kept_results_are_shown_without_a_run(memmlp: Memmlp, planned: None):
@@ -102,7 +102,7 @@ def test_one_kept_seed_of_three_is_no_finished_table(memmlp: Memmlp, planned: No
     memmlp("results", "docs")
     page = Path("docs/results/table14.md")
     assert (page.read_text().count("| 1/3 |"), page.read_text().count("| 1/1 |")) == (8, 0)
-    assert "missing: every arm's seed 0, 2; fill with: memmlp sweep table14" in page.read_text()
+    assert "missing: every variant's seed 0, 2; fill with: memmlp sweep table14" in page.read_text()
     memmlp("results", "save", "14", "seed=0,2,3")
     memmlp("results", "docs")
     assert page.read_text().count("| 4/4 |") == 8
@@ -159,7 +159,7 @@ def test_check_names_the_page_that_differs(memmlp: Memmlp, planned: None):
     memmlp("results", "docs")
     page = Path("docs/results/table14.md")
     text = page.read_text()
-    page.write_text(text.replace("open", "holds", 1))
+    page.write_text(text.replace("inconclusive", "holds", 1))
     ran = memmlp("results", "docs", "--check")
     assert ran.code == 1
     assert "differs: docs/results/table14.md" in ran.err
@@ -208,7 +208,7 @@ def test_a_page_says_that_a_protocol_is_shown_on_other_data(memmlp: Memmlp, plan
 
 
 def test_results_of_a_file_elsewhere_keep_its_path(memmlp: Memmlp, planned: None):
-    Path("mine.yaml").write_text("arms: {a: [b=1], c: [b=2]}\nseeds: [0, 1]\n")
+    Path("mine.yaml").write_text("variants: {a: [b=1], c: [b=2]}\nseeds: [0, 1]\n")
     memmlp("results", "save", "./mine.yaml", "x=/data/here")
     content = json.loads(Path("docs/results/data/mine.json").read_text())
     assert (content["sweep"], content["overrides"]) == ("./mine.yaml", ["x=.../here"])
@@ -217,7 +217,7 @@ def test_results_of_a_file_elsewhere_keep_its_path(memmlp: Memmlp, planned: None
 
 def test_a_file_of_ones_own_is_not_the_shipped_one(memmlp: Memmlp, planned: None):
     """Though it has its name."""
-    Path("table14.yaml").write_text("arms: {a: [b=1], c: [b=2]}\nseeds: [0, 1]\ntitle: mine\n")
+    Path("table14.yaml").write_text("variants: {a: [b=1], c: [b=2]}\nseeds: [0, 1]\ntitle: mine\n")
     memmlp("results", "save", "table14.yaml")
     assert memmlp("results", "docs").code == 0
     assert "mine" in Path("docs/results/table14.md").read_text()

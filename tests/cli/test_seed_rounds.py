@@ -16,7 +16,7 @@ from memmlp.runs.run import Run
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask
 
-ARMS = {"full": [], "worse": ["a=1"], "same": ["a=2"]}
+VARIANTS = {"full": [], "worse": ["a=1"], "same": ["a=2"]}
 FACTORS = {"worse": 1.5, "newer": 1.4}
 
 
@@ -33,7 +33,7 @@ class Runs:
         return f"{label}{self.version}"
 
     def planned(self, sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
-        cells = [(arm.label, seed) for arm in sweep.runnable() for seed in sweep.seeds_of(arm)]
+        cells = [(variant.label, seed) for variant in sweep.runnable() for seed in sweep.seeds_of(variant)]
         entries = [Entry(label, seed, self._id(label, seed)) for label, seed in cells]
         tasks = [RunTask(entry.id, "memmlp", {"optim": {"steps": 1}, "device": "cpu"}) for entry in entries]
         return Plan(sweep.name, self.outputs, tuple(entries), tuple(tasks))
@@ -62,7 +62,7 @@ class Runs:
 @pytest.fixture
 def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Runs:
     monkeypatch.chdir(tmp_path)
-    write(ARMS)
+    write(VARIANTS)
     found = Runs(tmp_path / "outputs")
     monkeypatch.setattr("memmlp.config.compose_plan.kept_or_new_plan", found.planned)
     monkeypatch.setattr("memmlp.cli.sweep.run_workers", found.work)
@@ -70,8 +70,8 @@ def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Runs:
     return found
 
 
-def write(arms: dict, **others: object) -> None:
-    content = {"metrics": ["MPJPE"], "arms": arms, **others}
+def write(variants: dict, **others: object) -> None:
+    content = {"metrics": ["MPJPE"], "variants": variants, **others}
     Path("trial.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
 
 
@@ -99,7 +99,9 @@ def test_seeds_go_where_verdicts_are_open(memmlp: Memmlp, runs: Runs):
     assert "look at 5 seeds (0.67 %): 2 of 4 comparisons decided" in ran.out
     assert "look at 8 seeds (1.3 %): 4 of 4 comparisons decided" in ran.out
     assert "all verdicts are decided" in ran.out
-    assert "19 runs were spent; 24 with 8 seeds for every arm, 39 with 13 seeds for every arm" in ran.out
+    assert (
+        "19 runs were spent; 24 with 8 seeds for every variant, 39 with 13 seeds for every variant" in ran.out
+    )
     before = record()
     assert memmlp(*SWEEP).code == 0
     assert len(runs.made) == 19
@@ -111,13 +113,13 @@ def test_the_table_shows_the_rounds(memmlp: Memmlp, runs: Runs):
     out = " ".join(memmlp("table", "trial.yaml").out.split())
     assert "higher (3)" in out
     assert "equivalent (8)" in out
-    assert "seeds were spent in rounds" in out
+    assert "seeds were added where verdicts were inconclusive" in out
     assert out.count("3/3") == 2
     assert out.count("8/8") == 4
     chosen = " ".join(memmlp("table", "trial.yaml", "seed=0,1,2").out.split())
     assert "seeds were spent in rounds with other seeds: these verdicts do not keep the 5 %" in chosen
     branch = " ".join(memmlp("table", "trial.yaml", "--branch", "position").out.split())
-    assert "seeds were spent in rounds with other arms" in branch
+    assert "seeds were spent in rounds with other variants" in branch
     assert "higher (3)" not in branch
     runs.version = "of other data"
     other = " ".join(memmlp("table", "trial.yaml").out.split())
@@ -138,17 +140,17 @@ def test_interrupted_anywhere_it_ends_the_same(memmlp: Memmlp, runs: Runs, patie
 def test_what_was_decided_is_of_the_sweep_as_it_was(memmlp: Memmlp, runs: Runs):
     memmlp(*SWEEP)
     before = record()
-    for arms, others, word in (
-        ({**ARMS, "newer": ["a=3"]}, {}, "arms"),
-        (ARMS, {"metrics": ["MPJRE"]}, "arms"),
-        (ARMS, {"smallest": {"MPJPE": 0.5}}, "smallest"),
-        (ARMS, {"branch": "position"}, "arms"),
-        (ARMS, {"seeds": [7]}, "seeds"),
+    for variants, others, word in (
+        ({**VARIANTS, "newer": ["a=3"]}, {}, "variants"),
+        (VARIANTS, {"metrics": ["MPJRE"]}, "variants"),
+        (VARIANTS, {"smallest": {"MPJPE": 0.5}}, "smallest"),
+        (VARIANTS, {"branch": "position"}, "variants"),
+        (VARIANTS, {"seeds": [7]}, "seeds"),
     ):
-        write(arms, **others)
+        write(variants, **others)
         line = f"rounds.json: its looks were taken with other {word}; remove it to begin anew"
         assert one_line(memmlp(*SWEEP), line)
-    write(ARMS)
+    write(VARIANTS)
     assert one_line(memmlp(*SWEEP, "--max-seeds", "8"), "--max-seeds 8: the looks of")
     runs.version = "of other data"
     assert one_line(memmlp(*SWEEP), "its looks were taken of other runs of 'worse'")
@@ -159,7 +161,7 @@ def test_what_was_decided_is_of_the_sweep_as_it_was(memmlp: Memmlp, runs: Runs):
 
 
 def test_what_cannot_be_compared_is_not_decided(memmlp: Memmlp, runs: Runs, monkeypatch: pytest.MonkeyPatch):
-    """An arm whose network diverged on every clip has no verdict."""
+    """A variant whose network diverged on every clip has no verdict."""
     monkeypatch.setitem(FACTORS, "same", float("nan"))
     out = memmlp(*SWEEP).out
     assert "of 'same' 2 comparisons have no verdict: the runs have nothing to compare" in out
@@ -176,7 +178,7 @@ def test_kept_rounds_of_another_sweep_decide_nothing(memmlp: Memmlp, runs: Runs)
     memmlp("results", "save", "trial.yaml")
     assert memmlp("results", "docs").code == 0
     assert "do not keep" not in page()
-    write(ARMS, smallest={"MPJPE": 0.5})
+    write(VARIANTS, smallest={"MPJPE": 0.5})
     memmlp("results", "docs")
     assert "seeds were spent in rounds with other smallest: these verdicts do not keep the 5 %" in page()
 
@@ -203,10 +205,12 @@ def test_one_group_of_clips_is_said(memmlp: Memmlp, runs: Runs):
 
 
 def test_open_to_the_end_is_said_with_what_it_would_take(memmlp: Memmlp, runs: Runs):
-    write(ARMS, smallest={"MPJPE": 0.01})
+    write(VARIANTS, smallest={"MPJPE": 0.01})
     out = memmlp(*SWEEP, "--max-seeds", "5").out
     assert looked() == [(3, ["same", "worse"]), (5, ["same"])]
-    assert re.search(r"open of 'same', if its effects are as measured: 2 would take about \d+ seeds", out)
+    assert re.search(
+        r"inconclusive of 'same', if its effects are as measured: 2 would take about \d+ seeds", out
+    )
     assert "all verdicts are decided" not in out
 
 

@@ -30,21 +30,21 @@ from memmlp.sweep.plan import Plan
 from memmlp.sweep.progress_table import name
 
 TINY = [*BRIEF, "export.graph=off"]
-ARMS = {"full": [], "none": ["memory=none"], "wild": ["optim.lr=1e30"]}
+VARIANTS = {"full": [], "none": ["memory=none"], "wild": ["optim.lr=1e30"]}
 
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory) -> Path:
-    """Run a sweep of three arms, one of which diverges, in a folder of its own."""
+    """Run a sweep of three variants, one of which diverges, in a folder of its own."""
     folder = tmp_path_factory.mktemp("sweep")
-    write(folder, ARMS)
+    write(folder, VARIANTS)
     said = run_apart(folder, "sweep", "trial.yaml", *TINY, "--workers", "1", code=1)
     (folder / "first.txt").write_text(said)
     return folder
 
 
-def write(folder: Path, arms: dict) -> None:
-    (folder / "trial.yaml").write_text(yaml.safe_dump({"arms": arms}))
+def write(folder: Path, variants: dict) -> None:
+    (folder / "trial.yaml").write_text(yaml.safe_dump({"variants": variants}))
 
 
 def command(folder: Path, *arguments: str, code: int = 0) -> str:
@@ -60,7 +60,7 @@ def test_what_can_be_done_is_done_once(home: Path):
     assert "3 of 4 runs done" in said
     assert "wild seed 0: failed, loss is nan" in said
     assert "MPJPE" in said
-    assert [re.search(rf"^{arm} +(./1)", said, re.M)[1] for arm in ARMS] == ["1/1", "1/1", "0/1"]
+    assert [re.search(rf"^{variant} +(./1)", said, re.M)[1] for variant in VARIANTS] == ["1/1", "1/1", "0/1"]
     runs = list_runs(home / "outputs")
     assert sorted(run.manifest["kind"] for run in runs if run.done) == ["memmlp", "memmlp", "vqvae"]
     assert {(run.manifest["device"], run.manifest["processes"]) for run in runs} == {("cpu", 1)}
@@ -97,15 +97,19 @@ def test_status_and_dry_run_show_and_do_nothing(home: Path):
     assert stamps(home) == before
 
 
-def test_arms_that_are_named_are_run_alone(home: Path):
+def test_variants_that_are_named_are_run_alone(home: Path):
     before = stamps(home)
-    assert "1 of 2 runs to do" in command(home, "seed=0,1", "--arm", "none", "--dry-run", "--workers", "1")
-    said = command(home, "--status", "--arm", "none")
+    assert "1 of 2 runs to do" in command(
+        home, "seed=0,1", "--variant", "none", "--dry-run", "--workers", "1"
+    )
+    said = command(home, "--status", "--variant", "none")
     assert "1 done" in said
     assert "wild" not in said
-    said = command(home, "--arm", "none", "--arm", "full")  # the failure of another arm is none of theirs
+    said = command(
+        home, "--variant", "none", "--variant", "full"
+    )  # the failure of another variant is none of theirs
     assert "3 of 4 runs done" in said
-    assert "again with: --retry" in command(home, "--arm", "wild", code=1)
+    assert "again with: --retry" in command(home, "--variant", "wild", code=1)
     assert stamps(home) == before
 
 
@@ -117,24 +121,24 @@ def test_a_first_dry_run_counts_the_runs_whose_data_is_not_prepared(tmp_path: Pa
     assert not list_runs(tmp_path / "outputs")
 
 
-def test_an_edited_file_adds_arms_and_lists_orphans(home: Path):
+def test_an_edited_file_adds_variants_and_lists_orphans(home: Path):
     try:
         write(home, {"full": [], "depth": ["model.depth=9"]})
         said = command(home, "--status")
         assert "2 done, 1 waiting" in said
         assert said.count("orphan: run") == 2
     finally:
-        write(home, ARMS)
+        write(home, VARIANTS)
     assert "orphan" not in command(home, "--status")
 
 
-def test_seeds_come_one_after_another_each_with_all_arms(home: Path, monkeypatch: pytest.MonkeyPatch):
+def test_seeds_come_one_after_another_each_with_all_variants(home: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(home)
     plan = kept_or_new_plan(
         find_sweep("trial.yaml").with_overrides([*TINY, "seed=1,0"]), (home / "outputs").absolute()
     )
     cells = [(entry.seed, entry.label) for entry in plan.entries]
-    assert cells == [(seed, arm) for seed in (1, 0) for arm in ARMS]
+    assert cells == [(seed, variant) for seed in (1, 0) for variant in VARIANTS]
     own = [task.id for task in plan.tasks if task.kind == "memmlp"]
     assert own == [entry.id for entry in plan.entries]
     for task in plan.tasks:
@@ -144,7 +148,7 @@ def test_seeds_come_one_after_another_each_with_all_arms(home: Path, monkeypatch
     (codes,) = (task for task in plan.tasks if task.kind == "vqvae" and task.id == plan.tasks[0].id)
     assert name(plan, codes).startswith(f"VQ-VAE {codes.id} of seed ")
     said = command(home, "seed=1,0", "--status")
-    assert re.search(r"arm +seed 0 +seed 1", said)
+    assert re.search(r"variant +seed 0 +seed 1", said)
     assert re.search(r"none +[\d.]+ cm +waiting", said)
 
 
@@ -152,14 +156,14 @@ def test_seeds_come_one_after_another_each_with_all_arms(home: Path, monkeypatch
 def test_the_first_failure_ends_the_sweep_where_that_is_wanted(tmp_path: Path):
     endless, failing = ["memory=none", "optim.steps=100000"], ["memory=none", "optim.lr=1e30"]
     write(tmp_path, {"endless": endless, "failing": failing, "late": ["memory=none"]})
-    settings = [word for word in TINY if not word.startswith("optim.")]  # which an arm sets itself
+    settings = [word for word in TINY if not word.startswith("optim.")]  # which a variant sets itself
     words = ["sweep", "trial.yaml", *settings, "--workers", "2", "--fail-fast"]
     said = run_apart(tmp_path, *words, code=1)
     assert "0 of 3 runs done" in said
     assert "failing seed 0: failed, loss is nan" in said
     assert re.search(r"^failed: run .*: loss is nan", said, re.M)
     runs = list_runs(tmp_path / "outputs")
-    assert len(runs) <= 2  # the last arm's was not begun
+    assert len(runs) <= 2  # the last variant's was not begun
     until(lambda: not any(run.doing for run in runs), "the workers end")
     assert [run.status for run in runs].count("failed") == 1
     assert "0 of 3 runs done" in run(tmp_path, *words, code=1)  # a run that failed before ends it again
@@ -178,7 +182,7 @@ def test_retry_takes_failed_runs_up_again(home: Path):
 def test_again_does_networks_again_and_force_is_refused(
     home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """With force=true two arms that share a run would make each other's stages again and again."""
+    """With force=true two variants that share a run would make each other's stages again and again."""
     copy = Path(shutil.copytree(home, tmp_path / "copy"))
     left = []
     monkeypatch.setattr(
@@ -296,8 +300,14 @@ def test_an_interrupted_sweep_ends_its_workers_and_goes_on_later(tmp_path: Path,
         (["99"], "sweep '99': no such sweep"),
         (["missing.yaml"], "missing.yaml: no such file; allowed"),
         (["trial.yaml", "memory=nosuch"], "memory=nosuch"),
-        (["trial.yaml", "--arm", "non"], "sweep trial: no arm 'non' that can be run; allowed are full, none"),
-        (["trial.yaml", "--arm", "none", "--until-decided"], "--arm: allowed is without --until-decided"),
+        (
+            ["trial.yaml", "--variant", "non"],
+            "sweep trial: no variant 'non' can be run",
+        ),
+        (
+            ["trial.yaml", "--variant", "none", "--until-decided"],
+            "--variant: allowed is without --until-decided",
+        ),
         (["trial.yaml", "executor=cloud"], "executor=cloud: allowed is local, slurm, ray or dask"),
         (["trial.yaml", "slurm.partition=x"], "slurm.partition: goes with executor=slurm"),
         (["trial.yaml", "executor=slurm", "slurm.nodes=2"], "slurm.nodes: allowed is none"),
@@ -312,11 +322,11 @@ def test_an_interrupted_sweep_ends_its_workers_and_goes_on_later(tmp_path: Path,
             "device=cuda:x: allowed is auto or cpu or cuda or cuda:INDEX or mps",
         ),
         (["trial.yaml", "seed=a"], "seed: ['a']; allowed is a list of whole numbers"),
-        (["trial.yaml", "data=mocap"], "arm 'full': data.root: has no value"),
+        (["trial.yaml", "data=mocap"], "variant 'full': data.root: has no value"),
     ],
 )
 def test_bad_input_is_one_line(tmp_path: Path, words: list[str], line: str):
-    write(tmp_path, ARMS)
+    write(tmp_path, VARIANTS)
     said = run(tmp_path, "sweep", *words, code=2)
     assert line in said
     assert said.count("\n") == 1

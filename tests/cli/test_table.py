@@ -23,8 +23,8 @@ def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
         if sweep.table == 1 or "bad=1" in sweep.command_line:
             raise InputError("data.root: has no value")
         find = fake_sweep(tmp_path / sweep.name, sweep, clips=CLIPS[-4:])
-        entries = [(arm, seed) for arm in sweep.runnable() for seed in sweep.seeds]
-        found = [Entry(arm.label, seed, find(arm, seed).id) for arm, seed in entries]  # type: ignore[union-attr]
+        entries = [(variant, seed) for variant in sweep.runnable() for seed in sweep.seeds]
+        found = [Entry(variant.label, seed, find(variant, seed).id) for variant, seed in entries]  # type: ignore[union-attr]
         return Plan(sweep.name, tmp_path / sweep.name, tuple(found), ())
 
     monkeypatch.setattr("memmlp.config.compose_plan.kept_or_new_plan", plan)
@@ -60,11 +60,16 @@ def test_command_plans_seeds(memmlp: Memmlp, planned: None):
     assert len(rows) == 3 * 4
     assert all(row[-2] == "3" or row[-3] == "3" for row in rows)
     assert "needed: seeds for an effect of the paper's size" in out
-    assert "no arm with an effect" in memmlp("table", "1", "--seeds-needed").out
+    assert "no variant with an effect" in memmlp("table", "1", "--seeds-needed").out
 
 
 def test_command_writes_the_format_of_the_ending(memmlp: Memmlp, planned: None, tmp_path: Path):
-    for ending, word in (("md", "| arm |"), ("tex", r"\toprule"), ("json", '"rows"'), ("html", "<table>")):
+    for ending, word in (
+        ("md", "| variant |"),
+        ("tex", r"\toprule"),
+        ("json", '"rows"'),
+        ("html", "<table>"),
+    ):
         ran = memmlp("table", "5", "--out", f"out/t.{ending}")
         assert (ran.code, ran.out) == (0, f"out/t.{ending}\n")
         assert word in Path(f"out/t.{ending}").read_text()

@@ -67,7 +67,7 @@ def test_the_same_command_does_nothing_and_status_shows_the_same(home: Path):
     assert (folder_of(home) / "study.journal").read_bytes() == before
 
 
-def test_the_best_is_an_arm_of_table_5(home: Path):
+def test_the_best_is_an_variant_of_table_5(home: Path):
     table = folder_of(home) / "table05.yaml"
     words = [str(table), "seed=0"]  # data and profile are those of the search
     assert "manual, searched" in command(home, "sweep", *words, "--dry-run")

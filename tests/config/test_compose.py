@@ -351,7 +351,7 @@ def test_an_option_of_ones_own_that_ours_hides_is_refused(
     own = tmp_path / "mine" / option
     own.parent.mkdir(parents=True)
     own.write_text(EXTRA.format(16))
-    (tmp_path / "s.yaml").write_text("arms: {a: [experiment=paper]}\n")
+    (tmp_path / "s.yaml").write_text("variants: {a: [experiment=paper]}\n")
     words = {
         "--config-dir": ["train", "--config-dir", "mine", "optim.lr=-1"],
         "--cfg": ["train", "--config-dir", "mine", "--cfg", "job"],

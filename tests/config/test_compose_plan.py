@@ -27,8 +27,8 @@ def test_a_plan_that_depends_on_the_environment_or_on_other_folders_is_made_anew
     words: list[str], kept: bool, tmp_path: Path
 ):
     for sweep in (
-        parse_sweep("s", {"arms": {"a": words}}),
-        parse_sweep("s", {"base": words, "arms": {"a": []}}),
+        parse_sweep("s", {"variants": {"a": words}}),
+        parse_sweep("s", {"base": words, "variants": {"a": []}}),
     ):
         assert (_stamp(sweep, tmp_path) == _stamp(sweep, tmp_path)) == kept
 
@@ -44,13 +44,15 @@ NESTED = {
 
 @pytest.mark.parametrize("place", ["--config-dir", "hydra.searchpath"])
 @pytest.mark.parametrize("name", NESTED)
-def test_nothing_undoes_what_an_arms_experiment_sets_by_another_one(tmp_path: Path, place: str, name: str):
+def test_nothing_undoes_what_an_variants_experiment_sets_by_another_one(
+    tmp_path: Path, place: str, name: str
+):
     folder = tmp_path / "conf/experiment"
     folder.mkdir(parents=True)
     for option, text in NESTED.items():
         (folder / f"{option}.yaml").write_text(f"# @package _global_\n{text}")
     path, near = tmp_path / "s.yaml", place == "--config-dir"
-    path.write_text(f"arms: {{a: [], b: [experiment={name}]}}\n")
+    path.write_text(f"variants: {{a: [], b: [experiment={name}]}}\n")
     words = [] if near else [f"hydra.searchpath=[file://{folder.parent}]"]
     with plugins.searching(folder.parent if near else None):
         for own in ("memory=lstm", "model.width=16"):
@@ -65,35 +67,39 @@ def test_nothing_undoes_what_an_arms_experiment_sets_by_another_one(tmp_path: Pa
     ("content", "words", "said"),
     [
         (
-            "arms: {a: [], b: [experiment=no_memory]}",
+            "variants: {a: [], b: [experiment=no_memory]}",
             ["memory=gru"],
-            "sweep s, arm 'b': experiment=no_memory sets memory, and memory=gru beside it would win",
+            "variant 'b': experiment=no_memory sets memory, and memory=gru beside it would win",
         ),
         (
-            "base: [memory=gru]\narms: {a: [], b: [experiment=no_memory]}",
+            "base: [memory=gru]\nvariants: {a: [], b: [experiment=no_memory]}",
             [],
             "memory=gru beside it would win",
         ),
         (
-            "arms: {a: [], b: [experiment=paper]}",
+            "variants: {a: [], b: [experiment=paper]}",
             ["data.drawn_by=frames"],
             "sets data.drawn_by, and",
         ),
         (
-            "base: [experiment=paper]\narms: {a: [], b: [experiment=no_memory]}",
+            "base: [experiment=paper]\nvariants: {a: [], b: [experiment=no_memory]}",
             [],
             "experiment=no_memory would replace experiment=paper; allowed is experiment=[paper,no_memory]",
         ),
-        ("arms: {a: [memory=gru]}\naxes: {experiment: [no_memory]}", [], "memory=gru beside it"),
-        ("base: [experiment=paper]\narms: {a: [], b: ['experiment=[paper,no_memory]']}", [], None),
-        ("base: [memory=gru]\narms: {a: [], b: [experiment=no_memory, memory=none]}", ["optim=muon"], None),
-        ("base: [memory=gru]\narms: {a: [], b: [memory=none]}", ["experiment=paper"], None),
+        ("variants: {a: [memory=gru]}\naxes: {experiment: [no_memory]}", [], "memory=gru beside it"),
+        ("base: [experiment=paper]\nvariants: {a: [], b: ['experiment=[paper,no_memory]']}", [], None),
+        (
+            "base: [memory=gru]\nvariants: {a: [], b: [experiment=no_memory, memory=none]}",
+            ["optim=muon"],
+            None,
+        ),
+        ("base: [memory=gru]\nvariants: {a: [], b: [memory=none]}", ["experiment=paper"], None),
     ],
 )
-def test_nothing_undoes_the_experiment_of_an_arm(
+def test_nothing_undoes_the_experiment_of_an_variant(
     tmp_path: Path, content: str, words: list[str], said: str | None
 ):
-    """Hydra lets a group on the command line win over an experiment's, and the arm's label would be wrong."""
+    """Hydra lets a group on the command line win over an experiment's, and the label would be wrong."""
     path = tmp_path / "s.yaml"
     path.write_text(content)
     if said is None:
@@ -117,8 +123,10 @@ def test_a_sweep_has_one_folder_in_whatever_order_it_is_asked_for(tmp_path: Path
     renamed = "profile=small", "loggers=none", "threads=1", "normalizer.z_scores=false", "data=mocap"
     of_0_2 = "table14-af91e19b"  # of the former names, made by version 0.2's code (commit ae007ecb)
     assert sweep_folder(replace(sweep, command_line=renamed), tmp_path).name == of_0_2
-    arms = tuple(replace(arm, overrides=("model=vae_hmd",)) for arm in sweep.runnable())  # choose the loss
-    typed = replace(sweep, arms=arms, command_line=("loss.position_from_pelvis=2",))
+    variants = tuple(
+        replace(variant, overrides=("model=vae_hmd",)) for variant in sweep.runnable()
+    )  # choose the loss
+    typed = replace(sweep, variants=variants, command_line=("loss.position_from_pelvis=2",))
     assert sweep_folder(typed, tmp_path).name == f"{sweep.name}-{digest(('loss.position=2',))[:8]}"
     earlier = tmp_path / "sweeps" / f"{sweep.name}-{digest(('threads=1', 'seed=3'))[:8]}"
     earlier.mkdir(parents=True)

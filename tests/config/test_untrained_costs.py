@@ -19,7 +19,7 @@ from memmlp.tables.measured_run import load
 
 ARMS = {"Mem-MLP": [], "AvatarPoser": ["model=avatar_poser"], "printed alone": {"overrides": None}}
 METRICS = ["FLOPs", "MACs", "size", "parameters"]
-SWEEP = parse_sweep("sizes", {"arms": ARMS, "metrics": METRICS, "base": ["profile=tiny"], "seeds": [3]})
+SWEEP = parse_sweep("sizes", {"variants": ARMS, "metrics": METRICS, "base": ["profile=tiny"], "seeds": [3]})
 
 
 @pytest.mark.slow
@@ -49,7 +49,7 @@ def test_times_are_measured_where_the_table_shows_them():
         "metrics": ["ms", "network ms", "pose ms", "ratio"],
         "base": ["profile=tiny", "export.alone=true", "model.depth=1"],
     }
-    sweep = parse_sweep("times", {"arms": {"AvatarPoser": ARMS["AvatarPoser"]}, "seeds": [0], **timed})
+    sweep = parse_sweep("times", {"variants": {"AvatarPoser": ARMS["AvatarPoser"]}, "seeds": [0], **timed})
     runs, _ = with_costs(sweep, {"AvatarPoser": {}})
     found = runs["AvatarPoser"][0]
     assert all(found.costs[metric] > 0 for metric in sweep.metrics)
@@ -58,7 +58,7 @@ def test_times_are_measured_where_the_table_shows_them():
 
 def test_what_needs_a_run_is_refused():
     with pytest.raises(InputError, match="--untrained: sweep t shows MPJPE; allowed are tables of FLOPs"):
-        with_costs(parse_sweep("t", {"arms": ARMS, "metrics": ["FLOPs", "MPJPE"]}), {})
+        with_costs(parse_sweep("t", {"variants": ARMS, "metrics": ["FLOPs", "MPJPE"]}), {})
 
 
 def test_the_command_refuses_it_for_other_tables(memmlp: Memmlp):

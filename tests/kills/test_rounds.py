@@ -28,9 +28,9 @@ WORDS = ["sweep", "trial.yaml", *(word for word in TINY if "synth" not in word),
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:unclosed file .*DEBUG:ResourceWarning")  # submitit leaves its logs open
 def test_rounds_go_on_after_a_kill(tmp_path: Path):
-    """Of two arms that hardly differ, which three seeds show."""
+    """Of two variants that hardly differ, which three seeds show."""
     hardly = ["memory=none", "optim.weight_decay=1.001e-4"]
-    content = {"metrics": ["MPJPE"], "arms": {"one": ["memory=none"], "other": hardly}}
+    content = {"metrics": ["MPJPE"], "variants": {"one": ["memory=none"], "other": hardly}}
     for activity in ("walking", "squatting", "reaching", "waving"):
         write_clip(tmp_path / f"clips/{activity}.npz", synthesize_clip(activity, 0, seconds=1))
     (tmp_path / "trial.yaml").write_text(yaml.safe_dump(content))

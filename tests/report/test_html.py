@@ -142,7 +142,7 @@ def test_distributions_by_hand(tmp_path: Path):
 def test_an_arm_that_diverges_on_hard_clips_does_not_look_better_for_it(tmp_path: Path):
     sweep = load_sweep(SHIPPED / "table14.yaml")
     runs = runs_of(sweep, fake_sweep(tmp_path, sweep, {"2": 0.5}))
-    branch = sweep.arms[0].branch
+    branch = sweep.variants[0].branch
 
     def of(label: str) -> Distribution:
         found = distributions(sweep, runs, "stream")["MPJPE"]
@@ -215,7 +215,7 @@ def test_config_differences(text: str):
 @pytest.mark.slow
 def test_labels_are_escaped(tmp_path: Path):
     content = (
-        "arms: {'<script>alert(1)</script>': [a=b], '& <b>': [a=c]}\ntitle: <i>title</i>\nseeds: [0, 1]\n"
+        "variants: {'<script>alert(1)</script>': [a=b], '& <b>': [a=c]}\ntitle: <i>title</i>\nseeds: [0, 1]\n"
     )
     (tmp_path / "bad.yaml").write_text(content)
     sweep = load_sweep(tmp_path / "bad.yaml")

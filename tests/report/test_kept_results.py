@@ -221,8 +221,8 @@ def test_damaged_results_are_one_line(tmp_path: Path, text: str):
 
 def test_results_of_an_arm_that_was_another_are_refused(sweep: Sweep, kept: Kept):
     """Otherwise its numbers would stand under a label that means something else now."""
-    arms = [replace(arm, overrides=("memory=gru",)) if arm.label == "2" else arm for arm in sweep.arms]
-    other = replace(sweep, arms=tuple(arms))
+    arms = [replace(arm, overrides=("memory=gru",)) if arm.label == "2" else arm for arm in sweep.variants]
+    other = replace(sweep, variants=tuple(arms))
     with pytest.raises(InputError, match="arm '2' was made with the overrides"):
         kept.of(other)
     with pytest.raises(InputError, match="arm '2' was made with the overrides"):

@@ -187,10 +187,10 @@ def by_hand(
 
 def test_the_way_from_the_first_arm_to_the_last_is_the_sum_of_its_steps(sweep: Sweep, tmp_path: Path):
     """Errors grow from arm to arm of a chain; a share is shown where the interval leaves 0 out."""
-    labels = [arm.label for arm in sweep.arms]
+    labels = [arm.label for arm in sweep.variants]
     against = {labels[0]: labels[1], labels[1]: labels[2], labels[2]: labels[0]}  # the control, two before it
-    arms = tuple(replace(arm, against=against.get(arm.label)) for arm in sweep.arms)
-    chained = replace(sweep, arms=arms, control=labels[0])
+    arms = tuple(replace(arm, against=against.get(arm.label)) for arm in sweep.variants)
+    chained = replace(sweep, variants=arms, control=labels[0])
     find = fake_sweep(tmp_path, chained, {labels[1]: 1.1, labels[2]: 1.3}, groups=GROUPS)
     words = Placeholders(
         {"t": source(chained, Kept("table14", (), runs_of(chained, find), overrides_of(chained)))}

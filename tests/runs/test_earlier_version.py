@@ -127,7 +127,12 @@ def test_its_times_and_errors_are_in_a_table(earlier):
     recorded = read_json(next(run.deployments.glob("*/latency.json")))
     assert costs["ratio"] == recorded["int8"]["ratio_to_reference"]  # of the precision that was asked for
     assert Run(run.folder).preferred_deployment.record["ratio_to_yardstick"] == recorded["ratio_to_reference"]
-    content = {"base": [*TINY, INT8], "metrics": ["MPJPE", "ratio"], "seeds": [0], "arms": {"earlier": []}}
+    content = {
+        "base": [*TINY, INT8],
+        "metrics": ["MPJPE", "ratio"],
+        "seeds": [0],
+        "variants": {"earlier": []},
+    }
     (home / "sweep.yaml").write_text(yaml.safe_dump(content))
     said = command(home, "sweep", "sweep.yaml")
     assert "2 of 2 runs done" in said

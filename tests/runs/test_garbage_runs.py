@@ -38,7 +38,7 @@ def outputs(tmp_path: Path) -> Path:
     sweep = tmp_path / "sweeps" / "mine"
     sweep.mkdir(parents=True)
     now = {"label": "a", "seed": 0, "id": GOOD}
-    write_json(sweep / "sweep.json", {"arms": [{"label": "a"}]})
+    write_json(sweep / "sweep.json", {"variants": [{"label": "a"}]})
     write_json(sweep / "plan.json", {"entries": [now], "tasks": [{"id": GOOD}]})
     write_json(sweep / "entries.json", {"entries": [{**now, "id": GONE}, now]})
     return tmp_path
@@ -91,7 +91,7 @@ def test_a_plan_that_does_not_name_a_run_condemns_none(outputs: Path, file: str,
 
 
 def test_runs_of_an_arm_that_is_gone_may_go(outputs: Path):
-    write_json(outputs / "sweeps" / "mine" / "sweep.json", {"arms": [{"label": "b"}]})
+    write_json(outputs / "sweeps" / "mine" / "sweep.json", {"variants": [{"label": "b"}]})
     write_json(outputs / "sweeps" / "mine" / "plan.json", {"entries": [], "tasks": []})
     assert found(outputs)[GOOD] == "orphaned"
 

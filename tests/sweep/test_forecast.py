@@ -1,4 +1,4 @@
-"""How long a plan's runs may take: each judged by its own arm where that has finished runs."""
+"""How long a plan's runs may take: each judged by its own variant where that has finished runs."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ CODES, QUICK, SLOW = ("c" * 16,), ("a" * 16, "b" * 16), ("d" * 16, "e" * 16)
 
 @pytest.fixture
 def plan(tmp_path: Path) -> Plan:
-    """Two arms of two seeds each, and what is upstream of them."""
-    arms = {"quick": QUICK, "slow": SLOW}
-    entries = [Entry(arm, seed, name) for arm, names in arms.items() for seed, name in enumerate(names)]
+    """Two variants of two seeds each, and what is upstream of them."""
+    variants = {"quick": QUICK, "slow": SLOW}
+    entries = [
+        Entry(variant, seed, name) for variant, names in variants.items() for seed, name in enumerate(names)
+    ]
     tasks = [RunTask(CODES[0], "vqvae", {})]
     tasks += [RunTask(entry.id, "memmlp", {}, CODES[0]) for entry in entries]
     return Plan("trial", tmp_path, tuple(entries), tuple(tasks))
@@ -39,7 +41,7 @@ def test_nothing_is_foretold_of_a_kind_of_which_nothing_has_finished(plan: Plan)
     assert forecast(plan) is None
 
 
-def test_a_run_is_judged_by_its_arm(plan: Plan):
+def test_a_run_is_judged_by_its_variant(plan: Plan):
     finish(plan, CODES[0], 10.0)
     finish(plan, QUICK[0], {"train": 50.0, "evaluate": 10.0})
     finish(plan, SLOW[0], {"train": 1000.0, "evaluate": 200.0})
@@ -58,7 +60,7 @@ def test_a_trained_run_without_what_the_plan_wants_of_it_judges_none(plan: Plan)
     assert forecast(again) == Forecast(3 * 60.0, finished=1, unlike=2)
 
 
-def test_an_arm_without_a_finished_run_is_judged_by_the_others_and_counted(plan: Plan):
+def test_an_variant_without_a_finished_run_is_judged_by_the_others_and_counted(plan: Plan):
     finish(plan, CODES[0], 10.0)
     finish(plan, QUICK[0], 60.0)
     assert forecast(plan) == Forecast(60.0 + 2 * 60.0, finished=1, unlike=2)

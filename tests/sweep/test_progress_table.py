@@ -23,7 +23,7 @@ CARD = {"device": "cuda", "gpu": "A card", "gpu_index": "1"}
 def plan(tmp_path: Path) -> Plan:
     """Three runs on a GPU and one on the CPU, of which the last one is done."""
     tasks = tuple(RunTask(str(number) * 16, "memmlp", {"optim": {"steps": 9}}) for number in range(4))
-    made = Plan("trial", tmp_path, tuple(Entry("arm", n, t.id) for n, t in enumerate(tasks)), tasks)
+    made = Plan("trial", tmp_path, tuple(Entry("variant", n, t.id) for n, t in enumerate(tasks)), tasks)
     for task, facts in zip(tasks, (CARD, CARD, {"device": "cpu", "gpu": None}, CARD), strict=True):
         made.run_of(task).folder.mkdir(parents=True)
         made.run_of(task).write_manifest(facts)
@@ -54,12 +54,12 @@ def test_a_log_is_not_silent_while_runs_go_on(plan: Plan, monkeypatch: pytest.Mo
     assert told("new", "new", "new", "done") == ["1 of 4 done; workers are starting"]
     assert told("new", "new", "new", "done") == []
     clock.now += QUIET - 1
-    assert told("running", "new", "new", "done") == ["1 of 4 done; arm seed 0: running"]
+    assert told("running", "new", "new", "done") == ["1 of 4 done; variant seed 0: running"]
     clock.now += QUIET - 1
     assert told("running", "new", "new", "done") == []
     plan.run_of(plan.tasks[0]).log(3, {"loss": 0.5})
     clock.now += 1
-    assert told("running", "new", "new", "done") == ["1 of 4 done; arm seed 0: 3/9 loss 0.5"]
+    assert told("running", "new", "new", "done") == ["1 of 4 done; variant seed 0: 3/9 loss 0.5"]
     assert told("running", "new", "new", "done") == []
 
 
@@ -92,7 +92,7 @@ def test_names(plan: Plan):
 def test_a_name_is_not_broken_into_letters_where_there_are_many_seeds(
     plan: Plan, capsys: pytest.CaptureFixture
 ):
-    """Seen with five seeds at 80 columns: an arm's name had three letters a line."""
+    """Seen with five seeds at 80 columns: a variant's name had three letters a line."""
     only = plan.entries[0]
     wide = replace(
         plan, entries=tuple(replace(only, label="AvatarPoser + refiner", seed=n) for n in range(5))

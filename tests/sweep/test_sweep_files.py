@@ -1,4 +1,4 @@
-"""The shipped sweep files: they load, their arms differ, and their paper values are those printed.
+"""The shipped sweep files: they load, their variants differ, and their paper values are those printed.
 
 paper_values.yaml has the printed values, transcribed apart from the sweeps. Facts of its own tell whether the
 transcription is right: rows that stand in several tables, numbers in the paper's text, and sums that the
@@ -21,7 +21,7 @@ from memmlp.config.build import build_experiment, untrained
 from memmlp.config.compose import composed
 from memmlp.motion.normalizer import Normalizer
 from memmlp.runs.identity import flatten
-from memmlp.sweep.definition import Arm, Sweep
+from memmlp.sweep.definition import Sweep, Variant
 from memmlp.sweep.sweep_file import load_sweep
 from memmlp.training.loop import train_step
 from memmlp.training.train_network import MotionTask
@@ -70,13 +70,15 @@ def row(table: int, label: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_arms_differ(path: Path):
+def test_variants_differ(path: Path):
     sweep = load_sweep(path)
     alike = (
         {"MANIKIN-LN"} if sweep.table == 16 else set()
     )  # its size is that of MANIKIN-L's network, as its note says
-    arms = [arm for arm in sweep.arms if arm.overrides is not None and arm.label not in alike]
-    runnable = [(arm.overrides, arm.branch) for arm in arms]
+    variants = [
+        variant for variant in sweep.variants if variant.overrides is not None and variant.label not in alike
+    ]
+    runnable = [(variant.overrides, variant.branch) for variant in variants]
     assert len(set(runnable)) == len(runnable)
     assert path.stem != sweep.title
 
@@ -85,9 +87,9 @@ def test_arms_differ(path: Path):
 def test_tables_carry_their_number_and_values(path: Path):
     sweep = load_sweep(path)
     assert path.stem == f"table{sweep.table:02}"
-    assert all(arm.paper for arm in sweep.arms if arm.label not in OURS)
-    assert len(sweep.arms) > len(OURS)
-    assert all(metric in sweep.metrics for arm in sweep.arms for metric in arm.paper or {})
+    assert all(variant.paper for variant in sweep.variants if variant.label not in OURS)
+    assert len(sweep.variants) > len(OURS)
+    assert all(metric in sweep.metrics for variant in sweep.variants for metric in variant.paper or {})
 
 
 def test_every_table_of_the_paper_is_there():
@@ -99,12 +101,12 @@ def test_values_are_those_printed(path: Path):
     """Each row has the printed values, and none beside them."""
     sweep = load_sweep(path)
     assert sweep.table
-    arms = [(arm.label, dict(arm.paper)) for arm in sweep.arms if arm.paper]
+    variants = [(variant.label, dict(variant.paper)) for variant in sweep.variants if variant.paper]
     printed = rows(sweep.table)
     labels = [found.pop("label") for found in printed]
-    assert [values for _, values in arms] == printed
+    assert [values for _, values in variants] == printed
     if sweep.table in LABELLED:
-        assert [label for label, _ in arms] == labels
+        assert [label for label, _ in variants] == labels
 
 
 @pytest.mark.parametrize("table", [12, 13])
@@ -122,19 +124,19 @@ def test_rows_with_table_6s_combined_values_show_the_combined_branch(path: Path)
     """The file also says how we know the branch. A network with rotations alone shows these."""
     sweep = load_sweep(path)
     assert sweep.branch_source
-    full = [arm for arm in sweep.arms if AFTER_IK.items() <= (arm.paper or {}).items()]
+    full = [variant for variant in sweep.variants if AFTER_IK.items() <= (variant.paper or {}).items()]
     assert bool(full) == (sweep.table not in (2, 3))
-    assert {arm.branch for arm in full} <= {"combined"}
-    for arm in sweep.runnable():
-        words = sweep.all_overrides(arm)
+    assert {variant.branch for variant in full} <= {"combined"}
+    for variant in sweep.runnable():
+        words = sweep.all_overrides(variant)
         single = any(word.startswith(("model=", "predictor=rotation_only")) for word in words)
-        assert (arm.branch == "rotation") == (single or arm.label == "Rotation Branch")
+        assert (variant.branch == "rotation") == (single or variant.label == "Rotation Branch")
         assert ("evaluation.ik=off" in words) == single
         assert ("evaluation.ik=lbfgs" in words) != single
 
 
 def test_the_first_row_of_table_4_is_agrols():
-    first = load_sweep(FOLDER / "table04.yaml").arms[0]
+    first = load_sweep(FOLDER / "table04.yaml").variants[0]
     assert {"model=agrol_mlp", "model.frames=41"} <= set(first.overrides or ())
     assert (first.paper or {})["Jitter"] == 22.70
 
@@ -149,20 +151,22 @@ DECOMPOSITION = load_sweep(FOLDER / "decomposition.yaml")
 
 @pytest.mark.slow
 def test_the_decomposition_changes_one_ingredient_a_step():
-    """Each arm's config differs from its control's in what its label names, or only its branch does."""
-    arms = {arm.label: arm for arm in DECOMPOSITION.arms}
+    """Each variant's config differs from its control's in what its label names, or only its branch does."""
+    variants = {variant.label: variant for variant in DECOMPOSITION.variants}
     configs = {
-        label: flatten(OmegaConf.to_container(composed([*DECOMPOSITION.all_overrides(arm)]), resolve=True))
-        for label, arm in arms.items()
+        label: flatten(
+            OmegaConf.to_container(composed([*DECOMPOSITION.all_overrides(variant)]), resolve=True)
+        )
+        for label, variant in variants.items()
     }
     changed = {}
-    for label, arm in arms.items():
-        control = DECOMPOSITION.control_of(arm)
+    for label, variant in variants.items():
+        control = DECOMPOSITION.control_of(variant)
         if control and label != "AGRoL-MLP-41":
             one, other = configs[label], configs[control]
             keys = {key for key in one.keys() | other.keys() if one.get(key) != other.get(key)}
             changed[label] = {key.split(".")[0] for key in keys}
-            changed[label] |= {"branch"} if arm.branch != arms[control].branch else set()
+            changed[label] |= {"branch"} if variant.branch != variants[control].branch else set()
     assert changed == {
         "+ features": {"normalizer"},
         "+ Mem-MLP's backbone": {"model", "memory", "predictor", "hand"},
@@ -204,10 +208,10 @@ def test_the_backbone_is_agrols_mlp_of_ten_blocks():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("arm", DECOMPOSITION.arms, ids=lambda arm: arm.label)
-def test_an_arm_of_the_decomposition_trains(arm: Arm):
-    """A step of each arm changes the weights, under the loss that its label names."""
-    experiment = build_experiment(composed([*DECOMPOSITION.all_overrides(arm), "profile=tiny"]))
+@pytest.mark.parametrize("variant", DECOMPOSITION.variants, ids=lambda variant: variant.label)
+def test_an_variant_of_the_decomposition_trains(variant: Variant):
+    """A step of each variant changes the weights, under the loss that its label names."""
+    experiment = build_experiment(composed([*DECOMPOSITION.all_overrides(variant), "profile=tiny"]))
     torch.manual_seed(0)
     architecture, frames = experiment.architecture, tiny.frames((60, 70))
     normalizer = Normalizer.raw(architecture.coordinates, tiny.REST)
@@ -218,7 +222,7 @@ def test_an_arm_of_the_decomposition_trains(arm: Arm):
     task = MotionTask(model, loss, rollout, frames, optim, 0, lambda network: {})
     result = train_step(task, optim, optim.build(task.parameter_groups()), 0)
     assert not torch.equal(model.stem.weight, before)
-    assert set(result.terms) == set(TERMS.get(arm.label, TERMS["rest"]))
+    assert set(result.terms) == set(TERMS.get(variant.label, TERMS["rest"]))
 
 
 TERMS = {
@@ -238,10 +242,14 @@ TERMS = {
 
 
 def test_the_cells_of_scaling_are_lines_through_one_point():
-    """Of each arm as many cells, with a memory in proportion to the width as the paper's is."""
+    """Of each variant as many cells, with a memory in proportion to the width as the paper's is."""
     sweep = load_sweep(FOLDER / "scaling.yaml")
     assert len(sweep.runnable()) == 66
-    cells = [dict(word.split("=") for word in arm.cell) for arm in sweep.arms if arm.series == "Mem-MLP"]
+    cells = [
+        dict(word.split("=") for word in variant.cell)
+        for variant in sweep.variants
+        if variant.series == "Mem-MLP"
+    ]
     centre = {"data.split.train_fraction": "1.0", "profile.width": "128", "optim.steps": "2000"}
     away = [[key for key in centre if cell[key] != centre[key]] for cell in cells]
     assert sorted(map(tuple, away)) == sorted(
@@ -251,8 +259,10 @@ def test_the_cells_of_scaling_are_lines_through_one_point():
         assert 8 * int(cell["profile.memory_width"]) == 3 * int(cell["profile.width"])
     paper = composed(["profile=paper"])
     assert 8 * paper.memory.width == 3 * paper.model.width
-    for arm in sweep.arms:
-        assert arm.series == "Mem-MLP" or sweep.control_of(arm) == f"Mem-MLP, {', '.join(arm.cell)}"
+    for variant in sweep.variants:
+        assert (
+            variant.series == "Mem-MLP" or sweep.control_of(variant) == f"Mem-MLP, {', '.join(variant.cell)}"
+        )
 
 
 @pytest.mark.parametrize("table", FULL)

@@ -13,10 +13,10 @@ from memmlp.sweep.sweep_json import NAME, keep_sweep, kept_sweep
 
 CONTENT = {
     "title": "Mine",
-    "notes": ["of two arms"],
+    "notes": ["of two variants"],
     "base": ["data=synthetic"],
     "control": "none",
-    "arms": {"none": ["memory=none"], "gru": ["memory=gru"]},
+    "variants": {"none": ["memory=none"], "gru": ["memory=gru"]},
 }
 
 
@@ -24,7 +24,7 @@ def test_what_is_read_is_what_was_kept(tmp_path: Path):
     sweep = parse_sweep("mine", CONTENT)
     changed = replace(
         sweep.with_overrides(["seed=4,5", "optim.lr=0.1"]),
-        arms=(*sweep.arms[1:], replace(sweep.arms[0], series="a", cell=("b=1", "c=2"))),
+        variants=(*sweep.variants[1:], replace(sweep.variants[0], series="a", cell=("b=1", "c=2"))),
     )
     assert kept_sweep(tmp_path) is None
     for each in (sweep, changed):
@@ -39,7 +39,7 @@ def test_a_copy_of_the_same_content_is_not_written_again(tmp_path: Path):
     assert (tmp_path / NAME).stat().st_mtime_ns == before
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"arms": [{"no": 1}]}'])
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"variants": [{"no": 1}]}'])
 def test_a_damaged_copy_is_named(tmp_path: Path, text: str):
     (tmp_path / NAME).write_text(text)
     with pytest.raises(InputError, match=f"{NAME}: not a sweep"):

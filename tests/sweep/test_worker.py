@@ -35,7 +35,7 @@ ONE, TWO, ALONE = (
 
 
 def plan(outputs: Path, *tasks: RunTask, **changes) -> Plan:
-    entries = tuple(Entry(f"arm {task.id[0]}", 0, task.id) for task in tasks if task.kind == "memmlp")
+    entries = tuple(Entry(f"variant {task.id[0]}", 0, task.id) for task in tasks if task.kind == "memmlp")
     return Plan("trial", outputs, entries, unique(tasks), **changes)
 
 

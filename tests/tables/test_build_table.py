@@ -50,12 +50,12 @@ def test_without_runs_the_papers_values_and_the_reason_are_shown():
     assert "missing" not in text
 
 
-def test_arms_without_a_sources_clips_are_left_out_and_named(tmp_path: Path):
-    """The control has clips of one source alone: on the other's, the next arm stands in its place."""
+def test_variants_without_a_sources_clips_are_left_out_and_named(tmp_path: Path):
+    """The control has clips of one source alone: on the other's, the next variant stands in its place."""
     sweep = parse_sweep(
         "mix",
         {
-            "arms": {
+            "variants": {
                 "one": [],
                 "both": ["optim.lr=1"],
                 "more": {"overrides": ["optim.lr=2"], "against": "one"},
@@ -74,7 +74,9 @@ def test_arms_without_a_sources_clips_are_left_out_and_named(tmp_path: Path):
     part = on_source(sweep, runs, "new")
     assert (list(part.runs), part.sweep.control) == (["both", "more"], "both")
     assert part.flags == ("no test clip of new, so left out: 'one'",)
-    waiting = on_source(sweep, runs | {"both": {}}, "new")  # an arm without a run is nothing to compare with
+    waiting = on_source(
+        sweep, runs | {"both": {}}, "new"
+    )  # a variant without a run is nothing to compare with
     assert (list(waiting.runs), waiting.sweep.control) == (["both", "more"], "more")
     table = make_table(part.sweep, part.runs)
     assert [row.label for row in table.rows] == ["both", "more"]
@@ -88,7 +90,7 @@ def test_arms_without_a_sources_clips_are_left_out_and_named(tmp_path: Path):
 
 def test_clips_that_are_put_together_count_as_those_that_the_data_has_together(tmp_path: Path):
     """Patterns add to the groups that there are: pairs of salsas stay together where kicks come together."""
-    sweep = parse_sweep("two", {"arms": {"one": [], "other": ["optim.lr=1"]}, "seeds": [0, 1, 2]})
+    sweep = parse_sweep("two", {"variants": {"one": [], "other": ["optim.lr=1"]}, "seeds": [0, 1, 2]})
     pairs = {clip: f"pair {int(clip[-2:]) // 2}" if "salsa" in clip else clip for clip in CLIPS}
     wanted = {**pairs, "kicks/01": "kicks", "kicks/02": "kicks"}
     effects = {"other": 1.1}
@@ -110,7 +112,7 @@ def test_clips_that_are_put_together_count_as_those_that_the_data_has_together(t
 
 
 def test_a_mode_in_which_nothing_was_measured_is_left_out(tmp_path: Path):
-    sweep = parse_sweep("two", {"arms": {"one": [], "both": ["optim.lr=1"]}, "seeds": [0]})
+    sweep = parse_sweep("two", {"variants": {"one": [], "both": ["optim.lr=1"]}, "seeds": [0]})
     runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
     assert make_table(sweep, runs).modes == ("stream", "window")
     streamed = {

@@ -23,7 +23,7 @@ from memmlp.tables.table import Table
 
 
 def test_difference_is_paired_by_seed_and_clip(sweep: Sweep, tmp_path: Path):
-    """Effects that both arms share cancel: the interval is far narrower than the arms' own spread."""
+    """Effects that both variants share cancel: the interval is far narrower than the variants' own spread."""
     table = table_of(sweep, fake_sweep(tmp_path, sweep, EFFECTS))
     effect = cell(table, "no | memory", "MPJPE").effect
     assert effect is not None
@@ -43,20 +43,20 @@ def test_correction_is_over_all_modes_and_metrics(table: Table):
         c.effect for row in table.rows for cells in row.cells.values() for c in cells.values() if c.effect
     ]
     tested = [effect for effect in effects if effect.p is not None]
-    assert table.comparisons == len(tested) == 2 * 3 + 2 * 2  # the arm "by position" has no MPJRE
+    assert table.comparisons == len(tested) == 2 * 3 + 2 * 2  # the variant "by position" has no MPJRE
     smallest = min(tested, key=lambda effect: effect.p)
     assert smallest.holm == pytest.approx(min(1, smallest.p * len(tested)))
 
 
 def test_what_would_have_been_found_is_so_after_the_table_s_own_correction(sweep: Sweep, tmp_path: Path):
-    """An arm of one seed has no p-values, and so no share in the correction."""
+    """A variant of one seed has no p-values, and so no share in the correction."""
     find = fake_sweep(tmp_path, sweep, EFFECTS)
 
-    def few(arm, seed):
-        return find(arm, seed) if arm.label != "by position" or seed == 0 else None
+    def few(variant, seed):
+        return find(variant, seed) if variant.label != "by position" or seed == 0 else None
 
-    def without(arm, seed):
-        return find(arm, seed) if arm.label != "by position" else None
+    def without(variant, seed):
+        return find(variant, seed) if variant.label != "by position" else None
 
     tables = [table_of(sweep, some) for some in (few, without, find)]
     assert [table.comparisons for table in tables] == [6, 6, 10]
@@ -109,8 +109,11 @@ def test_groups_of_clips_widen_the_interval(sweep: Sweep, tmp_path: Path):
 
 
 def test_a_row_has_its_own_control(sweep: Sweep, tmp_path: Path):
-    arms = tuple(replace(arm, against="by position") if arm.paper else arm for arm in sweep.arms[1:3])
-    chain = replace(sweep, arms=(*arms, *sweep.arms[3:]))
+    variants = tuple(
+        replace(variant, against="by position") if variant.paper else variant
+        for variant in sweep.variants[1:3]
+    )
+    chain = replace(sweep, variants=(*variants, *sweep.variants[3:]))
     table = table_of(chain, fake_sweep(tmp_path, chain, EFFECTS))
     means = [cell(table, label, "MPJPE").mean for label in ("no | memory", "by position")]
     found = cell(table, "no | memory", "MPJPE")
@@ -132,10 +135,10 @@ def test_one_head_is_told_by_its_positions(tmp_path: Path):
 
 
 def test_one_head_is_told_where_it_diverged_on_a_clip(sweep: Sweep, tmp_path: Path):
-    """A seed without a mean empties no arm's row; and two heads are not one for having diverged together."""
+    """A seed without a mean empties no variant's row; two heads that diverged are not one."""
     find = fake_sweep(tmp_path, sweep, {"no | memory": 1.2})
     for label, seed in (("no | memory", 0), ("no | memory", 1), ("full_model", 1)):
-        run = find(next(arm for arm in sweep.arms if arm.label == label), seed)
+        run = find(next(variant for variant in sweep.variants if variant.label == label), seed)
         assert run is not None
         for mode in ("stream", "window"):
             report = json.loads(run.evaluation(f"{mode}-0").read_text())
@@ -173,7 +176,7 @@ def test_another_branch_and_what_has_one_head(sweep: Sweep, tmp_path: Path):
     assert {row.cells["stream"]["MPJPE"].effect.verdict for row in table.rows[1:3]} <= {
         "higher",
         "lower",
-        "open",
+        "inconclusive",
     }
     run = runs_of(source, find)["full_model"][0]
     assert cell(table, "full_model", "MPJPE").values[0] == run.value("stream", "combined", "MPJPE")
@@ -197,15 +200,17 @@ def test_a_branch_without_rotations_has_no_mpjre(table: Table):
 
 def test_no_control_no_differences(sweep: Sweep, tmp_path: Path):
     find = fake_sweep(tmp_path, sweep)
-    table = table_of(sweep, lambda arm, seed: None if arm.label == "full_model" else find(arm, seed))
+    table = table_of(
+        sweep, lambda variant, seed: None if variant.label == "full_model" else find(variant, seed)
+    )
     assert table.comparisons == 0
     assert all(c.effect is None for row in table.rows for cells in row.cells.values() for c in cells.values())
 
 
-def test_arms_that_are_one_run_are_not_compared(sweep: Sweep, tmp_path: Path):
-    """Compared with itself an arm would be equivalent with certainty, whatever the paper says."""
+def test_variants_that_are_one_run_are_not_compared(sweep: Sweep, tmp_path: Path):
+    """Compared with itself a variant would be equivalent with certainty, whatever the paper says."""
     runs = {seed: fake_run(tmp_path, "one", seed) for seed in sweep.seeds}
-    table = table_of(sweep, lambda arm, seed: runs[seed])
+    table = table_of(sweep, lambda variant, seed: runs[seed])
     assert cell(table, "no | memory", "MPJPE").effect is None
     assert any("'no | memory' and 'full_model' are one run" in flag for flag in table.flags)
     assert cell(table, "by position", "MPJPE").effect is not None  # it shows another branch
@@ -226,23 +231,23 @@ def test_the_correction_is_the_same_whichever_mode_is_shown(sweep: Sweep, tmp_pa
 def test_nothing_is_claimed_of_the_clips_that_a_divergence_leaves(
     sweep: Sweep, tmp_path: Path, label: str, word: str
 ):
-    """An arm that diverged on a hard clip would be better for it; too short a clip takes no verdict."""
+    """A variant that diverged on a hard clip would be better for it; too short a clip takes no verdict."""
     find = fake_sweep(tmp_path, sweep, EFFECTS)
     before = table_of(sweep, find)
-    arm = next(arm for arm in sweep.arms if arm.label == label)
+    variant = next(variant for variant in sweep.variants if variant.label == label)
     for one, seed in [(one, seed) for one in sweep.runnable() for seed in sweep.seeds]:
         path = find(one, seed).evaluation("stream-0")
         report = json.loads(path.read_text())
         for branch in ("rotation", "position"):
             report["clips"][0][branch]["Jitter"] = "nan"  # of every run: it is too short
-        if (one, seed) == (arm, 1):
+        if (one, seed) == (variant, 1):
             report["clips"][1]["rotation"] |= dict.fromkeys(("MPJPE", "MPJRE"), word)
         path.write_text(json.dumps(report))
     table, lost = table_of(sweep, find), ("MPJPE", "MPJRE")
     assert all(cell(before, "no | memory", metric).effect.significant for metric in (*lost, "Jitter"))
     for metric in lost:
         effect = cell(table, "no | memory", metric).effect
-        assert (effect.clips, effect.verdict, effect.significant) == (11, Verdict.OPEN, False)
+        assert (effect.clips, effect.verdict, effect.significant) == (11, Verdict.INCONCLUSIVE, False)
         assert (effect.p, effect.equal, effect.detectable) == (None, None, None)
         assert cell(table, "no | memory", metric, "window").effect.significant
     assert cell(table, "no | memory", "Jitter").effect.clips == 11

@@ -18,7 +18,7 @@ from memmlp.report.kept_results import Kept, dumps, load_kept
 from memmlp.report.result_pages import origin_words
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.run import Run
-from memmlp.sweep.definition import Arm, Sweep
+from memmlp.sweep.definition import Sweep, Variant
 from memmlp.tables.build_table import make_table
 from memmlp.tables.formats import FORMATS
 from memmlp.tables.measured_run import Measured, load
@@ -38,14 +38,14 @@ def test_a_protocol_on_amass_with_other_data_is_flagged(sweep: Sweep):
 
 def test_missing_runs_are_shown_with_the_command(sweep: Sweep, tmp_path: Path):
     find = fake_sweep(tmp_path, sweep)
-    unfinished = find(sweep.arms[1], 1)
+    unfinished = find(sweep.variants[1], 1)
     assert unfinished is not None
     unfinished.marker.unlink()
     unfinished.fail("loss is NaN")
     gone = {("by position", seed) for seed in (0, 1, 2)}
     table = table_of(
         sweep,
-        lambda arm, seed: None if (arm.label, seed) in gone else find(arm, seed),
+        lambda variant, seed: None if (variant.label, seed) in gone else find(variant, seed),
         command="memmlp sweep 11 data=mocap",
     )
     rows = {row.label: row for row in table.rows}
@@ -64,23 +64,23 @@ def test_missing_runs_are_shown_with_the_command(sweep: Sweep, tmp_path: Path):
 
 def test_unequal_clips_are_flagged_and_left_out(sweep: Sweep, tmp_path: Path):
     runs = {
-        (arm.label, seed): fake_run(
-            tmp_path, arm.label, seed, clips=CLIPS[:3] if arm.label == "full_model" else CLIPS[1:4]
+        (variant.label, seed): fake_run(
+            tmp_path, variant.label, seed, clips=CLIPS[:3] if variant.label == "full_model" else CLIPS[1:4]
         )
-        for arm in sweep.runnable()
+        for variant in sweep.runnable()
         for seed in (0, 1)
     }
-    table = table_of(replace(sweep, seeds=(0, 1)), lambda arm, seed: runs[arm.label, seed])
+    table = table_of(replace(sweep, seeds=(0, 1)), lambda variant, seed: runs[variant.label, seed])
     effect = cell(table, "no | memory", "MPJPE").effect
     assert effect is not None
     assert effect.clips == 2
-    assert abs(effect.mean) < 0.3  # the clip that is far harder than the others is in one arm alone
+    assert abs(effect.mean) < 0.3  # the clip that is far harder than the others is in one variant alone
     assert sum("unequal test clips" in flag and "share 2 of 4" in flag for flag in table.flags) == 2
 
 
 def test_a_clip_that_is_no_number_is_left_out(sweep: Sweep, tmp_path: Path):
     find = fake_sweep(tmp_path, sweep)
-    run = find(sweep.arms[3], 1)
+    run = find(sweep.variants[3], 1)
     assert run is not None
     path = run.evaluation("stream-0")
     report = json.loads(path.read_text())
@@ -92,30 +92,30 @@ def test_a_clip_that_is_no_number_is_left_out(sweep: Sweep, tmp_path: Path):
 
 @pytest.mark.parametrize("word", ["nan", "inf"])
 def test_a_network_that_diverged_on_a_clip_is_said(sweep: Sweep, tmp_path: Path, word: str):
-    """What its arm is compared by are the clips where it did not; too short a clip is so for every run."""
+    """What its variant is compared by are the clips where it did not; too short a clip is short for all."""
     find = fake_sweep(tmp_path, sweep)
-    for arm in sweep.runnable():
+    for variant in sweep.runnable():
         for seed in sweep.seeds:
-            path = find(arm, seed).evaluation("stream-0")
+            path = find(variant, seed).evaluation("stream-0")
             report = json.loads(path.read_text())
             for branch in ("rotation", "position"):
                 report["clips"][0][branch]["Jitter"] = "nan"
-            for number in (1, 2) if (arm.label, seed) == (sweep.arms[3].label, 1) else ():
+            for number in (1, 2) if (variant.label, seed) == (sweep.variants[3].label, 1) else ():
                 report["clips"][number]["rotation"]["MPJPE"] = word
             path.write_text(json.dumps(report))
     table = table_of(sweep, find)
     assert [cell(table, "no | memory", metric).effect.clips for metric in ("Jitter", "MPJPE")] == [11, 10]
-    left = "of clips that are left out of differences, whose verdicts so stay open"
+    left = "of clips that are left out of differences, whose verdicts so stay inconclusive"
     line = f"errors that are no numbers, {left}: 'full_model' seed 1 (2 clips)"
     assert [flag for flag in table.flags if "no numbers" in flag] == [line]
 
 
 def test_a_mean_of_fewer_seeds_than_its_row_counts_is_said(sweep: Sweep, tmp_path: Path):
     runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
-    arm = sweep.runnable()[0]
+    variant = sweep.runnable()[0]
     for mode in ("stream", "window"):
-        del runs[arm.label][1].means[mode][arm.branch]["Jitter"]
-    del runs[arm.label][2].costs["ms"]
+        del runs[variant.label][1].means[mode][variant.branch]["Jitter"]
+    del runs[variant.label][2].costs["ms"]
     for one in runs["by position"].values():  # none of its seeds has one
         del one.means["stream"]["position"]["Jitter"]
     (line,) = (flag for flag in make_table(sweep, runs).flags if "not measured" in flag)
@@ -128,12 +128,12 @@ def test_a_mean_of_fewer_seeds_than_its_row_counts_is_said(sweep: Sweep, tmp_pat
 def test_a_clip_on_which_every_run_diverged_is_flagged(sweep: Sweep, tmp_path: Path):
     """It is not too short for a metric: the shortest clip has position errors."""
     runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
-    for run in (run for of_arm in runs.values() for run in of_arm.values()):
+    for run in (run for of_variant in runs.values() for run in of_variant.values()):
         for mode, branch in itertools.product(run.means, ("rotation", "position")):
             errors = next(iter(run.clips.values()))[mode][branch]
             errors.update(dict.fromkeys(errors, math.nan))
     (line,) = (flag for flag in make_table(sweep, runs).flags if "no numbers" in flag)
-    assert all(f"'{arm.label}' seed 0 (1 clips)" in line for arm in sweep.runnable())
+    assert all(f"'{variant.label}' seed 0 (1 clips)" in line for variant in sweep.runnable())
 
 
 def test_networks_that_hardly_saw_motion_are_told(sweep: Sweep, tmp_path: Path):
@@ -145,44 +145,48 @@ def test_networks_that_hardly_saw_motion_are_told(sweep: Sweep, tmp_path: Path):
 
     def flags(*hardly: str) -> list[str]:
         runs = {
-            arm.label: fake_run(tmp_path, arm.label, config=tiny if arm.label in hardly else small)
-            for arm in sweep.runnable()
+            variant.label: fake_run(
+                tmp_path, variant.label, config=tiny if variant.label in hardly else small
+            )
+            for variant in sweep.runnable()
         }
-        table = table_of(replace(sweep, seeds=(0,)), lambda arm, seed: runs[arm.label])
+        table = table_of(replace(sweep, seeds=(0,)), lambda variant, seed: runs[variant.label])
         return [flag for flag in table.flags if "hardly" in flag]
 
     said = "hardly trained (its steps saw 0.49 minutes of motion in all), so that "
     said += "errors say nothing of the network"
     assert flags() == []
     assert flags("no | memory") == [f"{said}: 'no | memory'"]
-    assert flags(*(arm.label for arm in sweep.runnable())) == [f"{said}: every arm"]
+    assert flags(*(variant.label for variant in sweep.runnable())) == [f"{said}: every variant"]
 
 
 def test_motion_calmer_than_the_true_one_is_said(sweep: Sweep, tmp_path: Path):
     """Where a network hardly follows, the best Jitter of a table is its own."""
     find = fake_sweep(tmp_path, sweep)
     assert not any("calmer" in flag for flag in table_of(sweep, find).flags)  # nothing is known of the truth
-    for arm in sweep.runnable():
+    for variant in sweep.runnable():
         for seed in sweep.seeds:
-            path = find(arm, seed).evaluation("stream-0")
+            path = find(variant, seed).evaluation("stream-0")
             report = json.loads(path.read_text())
-            of_branch = report["mean"][arm.branch]
+            of_branch = report["mean"][variant.branch]
             of_branch["GT Jitter"] = 6.0
-            of_branch["Jitter"] = 7.0 if arm.label != "no | memory" else 5.0 + seed / 2
+            of_branch["Jitter"] = 7.0 if variant.label != "no | memory" else 5.0 + seed / 2
             write_report(path, {key: report[key] for key in ("mode", "mean", "clips")})
     line = "Jitter below the truth's 6.00 (stream): 'no | memory' 5.50"
     line += "; calmer than the motion itself is no better"
     assert [flag for flag in table_of(sweep, find).flags if "calmer" in flag] == [line]
-    path = find(sweep.arms[1], 0).evaluation("stream-0")  # a seed that diverged hides the others from nobody
+    path = find(sweep.variants[1], 0).evaluation(
+        "stream-0"
+    )  # a seed that diverged hides the others from nobody
     report = json.loads(path.read_text())
-    report["mean"][sweep.arms[1].branch]["Jitter"] = "nan"
+    report["mean"][sweep.variants[1].branch]["Jitter"] = "nan"
     write_report(path, {key: report[key] for key in ("mode", "mean", "clips")})
     (flag,) = [flag for flag in table_of(sweep, find).flags if "calmer" in flag]
     assert flag == line.replace("5.50", "5.75")
-    for seed in sweep.seeds:  # an arm on other clips, whose truth has 8.00
-        path = find(sweep.arms[3], seed).evaluation("stream-0")
+    for seed in sweep.seeds:  # a variant on other clips, whose truth has 8.00
+        path = find(sweep.variants[3], seed).evaluation("stream-0")
         report = json.loads(path.read_text())
-        report["mean"][sweep.arms[3].branch]["GT Jitter"] = 8.0
+        report["mean"][sweep.variants[3].branch]["GT Jitter"] = 8.0
         write_report(path, {key: report[key] for key in ("mode", "mean", "clips")})
     other = "Jitter below the truth's 8.00 (stream): 'full_model' 7.00"
     flags = [flag.partition(";")[0] for flag in table_of(sweep, find).flags if "calmer" in flag]
@@ -193,15 +197,15 @@ def test_times_of_another_machine_than_the_controls_are_said(sweep: Sweep, tmp_p
     """A deployment may be made again anywhere, for instance in another precision."""
     find = fake_sweep(tmp_path, sweep)
     made_by = {"cpu": "A processor", "packages": {"onnxruntime": "1.9"}}
-    for arm in sweep.runnable():
+    for variant in sweep.runnable():
         for seed in sweep.seeds:
-            path = find(arm, seed).deployment("fp32-0").latency
+            path = find(variant, seed).deployment("fp32-0").latency
             path.write_text(json.dumps(json.loads(path.read_text()) | {"made_by": made_by}))
     assert not [flag for flag in table_of(sweep, find).flags if "machine" in flag]
     path.write_text(json.dumps(json.loads(path.read_text()) | {"made_by": {**made_by, "cpu": "A small one"}}))
     (flag,) = [flag for flag in table_of(sweep, find).flags if "machine" in flag]
     assert flag.startswith("machine of the times differs: A processor, ONNX Runtime 1.9 of ")
-    assert f"A small one, ONNX Runtime 1.9 of '{arm.label}'" in flag
+    assert f"A small one, ONNX Runtime 1.9 of '{variant.label}'" in flag
     unknown = find(sweep.runnable()[0], 0).deployment("fp32-0").latency  # an older one hides no other
     unknown.write_text(json.dumps(json.loads(unknown.read_text()) | {"made_by": {}}))
     assert [flag for flag in table_of(sweep, find).flags if "machine" in flag] == [flag]
@@ -223,7 +227,7 @@ def test_times_of_a_busy_machine_are_said(
 ):
     """The ratio to a network timed in the same minute suffers, too: a long step is interrupted more often."""
     find = fake_sweep(tmp_path, sweep)
-    path = find(sweep.arms[1], 1).deployment("fp32-0").latency
+    path = find(sweep.variants[1], 1).deployment("fp32-0").latency
     path.write_text(json.dumps(json.loads(path.read_text()) | changed))
     found = [flag for flag in table_of(sweep, find).flags if "busy" in flag]
     line = f"timed on a busy machine, so that other work is in the times: 'no | memory' {said}"
@@ -262,10 +266,12 @@ def test_runs_of_different_origin_are_flagged(
     sweep: Sweep, tmp_path: Path, change: dict, words: tuple[str, ...]
 ):
     runs = {
-        arm.label: fake_run(tmp_path, arm.label, origin=change if arm.label == "by position" else None)
-        for arm in sweep.runnable()
+        variant.label: fake_run(
+            tmp_path, variant.label, origin=change if variant.label == "by position" else None
+        )
+        for variant in sweep.runnable()
     }
-    table = table_of(replace(sweep, seeds=(0,)), lambda arm, seed: runs[arm.label])
+    table = table_of(replace(sweep, seeds=(0,)), lambda variant, seed: runs[variant.label])
     flags = [flag for flag in table.flags if words[0] in flag]
     assert len(flags) == 1
     assert all(word in flags[0] for word in words)
@@ -297,10 +303,10 @@ def test_runs_upon_upstream_runs_of_different_origin_are_flagged(
     usual = UPSTREAM | {"recipes": {"vqvae": 1}, "sources": {"ik.py": "1"}}
 
     def table(change: dict) -> Table:
-        def run(arm: Arm, seed: int) -> Run:
-            above = usual | (change if arm.label == "by position" else {})
+        def run(variant: Variant, seed: int) -> Run:
+            above = usual | (change if variant.label == "by position" else {})
             made = {"upstream": above["id"], "upstream_runs": [above], "sources": {"ik.py": "1"}}
-            return fake_run(tmp_path, arm.label, seed, origin=made)
+            return fake_run(tmp_path, variant.label, seed, origin=made)
 
         return table_of(sweep, run)
 
@@ -313,10 +319,10 @@ def test_seeds_upon_other_weights_of_one_upstream_run_are_flagged(sweep: Sweep, 
     """Also after they were kept, and where a training was resumed upon others; of old runs none is known."""
     weights = {0: ["1"], 1: ["1", "2"], 2: []}
 
-    def run(arm: Arm, seed: int) -> Run:
+    def run(variant: Variant, seed: int) -> Run:
         above = [UPSTREAM | {"weights": 64 * one} for one in weights[seed]]
         made = {"upstream": UPSTREAM["id"], **({"upstream_runs": above} if above else {})}
-        return fake_run(tmp_path, arm.label, seed, origin=made)
+        return fake_run(tmp_path, variant.label, seed, origin=made)
 
     def said(runs) -> list[str]:
         return [flag for flag in make_table(sweep, runs).flags if "weights of upstream" in flag]
@@ -334,15 +340,15 @@ def test_seeds_upon_other_weights_of_one_upstream_run_are_flagged(sweep: Sweep, 
     assert said(runs_of(sweep, run)) == []
 
 
-def test_files_that_differ_between_arms_of_one_commit_are_named(sweep: Sweep, tmp_path: Path):
+def test_files_that_differ_between_variants_of_one_commit_are_named(sweep: Sweep, tmp_path: Path):
     """As they do with other uncommitted changes; kept results have no digests of files."""
     terms, loop = "training/losses/terms.py", "training/loop.py"
-    codes = {arm.label: {terms: "111", loop: "222", "a.py": "1"} for arm in sweep.runnable()}
+    codes = {variant.label: {terms: "111", loop: "222", "a.py": "1"} for variant in sweep.runnable()}
     codes["by position"] |= {terms: "333", "mine:mine.py": "444"}
 
     def flags(read: Callable[[Path], Measured] = load) -> list[str]:
-        def run(arm: Arm, seed: int) -> Run:
-            return fake_run(tmp_path, arm.label, seed, origin={"sources": codes[arm.label]})
+        def run(variant: Variant, seed: int) -> Run:
+            return fake_run(tmp_path, variant.label, seed, origin={"sources": codes[variant.label]})
 
         found = make_table(sweep, runs_of(sweep, run, read)).flags
         return [flag for flag in found if "py differs" in flag]
@@ -374,9 +380,9 @@ def test_runs_from_before_code_changed_are_said(
     own = {"by position": {"mine": {"version": None, "digest": "d"}}}
 
     def flags() -> list[str]:
-        def run(arm: Arm, seed: int) -> Run:
-            made = {"sources": old.get(arm.label, code), "plugins": own.get(arm.label)}
-            return fake_run(tmp_path, arm.label, seed, origin=made)
+        def run(variant: Variant, seed: int) -> Run:
+            made = {"sources": old.get(variant.label, code), "plugins": own.get(variant.label)}
+            return fake_run(tmp_path, variant.label, seed, origin=made)
 
         return [flag for flag in table_of(sweep, run).flags if "has changed since" in flag]
 
@@ -390,9 +396,9 @@ def test_runs_from_before_code_changed_are_said(
 def test_imports_by_computed_names_are_said(sweep: Sweep, tmp_path: Path):
     own = {"mine": {"version": None, "digest": "d", "computed_imports": "a.py, b.py"}}
 
-    def run(arm: Arm, seed: int) -> Run:
+    def run(variant: Variant, seed: int) -> Run:
         return fake_run(
-            tmp_path, arm.label, seed, origin={"plugins": own if arm.label == "by position" else None}
+            tmp_path, variant.label, seed, origin={"plugins": own if variant.label == "by position" else None}
         )
 
     flags = [flag for flag in table_of(sweep, run).flags if "computed names" in flag]
@@ -401,15 +407,15 @@ def test_imports_by_computed_names_are_said(sweep: Sweep, tmp_path: Path):
     ]
 
 
-def test_arms_that_saw_more_in_training_are_said(sweep: Sweep, tmp_path: Path):
+def test_variants_that_saw_more_in_training_are_said(sweep: Sweep, tmp_path: Path):
     """A window twice as long, or a batch twice as large, is twice the data a step."""
     settings = {"optim": {"steps": 2000, "batch": 32}, "model": {"frames": 41}}
     nearly, more = (settings | {"model": {"frames": frames}} for frames in (40, 82))
-    configs = {arm.label: dict(settings) for arm in sweep.runnable()}
+    configs = {variant.label: dict(settings) for variant in sweep.runnable()}
 
     def flags() -> list[str]:
         runs = {label: fake_run(tmp_path, label, config=config) for label, config in configs.items()}
-        table = table_of(replace(sweep, seeds=(0,)), lambda arm, seed: runs[arm.label])
+        table = table_of(replace(sweep, seeds=(0,)), lambda variant, seed: runs[variant.label])
         return [flag for flag in table.flags if "in training" in flag]
 
     assert flags() == []
@@ -419,7 +425,7 @@ def test_arms_that_saw_more_in_training_are_said(sweep: Sweep, tmp_path: Path):
     line = "number of frames seen in training differs: 'by position' 5.25 M to 'full_model' 2.62 M"
     assert flags() == [line]
     configs["full_model"] = more
-    assert len(flags()) == 1  # of the other arm now
+    assert len(flags()) == 1  # of the other variant now
     assert "'no | memory' 2.62 M to 'full_model' 5.25 M" in flags()[0]
     configs["full_model"] = {"optim": settings["optim"]}  # not known
     assert flags() == []
@@ -428,10 +434,10 @@ def test_arms_that_saw_more_in_training_are_said(sweep: Sweep, tmp_path: Path):
 def test_what_any_seed_saw_in_training_counts(sweep: Sweep, tmp_path: Path):
     """Not that of the last one alone."""
     runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
-    for label, of_arm in runs.items():
-        for seed, run in of_arm.items():
+    for label, of_variant in runs.items():
+        for seed, run in of_variant.items():
             more = 2 if (label, seed) == ("by position", 0) else 1
-            of_arm[seed] = replace(run, training={"frames": more * 3e6})
+            of_variant[seed] = replace(run, training={"frames": more * 3e6})
     line = "number of frames seen in training differs: 'by position' 3-6 M to 'full_model' 3 M"
     assert [flag for flag in make_table(sweep, runs).flags if "in training" in flag] == [line]
 
@@ -439,9 +445,10 @@ def test_what_any_seed_saw_in_training_counts(sweep: Sweep, tmp_path: Path):
 def test_what_is_no_stream_is_said_in_every_format(sweep: Sweep, tmp_path: Path):
     late = {"by position": {"offline": True}}
     runs = {
-        arm.label: fake_run(tmp_path, arm.label, evaluated=late.get(arm.label)) for arm in sweep.runnable()
+        variant.label: fake_run(tmp_path, variant.label, evaluated=late.get(variant.label))
+        for variant in sweep.runnable()
     }
-    table = table_of(replace(sweep, seeds=(0,)), lambda arm, seed: runs[arm.label])
+    table = table_of(replace(sweep, seeds=(0,)), lambda variant, seed: runs[variant.label])
     assert "offline, no stream, for frames are made with later ones: 'by position'" in table.flags
     assert all("offline, no stream" in write(table) for write in FORMATS.values())
 
@@ -471,7 +478,9 @@ def test_test_clips_that_hardly_anything_ties_are_said(
 
 def test_a_comparison_of_one_seed_among_others_of_more_is_said(sweep: Sweep, tmp_path: Path):
     find = fake_sweep(tmp_path, sweep)
-    table = table_of(sweep, lambda arm, seed: find(arm, seed) if seed == 0 or "no" not in arm.label else None)
+    table = table_of(
+        sweep, lambda variant, seed: find(variant, seed) if seed == 0 or "no" not in variant.label else None
+    )
     assert sum(flag.startswith("one seed, so that") and "'no | memory'" in flag for flag in table.flags) == 1
 
 
@@ -481,9 +490,13 @@ def test_a_comparison_of_one_seed_among_others_of_more_is_said(sweep: Sweep, tmp
         (
             (0,),
             CLIPS[:1],
-            ["one seed an arm and one group of test clips: no interval, and nothing is starred"],
+            ["one seed a variant and one group of test clips: no interval, and nothing is starred"],
         ),
-        ((0,), CLIPS, ["one seed an arm: the intervals speak of other clips, not of other seeds; nothing"]),
+        (
+            (0,),
+            CLIPS,
+            ["one seed a variant: the intervals speak of other clips, not of other seeds; nothing"],
+        ),
         ((0, 1), CLIPS[:1], ["one group of test clips: the intervals speak of other seeds, not of other"]),
         ((0, 1), CLIPS, []),
     ],
@@ -498,34 +511,35 @@ def test_what_intervals_speak_of_is_said_once(
     assert [flag[: len(words)] for flag, words in zip(found, said, strict=True)] == said
 
 
-def test_arms_that_share_a_single_seed_of_several_are_said(sweep: Sweep, tmp_path: Path):
+def test_variants_that_share_a_single_seed_of_several_are_said(sweep: Sweep, tmp_path: Path):
     find, kept = fake_sweep(tmp_path, sweep), {"full_model": (0, 1)}
     table = table_of(
-        sweep, lambda arm, seed: find(arm, seed) if seed in kept.get(arm.label, (1, 2)) else None
+        sweep, lambda variant, seed: find(variant, seed) if seed in kept.get(variant.label, (1, 2)) else None
     )
     (line,) = (flag for flag in table.flags if flag.startswith("one seed"))
     assert line.endswith("speaks of other clips alone, and no star: 'no | memory', 'by position'")
 
 
-def test_recipes_of_what_only_some_arms_have_do_not_differ(sweep: Sweep, tmp_path: Path):
+def test_recipes_of_what_only_some_variants_have_do_not_differ(sweep: Sweep, tmp_path: Path):
     recipes = {"by position": {"recipes": {"memory": 1, "gru": 7}}}
     runs = {
-        arm.label: fake_run(tmp_path, arm.label, origin=recipes.get(arm.label)) for arm in sweep.runnable()
+        variant.label: fake_run(tmp_path, variant.label, origin=recipes.get(variant.label))
+        for variant in sweep.runnable()
     }
-    table = table_of(replace(sweep, seeds=(0,)), lambda arm, seed: runs[arm.label])
+    table = table_of(replace(sweep, seeds=(0,)), lambda variant, seed: runs[variant.label])
     assert not any("recipe" in flag for flag in table.flags)
 
 
 @pytest.mark.parametrize(("shared", "flagged"), [(True, 1), (False, 0)])
 def test_seeds_that_share_a_vqvae_are_flagged(sweep: Sweep, tmp_path: Path, shared: bool, flagged: int):
     runs = {
-        (arm.label, seed): fake_run(
-            tmp_path, arm.label, seed, origin={"upstream": "v" if shared else f"v{seed}"}
+        (variant.label, seed): fake_run(
+            tmp_path, variant.label, seed, origin={"upstream": "v" if shared else f"v{seed}"}
         )
-        for arm in sweep.runnable()
+        for variant in sweep.runnable()
         for seed in sweep.seeds
     }
-    table = table_of(sweep, lambda arm, seed: runs[arm.label, seed])
+    table = table_of(sweep, lambda variant, seed: runs[variant.label, seed])
     lines = [flag for flag in table.flags if "share one VQ-VAE" in flag]
     assert len(lines) == flagged
     assert all("'no | memory', 'by position', 'full_model'" in line for line in lines)
@@ -537,7 +551,7 @@ def test_one_group_of_clips_is_said_and_starred_by_nobody(sweep: Sweep, tmp_path
     assert any("one group of test clips" in flag for flag in table.flags)
     assert table.comparisons == 0
     effect = cell(table, "no | memory", "MPJPE").effect
-    assert (effect.significant, effect.verdict) == (False, Verdict.OPEN)
+    assert (effect.significant, effect.verdict) == (False, Verdict.INCONCLUSIVE)
     assert "*" not in printed(table, 100)
 
 
@@ -555,7 +569,9 @@ def test_the_built_in_body_beside_smplh_numbers(
 def test_runs_of_an_older_recipe_are_named(sweep: Sweep, tmp_path: Path):
     runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
     runs["no | memory"] = {seed: run for seed, run in runs["no | memory"].items() if seed}
-    table = make_table(sweep, runs, older=lambda arm, seed: "abc" if arm.label != "full_model" else None)
+    table = make_table(
+        sweep, runs, older=lambda variant, seed: "abc" if variant.label != "full_model" else None
+    )
     assert "made by an earlier recipe, left out and made again by the sweep: 'no | memory' seed 0 (abc)" in (
         table.flags
     )
@@ -563,16 +579,21 @@ def test_runs_of_an_older_recipe_are_named(sweep: Sweep, tmp_path: Path):
 
 def test_a_part_of_a_list_is_said_wherever_its_runs_are(sweep: Sweep, tmp_path: Path):
     part = "amass_s1, 61 % of the list (3262 of 5350 entries)"
-    arms = sweep.runnable()
+    variants = sweep.runnable()
     runs = {
-        arm.label: fake_run(tmp_path, arm.label, origin={"partial": part} if arm is arms[0] else None)
-        for arm in arms
+        variant.label: fake_run(
+            tmp_path, variant.label, origin={"partial": part} if variant is variants[0] else None
+        )
+        for variant in variants
     }
     one = replace(sweep, seeds=(0,))
-    assert f"{part}, and no more: '{arms[0].label}'" in table_of(one, lambda arm, seed: runs[arm.label]).flags
-    measured = {arm.label: {0: load(runs[arm.label].folder)} for arm in arms}
+    assert (
+        f"{part}, and no more: '{variants[0].label}'"
+        in table_of(one, lambda variant, seed: runs[variant.label]).flags
+    )
+    measured = {variant.label: {0: load(runs[variant.label].folder)} for variant in variants}
     path = tmp_path / "kept.json"
-    path.write_text(dumps(Kept("5", (), measured, {arm.label: () for arm in arms})))
+    path.write_text(dumps(Kept("5", (), measured, {variant.label: () for variant in variants})))
     kept = load_kept(path)
     assert {run.origin.partial for run in kept.every} == {part, None}
     assert part in origin_words(kept).replace("\\", "")  # escaped for Markdown
@@ -593,14 +614,15 @@ def test_what_runs_say_of_their_data_is_flagged_with_their_names(
     sweep: Sweep, tmp_path: Path, fact: str, said: str
 ):
     """People of the training in the test, or clips whose truth has kinks; kept results know it, too."""
-    arms = [arm.label for arm in sweep.runnable()]
+    variants = [variant.label for variant in sweep.runnable()]
     runs = {
-        label: fake_run(tmp_path, label, origin={fact: said} if label != arms[0] else None) for label in arms
+        label: fake_run(tmp_path, label, origin={fact: said} if label != variants[0] else None)
+        for label in variants
     }
-    flagged = table_of(replace(sweep, seeds=(0,)), lambda arm, seed: runs[arm.label]).flags
-    assert f"{said}: {', '.join(map(repr, arms[1:]))}" in flagged
-    measured = {label: {0: load(runs[label].folder)} for label in arms}
+    flagged = table_of(replace(sweep, seeds=(0,)), lambda variant, seed: runs[variant.label]).flags
+    assert f"{said}: {', '.join(map(repr, variants[1:]))}" in flagged
+    measured = {label: {0: load(runs[label].folder)} for label in variants}
     path = tmp_path / "kept.json"
-    path.write_text(dumps(Kept("5", (), measured, {label: () for label in arms})))
+    path.write_text(dumps(Kept("5", (), measured, {label: () for label in variants})))
     assert {getattr(run.origin, fact) for run in load_kept(path).every} == {said, None}
     assert f'"{fact}": null' not in path.read_text()  # files of before keep their bytes

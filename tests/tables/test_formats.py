@@ -31,7 +31,7 @@ def test_long_labels_fold_so_that_four_metrics_fit(tmp_path: Path):
 
 @pytest.fixture(scope="module", params=sorted(SHIPPED.glob("*.yaml")), ids=lambda path: path.stem)
 def shipped(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Sweep, Table]:
-    """A shipped sweep, and a table of runs of all its arms."""
+    """A shipped sweep, and a table of runs of all its variants."""
     sweep = load_sweep(request.param)
     runs = fake_sweep(tmp_path_factory.mktemp("shipped"), sweep, clips=CLIPS[:4])
     return sweep, table_of(sweep, runs)
@@ -43,14 +43,14 @@ def test_shipped_tables_fit_the_screen(shipped: tuple[Sweep, Table], width: int)
     sweep, table = shipped
     text = printed(table, width)
     assert max(map(len, text.splitlines())) <= width
-    for arm in sweep.arms:
-        assert arm.label.split()[0] in text
-        for value in (arm.paper or {}).values():
+    for variant in sweep.variants:
+        assert variant.label.split()[0] in text
+        for value in (variant.paper or {}).values():
             assert f"{value:.1f}" in text or f"{value:.2f}" in text
     assert text.count(f"{len(sweep.seeds)}/{len(sweep.seeds)}") >= len(sweep.runnable())
 
 
-def test_screen_shows_everything_of_an_arm(table: Table):
+def test_screen_shows_everything_of_an_variant(table: Table):
     lines = [line.split("  ") for line in printed(table, 100).splitlines()]
     words = [[word.strip() for word in line if word.strip()] for line in lines]
     start = next(i for i, line in enumerate(words) if line[:1] == ["no | memory"])

@@ -37,12 +37,12 @@ def test_size_and_times_are_of_the_precision_that_was_asked_for(sweep: Sweep, tm
         "FLOPs": 0.026, "MACs": 0.013, "parameters": 0.356798, "size": 0.5, "ms": 0.4, "network ms": 0.7,
         "pose ms": 0.5, "ratio": 0.3, "FPS": 2500,
     })  # fmt: skip
-    said = table_of(replace(sweep, seeds=(0,)), lambda arm, seed: run).flags
+    said = table_of(replace(sweep, seeds=(0,)), lambda variant, seed: run).flags
     assert any("of a file of less precision, errors of float32" in flag for flag in said)
     path.write_text(json.dumps(record | {"int8": int8}))
     assert load(run.folder).costs["size"] == 1.9
     assert not any(
-        "less precision" in f for f in table_of(replace(sweep, seeds=(0,)), lambda arm, seed: run).flags
+        "less precision" in f for f in table_of(replace(sweep, seeds=(0,)), lambda variant, seed: run).flags
     )
 
 
@@ -65,10 +65,12 @@ def test_what_an_evaluation_ran_on_counts_too(sweep: Sweep, tmp_path: Path):
     """An evaluation's numbers depend on code and device as the weights do."""
     other = {"device": "cuda:0", "made_by": {**ORIGIN, "git": {"commit": "fedcba98", "dirty": True}}}
     runs = {
-        arm.label: fake_run(tmp_path, arm.label, evaluated=other if arm.label == "by position" else None)
-        for arm in sweep.runnable()
+        variant.label: fake_run(
+            tmp_path, variant.label, evaluated=other if variant.label == "by position" else None
+        )
+        for variant in sweep.runnable()
     }
-    said = " ".join(table_of(replace(sweep, seeds=(0,)), lambda arm, seed: runs[arm.label]).flags)
+    said = " ".join(table_of(replace(sweep, seeds=(0,)), lambda variant, seed: runs[variant.label]).flags)
     assert "0123456, fedcba9 of 'by position'" in said
     assert ", cuda:0 of 'by position'" in said
     assert "uncommitted changes: 'by position'" in said
@@ -87,7 +89,7 @@ def test_a_refined_network_saw_its_own_frames_and_the_refiners(tmp_path: Path):
 
 def test_damaged_results_are_one_line(tmp_path: Path, sweep: Sweep):
     find = fake_sweep(tmp_path, sweep)
-    run = find(sweep.arms[3], 1)
+    run = find(sweep.variants[3], 1)
     assert run is not None
     for text in ("[{", "[5]", "{}"):
         run.evaluation("stream-0").write_text(text)

@@ -27,7 +27,7 @@ SWEEP = parse_sweep(
         "seeds": [4, 2],
         "control": "full",
         "metrics": ["MPJPE", "FLOPs"],
-        "arms": {
+        "variants": {
             "full": [],
             "worse": ["a=1"],
             "same": ["a=2"],
@@ -55,7 +55,7 @@ def run(label: str, seed: int, draw: Draw, metrics: tuple[str, ...], groups: Map
 
 
 def planted(label: str, seed: int, metric: str) -> np.ndarray:
-    """Return the arm's true error with noise by seed and clip; the arm "unsure" has more noise."""
+    """Return the variant's true error with noise by seed and clip; the variant "unsure" has more noise."""
     noise = np.random.default_rng([seed, *label.encode(), *metric.encode()]).normal(size=len(CLIPS))
     return 5 + TRUTH[label] + (0.4 if label == "unsure" else 0.005) * noise
 
@@ -66,15 +66,15 @@ class World:
     def __init__(self, sweep: Sweep = SWEEP, draw: Draw = planted, groups: Mapping[str, str] | None = None):
         self.sweep, self.draw, self.groups = sweep, draw, groups or {}
         self.failing: set[tuple[str, int]] = set()
-        self.runs: dict[str, dict[int, Measured]] = {arm.label: {} for arm in sweep.runnable()}
+        self.runs: dict[str, dict[int, Measured]] = {variant.label: {} for variant in sweep.runnable()}
 
     def spend(self, rounds: Rounds) -> Mapping[str, RunsBySeed]:
         spent = rounds.spent(self.sweep)
-        for arm in spent.runnable():
-            for seed in set(spent.seeds_of(arm)) - self.runs[arm.label].keys():
-                if (arm.label, seed) not in self.failing:
+        for variant in spent.runnable():
+            for seed in set(spent.seeds_of(variant)) - self.runs[variant.label].keys():
+                if (variant.label, seed) not in self.failing:
                     metrics = tuple(metric for metric in self.sweep.metrics if metric != "FLOPs")
-                    self.runs[arm.label][seed] = run(arm.label, seed, self.draw, metrics, self.groups)
+                    self.runs[variant.label][seed] = run(variant.label, seed, self.draw, metrics, self.groups)
         return self.runs
 
     def to_the_end(self, rounds: Rounds) -> Rounds:
@@ -102,20 +102,26 @@ def test_the_schedule_is_fixed_at_the_start():
     assert sum(rounds.levels) == pytest.approx(0.05)
     assert rounds.next_looks(SWEEP) == {"worse": 0, "same": 0, "unsure": 0}
     spent = rounds.spent(SWEEP)
-    assert {arm.label: spent.seeds_of(arm) for arm in spent.runnable()} == dict.fromkeys(TRUTH, (4, 2, 5))
-    assert len(spent.arm_seeds()) == 12
+    assert {variant.label: spent.seeds_of(variant) for variant in spent.runnable()} == dict.fromkeys(
+        TRUTH, (4, 2, 5)
+    )
+    assert len(spent.variant_seeds()) == 12
     assert new_rounds(SWEEP, 1 + 2).looks == (3,)
 
 
-def test_open_arms_and_their_control_alone_go_on():
+def test_open_variants_and_their_control_alone_go_on():
     world = World()
     rounds = world.look(new_rounds(SWEEP))
-    assert verdicts(rounds) == {"worse": ("higher", 3), "same": ("equivalent", 3), "unsure": ("open", 3)}
+    assert verdicts(rounds) == {
+        "worse": ("higher", 3),
+        "same": ("equivalent", 3),
+        "unsure": ("inconclusive", 3),
+    }
     assert rounds.next_looks(SWEEP) == {"unsure": 1}
     assert rounds.counts(SWEEP) == {"full": 5, "worse": 3, "same": 3, "unsure": 5}
     rounds = world.to_the_end(rounds)
     assert [look.seeds for look in rounds.taken] == [3, 5, 8, 13]
-    assert verdicts(rounds)["unsure"] == ("open", 13)
+    assert verdicts(rounds)["unsure"] == ("inconclusive", 13)
     assert {label: len(runs) for label, runs in world.runs.items()} == {
         "full": 13, "worse": 3, "same": 3, "unsure": 13
     }  # fmt: skip
@@ -124,9 +130,9 @@ def test_open_arms_and_their_control_alone_go_on():
 
 
 def test_what_is_decided_stays_though_later_data_would_reverse_it():
-    """`other` is the control of an open arm, and so gets more seeds after it was found to be worse."""
-    arms = {"full": [], "other": ["a=1"], "unsure": {"overrides": ["a=3"], "against": "other"}}
-    sweep = parse_sweep("chain", {"seeds": [0], "metrics": ["MPJPE"], "arms": arms})
+    """`other` is the control of an inconclusive variant, and so gets more seeds."""
+    variants = {"full": [], "other": ["a=1"], "unsure": {"overrides": ["a=3"], "against": "other"}}
+    sweep = parse_sweep("chain", {"seeds": [0], "metrics": ["MPJPE"], "variants": variants})
 
     def draw(label: str, seed: int, metric: str) -> np.ndarray:
         if label == "other" and seed >= 3:
@@ -144,9 +150,11 @@ def test_what_is_decided_stays_though_later_data_would_reverse_it():
     assert cell.effect.significant
 
 
-def test_a_decided_comparison_of_an_open_arm_is_not_looked_at_again():
-    """The arm is worse in stream mode at three seeds and better after them; its window mode stays open."""
-    sweep = parse_sweep("mixed", {"seeds": [0], "metrics": ["MPJPE"], "arms": {"full": [], "other": ["a=1"]}})
+def test_a_decided_comparison_of_an_open_variant_is_not_looked_at_again():
+    """The variant is worse in stream mode at three seeds and better later; window mode stays inconclusive."""
+    sweep = parse_sweep(
+        "mixed", {"seeds": [0], "metrics": ["MPJPE"], "variants": {"full": [], "other": ["a=1"]}}
+    )
 
     def draw(label: str, seed: int, metric: str) -> np.ndarray:
         if label == "full" or "window" in metric:
@@ -172,11 +180,11 @@ def test_one_group_of_clips_ends_it_at_once():
     world = World(groups=dict.fromkeys(CLIPS, "one take"))
     rounds = world.to_the_end(new_rounds(SWEEP))
     assert len(rounds.taken) == 1
-    assert {verdict for verdict, _ in verdicts(rounds).values()} == {"open"}
+    assert {verdict for verdict, _ in verdicts(rounds).values()} == {"inconclusive"}
     assert rounds.next_looks(SWEEP) == {}
 
 
-def test_an_arm_whose_runs_failed_is_late_and_others_do_not_wait():
+def test_an_variant_whose_runs_failed_is_late_and_others_do_not_wait():
     world = World()
     world.failing = {("worse", 2)}
     rounds = world.to_the_end(new_rounds(SWEEP, 5))
@@ -221,7 +229,7 @@ def test_the_table_shows_rounds(tmp_path):
     text = markdown(table)
     assert "higher (3)" in text
     assert "equivalent (3)" in text
-    assert "looks at 3 (1.7 %), 5 (3.3 %) seeds" in text
+    assert "analyses at 3 (1.7 %), 5 (3.3 %) seeds" in text
     assert "p \\< its look's level by Holm's correction over the table's 6 comparisons" in text
     assert "missing" not in text
     del world.runs["unsure"][6]
@@ -240,11 +248,12 @@ def false_claims(truth: float, noise: float, spend: Callable[[Rounds], Rounds], 
     """Return the share of sweeps with a false claim.
 
     Differences vary by seed alone, where the p-values are exact, and two clips say as much as more. `truth`
-    is the true difference of all arms: 0, or 1, the smallest effect of interest, where a claim of equivalence
+    is the true difference of all variants: 0, or 1, the smallest effect of interest, where a claim of
+        equivalence
     is false.
     """
-    arms = {"full": [], **{f"arm {number}": [f"a={number}"] for number in range(5)}}
-    sweep = parse_sweep("null", {"metrics": ["MPJPE"], "smallest": {"MPJPE": 1.0}, "arms": arms})
+    variants = {"full": [], **{f"variant {number}": [f"a={number}"] for number in range(5)}}
+    sweep = parse_sweep("null", {"metrics": ["MPJPE"], "smallest": {"MPJPE": 1.0}, "variants": variants})
     false = ("equivalent",) if truth else ("higher", "lower")
     counts = []
     for number in range(times):

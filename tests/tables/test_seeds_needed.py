@@ -15,8 +15,8 @@ def test_seeds_that_the_papers_effects_need(sweep: Sweep, tmp_path: Path):
     find = fake_sweep(tmp_path, sweep)
     found = {(n.label, n.mode, n.metric): n for n in needs(sweep, runs_of(sweep, find))}
     assert {key[::2] for key in found} == {("no | memory", "MPJRE"), ("no | memory", "MPJPE")}
-    big = replace(sweep.arms[1], paper={"MPJRE": 9.0, "MPJPE": 9.0})
-    louder = replace(sweep, arms=(sweep.arms[0], big, *sweep.arms[2:]))
+    big = replace(sweep.variants[1], paper={"MPJRE": 9.0, "MPJPE": 9.0})
+    louder = replace(sweep, variants=(sweep.variants[0], big, *sweep.variants[2:]))
     fewer = {(n.label, n.mode, n.metric): n for n in needs(louder, runs_of(louder, find))}
     for key, need in found.items():
         assert need.have == 3

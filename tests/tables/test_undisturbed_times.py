@@ -25,9 +25,9 @@ def test_times_are_of_undisturbed_seeds(
 ):
     """Seed 0 took 1 ms, seed 1 took 3 ms, and so on; all other columns are of all seeds."""
     find = fake_sweep(tmp_path, sweep)
-    for arm in sweep.runnable():
+    for variant in sweep.runnable():
         for seed, share in enumerate(shares):
-            path = find(arm, seed).deployment("fp32-0").latency
+            path = find(variant, seed).deployment("fp32-0").latency
             known = {"core_share": share} if share is not None else {}
             took = {"median_ms": 1.0 + 2 * seed, "ratio_to_yardstick": 0.6}
             path.write_text(json.dumps(json.loads(path.read_text()) | took | known))
@@ -46,4 +46,4 @@ def test_times_are_of_undisturbed_seeds(
 
 
 def _each(sweep: Sweep, number: int) -> str:
-    return ", ".join(f"'{arm.label}' ({number} of 3)" for arm in sweep.runnable())
+    return ", ".join(f"'{variant.label}' ({number} of 3)" for variant in sweep.runnable())

@@ -90,7 +90,7 @@ def sweep_storm(
     with tempfile.TemporaryDirectory() as folder:
         sweep = Path(folder) / "chaos.yaml"
         arms = {"vq": [], "none": ["memory=none"]}
-        sweep.write_text(yaml.safe_dump({"arms": arms, "seeds": list(range((runs + 1) // 2))}))
+        sweep.write_text(yaml.safe_dump({"variants": arms, "seeds": list(range((runs + 1) // 2))}))
         words = ["sweep", str(sweep), *OVERRIDES, *overrides]
         calm, stormy = Path(folder) / "calm", Path(folder) / "stormy"
         started = time.monotonic()

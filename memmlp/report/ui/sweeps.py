@@ -19,7 +19,7 @@ from memmlp.evaluation.metric_facts import UNITS
 from memmlp.report.ui.index import Index
 from memmlp.runs.identity import NETWORK, training_settings
 from memmlp.runs.run import STAGE_WORDS
-from memmlp.sweep.definition import Arm, Sweep
+from memmlp.sweep.definition import Sweep, Variant
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.progress_table import name as task_name
 from memmlp.sweep.sweep_file import parse_sweep
@@ -116,7 +116,7 @@ class Sweeps:
         made = self.made(plan)
         cells = [self._cell(entry, states, made) for entry in plan.entries]
         upstream = [self._upstream(plan, task, states) for task in plan.tasks if task.kind != NETWORK]
-        branches = {arm.branch for arm in sweep.arms}
+        branches = {arm.branch for arm in sweep.variants}
         found = {
             "metric": _shown_metric(sweep),
             "branch": branches.pop() if len(branches) == 1 else "",
@@ -143,7 +143,7 @@ class Sweeps:
     def _control(self, plan: Plan, label: str) -> str:
         """Return the label of an arm's control; empty for none."""
         sweep = self._kept(plan.name) or sweep_of_plan(plan)
-        return next((sweep.control_of(arm) or "" for arm in sweep.arms if arm.label == label), "")
+        return next((sweep.control_of(arm) or "" for arm in sweep.variants if arm.label == label), "")
 
     def states(self, plan: Plan) -> dict[str, str]:
         """Return every task's state by its key, as `Plan.states` does, from the facts in the index."""
@@ -234,7 +234,7 @@ class Sweeps:
         metric = _shown_metric(sweep)
         values: dict[tuple[str, int], float] = {}
 
-        def find(arm: Arm, seed: int) -> Measured | None:
+        def find(arm: Variant, seed: int) -> Measured | None:
             entry = entries.get((arm.label, seed))
             if entry is None or not plan.complete(entry):
                 return None
@@ -286,7 +286,7 @@ def rounds_words(rounds: Rounds, sweep: Sweep) -> dict[str, Any]:
     looks = []
     for seeds, level in zip(rounds.looks, rounds.levels, strict=True):
         found = [finding for look in rounds.taken if look.seeds == seeds for finding in look.found]
-        decided = sum(finding.verdict is not Verdict.OPEN for finding in found)
+        decided = sum(finding.verdict is not Verdict.INCONCLUSIVE for finding in found)
         looks.append({"seeds": seeds, "level": level, "compared": len(found), "decided": decided})
     return {
         "comparisons": len(rounds.family(sweep)),
@@ -326,7 +326,7 @@ def sweep_of_plan(plan: Plan) -> Sweep:
     arms: dict[str, list[str]] = {
         label: [] for label in dict.fromkeys(entry.label for entry in plan.entries)
     } or {"-": []}
-    return parse_sweep(plan.name, {"title": plan.name, "seeds": seeds, "arms": arms})
+    return parse_sweep(plan.name, {"title": plan.name, "seeds": seeds, "variants": arms})
 
 
 def _changed(path: Path) -> int:

@@ -133,13 +133,13 @@ def _put(tree: dict[str, Any], keys: Sequence[str], value: Any) -> None:
 
 
 def write_table(study: Study, shipped: Path, path: Path, words: Sequence[str]) -> bool:
-    """Write the paper's Table 5 with the best trial as one more arm, if only loss weights were searched.
+    """Write the paper's Table 5 with the best trial as one more variant, if only loss weights were searched.
 
     Args:
         study: the study.
         shipped: the file of Table 5.
         path: the file to write.
-        words: the overrides of the search's command line, which all arms get, since the weights were
+        words: the overrides of the search's command line, which all variants get, since the weights were
             searched with them. The table has its own seeds.
 
     Returns:
@@ -151,7 +151,7 @@ def write_table(study: Study, shipped: Path, path: Path, words: Sequence[str]) -
     content = yaml.safe_load(shipped.read_text(encoding="utf-8"))
     overrides = [*study.search.base, *study.search.overrides(values(best[0], study.search))]
     content["base"] = [*content.get("base", []), *(word for word in words if not word.startswith("seed="))]
-    content["arms"] = {"manual, searched": {"overrides": overrides}, **content["arms"]}
+    content["variants"] = {"manual, searched": {"overrides": overrides}, **content["variants"]}
     atomic_write(path, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
     return True
 

@@ -1,7 +1,8 @@
-"""Statistics of differences between two arms that were run with the same seeds and tested on the same clips.
+"""Statistics of differences between two variants that were run with the same seeds and tested on the same
+clips.
 
-`differences` are always (K, S, C): for each of K comparisons, one arm's error minus the other's, for seed s
-on clip c. `crossed` estimates the error of their mean, to which seeds and groups of clips contribute.
+`differences` are always (K, S, C): for each of K comparisons, one variant's error minus the other's, for seed
+s on clip c. `crossed` estimates the error of their mean, to which seeds and groups of clips contribute.
 `paired_differences` turns it into intervals and p-values. `power` says which effects could have been found,
 `verdicts` what may be claimed about many comparisons, in one look or in several, and `robust` describes
 errors without testing. docs/statistics.md explains the method and how well it keeps its promises.

@@ -14,7 +14,7 @@ class Verdict(StrEnum):
     """What is claimed about a comparison.
 
     HOLDS and OPPOSITE are about the paper's effect, HIGHER and LOWER about the measured difference if the
-    paper has no effect. OPEN claims nothing.
+    paper has no effect. INCONCLUSIVE claims nothing.
     """
 
     HOLDS = "holds"
@@ -22,7 +22,7 @@ class Verdict(StrEnum):
     HIGHER = "higher"
     LOWER = "lower"
     EQUIVALENT = "equivalent"
-    OPEN = "open"
+    INCONCLUSIVE = "inconclusive"
 
 
 def holm(p: np.ndarray) -> np.ndarray:
@@ -57,7 +57,7 @@ def verdict(
     if equivalence <= level:
         return Verdict.EQUIVALENT
     if not difference <= level:
-        return Verdict.OPEN
+        return Verdict.INCONCLUSIVE
     if paper:
         return Verdict.HOLDS if mean * paper > 0 else Verdict.OPPOSITE
     return Verdict.HIGHER if mean > 0 else Verdict.LOWER
@@ -90,8 +90,9 @@ def sequential(p: np.ndarray, claimed: np.ndarray, closed: np.ndarray) -> np.nda
 
     What was decided stays decided. Comparisons that this family has claimed are removed from the correction
     of the others. Comparisons that are closed without such a claim, because the other family decided them or
-    their arm has stopped, stay in the correction, but can no longer be claimed. So a first wrong claim needs
-    a true null whose p-value is below the look's level over the number of nulls, at a look that was fixed
+    their variant has stopped, stay in the correction, but can no longer be claimed. So a first wrong claim
+    needs a true null whose p-value is below the look's level over the number of nulls, at a look that was
+    fixed
     beforehand: the looks' levels add up.
 
     Args:

@@ -30,7 +30,9 @@ def made(outputs: Path) -> Sweep:
     arms = {
         arm: {"overrides": [f"memory={arm}"], "paper": {"MPJPE": 6 * factor}} for arm, factor in ARMS.items()
     }
-    sweep = parse_sweep("mine", {"title": "Mine", "seeds": list(SEEDS), "arms": arms, "metrics": ["MPJPE"]})
+    sweep = parse_sweep(
+        "mine", {"title": "Mine", "seeds": list(SEEDS), "variants": arms, "metrics": ["MPJPE"]}
+    )
     entries, tasks = [], []
     for arm, factor in ARMS.items():
         for seed in SEEDS:

@@ -211,7 +211,7 @@ def test_verdicts_of_rounds_and_their_looks_are_shown(outputs: Path):
     assert first == {"seeds": 3, "level": rounds.levels[0], "compared": 2, "decided": 2}
     assert (second["compared"], page["rounds"]["comparisons"]) == (0, 2)
     arms = {arm["label"]: arm for arm in page["rounds"]["arms"]}
-    assert arms["gru"] == {"label": "gru", "decided": 2, "open": 0, "seeds": 3, "next": None}
+    assert arms["gru"] == {"label": "gru", "decided": 2, "inconclusive": 0, "seeds": 3, "next": None}
 
 
 @pytest.mark.parametrize(

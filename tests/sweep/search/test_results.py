@@ -102,14 +102,14 @@ def test_what_a_search_leaves(tmp_path: Path):
     assert {f"loss.{key}": value for key, value in content["loss"].items()} == best.params
     assert path.read_text().startswith("# @package _global_\n")
     shipped = tmp_path / "shipped.yaml"
-    shipped.write_text("control: b\narms: {a: {overrides: [loss=manual]}, b: []}\n")
+    shipped.write_text("control: b\nvariants: {a: {overrides: [loss=manual]}, b: []}\n")
     words = ["data=mine", "seed=3", "profile=small"]
     assert results.write_table(study, shipped, tmp_path / "table05.yaml", words)
     written = yaml.safe_load((tmp_path / "table05.yaml").read_text())
     assert written["base"] == ["data=mine", "profile=small"]
-    arms = written["arms"]
-    assert list(arms) == ["manual, searched", "a", "b"]
-    assert f"loss.hand={best.params['loss.hand']}" in arms["manual, searched"]["overrides"]
+    variants = written["variants"]
+    assert list(variants) == ["manual, searched", "a", "b"]
+    assert f"loss.hand={best.params['loss.hand']}" in variants["manual, searched"]["overrides"]
     plots = results.write_plots(study, tmp_path)
     assert {path.name for path in plots} == {
         "optimization_history.png", "parallel_coordinate.png", "slice.png", "study.html",

@@ -37,8 +37,8 @@ def test_holm_stays_below_one_and_leaves_nan_out():
         (0.01, 1.0, -0.3, 0.0, Verdict.LOWER),
         (0.05, 0.06, 0.3, 2.0, Verdict.HOLDS),
         (0.01, 0.05, 0.3, 2.0, Verdict.EQUIVALENT),
-        (0.06, 0.06, 0.3, 2.0, Verdict.OPEN),
-        (np.nan, np.nan, 0.3, 2.0, Verdict.OPEN),
+        (0.06, 0.06, 0.3, 2.0, Verdict.INCONCLUSIVE),
+        (np.nan, np.nan, 0.3, 2.0, Verdict.INCONCLUSIVE),
     ],
 )
 def test_verdicts(difference: float, equivalence: float, mean: float, paper: float | None, expected: Verdict):
@@ -46,7 +46,7 @@ def test_verdicts(difference: float, equivalence: float, mean: float, paper: flo
 
 
 def test_a_look_has_its_own_level():
-    assert verdict(0.03, 1.0, 1.0, 1.0, level=0.02) is Verdict.OPEN
+    assert verdict(0.03, 1.0, 1.0, 1.0, level=0.02) is Verdict.INCONCLUSIVE
     assert verdict(0.03, 1.0, 1.0, 1.0, level=0.03) is Verdict.HOLDS
 
 

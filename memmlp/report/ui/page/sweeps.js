@@ -105,10 +105,10 @@ function rounds(about) {
     h('thead', {}, h('tr', {}, heads.map((head, i) => h('th', { scope: 'col', class: i ? 'n' : null }, head)))),
     h('tbody', {}, lines.map(([head, ...cells]) => h('tr', {}, h('th', { scope: 'row' }, head), cells.map(cell => h('td', { class: 'n' }, cell)))))));
   const decided = about.arms.reduce((sum, arm) => sum + arm.decided, 0);
-  return section('Rounds', h('p', { class: 'faint' }, `Seeds were added where verdicts were open: ${decided} of ${about.comparisons} comparisons are decided. What a look decides is final; all looks together spend 5 %.`),
+  return section('Rounds', h('p', { class: 'faint' }, `Seeds were added where verdicts were inconclusive: ${decided} of ${about.comparisons} comparisons are decided. What a look decides is final; all looks together spend 5 %.`),
     h('div', { class: 'pair' },
       table(['look at', 'spends', 'compared', 'decided'], about.looks.map(look => [`${look.seeds} seeds`, percent(look.level), ...(look.compared ? [number(look.compared), number(look.decided)] : [DASH, DASH])])),
-      table(['arm', 'decided', 'open', 'seeds', 'next'], about.arms.map(arm => [arm.label, number(arm.decided), number(arm.open), number(arm.seeds), arm.next ? `look at ${arm.next}` : DASH]))));
+      table(['arm', 'decided', 'inconclusive', 'seeds', 'next'], about.arms.map(arm => [arm.label, number(arm.decided), number(arm.inconclusive), number(arm.seeds), arm.next ? `look at ${arm.next}` : DASH]))));
 }
 
 function results(table) {
