@@ -18,9 +18,9 @@ from memmlp.live.rotations import BodyTree
 from memmlp.live.spaces import SPACES, Space
 from memmlp.motion.body import JOINTS, PARENTS, TRACKED, builtin_rest_joints
 from memmlp.motion.limb_shapes import RADII
-from memmlp.render.canvas import FAINT, INK, Sheet, png
-from memmlp.render.raster import Camera, draw
-from memmlp.render.skeleton_picture import LEFT, MIDDLE, RIGHT
+from memmlp.report.pictures.canvas import FAINT, INK, Sheet, png
+from memmlp.report.pictures.raster import Camera, draw
+from memmlp.report.pictures.skeleton_picture import LEFT, MIDDLE, RIGHT
 
 IMAGES = Path(__file__).parent / "images"
 COLOURS = ("#d1242f", "#1a7f37", "#0969da")  # of X, Y and Z

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from memmlp.live.spaces import SpaceName
     from memmlp.live.stream import RotationFormat
     from memmlp.networks.motion_model import MotionModel
-    from memmlp.render.clip_piece import ClipPiece
+    from memmlp.report.pictures.clip_piece import ClipPiece
 
 StrPath = str | os.PathLike[str]
 Mode = Literal["stream", "window"]
@@ -324,8 +324,8 @@ class Prediction:
             InputError: for another kind of file, a folder that does not exist, another branch, a piece
                 without frames, a number of poses out of range, or an MP4 without PyAV installed.
         """
-        from memmlp.render.clip_piece import span
-        from memmlp.render.figure_or_film import check_picture, write_picture
+        from memmlp.report.pictures.clip_pictures import check_picture, write_picture
+        from memmlp.report.pictures.clip_piece import span
 
         file = Path(path)
         check_picture(file)
@@ -363,7 +363,7 @@ class Prediction:
 
     def _piece(self, branch: Branch, first: int = 0, last: int | None = None) -> ClipPiece:
         """Return the frames of a branch from one index up to another, for drawing."""
-        from memmlp.render.clip_piece import ClipPiece
+        from memmlp.report.pictures.clip_piece import ClipPiece
 
         _check("branch", branch, [name for name, joints in self._joints.items() if joints is not None])
         joints = self._joints[branch]

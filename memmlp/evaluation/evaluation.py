@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from memmlp.common.errors import InputError
@@ -19,7 +19,7 @@ from memmlp.motion.dataset import MotionDataset
 from memmlp.networks.motion_model import MotionModel
 
 SAME = 0.1  # cm: MPJPE of two branches up to this apart is that of the same joints
-PICTURE_FRAMES = 600  # the picture shows the first 10 s of the first test clip
+PICTURE_FRAMES = 600  # the first 10 s
 
 
 @dataclass(frozen=True)
@@ -78,14 +78,14 @@ def check_positions(network: str, rows: Sequence[dict[str, Any]]) -> None:
             )
 
 
-def picture(model: MotionModel, test: MotionDataset, path: Path) -> None:
-    """Draw the start of the first test clip beside the truth, as a PNG: streamed, where the network can."""
-    # Imported here, since it imports matplotlib: half a second that planning a sweep need not spend.
-    from memmlp.render.heatmap import poses_png
+def predict_first_clip(model: MotionModel, test: MotionDataset) -> tuple[np.ndarray, np.ndarray]:
+    """Return truth and prediction (N, 22, 3) of the first test clip's start, metres, world.
 
+    The prediction is made by streaming, if the network can.
+    """
     device = model.normalizer.rest.device
     clip = test.clip(0)[:PICTURE_FRAMES].to(device)
     motion = modes.MODE_FUNCTIONS["stream" if model.is_stream else "window"](model, [clip])[0]
     predicted = model.normalizer.pose(motion, clip[:, :SPARSE_DIM])
     truth = modes.joint_positions(clip[:, SPARSE_DIM:])
-    poses_png(path, truth.cpu().numpy(), predicted.cpu().numpy(), test.names[0])
+    return truth.cpu().numpy(), predicted.cpu().numpy()

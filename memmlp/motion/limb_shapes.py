@@ -16,6 +16,9 @@ _RADII = {
 RADII = tuple(_RADII[name.split("_")[-1]] for name in JOINTS)
 """The body's radius at each joint, metres."""
 
+HEAT = ("#2b5fd9", "#27a9e1", "#3fc380", "#f2d43d", "#f28c28", "#c4161c")
+"""The colours of a limb from no error to the top of the colour scale, evenly spaced."""
+
 
 class Limb(NamedTuple):
     """A round limb between two joints, or from a joint to a tip that is no joint.

@@ -13,6 +13,7 @@ import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -21,11 +22,13 @@ from memmlp.common import distributed
 from memmlp.common.errors import LeaseLost, TrainingDiverged, of_the_disk
 from memmlp.common.files import write_json
 from memmlp.common.progress import remark, tell
-from memmlp.evaluation.evaluation import picture
+from memmlp.evaluation.evaluation import predict_first_clip
 from memmlp.evaluation.predictions import save_predictions
 from memmlp.experiment_tracking.follower_pipe import Loggers
 from memmlp.live.pose_latency import measure_pose
+from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.motion_source import Prepared
+from memmlp.networks.motion_model import MotionModel
 from memmlp.pipeline.data_remarks import (
     data_remarks,
     data_warnings,
@@ -301,7 +304,16 @@ def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequen
             report |= {"recipes": evaluation_recipes(settings), **machine(experiment), **own_code(experiment)}
             write_report(run.evaluation(name), report | experiment.evaluation.report(model, test, mode))
         if not run.picture.exists() and find_spec("matplotlib"):
-            picture(model, test, run.picture)
+            draw_first_clip(model, test, run.picture)
+
+
+def draw_first_clip(model: MotionModel, test: MotionDataset, path: Path) -> None:
+    """Draw the start of the first test clip beside the truth, as a PNG."""
+    from memmlp.report.pictures.clip_pictures import write_picture  # matplotlib takes 0.5 s to import
+    from memmlp.report.pictures.clip_piece import ClipPiece
+
+    truth, predicted = predict_first_clip(model, test)
+    write_picture(path, ClipPiece(test.names[0], truth, {"prediction": predicted}))
 
 
 def deploy_run(experiment: Experiment, run: Run, data: Prepared, name: str) -> None:

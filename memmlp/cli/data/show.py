@@ -21,9 +21,9 @@ def show(source: Path, out: Path, clips: int, body: str) -> None:
     The clips are spread evenly over the folder's files in the order of their names.
     """
     from memmlp.common.files import atomic_write
-    from memmlp.render.canvas import png
-    from memmlp.render.clip_sheet import clip_sheet, some_clips
-    from memmlp.render.figure_or_film import check_picture
+    from memmlp.report.pictures.canvas import png
+    from memmlp.report.pictures.clip_pictures import check_picture
+    from memmlp.report.pictures.clip_sheet import clip_sheet, some_clips
 
     check_picture(out, "--out", (".png",))
     shown, skipped, total = some_clips(source, clips, body)

@@ -57,8 +57,8 @@ def show(file: Path, which: str | None, out: Path) -> None:
     from memmlp.motion.importing.importable_files import read_recording
     from memmlp.motion.importing.skeleton_map import find_skeleton, load_skeleton
     from memmlp.motion.importing.stance_with_all_nodes import find_stance_with_all_nodes
-    from memmlp.render.figure_or_film import check_picture
-    from memmlp.render.skeleton_picture import skeleton_png
+    from memmlp.report.pictures.clip_pictures import check_picture
+    from memmlp.report.pictures.skeleton_picture import skeleton_png
 
     check_picture(out, "--out", (".png",))
     recording = read_recording(file)

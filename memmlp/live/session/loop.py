@@ -19,8 +19,7 @@ from memmlp.live.spaces import SPACES, Space
 from memmlp.live.stream import Pose, Stream
 from memmlp.motion.body import FPS, JOINTS, PARENTS, ROOT
 from memmlp.motion.formats.humanoid_bones import VRM
-from memmlp.motion.limb_shapes import LIMBS
-from memmlp.render.error_colours import HEAT
+from memmlp.motion.limb_shapes import HEAT, LIMBS
 
 PAGE_SPACE = SPACES["openxr"]  # the page's axes: those of three.js
 TOP = 20  # cm at the top of the page's colour scale

@@ -25,8 +25,7 @@ from memmlp.live.web.clips import SiteClip, write_clips
 from memmlp.live.web.networks import SiteNetwork, Writer
 from memmlp.live.web.packages import write_packages
 from memmlp.motion.body import JOINTS
-from memmlp.motion.limb_shapes import LIMBS
-from memmlp.render.error_colours import HEAT
+from memmlp.motion.limb_shapes import HEAT, LIMBS
 
 SHARED = {
     "memmlp.live.session": ("stage.js", "history.js"),

@@ -15,8 +15,8 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
 from memmlp.live.spaces import SPACES
 from memmlp.motion.body import FPS, JOINTS
-from memmlp.motion.limb_shapes import LIMBS
-from memmlp.render.error_colours import HEAT, scale
+from memmlp.motion.limb_shapes import HEAT, LIMBS
+from memmlp.report.pictures.raster import scale
 from memmlp.runs.identity import evaluation_id
 from memmlp.runs.run import Run
 

@@ -27,4 +27,4 @@ def test_a_sheet_is_written_and_bad_files_are_named(tmp_path: Path):
 def test_other_pictures_are_refused(tmp_path: Path):
     result = CliRunner().invoke(data, ["show", str(tmp_path), "--out", str(tmp_path / "sheet.gif")])
     assert isinstance(result.exception, InputError)
-    assert "allowed are .png" in str(result.exception)
+    assert "must end in .png" in str(result.exception)

@@ -1,4 +1,4 @@
-"""A picture of a skeleton map: the stance from which a file is read, its mapped nodes, and the body."""
+"""A picture of a skeleton map: a file's stance with its mapped nodes beside the built-in body."""
 
 from __future__ import annotations
 
@@ -7,26 +7,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.lines import Line2D
 
 from memmlp.common.files import atomic_write
 from memmlp.motion.importing.node_names import without_namespace
 from memmlp.motion.importing.skeleton_map import Z_UP
 from memmlp.motion.importing.stance_with_all_nodes import StanceWithAllNodes
 from memmlp.motion.limb_shapes import RADII
-from memmlp.render.canvas import DPI, FAINT, INK, Sheet, png
-from memmlp.render.raster import Camera, draw
+from memmlp.report.pictures.canvas import FAINT, INK, Sheet, png, shorten
+from memmlp.report.pictures.raster import Camera, draw
 
 HEIGHT, TOP, BOTTOM = 700, 90, 50  # pixels
 NAMES, FRONT, SIDE = 250, 480, 230  # widths of a column of names, of a front view, of a side view
 WIDTH = 3 * NAMES + 2 * (FRONT + SIDE)
-TALL, WIDE = 1.95, 1.9  # metres that a view covers at least; larger people are drawn smaller
+TALL, WIDE = 1.95, 1.9  # smallest height and width that a view covers, metres
 SPACING = 21  # pixels from a name to the next
 LEFT, RIGHT, MIDDLE, BARE = "#1f6fd0", "#d0561f", "#2a8c4a", "#b4bac1"
 
 
 def skeleton_png(path: Path, stance: StanceWithAllNodes, title: str) -> None:
-    """Write a PNG of a stance: the file's nodes from the front and from the right, and the body, too.
+    """Write a PNG of a stance from the front and from the right: the file's nodes, and the body.
 
     All nodes are grey; those mapped to a body joint are coloured, and named `body joint = node`.
     """
@@ -34,7 +33,8 @@ def skeleton_png(path: Path, stance: StanceWithAllNodes, title: str) -> None:
     sheet.text(24, 28, title, 20, ha="left", weight="bold")
     sheet.text(24, 58, f"read from {stance.source}", 15, ha="left", color=FAINT)
     mapped = stance.positions[list(stance.mapped.values())]
-    positions, scale = stance.positions - (mapped.min(0) + mapped.max(0)) / 2, _scale(mapped)
+    positions, size = stance.positions - (mapped.min(0) + mapped.max(0)) / 2, np.ptp(mapped, axis=0)
+    scale = float(min((HEIGHT - TOP - BOTTOM) / max(size[1], TALL), FRONT / max(size[0], WIDE)))
     front, side = NAMES + FRONT / 2, 2 * NAMES + FRONT + SIDE / 2 - 60
     places = _place(positions, front, 0, scale), _place(positions, side, 2, scale)
     for place, middle, width in zip(places, (front, side), (FRONT, SIDE), strict=True):
@@ -47,13 +47,6 @@ def skeleton_png(path: Path, stance: StanceWithAllNodes, title: str) -> None:
     atomic_write(path, png(sheet.pixels()))
 
 
-def _scale(positions: np.ndarray) -> float:
-    """Return the pixels per metre at which these points (n, 3) are in view."""
-    size = np.ptp(positions, axis=0)
-    room = HEIGHT - TOP - BOTTOM
-    return float(min(room / max(size[1], TALL), FRONT / max(size[0], WIDE)))
-
-
 def _place(positions: np.ndarray, middle: float, axis: int, scale: float) -> np.ndarray:
     """Return the places (nodes, 2) of points (nodes, 3) in the picture, with the given axis to the right."""
     height = TOP + (HEIGHT - TOP - BOTTOM) / 2
@@ -62,8 +55,9 @@ def _place(positions: np.ndarray, middle: float, axis: int, scale: float) -> np.
 
 def _line(sheet: Sheet, points: np.ndarray, **style: Any) -> None:
     """Add a line through points (n, 2) of the picture."""
-    size = sheet.figure.get_size_inches() * DPI
-    x, y = points[:, 0] / size[0], 1 - points[:, 1] / size[1]
+    from matplotlib.lines import Line2D
+
+    x, y = points[:, 0] / sheet.width, 1 - points[:, 1] / sheet.height
     sheet.figure.add_artist(Line2D(x, y, **style))
 
 
@@ -96,11 +90,7 @@ def _names(
         node = stance.mapped[joint]
         end = x + (4 if align == "right" else -4)
         _line(sheet, np.array([[end, y], places[node]]), color=_colour(joint), lw=0.6, alpha=0.6)
-        sheet.text(x, y, f"{joint} = {_short(plain[node])}", 14, ha=align, color=_colour(joint))
-
-
-def _short(name: str, most: int = 20) -> str:
-    return name if len(name) <= most else "…" + name[1 - most :]
+        sheet.text(x, y, f"{joint} = {shorten(plain[node], 20)}", 14, ha=align, color=_colour(joint))
 
 
 def spread(wanted: Sequence[float], least: float, low: float, high: float) -> list[float]:

@@ -1,4 +1,4 @@
-"""The content of a picture or a film: a piece of a clip, and the camera."""
+"""A piece of a clip with predictions, and the camera that films it."""
 
 from __future__ import annotations
 
@@ -11,20 +11,19 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.motion.body import FPS, ROOT
 from memmlp.motion.limb_shapes import LIMBS, RADII
-from memmlp.render.error_colours import scale
-from memmlp.render.raster import ELEVATION, Camera
+from memmlp.report.pictures.raster import ELEVATION, Camera, scale
 
 BOTTOM = -0.195  # height of a picture's lower edge above the floor, metres
 SIDE = np.deg2rad(25)  # the camera's angle from the person's front, radians
-METRES, MOST = 2.15, 2.9  # heights that a picture covers at least and at most, metres
-TIP = max(limb.tip + max(limb.radii) for limb in LIMBS)  # what a limb adds to its joint at most, metres
-FOLLOW = 0.4  # seconds over which the camera's way is smoothed
+LOWEST, HIGHEST = 2.15, 2.9  # smallest and largest height that a picture covers, metres
+TIP = max(limb.tip + max(limb.radii) for limb in LIMBS)  # largest reach of a limb beyond its joint, metres
+SMOOTHING = 0.4  # seconds over which the camera's path is smoothed
 
 
 def span(
     length: int, title: str, begin: float, end: float | None, keys: tuple[str, str] = ("begin", "end")
 ) -> tuple[int, int]:
-    """Return the first frame of a piece of a clip, and the frame after its last one.
+    """Return the first frame of a piece of a clip, and the frame after its last.
 
     Args:
         length: the clip's number of frames.
@@ -38,7 +37,7 @@ def span(
     stop = length / FPS if end is None else min(end, length / FPS)
     if not 0 <= begin < stop or round(begin * FPS) == round(stop * FPS):  # NaN is neither
         given = f"{keys[0]} {begin:g}" + ("" if end is None else f" {keys[1]} {end:g}")
-        raise InputError(f"{given}: nothing between; {title} has {length / FPS:.1f} s")
+        raise InputError(f"{given}: there is no frame between; {title} has {length / FPS:.1f} s")
     return round(begin * FPS), round(stop * FPS)
 
 
@@ -75,12 +74,12 @@ class ClipPiece:
 
     @cached_property
     def metres(self) -> float:
-        """The height that a picture covers, metres: more where somebody's hands are above the head."""
+        """The height that a picture covers, metres: larger with hands above the head."""
         joints = np.stack([self.truth, *self.predictions.values()])
-        away = np.linalg.norm(joints[..., :2] - self.truth[:, None, ROOT, :2], axis=-1)
-        up = joints[..., 2] - self.floor + np.tan(ELEVATION) * away  # what is farther away is drawn higher
+        distance = np.linalg.norm(joints[..., :2] - self.truth[:, None, ROOT, :2], axis=-1)
+        up = joints[..., 2] - self.floor + np.tan(ELEVATION) * distance  # distant joints are drawn higher
         highest = np.nan_to_num(up, nan=0.0, posinf=0.0).max() + TIP
-        return float(np.clip(highest - BOTTOM, METRES, MOST))
+        return float(np.clip(highest - BOTTOM, LOWEST, HIGHEST))
 
     def rows(self, frame: int) -> list[tuple[np.ndarray, np.ndarray | None]]:
         """Return joints (22, 3) and their errors (22,) as fractions of the scale's top, for each row.
@@ -101,8 +100,8 @@ class ClipPiece:
         return float(np.arctan2(left[1], left[0])) + SIDE
 
     def path(self) -> np.ndarray:
-        """Return the camera's place over time (N, 2), which follows the truth's root, smoothed."""
-        width = round(FOLLOW * FPS)
+        """Return the camera's position over time (N, 2), metres: the truth's root, smoothed."""
+        width = round(SMOOTHING * FPS)
         window = np.hanning(2 * width + 3)[1:-1]
         padded = np.pad(self.truth[:, ROOT, :2], ((width, width), (0, 0)), mode="edge")
         columns = [np.convolve(column, window / window.sum(), "valid") for column in padded.T]

@@ -1,7 +1,6 @@
-"""Draw skeletons as shaded bodies on a floor, in NumPy.
+"""Draw skeletons as shaded bodies on a floor, in NumPy, with limbs coloured by error.
 
-A limb is a row of spheres, a depth buffer decides what is in front, and the projection is parallel. For
-smooth edges the picture is drawn with SAMPLES x SAMPLES samples per pixel and averaged at the end.
+A limb is a row of spheres, and a depth buffer decides what is in front. The projection is parallel.
 """
 
 from __future__ import annotations
@@ -10,17 +9,31 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from memmlp.motion.limb_shapes import LIMBS, Limb, ends
-from memmlp.render.error_colours import NEUTRAL, heat
+from memmlp.motion.limb_shapes import HEAT, LIMBS, Limb, ends
 
-SAMPLES = 2  # samples along a pixel's side
+NEUTRAL = (0.66, 0.70, 0.74)  # the truth's colour
+SCALES = (10, 15, 20, 30, 40, 50, 75, 100)  # the possible tops of a colour scale, cm
+SAMPLES = 2  # samples along a pixel's side, which are averaged for smooth edges
 SPHERES = 18  # spheres of a limb
 LIGHT = np.array([-0.45, 0.65, 0.62]) / np.linalg.norm([-0.45, 0.65, 0.62])  # to the light, camera's axes
 AMBIENT = 0.46
 ELEVATION = np.deg2rad(12)  # by which a camera looks down, radians
 GRID = 0.5  # metres between the floor's lines
-FLOOR = 0.56  # radius of the visible floor, of a picture's width; it fades out towards it
+FLOOR = 0.56  # radius of the visible floor as a fraction of the picture's width
 SHADOW = 0.13  # metres over which a shadow is blurred
+
+
+def heat(fractions: np.ndarray) -> np.ndarray:
+    """Return colours (..., 3), 0 to 1, of errors (...) as fractions of the scale's top."""
+    anchors = np.array([[int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)] for colour in HEAT])
+    place = np.clip(fractions, 0, 1) * (len(anchors) - 1)
+    return np.stack([np.interp(place, range(len(anchors)), channel) for channel in anchors.T], -1)
+
+
+def scale(errors: np.ndarray) -> float:
+    """Return the top of a scale for errors in cm: the least of `SCALES` below which 98 % of them are."""
+    high = float(np.percentile(errors, 98))
+    return float(next((top for top in SCALES if high <= top), SCALES[-1]))
 
 
 @dataclass(frozen=True)
@@ -70,26 +83,33 @@ def draw(camera: Camera, joints: np.ndarray, errors: np.ndarray | None, floor: f
         floor: the floor's height, metres.
     """
     right, up = camera.grid()
-    picture = ground(camera, joints, floor)
+    picture = _draw_floor(camera, joints, floor)
     depth = np.full(picture.shape[:2], -np.inf, np.float32)
     for limb in LIMBS:
-        shade(limb, camera, joints, errors, right, up, picture, depth)
-    height, width = camera.height, camera.width
-    smooth = picture.reshape(height, SAMPLES, width, SAMPLES, 3).mean((1, 3))
+        _draw_limb(limb, camera, joints, errors, right, up, picture, depth)
+    smooth = picture.reshape(camera.height, SAMPLES, camera.width, SAMPLES, 3).mean((1, 3))
     return (smooth * 255 + 0.5).astype(np.uint8)
 
 
-def ground(camera: Camera, joints: np.ndarray, floor: float) -> np.ndarray:
+def _draw_floor(camera: Camera, joints: np.ndarray, floor: float) -> np.ndarray:
     """Draw the floor's grid and the skeleton's shadow on white: (H, W, 3) samples, 0 to 1.
 
     Both are smooth, so they are computed once for each pixel and repeated for its samples.
     """
-    x, y = on_floor(camera, floor)
+    right, up = camera.grid()
+    right, up = right[:, ::SAMPLES], up[::SAMPLES]
+    axes = camera.axes.astype(np.float32)
+    # World X and Y of the floor behind each pixel: how far towards the viewer its ray meets the floor.
+    away = (floor - camera.centre[2] - right * axes[0, 2] - up * axes[1, 2]) / axes[2, 2]
+    x, y = (
+        (camera.centre[i] + right * axes[0, i] + up * axes[1, i] + away * axes[2, i]).astype(np.float32)
+        for i in (0, 1)
+    )
     # The floor has no horizon in a parallel projection: it fades out around the person instead.
     far = np.hypot(x - camera.centre[0], y - camera.centre[1]) / (FLOOR * camera.width / camera.scale)
     fade = np.clip(1.8 * (1 - far), 0, 1)
-    lines = np.maximum(*(grid_lines(v, camera) for v in (x, y)))
-    # The shadow is a soft spot under each end of a limb; where spots overlap the darkest counts.
+    lines = np.maximum(*(_grid_lines(along) for along in (x, y)))
+    # The shadow is a soft spot under each end of a limb; where spots overlap, the darkest counts.
     shadow = np.zeros_like(fade)
     for px, py, pz in np.concatenate([ends(limb, joints) for limb in LIMBS]).tolist():
         spread = SHADOW + 0.25 * max(pz - floor, 0.0)  # higher up, wider and fainter
@@ -99,28 +119,14 @@ def ground(camera: Camera, joints: np.ndarray, floor: float) -> np.ndarray:
     return np.kron((1 - dark)[..., None], np.ones((SAMPLES, SAMPLES, 3), np.float32))
 
 
-def on_floor(camera: Camera, floor: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return world X and Y (height, width), metres, of the floor behind each pixel."""
-    right, up = camera.grid()
-    right, up = right[:, ::SAMPLES], up[::SAMPLES]
-    axes = camera.axes.astype(np.float32)
-    # How far towards the viewer each pixel's ray meets the floor, from the plane through the centre.
-    away = (floor - camera.centre[2] - right * axes[0, 2] - up * axes[1, 2]) / axes[2, 2]
-    x, y = (camera.centre[i] + right * axes[0, i] + up * axes[1, i] + away * axes[2, i] for i in (0, 1))
-    return x.astype(np.float32), y.astype(np.float32)
-
-
-def grid_lines(along: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return how much (height, width), 0 to 1, of each pixel lies on the grid lines of a floor coordinate.
-
-    Lines are a pixel or two wide at any scale, since distances are divided by the size that a pixel covers.
-    """
+def _grid_lines(along: np.ndarray) -> np.ndarray:
+    """Return the fraction (height, width) of each pixel on the grid lines of a floor coordinate, metres."""
     off = np.abs((along / GRID + 0.5) % 1 - 0.5) * GRID
     pixel = np.hypot(*np.gradient(along))  # metres of the floor that a pixel covers
     return np.clip(1.2 - off / np.maximum(pixel, 1e-6), 0, 1)
 
 
-def shade(
+def _draw_limb(
     limb: Limb,
     camera: Camera,
     joints: np.ndarray,
@@ -130,56 +136,39 @@ def shade(
     picture: np.ndarray,
     depth: np.ndarray,
 ) -> None:
-    """Draw a limb into a picture (H, W, 3), wherever it is nearer than the depth buffer (H, W).
+    """Draw a limb into a picture (H, W, 3), in place, wherever it is nearer than the depth buffer (H, W).
 
-    The picture and the buffer are changed in place. Metres to the `right` (1, W) and `up` (H, 1) are those of
-    `Camera.grid`.
+    Metres to the `right` (1, W) and `up` (H, 1) are those of `Camera.grid`.
     """
     a, b = (camera.project(point).astype(np.float32) for point in ends(limb, joints))
     part = np.linspace(0, 1, SPHERES, dtype=np.float32)[:, None, None]
     # The axes are (sphere, row, column). Only the rectangle of samples that the limb can cover is computed.
     centre = [a[i] + part * (b[i] - a[i]) for i in range(3)]
     radius = limb.radii[0] + part * (limb.radii[1] - limb.radii[0])
-    rows, columns = box(centre, radius, right, up)
+    columns = slice(*np.searchsorted(right[0], [(centre[0] - radius).min(), (centre[0] + radius).max()]))
+    rows = slice(*np.searchsorted(-up[:, 0], [(-centre[1] - radius).min(), (-centre[1] + radius).max()]))
     x, y = right[:, columns] - centre[0], up[rows] - centre[1]
     inside = radius**2 - x**2 - y**2
-    # A sphere's surface towards the viewer; the nearest sphere at each sample is what is seen of the limb.
+    # A sphere's surface towards the viewer; the nearest sphere at each sample is visible.
     surface = np.where(inside > 0, centre[2] + np.sqrt(np.maximum(inside, 0)), -np.inf)
     best = surface.argmax(0)[None]
     near = np.take_along_axis(surface, best, 0)[0]
-    seen = near > depth[rows, columns]
+    visible = near > depth[rows, columns]
     # How far along the limb that sphere is, for the colour, and its normal there, for the light.
     t = part[best[0], 0, 0]
     normal = np.stack(
         [np.take_along_axis(v, best, 0)[0] / radius[best[0], 0, 0] for v in np.broadcast_arrays(x, y)], -1
     )
     normal = np.concatenate([normal, np.sqrt(np.clip(1 - (normal**2).sum(-1, keepdims=True), 0, 1))], -1)
-    normal = along_tube(normal, b - a, (t > 0) & (t < 1))
-    # Diffuse light from LIGHT, and a little more where the surface faces the viewer.
-    light = AMBIENT + (1 - AMBIENT) * np.clip(normal @ LIGHT, 0, 1) + 0.12 * normal[..., 2] - 0.06
-    colour = (
-        np.array(NEUTRAL) if errors is None else heat(np.interp(t, (0, 1), errors[[limb.first, limb.end]]))
-    )
-    picture[rows, columns][seen] = np.clip(colour * light[..., None], 0, 1)[seen]
-    depth[rows, columns][seen] = near[seen]
-
-
-def box(
-    centre: list[np.ndarray], radius: np.ndarray, right: np.ndarray, up: np.ndarray
-) -> tuple[slice, slice]:
-    """Return the rows and columns of the samples that a row of spheres can cover."""
-    columns = np.searchsorted(right[0], [(centre[0] - radius).min(), (centre[0] + radius).max()])
-    rows = np.searchsorted(-up[:, 0], [(-centre[1] - radius).min(), (-centre[1] + radius).max()])
-    return slice(*rows), slice(*columns)
-
-
-def along_tube(normal: np.ndarray, axis: np.ndarray, side: np.ndarray) -> np.ndarray:
-    """Return the normals (H, W, 3) of a row of spheres as those of a smooth tube along the axis (3,).
-
-    Otherwise bumps between the spheres would be visible. Only the normals on the tube's side change, where
-    `side` (H, W) is true; at its round ends they stay those of spheres.
-    """
-    axis = axis / max(float(np.linalg.norm(axis)), 1e-6)
+    # On the side, the normals are those of a smooth tube, which hides the bumps between the spheres.
+    axis = (b - a) / max(float(np.linalg.norm(b - a)), 1e-6)
     flat = normal - (normal @ axis)[..., None] * axis
     flat /= np.maximum(np.linalg.norm(flat, axis=-1, keepdims=True), 1e-6)
-    return np.where(side[..., None], flat, normal)
+    normal = np.where(((t > 0) & (t < 1))[..., None], flat, normal)
+    # Diffuse light from LIGHT, and a little more where the surface faces the viewer.
+    light = AMBIENT + (1 - AMBIENT) * np.clip(normal @ LIGHT, 0, 1) + 0.12 * normal[..., 2] - 0.06
+    colour = np.array(NEUTRAL)
+    if errors is not None:
+        colour = heat(np.interp(t, (0, 1), errors[[limb.first, limb.end]]))
+    picture[rows, columns][visible] = np.clip(colour * light[..., None], 0, 1)[visible]
+    depth[rows, columns][visible] = near[visible]

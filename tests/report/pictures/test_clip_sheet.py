@@ -10,7 +10,7 @@ import pytest
 from memmlp.common.errors import InputError
 from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.synthetic import synthesize_clip
-from memmlp.render.clip_sheet import COLUMNS, HEIGHT, LABEL, WIDTH, clip_sheet, some_clips
+from memmlp.report.pictures.clip_sheet import COLUMNS, HEIGHT, LABEL, WIDTH, clip_sheet, some_clips
 
 
 @pytest.fixture
@@ -22,17 +22,13 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "clips"
 
 
-@pytest.mark.parametrize(("count", "numbers"), [(1, [0]), (3, [0, 3, 6]), (7, range(7)), (99, range(7))])
+@pytest.mark.parametrize(("count", "numbers"), [(1, [0]), (3, [0, 3, 6]), (99, range(7))])
 def test_clips_are_evenly_spread(folder: Path, count: int, numbers: list[int]):
     clips, skipped, total = some_clips(folder, count)
     assert [name for name, _ in clips] == [f"{number}/walk" for number in numbers]
     assert (skipped, total) == ([], 7)
     assert clips[0][1].shape[1:] == (22, 3)
-
-
-def test_one_clip(folder: Path):
-    clips, _, total = some_clips(folder / "2" / "walk.npz", 12)
-    assert ([name for name, _ in clips], total) == (["walk"], 1)
+    assert some_clips(folder / "2" / "walk.npz", count)[0][0][0] == "walk"
 
 
 def test_bad_files_are_named(folder: Path):

@@ -1,4 +1,4 @@
-"""A sheet of motion clips, each at a few moments: an overview of an import or a dataset."""
+"""A sheet of motion clips, each at a few moments."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from memmlp.motion.clip import Skipped
 from memmlp.motion.clip_kinematics import clip_kinematics
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.preparing.find_clips import clip_name, find_clips
-from memmlp.render.canvas import Sheet
-from memmlp.render.raster import Camera, draw
+from memmlp.report.pictures.canvas import Sheet, shorten
+from memmlp.report.pictures.raster import Camera, draw
 
 WIDTH, HEIGHT, LABEL, COLUMNS = 150, 220, 26, 12  # pixels; panels a row
 SCALE = 100.0  # pixels a metre
-LENS = 1.0  # metres above the floor that the camera looks at
-ASKEW = np.deg2rad(35)  # the camera stands beside the person's front
+LENS = 1.0  # height that the camera looks at, metres
+SIDE = np.deg2rad(35)  # the camera's angle from the person's front, radians
 
 
 def some_clips(
@@ -28,11 +28,11 @@ def some_clips(
     """Read a clip, or `count` of a folder's npz files, evenly spread in the order of their names.
 
     Returns:
-        Name and global joint positions (N, 22, 3), metres, world, of each clip; those of the read files that
-        contain no clip; and the number of all files.
+        Name and global joint positions (N, 22, 3), metres, world, of each clip; the files that contain no
+        clip; and the number of all files.
 
     Raises:
-        InputError: if there are no npz files, or no clip in those that were read.
+        InputError: if there are no npz files, or none that was read contains a clip.
     """
     rest = load_rest_joints(body)
     files = find_clips(source).files if source.is_dir() else [source.name]
@@ -67,7 +67,7 @@ def clip_sheet(clips: Sequence[tuple[str, np.ndarray]], moments: int = 3) -> np.
     sheet = Sheet(across * moments * WIDTH, rows * (HEIGHT + LABEL))
     for index, (name, joints) in enumerate(clips):
         left, top = index % across * moments * WIDTH, index // across * (HEIGHT + LABEL)
-        sheet.text(left + moments * WIDTH / 2, top + LABEL / 2, _short(name), 13)
+        sheet.text(left + moments * WIDTH / 2, top + LABEL / 2, shorten(name, 48), 13)
         for moment in range(moments):
             frame = (2 * moment + 1) * len(joints) // (2 * moments)
             panel = sheet.panel(left + moment * WIDTH, top + LABEL, WIDTH, HEIGHT)
@@ -75,12 +75,7 @@ def clip_sheet(clips: Sequence[tuple[str, np.ndarray]], moments: int = 3) -> np.
     return sheet.pixels()
 
 
-def _short(name: str, most: int = 48) -> str:
-    return name if len(name) <= most else "…" + name[1 - most :]
-
-
 def _camera(joints: np.ndarray) -> Camera:
-    """Return a camera beside the front of a person whose left hip is joint 1 and right hip joint 2."""
-    left = joints[1] - joints[2]
+    left = joints[1] - joints[2]  # from right to left hip
     centre = np.array([*joints[0, :2], LENS])
-    return Camera(centre, np.arctan2(left[1], left[0]) + ASKEW, WIDTH, HEIGHT, SCALE)
+    return Camera(centre, np.arctan2(left[1], left[0]) + SIDE, WIDTH, HEIGHT, SCALE)

@@ -1,0 +1,1 @@
+"""Pictures of motion: figures, films, sheets of clips and skeleton maps."""
