@@ -49,7 +49,7 @@ COMMANDS = {
     "live": Command("live", "live", "A network live on a local page: a clip, or trackers by UDP or OSC."),
     "web": Command("web", "web", "A site that times and plays networks in any browser, and on a headset."),
     "export": Command("export", "export", "ONNX file of a finished run."),
-    "bench": Command("bench", "bench", "Measure this machine; sweeps and searches under kills."),
+    "bench": Command("bench", "bench", "Measure speed on this machine."),
 }
 
 

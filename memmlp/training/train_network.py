@@ -8,7 +8,6 @@ from pathlib import Path
 
 import torch
 from torch import nn
-from torch.profiler import record_function
 
 from memmlp.common import distributed
 from memmlp.evaluation import modes
@@ -25,7 +24,6 @@ from memmlp.training.loop import StepResult, Watch, train, unwatched
 from memmlp.training.losses import Loss
 from memmlp.training.optim import Optim
 from memmlp.training.rollout import Rollout
-from memmlp.training.step_profile import SAMPLING
 
 VALIDATION_PIECE = 240  # frames, 4 s: validation streams through pieces of clips of this length
 
@@ -137,8 +135,7 @@ class MotionTask:
 
     def step(self, step: int) -> StepResult:
         """Compute the loss of one training call."""
-        with record_function(SAMPLING):
-            call = self.rollout.draw(self.model, self.dataset, self.sampler, step)
+        call = self.rollout.draw(self.model, self.dataset, self.sampler, step)
         motion, state, own = self.training_call(call.sparse, call.state, call.true_frames)
         self.rollout.keep(state)
         times = len(motion) // len(call.true_frames)  # each of a network's members may have learned them

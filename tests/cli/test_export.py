@@ -50,13 +50,6 @@ def test_no_number_of_clips_is_below_zero(memmlp: Memmlp):
     )
 
 
-def test_a_live_frame_is_of_one_thing(memmlp: Memmlp, tmp_path: Path):
-    write(tmp_path / "step.onnx", "Relu")
-    line = ["bench", "live-frame", "--onnx", "step.onnx"]
-    for other in (["--run", "0123"], ["model=sage"]):
-        assert one_line(memmlp(*line, *other), "--run, --onnx, overrides", "allowed is one of them")
-
-
 def test_web_is_all_of_its_backends(memmlp: Memmlp, tmp_path: Path):
     write(tmp_path / "step.onnx", "Relu", "Sign")
     said = memmlp("export", str(tmp_path / "step.onnx"), "--operators-for", "web")

@@ -12,10 +12,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from benchmarks.chaos import examine
 from command_line import BRIEF, run_apart
 from command_line import run as command
 
-from memmlp.cli.bench.chaos import examine
 from memmlp.cli.tune import _makes, _tasks, prepare_search, search, training, write_results
 from memmlp.cli.workers import Workers
 from memmlp.common.errors import InputError

@@ -1,12 +1,12 @@
-"""What `memmlp bench chaos` and `chaos-tune` start, without importing torch for each process."""
+"""The processes of tests/benchmarks/chaos.py, without importing torch for each."""
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+from benchmarks import chaos
 from command_line import in_folder
 from processes import Forked
 
@@ -16,7 +16,6 @@ def forked_controllers(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     That sweeps live and end as users start them is tests/cli/test_sweep.py's.
     """
-    chaos = importlib.import_module("memmlp.cli.bench.chaos")  # in its package the name is the command's
 
     def start(words: Sequence[str], outputs: Path, workers: int) -> Forked:
         """What `chaos.start` does."""

@@ -1,22 +1,19 @@
-"""A search under SIGKILLs: the short form of `memmlp bench chaos-tune`."""
+"""A search under SIGKILLs: a short form of tests/benchmarks/chaos.py."""
 
 from __future__ import annotations
 
-import importlib
+import random
 from pathlib import Path
 
 import pytest
-from command_line import SMALL, run
+from benchmarks import chaos
+from command_line import SMALL
 from kills.storms import forked_controllers
 
 
 @pytest.mark.slow
 def test_every_trial_is_there_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """With two seeds a trial, so that some kills come between a trial's runs, which are short here."""
-    chaos = importlib.import_module("memmlp.cli.bench.chaos")  # in its package the name is the command's
     monkeypatch.setattr(chaos, "LONG_PAUSES", (1.0, 4.0))
     forked_controllers(tmp_path, monkeypatch)
-    words = ["--trials", "2", "--kills", "3", *SMALL, "search.seeds=2"]
-    said = run(tmp_path, "bench", "chaos-tune", *words)
-    assert "2 trials with 3 kills" in said
-    assert "all trials as they should be: 0 differences" in said
+    assert chaos.search_storm(2, 3, 1, random.Random(0), [*SMALL, "search.seeds=2"]) == []

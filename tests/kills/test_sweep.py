@@ -1,4 +1,4 @@
-"""Sweeps under SIGKILLs: the short form of `memmlp bench chaos`, and that its judge can say no."""
+"""A sweep under SIGKILLs: a short form of tests/benchmarks/chaos.py, and that its judge finds differences."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from command_line import SMALL, run
+from benchmarks.chaos import check, compare, storm, sweep_storm
+from command_line import SMALL
 from kills.storms import forked_controllers
 
-from memmlp.cli.bench.chaos import check, compare, storm
 from memmlp.common.lease import current_process
 from memmlp.runs.run import Run
 
@@ -21,11 +21,8 @@ from memmlp.runs.run import Run
 @pytest.mark.slow
 def test_a_sweep_under_kills_ends_as_an_undisturbed_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     forked_controllers(tmp_path, monkeypatch)
-    words = ["--runs", "2", "--kills", "3", "--controllers", "2", "--trials", "0"]
-    words += [*SMALL, "export.graph=off"]
-    said = run(tmp_path, "bench", "chaos", *words)
-    assert "with 3 kills" in said
-    assert "3 kills: as undisturbed: 0 differences" in said
+    overrides = [*SMALL, "export.graph=off"]
+    assert sweep_storm(2, 3, 2, random.Random(0), overrides) == []
 
 
 def test_a_storm_over_processes_that_end_at_once_ends_too(tmp_path: Path):
@@ -37,7 +34,7 @@ def test_a_storm_over_processes_that_end_at_once_ends_too(tmp_path: Path):
         return launched[-1]
 
     try:
-        assert storm([launch, launch], tmp_path, 2, (0.6, 0.8), random.Random(0)) == 2
+        storm([launch, launch], tmp_path, 2, (0.6, 0.8), random.Random(0))
     finally:
         for process in launched:
             process.kill()
@@ -72,7 +69,7 @@ def test_every_kind_of_difference_is_found(tmp_path: Path):
         f"run {'f' * 16} should not be",
         f"run {'b' * 16}: other weights",
         f"run {'c' * 16}: stopped, not done",
-        f"run {'d' * 16}: is held still",
+        f"run {'d' * 16}: is still held",
         f"run {'e' * 16}: artifact model.safetensors is missing or changed",
     ):
         assert line in said
@@ -81,4 +78,4 @@ def test_every_kind_of_difference_is_found(tmp_path: Path):
 def test_a_run_that_was_begun_again_after_its_end_is_found(tmp_path: Path):
     run = finished(tmp_path, "a")
     run.write_manifest({"attempts": [{"started": "2999-01-01T00:00:00+00:00", "stage": "training"}]})
-    assert check(run.folder) == ["begun again after it was finished"]
+    assert check(run.folder) == ["trained again after it was finished"]

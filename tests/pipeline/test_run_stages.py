@@ -2,7 +2,6 @@
 
 import importlib
 import json
-import re
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -198,12 +197,7 @@ def test_a_run_of_other_code_under_the_same_recipes_is_said(home, monkeypatch):
 def test_the_live_stream_of_a_run(home, memmlp, monkeypatch):
     monkeypatch.chdir(home)
     run = motion_run(home)
-    out = memmlp("bench", "soak", run.id, "--hours", "0.001").out
-    assert "all finite: yes" in out
-    first, last = re.search(r"MPJPE (\S+) cm in the first tenth, (\S+) cm in the last", out).groups()
-    assert float(last) == pytest.approx(float(first), rel=0.05)
     assert "ratio" in memmlp("bench", "live-frame", "--run", run.id, "--frames", "5", "--rounds", "1").out
-    assert one_line(memmlp("bench", "soak"), "neither RUN nor --onnx")
 
 
 def test_export_again_and_bad_names(home, memmlp, monkeypatch):

@@ -1,26 +1,17 @@
-"""`memmlp bench`: measurements on this machine of speed, and of sweeps under kills."""
+"""`memmlp bench`: measurements of speed on this machine."""
 
 from __future__ import annotations
 
 import click
 
-from memmlp.cli.bench.chaos import chaos, chaos_tune
-from memmlp.cli.bench.latency import latency
-from memmlp.cli.bench.live_frame import live_frame
-from memmlp.cli.bench.loggers import loggers
-from memmlp.cli.bench.prepare_data import prepare
-from memmlp.cli.bench.soak import soak
-from memmlp.cli.bench.stream_evaluation import stream
-from memmlp.cli.bench.time_to_error import train
-from memmlp.cli.bench.ui_page import ui
+from memmlp.cli.bench.latency import latency, live_frame
+from memmlp.cli.bench.train import train
 
 
 @click.group("bench")
 def bench() -> None:
-    """Measure this machine: speed as rates and ratios within one run, sweeps under kills, pages."""
+    """Measure speed on this machine: rates, and ratios within one process."""
 
 
-for command in (
-    prepare, stream, train, latency, live_frame, soak, loggers, chaos, chaos_tune, ui,
-):  # fmt: skip
+for command in (latency, live_frame, train):
     bench.add_command(command)

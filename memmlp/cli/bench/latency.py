@@ -1,193 +1,123 @@
-"""`memmlp bench latency`: each network alone, and its step as trained and as a stream, fp32, fp16, int8."""
+"""`memmlp bench latency` and `live-frame`: the time of networks' steps, and of whole live frames."""
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from memmlp.cli.options import config_dir_option, plugins_option
+from memmlp.cli.options import config_dir_option, outputs_option, plugins_option
 
 if TYPE_CHECKING:
     from memmlp.deploy.latency import InTurn
+    from memmlp.live.spaces import SpaceName
+    from memmlp.live.stream import RotationFormat
 
-Timed = tuple[str, str]
-"""A network in MODELS, and a variant in VARIANTS."""
-BASE = ("avatar_poser", "network")
-"""The step with which all others are compared: AvatarPoser's network alone, from features to rotations."""
-POSE_BASE = ("avatar_poser", "naive")
-"""The whole pose with which all others are compared: AvatarPoser's."""
-CHECK = ("avatar_poser", "torch")
-"""The same layers, written and exported without this project."""
-
-MODELS: dict[str, tuple[str, ...]] = {
-    "avatar_poser": ("model=avatar_poser",),
-    "agrol_mlp_196": ("model=agrol_mlp", "model.frames=196"),
-    "agrol_mlp_41": ("model=agrol_mlp", "model.frames=41"),
-    "agrol_diffusion": ("model=agrol_diffusion", "model.sampling_steps=5"),
-    "bodiffusion": ("model=bodiffusion",),
-    "mem_mlp_41": ("model.frames=41",),
-    "mem_mlp_60": ("model.frames=60",),
-    "ego_poser": ("model=ego_poser",),
-    "hmd_poser": ("model=hmd_poser",),
-    "vae_hmd": ("model=vae_hmd",),
-    "rpm": ("model=rpm",),
-    "manikin_s": ("model=manikin_s",),
-    "avatar_jlm": ("model=avatar_jlm",),
-    "manikin_l": ("model=manikin_l",),
-    "sage": ("model=sage",),
-    "recurrent_poser": ("model=recurrent_poser",),
-}
-SLOW = ("bodiffusion", "avatar_jlm", "manikin_l", "sage")
-"""Networks with seconds per step, or gigabytes of files, which are timed only if asked for."""
+BASE = "avatar_poser"
+"""The network whose times are the unit of all ratios, in the size of its option."""
+DEFAULT_MODELS = (
+    f"{BASE},agrol_mlp,agrol_mlp@41,agrol_diffusion,mem_mlp,mem_mlp@60,ego_poser,hmd_poser,vae_hmd,rpm,"
+    "manikin_s,recurrent_poser"
+)
 LOWER = ("fp16", "int8", "int8_blocks")
 DEPLOYED = ("naive", "streaming", *LOWER)
-VARIANTS = ("network", *DEPLOYED)
+GRAPHS = ("network", *DEPLOYED)
 
 
 @click.command("latency")
-@click.option(
-    "--rounds",
-    default=5,
-    show_default=True,
-    type=click.IntRange(5),
-    help="How many rounds are timed, the networks in turn.",
-)
-@click.option(
-    "--steps",
-    default=20,
-    show_default=True,
-    type=click.IntRange(2),
-    help="How many steps of each network a round has.",
-)
+@click.option("--rounds", default=5, show_default=True, type=click.IntRange(5), help="Timed rounds.")
+@click.option("--steps", default=20, show_default=True, type=click.IntRange(2), help="Steps in a round.")
 @click.option(
     "--models",
-    default=",".join(name for name in MODELS if name not in SLOW),
+    default=DEFAULT_MODELS,
     show_default=True,
-    help=f"Networks to time, separated by commas; {' and '.join(SLOW)} take minutes, and can be named.",
+    help="Options of `model` to time, separated by commas; NAME@FRAMES sets model.frames.",
 )
-@click.option(
-    "--json",
-    "file",
-    type=click.Path(path_type=Path),
-    help="File to write the measured rows into, as JSON, with the overrides and the machine.",
-)
-@click.option(
-    "--breakdown",
-    help="Show instead where the time of one network goes: NETWORK:VARIANT, such as mem_mlp_41:int8.",
-)
+@click.option("--json", "file", type=click.Path(path_type=Path), help="JSON file to write the rows into.")
 @click.argument("overrides", nargs=-1)
 @config_dir_option
 @plugins_option
-def latency(
-    rounds: int, steps: int, models: str, file: Path | None, breakdown: str | None, overrides: tuple[str, ...]
-) -> None:
+def latency(rounds: int, steps: int, models: str, file: Path | None, overrides: tuple[str, ...]) -> None:
     """Time a step of every network.
 
     All run in ONNX Runtime, in turn in one process, on one thread: the network alone, from features to its
-    own outputs; the steps that are deployed, which convert coordinates and make joints beside; and of these a
-    whole pose, from a sample of the trackers to the joints. OVERRIDES are those of `memmlp train`; the
-    default is profile=paper. Weights are random: they do not matter for the time. Ratios are of each round's
-    medians: a step's to AvatarPoser's network alone, a pose's to AvatarPoser's pose.
+    own outputs; the deployed steps, which include conversions and forward kinematics; and a whole pose, from
+    a sample of the trackers to the joints. OVERRIDES are those of `memmlp train`; the default is
+    profile=paper. Weights are random, which does not matter for the time. Ratios are of each round's medians:
+    a step's to AvatarPoser's network alone, a pose's to AvatarPoser's pose. The streaming graph is timed
+    where the network has one.
     """
-    import tempfile
-
     from memmlp.common.errors import InputError
 
     chosen = [name.strip() for name in models.split(",")]
-    allowed = [f"{name}:{variant}" for name in MODELS for variant in VARIANTS]
-    if not set(chosen) <= set(MODELS) or BASE[0] not in chosen:
-        raise InputError(
-            f"--models {models}: allowed are {', '.join(MODELS)}, with {BASE[0]} for the comparison"
-        )
-    if breakdown and breakdown not in allowed:
-        raise InputError(f"--breakdown {breakdown}: allowed are {', '.join(allowed)}")
+    if BASE not in chosen:
+        raise InputError(f"--models {models}: must include {BASE}, for the comparison")
     if named := [word for word in overrides if word.lstrip("+").startswith(("model=", "model.frames="))]:
-        raise InputError(f"{named[0]}: --models names the networks and their windows; allowed are other keys")
+        raise InputError(f"{named[0]}: set networks and their windows with --models")
     if file and not file.absolute().parent.is_dir():
         raise InputError(f"--json {file}: there is no folder {file.parent}")
     with tempfile.TemporaryDirectory() as folder:
-        paths = dict(export_all(chosen, overrides, Path(folder)))
-        rows = timed(paths, rounds, steps)
-        show(rows, rounds)
-        if warning := busy(rows):
-            click.echo(warning, err=True)
-        if file:
-            from memmlp.common.files import write_json
-            from memmlp.runs.environment import environment
+        rows = time_all(dict(export_all(chosen, overrides, Path(folder))), rounds, steps)
+    show(rows, rounds)
+    if file:
+        from memmlp.common.files import write_json
+        from memmlp.runs.environment import environment
 
-            how = {"overrides": list(overrides), "rounds": rounds, "steps": steps, "threads": 1}
-            write_json(file, {**how, "made_by": environment(), "rows": rows})
-        if breakdown:
-            name, variant = breakdown.split(":")
-            show_breakdown(paths[name, variant])
+        how = {"overrides": list(overrides), "rounds": rounds, "steps": steps, "threads": 1}
+        write_json(file, {**how, "made_by": environment(), "rows": rows})
 
 
-def export_all(models: list[str], overrides: tuple[str, ...], folder: Path) -> Iterator[tuple[Timed, Path]]:
-    """Export each model in all variants, with a progress bar, and yield (model, variant) with the file."""
+def export_all(
+    models: list[str], overrides: tuple[str, ...], folder: Path
+) -> Iterator[tuple[tuple[str, str], Path]]:
+    """Export each model's graphs, with a progress bar, and yield (model, graph) with the file."""
+    import torch
+
     from memmlp.common.progress import progress_bar
     from memmlp.config.build import untrained
     from memmlp.deploy.deployment import lower
     from memmlp.deploy.export import export
     from memmlp.deploy.network_alone import network_alone
-    from memmlp.networks.streaming import streaming
-
-    clips = calibration_clips()
-    for name in progress_bar(models, "exporting"):
-        model = untrained(("profile=paper", *overrides, *MODELS[name]))
-        paths = {variant: folder / f"{name}.{variant}.onnx" for variant in VARIANTS}
-        stream = streaming(model)
-        export(network_alone(model), paths["network"], "random")
-        export(model, paths["naive"], "random")
-        export(stream, paths["streaming"], "random")
-        for precision in LOWER:
-            lower(precision, paths["streaming"], paths[precision], stream, clips)
-        for variant, path in paths.items():
-            yield (name, variant), path
-        if name == CHECK[0]:
-            yield CHECK, export_independently(overrides, folder / "independent.onnx")
-
-
-def export_independently(overrides: tuple[str, ...], path: Path) -> Path:
-    """Export an AvatarPoser made of torch's own layers, in the config's sizes, and return the file."""
-    from memmlp.cli.bench.torch_avatar_poser import TorchAvatarPoser, export_plainly
-    from memmlp.config.compose import composed
-
-    sizes = composed(["profile=paper", *overrides, *MODELS[CHECK[0]]]).model
-    names = ("frames", "width", "depth", "heads", "feedforward")
-    export_plainly(TorchAvatarPoser(**{name: sizes[name] for name in names}), path)
-    return path
-
-
-def calibration_clips() -> list[Any]:
-    """Return one short clip (60, 252) of random frames, to calibrate int8."""
-    import torch
-
     from memmlp.motion.body import FRAME_DIM
+    from memmlp.networks.streaming import has_stream, streaming
 
-    return [0.1 * torch.randn(60, FRAME_DIM, generator=torch.Generator().manual_seed(0))]
+    clips = [0.1 * torch.randn(60, FRAME_DIM, generator=torch.Generator().manual_seed(0))]
+    for name in progress_bar(models, "exporting"):
+        option, _, frames = name.partition("@")
+        size = (f"model.frames={frames}",) if frames else ()
+        model = untrained(("profile=paper", *overrides, f"model={option}", *size))
+        files = {graph: folder / f"{name}.{graph}.onnx" for graph in GRAPHS}
+        export(network_alone(model), files["network"], "random")
+        export(model, files["naive"], "random")
+        if has_stream(model):
+            stream = streaming(model)
+            export(stream, files["streaming"], "random")
+            for precision in LOWER:
+                lower(precision, files["streaming"], files[precision], stream, clips)
+        yield from (((name, graph), path) for graph, path in files.items() if path.exists())
 
 
-def timed(paths: dict[Timed, Path], rounds: int, steps: int) -> list[dict[str, Any]]:
-    """Time all files in turn: their steps, then the whole poses of those that make any; see `summary`."""
+def time_all(paths: dict[tuple[str, str], Path], rounds: int, steps: int) -> list[dict[str, Any]]:
+    """Time all files in turn: their steps, then the whole poses of the deployed ones; see `summarize`."""
     from memmlp.deploy.latency import time_in_turn
     from memmlp.live.pose_latency import time_poses_in_turn
 
-    whole = time_in_turn(paths, rounds, steps)
+    times = time_in_turn(paths, rounds, steps)
     deployed = {key: path for key, path in paths.items() if key[1] in DEPLOYED}
     poses = time_poses_in_turn(deployed, rounds, steps)
     return [
         {"model": key[0], "variant": key[1]}
-        | summary("", times, whole[BASE])
-        | (summary("pose_", poses[key], poses[POSE_BASE]) if key in poses else {})
-        for key, times in whole.items()
+        | summarize("", times[key], times[BASE, "network"])
+        | (summarize("pose_", poses[key], poses[BASE, "naive"]) if key in poses else {})
+        for key in paths
     ]
 
 
-def summary(prefix: str, times: InTurn, base: InTurn) -> dict[str, float]:
-    """Summarise a file's times.
+def summarize(prefix: str, times: InTurn, base: InTurn) -> dict[str, float]:
+    """Summarize a file's times.
 
     Args:
         prefix: the beginning of the keys.
@@ -200,11 +130,10 @@ def summary(prefix: str, times: InTurn, base: InTurn) -> dict[str, float]:
     """
     import numpy as np
 
-    seconds = times.seconds
-    ratios = np.median(seconds, 1) / np.median(base.seconds, 1)
+    ratios = np.median(times.seconds, 1) / np.median(base.seconds, 1)
     return {
-        f"{prefix}median_ms": 1000 * float(np.median(seconds)),
-        f"{prefix}p95_ms": 1000 * float(np.percentile(seconds, 95)),
+        f"{prefix}median_ms": 1000 * float(np.median(times.seconds)),
+        f"{prefix}p95_ms": 1000 * float(np.percentile(times.seconds, 95)),
         f"{prefix}ratio_to_avatar_poser": float(np.median(ratios)),
         f"{prefix}ratio_least": float(ratios.min()),
         f"{prefix}ratio_most": float(ratios.max()),
@@ -212,70 +141,89 @@ def summary(prefix: str, times: InTurn, base: InTurn) -> dict[str, float]:
     }
 
 
-def least_core_share(row: dict[str, Any]) -> float:
-    """Return the least share of a round, of steps or of poses, in which a row's thread had a core."""
-    return min(row[key] for key in ("core_share", "pose_core_share") if key in row)
-
-
-def busy(rows: list[dict[str, Any]]) -> str:
-    """Return a line that names the rows that were timed while other work ran; empty if there are none.
-
-    A long step is interrupted more often than a short one, so that other work is in their ratio, too.
-    """
-    from memmlp.common.thread_core_share import LEAST_CORE_SHARE
-    from memmlp.tables.flag_words import had_core, listed
-
-    found = [
-        had_core(f"{row['model']} {row['variant']}", share)
-        for row in rows
-        if (share := least_core_share(row)) < LEAST_CORE_SHARE
-    ]
-    said = "timed on a busy machine, so that other work is in the times and ratios"
-    return f"{said}: {listed(found)}" if found else ""
-
-
 def show(rows: list[dict[str, Any]], rounds: int) -> None:
     """Print the rows as a table of 80 columns, one line each."""
     from rich.console import Console
     from rich.table import Table
 
-    print(f"milliseconds on one thread, {rounds} rounds in turn; x: of AvatarPoser's network, or of its pose")
-    print("torch: AvatarPoser's network of torch's own layers, which checks the time of ours")
-    print("core: the least % of a round in which the thread had a core")
+    print(f"milliseconds on one thread, {rounds} rounds in turn; x: ratio to AvatarPoser's network or pose")
+    print("core: the least % of a round in which the thread had a core; below 90, other work is in the times")
     table = Table(box=None, pad_edge=False)
     for name in ("network", "graph"):
         table.add_column(name, no_wrap=True)
     for name in ("step", "p95", "x", "rounds", "pose", "x", "core"):
         table.add_column(name, justify="right", no_wrap=True)
-    for r in rows:
+    for row in rows:
+        pose = [row.get("pose_median_ms"), row.get("pose_ratio_to_avatar_poser")]
+        core = min(row["core_share"], row.get("pose_core_share", 1.0))
         table.add_row(
-            r["model"],
-            r["variant"],
-            *(short(r[key]) for key in ("median_ms", "p95_ms", "ratio_to_avatar_poser")),
-            f"{short(r['ratio_least'])}-{short(r['ratio_most'])}",
-            *(short(r[key]) if key in r else "" for key in ("pose_median_ms", "pose_ratio_to_avatar_poser")),
-            f"{100 * least_core_share(r):.0f}",
+            row["model"],
+            row["variant"],
+            *(shorten(row[key]) for key in ("median_ms", "p95_ms", "ratio_to_avatar_poser")),
+            f"{shorten(row['ratio_least'])}-{shorten(row['ratio_most'])}",
+            *("" if value is None else shorten(value) for value in pose),
+            f"{100 * core:.0f}",
         )
     Console().print(table)
 
 
-def short(number: float) -> str:
+def shorten(number: float) -> str:
     """Return a number in at most four characters, so that a row fits a line of 80."""
     return f"{number:.2f}" if number < 10 else f"{number:.1f}" if number < 100 else f"{number:.0f}"
 
 
-def show_breakdown(path: Path) -> None:
-    """Print where a step's time goes, by kind and shape of operation."""
-    from rich.console import Console
-    from rich.table import Table
+@click.command("live-frame")
+@click.option("--run", help="Finished run to time.  [default: a network with random weights]")
+@click.option("--onnx", type=click.Path(path_type=Path), help="ONNX file to time, in place of a run.")
+@click.option("--frames", default=300, show_default=True, help="Frames in a round.")
+@click.option("--rounds", default=5, show_default=True, help="Timed rounds.")
+@click.option("--space", default="amass", show_default=True, help="The poses' space: amass, openxr or unity.")
+@click.option("--rotations", default="matrix", show_default=True, help="matrix or quaternion.")
+@plugins_option
+@outputs_option
+@click.argument("overrides", nargs=-1)
+def live_frame(
+    run: str | None,
+    onnx: Path | None,
+    frames: int,
+    rounds: int,
+    space: SpaceName,
+    rotations: RotationFormat,
+    outputs: Path,
+    overrides: tuple[str, ...],
+) -> None:
+    """Time a frame of the live stream.
 
-    from memmlp.deploy.latency import profiled
+    It is timed beside the network's session alone, the two in alternation: milliseconds, and the ratio.
+    OVERRIDES are those of `memmlp train`, for random weights; the default is profile=paper.
+    """
+    import numpy as np
 
-    table = Table(title=f"{path.name.removesuffix('.onnx')}: microseconds a step", title_justify="left")
-    table.add_column("operation")
-    table.add_column("first input")
-    for name in ("times", "us each", "us a step"):
-        table.add_column(name, justify="right")
-    for kind, shape, times, each in profiled(path)[:20]:
-        table.add_row(kind, shape, f"{times:.0f}", f"{each:.1f}", f"{times * each:.0f}")
-    Console().print(table)
+    from memmlp.common.errors import InputError
+    from memmlp.deploy.onnx_stream import OnnxStream
+    from memmlp.live.pose_latency import alternate
+    from memmlp.live.stream import Stream
+    from memmlp.runs.lookup import find_run
+
+    if sum([run is not None, onnx is not None, bool(overrides)]) > 1:
+        raise InputError("--run, --onnx, overrides: expected only one of them")
+    with tempfile.TemporaryDirectory() as folder:
+        if run is not None:
+            onnx = find_run(outputs, run).onnx
+        elif onnx is None:
+            from memmlp.config.build import untrained
+            from memmlp.deploy.deployment import GRAPHS as NETWORKS
+            from memmlp.deploy.export import export
+
+            onnx = Path(folder) / "step.onnx"
+            export(NETWORKS["auto"](untrained(("profile=paper", *overrides))), onnx, "random")
+        stream = Stream(onnx, space=space, rotations=rotations)
+        network = OnnxStream(onnx)
+        times = [alternate(stream, network, frames) for _ in range(rounds + 1)][1:]  # one to warm up
+    medians = 1000 * np.median(times, 1)
+    ratios = medians[:, 1] / medians[:, 0]
+    session, whole = np.median(medians, 0)
+    click.echo(f"session.run  {session:7.3f} ms a frame")
+    click.echo(f"Stream.step  {whole:7.3f} ms a frame")
+    spread = f"{ratios.min():.3f} to {ratios.max():.3f} over {rounds} rounds of {frames} frames"
+    click.echo(f"ratio {np.median(ratios):.3f} ({spread})")

@@ -97,8 +97,4 @@ try {
 await show();
 document.documentElement.dataset.ready = String(Math.round(performance.now()));
 follow();
-if (place().query.has('time')) { // memmlp bench ui measures
-  const { ready, filtered } = document.documentElement.dataset;
-  ask(`timing?${new URLSearchParams({ ready, filtered })}`);
-}
 if (alone) document.documentElement.dataset.alone = '';

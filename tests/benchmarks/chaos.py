@@ -1,0 +1,191 @@
+"""Kill a sweep's and a search's processes at random; the results must be those of undisturbed ones.
+
+    python tests/benchmarks/chaos.py --runs 12 --kills 20
+
+Exits with 1 where they differ. tests/kills runs the same with a few kills.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from statistics import fmean
+
+import click
+import yaml
+
+from memmlp.common.files import file_digest
+from memmlp.common.lease import Lock, is_alive
+from memmlp.runs.identity import NETWORK
+from memmlp.runs.lookup import list_runs
+from memmlp.runs.run import Run
+
+OVERRIDES = ["profile=tiny", "data.synth.minutes=1", "loggers=none", "threads=1"]
+PAUSES = (0.5, 3.0)  # seconds between kills of a sweep's processes
+LONG_PAUSES = (3.0, 9.0)  # between kills of a search's, where the one controller has to start again
+SEARCH_SHARE = 0.25  # of all kills
+PATIENCE = 60.0  # seconds for the last workers to release their runs
+ENDS = ("complete", "pruned")  # the ends of trials whose runs can't fail
+
+Launch = Callable[[], subprocess.Popen[bytes]]
+
+
+@click.command()
+@click.option("--runs", default=12, show_default=True, help="Runs of the sweep, of two variants with seeds.")
+@click.option("--kills", default=20, show_default=True, help="How often a process is killed (SIGKILL).")
+@click.option("--controllers", default=3, show_default=True, help="How many controllers work at once.")
+@click.option("--trials", default=10, show_default=True, help="Trials of the search; 0 for no search.")
+@click.option("--seed", default=0, show_default=True, help="Seed of the choice of victims and pauses.")
+@click.argument("overrides", nargs=-1)
+def main(runs: int, kills: int, controllers: int, trials: int, seed: int, overrides: tuple[str, ...]) -> None:
+    """Run a sweep, then a search, under random SIGKILLs.
+
+    Every run must be finished exactly once, with bit-identical weights. The search must end with exactly the
+    expected trials, none repeated, none lost.
+    """
+    of_search = round(SEARCH_SHARE * kills) if trials else 0
+    dice = random.Random(seed)
+    problems = sweep_storm(runs, kills - of_search, controllers, dice, overrides)
+    if trials:
+        problems += search_storm(trials, of_search, controllers, dice, overrides)
+    click.echo("\n".join([*problems, f"{kills} kills: {len(problems)} differences"]))
+    raise SystemExit(bool(problems))
+
+
+def sweep_storm(
+    runs: int, kills: int, controllers: int, dice: random.Random, overrides: Sequence[str]
+) -> list[str]:
+    """Run a sweep of two variants under kills, and list how it differs from an undisturbed one."""
+    with tempfile.TemporaryDirectory() as folder:
+        sweep = Path(folder) / "chaos.yaml"
+        variants = {"vq": [], "none": ["memory=none"]}
+        sweep.write_text(yaml.safe_dump({"variants": variants, "seeds": list(range((runs + 1) // 2))}))
+        arguments = ["sweep", str(sweep), *OVERRIDES, *overrides]
+        calm, stormy = Path(folder) / "calm", Path(folder) / "stormy"
+        assert start(arguments, calm, workers=2).wait() == 0, "the undisturbed sweep failed"
+        storm([partial(start, arguments, stormy, workers=1)] * controllers, stormy, kills, PAUSES, dice)
+        return compare(calm, stormy)
+
+
+def search_storm(
+    trials: int, kills: int, controllers: int, dice: random.Random, overrides: Sequence[str]
+) -> list[str]:
+    """Run a search under kills, and list what is wrong afterwards.
+
+    One of several controllers directs the search; the others are refused, and started again until they
+    succeed.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        outputs = Path(folder) / "outputs"
+        arguments = ["tune", *OVERRIDES, f"search.n_trials={trials}", "search.prune_after=3", *overrides]
+        launch = partial(start, arguments, outputs, workers=2)
+        storm([launch] * controllers, outputs, kills, LONG_PAUSES, dice)
+        return examine(outputs, trials)
+
+
+def start(arguments: Sequence[str], outputs: Path, workers: int) -> subprocess.Popen[bytes]:
+    """Start a `memmlp` process that works on a sweep or search."""
+    line = [sys.executable, "-c", "from memmlp.cli.main import main; main()", *arguments]
+    line += ["--workers", str(workers), "--outputs", str(outputs)]
+    return subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def storm(
+    launches: Sequence[Launch], outputs: Path, kills: int, pauses: tuple[float, float], dice: random.Random
+) -> None:
+    """Keep the processes running until all have succeeded, and kill random ones meanwhile.
+
+    A process that was killed, or that ended before all kills were made, is started again. Where all have
+    ended before anything could be killed, the next pause is half as long: when their work is done, they
+    live shorter than a pause.
+    """
+    processes = [launch() for launch in launches]
+    killed, factor = 0, 1.0
+    while killed < kills or any(process.poll() != 0 for process in processes):
+        time.sleep(factor * dice.uniform(*pauses))
+        if killed < kills:
+            victim = choose(processes, outputs, dice)
+            factor = factor / 2 if victim is None else 1.0
+            if victim is not None:
+                os.kill(victim, signal.SIGKILL)
+                killed += 1
+        for index, launch in enumerate(launches):
+            code = processes[index].poll()
+            if code not in (None, 0) or (code == 0 and killed < kills):
+                processes[index] = launch()
+    end = time.monotonic() + PATIENCE
+    while any(Lock(folder).held for folder in outputs.glob("runs/*/")) and time.monotonic() < end:
+        time.sleep(0.1)
+
+
+def choose(processes: Sequence[subprocess.Popen[bytes]], outputs: Path, dice: random.Random) -> int | None:
+    """Choose a process to kill: a controller, or a worker that holds a run; None if there is none."""
+    owners = [Lock(folder).owner for folder in sorted(outputs.glob("runs/*/"))]
+    workers = [int(owner["pid"]) for owner in owners if owner and is_alive(owner)]
+    victims = [*(process.pid for process in processes if process.poll() is None), *workers]
+    return dice.choice(victims) if victims else None
+
+
+def compare(calm: Path, stormy: Path) -> list[str]:
+    """List what is wrong in the disturbed sweep's outputs."""
+    expected, found = ({run.id: run for run in list_runs(outputs)} for outputs in (calm, stormy))
+    problems = [f"run {name} is missing" for name in expected.keys() - found.keys()]
+    problems += [f"run {name} should not be" for name in found.keys() - expected.keys()]
+    for name in sorted(expected.keys() & found.keys()):
+        run = found[name]
+        problems += [f"run {name}: {problem}" for problem in check(run.folder)]
+        if run.done and file_digest(run.model) != file_digest(expected[name].model):
+            problems.append(f"run {name}: other weights")
+    return problems
+
+
+def check(folder: Path) -> list[str]:
+    """List what is wrong with a run that should have been finished exactly once."""
+    run = Run(folder)
+    if run.status != "done":
+        return [f"{run.status}, not done"]
+    problems = [f"artifact {name} is missing or changed" for name in run.verify()]
+    attempts = run.manifest["attempts"]
+    starts = [attempt["started"] for attempt in attempts if attempt["stage"] == "training"]
+    if max(starts) > run.manifest["finished"]:
+        problems.append("trained again after it was finished")
+    if Lock(folder).held:
+        problems.append("is still held")
+    return problems
+
+
+def examine(outputs: Path, trials: int) -> list[str]:
+    """List what is wrong with a search's trials and runs."""
+    (folder,) = (outputs / "tune").iterdir()
+    with open(folder / "trials.csv", encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    problems = [] if len(rows) == trials else [f"{len(rows)} trials, not {trials}"]
+    problems += [f"trial {row['trial']}: {row['state']}" for row in rows if row["state"] not in ENDS]
+    ids = Counter(name for row in rows for name in row["run"].split())
+    problems += [f"run {name}: of {count} trials" for name, count in ids.items() if count > 1]
+    runs = {run.id: run for run in list_runs(outputs) if run.manifest.get("kind") in (None, NETWORK)}
+    problems += [f"run {name}: of no trial" for name in runs.keys() - ids.keys()]
+    for row in (row for row in rows if row["state"] == "complete"):
+        names = row["run"].split()
+        if missing := [name for name in names if name not in runs]:
+            problems += [f"trial {row['trial']}: its run {name} is missing" for name in missing]
+            continue
+        problems += [f"run {name}: {problem}" for name in names for problem in check(runs[name].folder)]
+        last = [[entry for entry in runs[name].metrics() if entry.phase == "val"][-1] for name in names]
+        if float(row["MPJPE"]) != fmean(entry.values["rotation MPJPE"] for entry in last):
+            problems.append(f"trial {row['trial']}: not the mean of its runs")
+    return problems
+
+
+if __name__ == "__main__":
+    main()
