@@ -25,7 +25,6 @@ NOT_NUMBERS = (
     "config",
     "experiment_tracking",
     "live",
-    "render",
     "report",
     "sweep",
     "tables",
