@@ -110,7 +110,7 @@ def refiner() -> Numbers:
     found = {}
     for kind, loss in LOSSES.items():
         model, split, optim = tiny.refined(), frames(), Optim(steps=3, batch=4, lr=1e-2)
-        pieces = RefinerTraining(0, SAGERefiner(6, 2, 20, 6), optim, "frames").drawn(split)
+        pieces = RefinerTraining(0, SAGERefiner(6, 2, 20, 6), optim, "frames").draw_pieces(split)
         task = RefinerTask(model, loss(), split, pieces, optim, validate=lambda: {})
         numbers = _trained(task, optim)
         numbers |= summary("stream", evaluation.stream(model.eval(), [tiny.clip(25)])[0])

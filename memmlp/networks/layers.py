@@ -116,7 +116,7 @@ class Dropout(nn.Dropout):
         return h * distributed.drawn(lambda like: F.dropout(torch.ones_like(like), self.p), h)
 
 
-def undivided(module: nn.Module) -> list[str]:
+def find_batch_dependent(module: nn.Module) -> list[str]:
     """Name the layers whose result for a row depends on the other rows of the batch."""
     found = [layer for layer in module.modules() if _counts(layer) or (_draws(layer) and layer.p)]
     found += [layer for layer in module.modules() if isinstance(layer, nn.RNNBase) and layer.dropout]

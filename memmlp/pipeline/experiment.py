@@ -32,7 +32,7 @@ class UpstreamTraining(Protocol):
         """The part of the resolved config that determines the training's result."""
 
     @property
-    def told(self) -> str:
+    def description(self) -> str:
         """What the training does, in words."""
 
     def train(

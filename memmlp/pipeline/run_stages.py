@@ -49,7 +49,7 @@ from memmlp.runs.identity import (
 from memmlp.runs.resumed_origin import UPSTREAM
 from memmlp.runs.run import Run
 from memmlp.runs.upstream_origin import upstream_origins
-from memmlp.training.loop import Watch, unwatched
+from memmlp.training.loop import ValidationCallback
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Outcome:
     stage_ids: tuple[str, ...]
 
 
-def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
+def run_experiment(experiment: Experiment, on_validation: ValidationCallback | None = None) -> Outcome:
     """Bring the experiment's run to its end, doing only what is missing.
 
     Args:
@@ -96,7 +96,9 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
         with recording_outcome(experiment, run):
             if not run.done:
                 # Another process may have begun the run anew since it was seen to be done.
-                train_run(experiment, run, data, upstream or make_upstream_runs(experiment, data), watch)
+                train_run(
+                    experiment, run, data, upstream or make_upstream_runs(experiment, data), on_validation
+                )
                 made.append("training")
             made += make_missing_stages(experiment, run, data)
         if experiment.predictions is not None:
@@ -236,7 +238,7 @@ def train_upstream(
     """Train a run that other runs build upon, and mark it as done."""
     begin(experiment, run, identity, training.config, upstream)
     run.write_manifest({"partial": partial_words(experiment, data)})
-    tell(f"{training.told} (run {run.id})")
+    tell(f"{training.description} (run {run.id})")
     weights = upstream.weights() if upstream else None
     distributed.broadcast(training.kind)  # tells the others what is trained now
     errors = training.train(experiment.architecture, data, weights, run, experiment.device)
@@ -270,7 +272,11 @@ def recording_outcome(experiment: Experiment, run: Run, again: bool = False) -> 
 
 
 def train_run(
-    experiment: Experiment, run: Run, data: Prepared, upstream: Run | None, watch: Watch = unwatched
+    experiment: Experiment,
+    run: Run,
+    data: Prepared,
+    upstream: Run | None,
+    on_validation: ValidationCallback | None = None,
 ) -> None:
     """Train the network of a run, and mark the run as done."""
     steps = experiment.training.optim.steps
@@ -283,7 +289,7 @@ def train_run(
     run.clear_stages()
     weights = upstream.weights() if upstream else None
     distributed.broadcast(NETWORK)  # tells the others what is trained now
-    experiment.training.train(experiment.architecture, data, weights, run, experiment.device, watch)
+    experiment.training.train(experiment.architecture, data, weights, run, experiment.device, on_validation)
     run.finish(("model.safetensors",))
 
 

@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -42,28 +41,32 @@ class StepResult:
     clips: Tensor
 
 
-class TrainingTask(Protocol):
-    """What the loop trains: a module with a loss and data."""
+class TrainingTask:
+    """What the loop trains: a module with a loss and data.
 
-    @property
-    def module(self) -> nn.Module:
-        """The module whose parameters and buffers a checkpoint must hold."""
+    Attributes:
+        module: the module whose parameters and buffers a checkpoint must hold.
+        dataset: the training part of the dataset.
+    """
 
-    @property
-    def dataset(self) -> MotionDataset:
-        """The training part of the dataset."""
+    module: nn.Module
+    dataset: MotionDataset
 
     def parameter_groups(self) -> list[dict]:
-        """Return the optimiser's parameter groups."""
+        """Return the optimiser's parameter groups; by default all trainable parameters of the module."""
+        return [{"params": [p for p in self.module.parameters() if p.requires_grad]}]
 
     def step(self, step: int) -> StepResult:
         """Compute the loss of a training step."""
+        raise NotImplementedError
 
     def report(self) -> dict[str, float]:
-        """Return values to log besides the loss terms."""
+        """Return values to log besides the loss terms; by default none."""
+        return {}
 
     def validate(self) -> dict[str, float]:
         """Compute the metrics on the validation part."""
+        raise NotImplementedError
 
 
 def seed_step(seed: int, step: int) -> None:
@@ -71,15 +74,17 @@ def seed_step(seed: int, step: int) -> None:
     torch.manual_seed(int(np.random.SeedSequence([seed, step]).generate_state(1, np.uint64)[0] >> 1))
 
 
-Watch = Callable[[int, dict[str, float]], None]
-
-
-def unwatched(step: int, values: dict[str, float]) -> None:
-    """Do nothing after a validation, so that the training runs to its end."""
+ValidationCallback = Callable[[int, dict[str, float]], None]
+"""Called after each validation with the step and its values; it may raise to stop the training."""
 
 
 def train(
-    task: TrainingTask, optim: Optim, run: Run, seed: int, description: str, watch: Watch = unwatched
+    task: TrainingTask,
+    optim: Optim,
+    run: Run,
+    seed: int,
+    description: str,
+    on_validation: ValidationCallback | None = None,
 ) -> None:
     """Train to `optim.steps`, starting from the run's checkpoint if there is one.
 
@@ -92,19 +97,19 @@ def train(
         run: the run whose folder takes checkpoints and the metrics log.
         seed: the seed of all steps.
         description: label of the progress bar.
-        watch: called after each validation with the step and its values; it may raise to stop the training.
+        on_validation: called after each validation; see ValidationCallback.
 
     Raises:
         TrainingDiverged: if the loss is NaN or infinite.
-        InputError: if several processes can't train the task with the same result as one.
+        InputError: if several processes cannot train the task with the same result as one.
     """
-    check_divisible(task, optim, description)
+    check_processes(task, optim, description)
     optimiser = optim.build(task.parameter_groups())
     average = optim.average(task.module, optimiser)
     start, spent = resume(task, optimiser, average, run)
-    begun = time.monotonic() - spent
-    if start and distributed.first():  # a progress bar does not tell why it begins in the middle
-        remark(f"{description}: on from step {start} of {optim.steps}, the last checkpoint")
+    started = time.monotonic() - spent
+    if start and distributed.first():
+        remark(f"{description}: resumes at step {start} of {optim.steps}, the last checkpoint")
     distributed.align(task.module)
     with counting(description, optim.steps, start, shown=distributed.first(), unit="steps") as count:
         for step in range(start, optim.steps):
@@ -114,26 +119,26 @@ def train(
             first = distributed.first()
             validation = record(task, optim, average, run, step + 1, result, count) if first else {}
             if (step + 1) % optim.checkpoint_every == 0 or step + 1 == optim.steps:
-                save(task, optimiser, average, run, step + 1, time.monotonic() - begun)
-            if validation:
-                watch(step + 1, validation)
+                save(task, optimiser, average, run, step + 1, time.monotonic() - started)
+            if validation and on_validation:
+                on_validation(step + 1, validation)
     if distributed.first():
-        run.took("train", time.monotonic() - begun)
+        run.took("train", time.monotonic() - started)
     average.put_in_place()
 
 
-def check_divisible(task: TrainingTask, optim: Optim, description: str) -> None:
+def check_processes(task: TrainingTask, optim: Optim, description: str) -> None:
     """Raise InputError if a batch shared by several processes does not give the same step as on one."""
     count = distributed.size()
     if optim.batch % count:
         raise InputError(
-            f"{description}: a batch of {optim.batch} (optim.batch, vqvae.batch) on {count} processes: "
-            f"allowed is a multiple of {count}"
+            f"{description}: optim.batch or vqvae.batch={optim.batch}: must be a multiple of {count}, "
+            "the number of processes"
         )
-    if count > 1 and (names := layers.undivided(task.module)):
+    if count > 1 and (names := layers.find_batch_dependent(task.module)):
         raise InputError(
-            f"{description}: {', '.join(names)} on {count} processes: each would draw or count by itself; "
-            "allowed are layers that work row by row, and memmlp.networks.layers.Dropout"
+            f"{description}: {', '.join(names)} on {count} processes: each process would draw or count by "
+            "itself; use layers that work row by row, and memmlp.networks.layers.Dropout"
         )
 
 
@@ -147,7 +152,7 @@ def train_step(task: TrainingTask, optim: Optim, optimiser: torch.optim.Optimize
     mixed = torch.autocast(device.type, torch.bfloat16) if optim.precision == "bf16" else nullcontext()
     with mixed, distributed.sharing():
         result = task.step(step)
-        seen = of_whole_batch(result)
+        seen = gather_batch(result)
     check_finite(task, seen, step)
     optimiser.zero_grad(set_to_none=True)
     result.loss.backward()
@@ -158,8 +163,8 @@ def train_step(task: TrainingTask, optim: Optim, optimiser: torch.optim.Optimize
     return seen
 
 
-def of_whole_batch(result: StepResult) -> StepResult:
-    """Return the loss, terms and clips of the whole batch, which several processes may share."""
+def gather_batch(result: StepResult) -> StepResult:
+    """Return the mean loss and terms, and all clips, of a batch that several processes may share."""
     if not distributed.shared():
         return result
     terms = torch.stack([result.loss, *result.terms.values()])
@@ -180,28 +185,9 @@ def check_finite(task: TrainingTask, result: StepResult, step: int) -> None:
 
 
 def record(
-    task: TrainingTask,
-    optim: Optim,
-    average: Average,
-    run: Run,
-    step: int,
-    result: StepResult,
-    count: Count,
+    task: TrainingTask, optim: Optim, average: Average, run: Run, step: int, result: StepResult, count: Count
 ) -> dict[str, float]:
-    """Log and show a finished step, and validate if a validation is due.
-
-    Args:
-        task: what is trained.
-        optim: the intervals.
-        average: says which weights count.
-        run: the run whose log takes the values.
-        step: how many steps are finished.
-        result: what the step computed.
-        count: shows how far the training is.
-
-    Returns:
-        The validation's values, empty where there was no validation.
-    """
+    """Log and show a finished step; return the values of a validation, or nothing where none was due."""
     last = step == optim.steps
     if step % optim.log_every == 0 or last:
         loss = float(result.loss.detach())
@@ -231,10 +217,9 @@ def save(
     step: int,
     seconds: float,
 ) -> None:
-    """Write a checkpoint with everything that a later process needs to go on after `step` steps.
+    """Write a checkpoint from which another process can resume after `step` steps, which took `seconds`.
 
-    Of several processes the first one writes, and the others go on with its weights. `seconds` is the time
-    that all steps took.
+    Of several processes the first one writes, and the others go on with its weights.
     """
     distributed.align(task.module)
     if not distributed.first():
@@ -249,7 +234,7 @@ def save(
 def resume(
     task: TrainingTask, optimiser: torch.optim.Optimizer, average: Average, run: Run
 ) -> tuple[int, float]:
-    """Load the run's checkpoint, if any; return the number of finished steps, and the seconds they took."""
+    """Load the run's checkpoint, if any; return the number of finished steps and the seconds they took."""
     found = checkpoint.read(run.checkpoint) if distributed.first() and run.checkpoint.exists() else None
     found = distributed.broadcast(found)
     if found is None:
@@ -261,4 +246,4 @@ def resume(
     torch.set_rng_state(tensors["rng.torch"])
     for group, rate in zip(optimiser.param_groups, values["initial_lr"], strict=True):
         group["initial_lr"] = rate
-    return values["step"], values.get("seconds", 0.0)  # older checkpoints have none
+    return values["step"], values["seconds"]

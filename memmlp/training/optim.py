@@ -16,7 +16,7 @@ from torch import nn
 
 from memmlp.common.errors import InputError
 from memmlp.training.averaging import EMA, Average, LastWeights, ScheduleFreeAverage
-from memmlp.training.composed_optimiser import ComposedOptimiser
+from memmlp.training.muon import ComposedOptimiser
 
 SCHEDULES: dict[str, Callable[[float, float, float], float]] = {
     # Each maps the progress in [0, 1), final rate / first rate and `drop_at` to the factor on the first rate.
@@ -106,7 +106,7 @@ class Muon(Optim):
 
     Muon's steps are scaled to the typical length of AdamW's steps (Liu et al. 2025), so that AdamW's learning
     rates and weight decay fit both. The implementation is torch.optim.Muon, which multiplies matrices in
-    bfloat16 (memmlp.training.bfloat16_products).
+    bfloat16 (memmlp.training.muon).
 
     Attributes:
         momentum: Muon's momentum, which is Nesterov momentum.

@@ -1,4 +1,4 @@
-"""How soon trainings reach an error: several trainings take turns, so that a busy machine slows all alike."""
+"""How soon trainings reach an error: they take turns, so that a busy machine slows all of them equally."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Learner:
         self.validations.append(Validation(self.steps, self.seconds, error))
 
 
-def in_turn(learners: Sequence[Learner], every: int) -> Iterator[int]:
+def train_in_turn(learners: Sequence[Learner], every: int) -> Iterator[int]:
     """Train all learners to their ends, in turn, in pieces of `every` steps; yield each piece's steps.
 
     The order is reversed after each round, so that no learner is always the first.
@@ -77,6 +77,6 @@ def in_turn(learners: Sequence[Learner], every: int) -> Iterator[int]:
         order.reverse()
 
 
-def first_at(validations: Sequence[Validation], error: float) -> Validation | None:
+def find_first(validations: Sequence[Validation], error: float) -> Validation | None:
     """Return the first validation whose error is at most `error`; None if there is none."""
     return next((one for one in validations if one.error <= error), None)

@@ -20,7 +20,7 @@ from memmlp.networks import checkpoint
 from memmlp.networks.architectures import Architecture
 from memmlp.networks.motion_model import MotionModel
 from memmlp.runs.run import Run
-from memmlp.training.loop import StepResult, Watch, train, unwatched
+from memmlp.training.loop import StepResult, TrainingTask, ValidationCallback, train
 from memmlp.training.losses import Loss
 from memmlp.training.optim import Optim
 from memmlp.training.rollout import Rollout
@@ -59,24 +59,23 @@ class NetworkTraining:
         upstream: Path | None,
         run: Run,
         device: torch.device,
-        watch: Watch = unwatched,
+        on_validation: ValidationCallback | None = None,
     ) -> MotionModel:
         """Train a network, from the run's checkpoint if there is one, and write the network's weights.
 
         Args:
             architecture: builds the network.
             data: the prepared motion.
-            upstream: file of the weights that the network builds upon, such as a frozen VQ-VAE's; None for
-                none.
+            upstream: file of the weights that the network builds upon, such as a frozen VQ-VAE's, or None.
             run: the run whose folder takes checkpoints, log and weights.
             device: the device to train on.
-            watch: called after each validation; see `memmlp.training.loop.train`.
+            on_validation: called after each validation; see `memmlp.training.loop.train`.
 
         Returns:
             The trained network in evaluation mode.
         """
         task = self.task(architecture, data, upstream, device)
-        train(task, self.optim, run, self.seed, "network", watch)
+        train(task, self.optim, run, self.seed, "network", on_validation)
         if distributed.first():
             checkpoint.write(run.model, checkpoint.module_tensors("model", task.model), {})
         return task.model.eval()
@@ -84,9 +83,9 @@ class NetworkTraining:
     def task(
         self, architecture: Architecture, data: Prepared, upstream: Path | None, device: torch.device
     ) -> MotionTask:
-        """Make the task of training a network that is not yet trained; for the arguments see `train`.
+        """Make the task of training an untrained network; for the arguments see `train`.
 
-        It seeds torch, for the first weights, and begins the rollout anew.
+        It seeds torch for the first weights, and restarts the rollout.
         """
         dataset = data.open("train").to(device)
         torch.manual_seed(self.seed)
@@ -107,7 +106,7 @@ class NetworkTraining:
         )
 
 
-class MotionTask:
+class MotionTask(TrainingTask):
     """The training task of a motion network: its loss, on the history that the rollout makes."""
 
     def __init__(
@@ -123,7 +122,7 @@ class MotionTask:
         shares: Mapping[str, float] | None = None,
     ):
         self.model, self.loss, self.rollout, self.dataset = model, loss, rollout, dataset
-        self.module: nn.Module = nn.ModuleDict({"model": model, "loss": loss, "rollout": rollout})
+        self.module = nn.ModuleDict({"model": model, "loss": loss, "rollout": rollout})
         self.sampler = WindowSampler(dataset, optim.batch, model.frames, seed, drawn_by, shares)
         self.training_call = torch.compile(model.training_call) if optim.compile else model.training_call
         self._validate = validate
@@ -138,8 +137,8 @@ class MotionTask:
         call = self.rollout.draw(self.model, self.dataset, self.sampler, step)
         motion, state, own = self.training_call(call.sparse, call.state, call.true_frames)
         self.rollout.keep(state)
-        times = len(motion) // len(call.true_frames)  # each of a network's members may have learned them
-        true = call.true_frames[:, -motion.shape[1] :].repeat(times, 1, 1)
+        members = len(motion) // len(call.true_frames)  # a network may return the motion of several
+        true = call.true_frames[:, -motion.shape[1] :].repeat(members, 1, 1)
         loss, terms = self.loss(motion, true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], self.model.normalizer)
         return StepResult(sum(own.values(), loss), terms | own, call.clips)
 

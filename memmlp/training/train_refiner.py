@@ -7,32 +7,63 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.evaluation import modes
 from memmlp.evaluation.metrics import UserMetrics
-from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.body import HANDS, HEAD, ROOT, ROTATION, SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.motion.mirror import MirroredDataset
 from memmlp.motion.motion_source import Prepared
+from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import checkpoint
 from memmlp.networks.architectures import Architecture, RefinedArchitecture
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.refiner import HIDDEN, Refined, SAGERefiner
 from memmlp.runs.run import Run
-from memmlp.training.loop import StepResult, Watch, train, unwatched
-from memmlp.training.losses import Loss, SAGERefinerLoss, TermsLoss
+from memmlp.training.loop import StepResult, TrainingTask, ValidationCallback, train
+from memmlp.training.losses import Fixed, Loss, Terms, TermsLoss
+from memmlp.training.losses.terms import Comparison, measure_jerk
 from memmlp.training.optim import Optim
 from memmlp.training.train_network import VALIDATION_PIECE
 
 TOGETHER = 64  # pieces that the network streams through side by side
 
 
-def joints_loss() -> Loss:
-    """Return the loss that compares how joints move, where that of SAGE-Net's authors does so with rotations.
+class SAGERefinerLoss(Loss):
+    """What SAGE-Net's refiner is trained with (CVPR 2024, released code): mostly how rotations move.
 
-    Its weights are theirs. Refiners were trained with it before their code was followed.
+    Errors of 6D rotations, and of their movement over one frame and over three, are smooth L1 over all
+    components; positions are by forward kinematics from the pelvis, and those of head and hands with the head
+    on its tracker.
     """
+
+    def __init__(self) -> None:
+        super().__init__()
+        weights = {"rotation_all": 0.01, "rotation_velocity": 60.0, "rotation_velocity_3": 20.0}
+        self.weighting = Fixed({**weights, "position_from_pelvis": 0.01, "trackers": 0.01, "jerk": 0.03})
+
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
+        """Return each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
+        error, pair = (motion - truth)[..., ROTATION], Comparison(motion, truth, sparse, normalizer)
+        true, rooted = pair.true_positions, pair.made.posed[1]
+        return {
+            "rotation_all": _smooth_l1(error),
+            "rotation_velocity": _smooth_l1(error.diff(dim=1)),
+            "rotation_velocity_3": _smooth_l1(error[:, ::3].diff(dim=1)),
+            "position_from_pelvis": (rooted - (true - true[..., ROOT : ROOT + 1, :])).norm(dim=-1).mean(),
+            "trackers": _smooth_l1((pair.positions - true)[..., [HEAD, *HANDS], :]),
+            "jerk": measure_jerk(rooted),
+        }
+
+
+def _smooth_l1(error: Tensor) -> Tensor:
+    return F.smooth_l1_loss(error, error.new_zeros(()).expand_as(error))
+
+
+def make_joints_loss() -> Loss:
+    """Return the loss that compares the movement of joints, with the weights of SAGE-Net's loss."""
     return TermsLoss(
         "smooth",
         orientation=0.01,
@@ -45,7 +76,7 @@ def joints_loss() -> Loss:
     )
 
 
-LOSSES: dict[str, Callable[[], Loss]] = {"rotations": SAGERefinerLoss, "joints": joints_loss}
+LOSSES: dict[str, Callable[[], Loss]] = {"rotations": SAGERefinerLoss, "joints": make_joints_loss}
 """The losses of a refiner, by what they compare the movement of."""
 
 
@@ -78,7 +109,7 @@ class RefinerTraining:
         upstream: Path | None,
         run: Run,
         device: torch.device,
-        watch: Watch = unwatched,
+        on_validation: ValidationCallback | None = None,
     ) -> MotionModel:
         """Train a refiner, from the run's checkpoint if there is one, and write it together with its network.
 
@@ -88,7 +119,7 @@ class RefinerTraining:
             upstream: file of the weights of the finished network.
             run: the run whose folder takes checkpoints, log and weights.
             device: the device to train on.
-            watch: called after each validation; see `memmlp.training.loop.train`.
+            on_validation: called after each validation; see `memmlp.training.loop.train`.
 
         Returns:
             The refined network in evaluation mode.
@@ -105,16 +136,16 @@ class RefinerTraining:
             model,
             LOSSES[self.refiner.velocities](),
             dataset,
-            self.drawn(dataset),
+            self.draw_pieces(dataset),
             self.optim,
             validate=lambda: modes.quick_stream(model.eval(), validation, self.metrics),
         )
-        train(task, self.optim, run, self.seed, "refiner", watch)
+        train(task, self.optim, run, self.seed, "refiner", on_validation)
         finished.requires_grad_(True)
         checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
         return model.eval()
 
-    def drawn(self, dataset: MotionDataset) -> tuple[Tensor, Tensor]:
+    def draw_pieces(self, dataset: MotionDataset) -> tuple[Tensor, Tensor]:
         """Draw the pieces: frames (P, n, 252), and the indices (P,) of the clips that they come from."""
         pieces = WindowSampler(
             dataset, self.refiner.pieces, self.refiner.frames, self.seed, self.drawn_by, self.shares
@@ -123,8 +154,8 @@ class RefinerTraining:
         return dataset.stretches(clips, end, self.refiner.frames), clips
 
 
-class RefinerTask:
-    """The training task of a refiner: its loss on pieces for which the network's stream is known."""
+class RefinerTask(TrainingTask):
+    """The training task of a refiner: its loss on pieces that the network streams beforehand."""
 
     def __init__(
         self,
@@ -137,14 +168,10 @@ class RefinerTask:
     ):
         self.model, self.loss, self.dataset, self.batch = model, loss, dataset, optim.batch
         self.frames, self.clips = pieces
-        self.module: nn.Module = nn.ModuleDict({"layers": model.layers, "head": model.head})
+        self.module = nn.ModuleDict({"layers": model.layers, "head": model.head})
         model.network.eval()
-        self.streamed = torch.stack(streamed(model.network, self.frames))
-        self.validate = validate
-
-    def parameter_groups(self) -> list[dict]:
-        """Return the refiner's parameters."""
-        return [{"params": list(self.module.parameters())}]
+        streamed = modes.predict(model.network, list(self.frames), "stream", TOGETHER)
+        self.streamed, self._validate = torch.stack(streamed), validate
 
     def step(self, step: int) -> StepResult:
         """Compute the loss on a batch of pieces."""
@@ -155,11 +182,6 @@ class RefinerTask:
         loss, terms = self.loss(motion, truth, sparse, self.model.normalizer)
         return StepResult(loss, terms, self.clips[drawn])
 
-    def report(self) -> dict[str, float]:
-        """Return nothing: no values are logged besides the loss terms."""
-        return {}
-
-
-def streamed(network: MotionModel, pieces: Tensor) -> list[Tensor]:
-    """Return the motion (n, 198) that a network streams for each piece (P, n, 252)."""
-    return modes.predict(network, list(pieces), "stream", TOGETHER)
+    def validate(self) -> dict[str, float]:
+        """Compute the stream-mode metrics of the network with its refiner on the validation part."""
+        return self._validate()

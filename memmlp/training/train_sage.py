@@ -7,33 +7,40 @@ predict. Each part is a run of its own, whose file holds all parts trained so fa
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common import distributed
+from memmlp.common.float32_regions import in_float32
+from memmlp.motion.body import HANDS, HEAD, N_JOINTS, ROOT, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.motion.mirror import MirroredDataset
 from memmlp.motion.motion_source import Prepared
 from memmlp.networks import checkpoint
 from memmlp.networks.architectures import Architecture, PartedArchitecture
 from memmlp.networks.sage_net import SAGENet
-from memmlp.networks.sage_parts import LOWER, UPPER
+from memmlp.networks.sage_parts import HIDDEN, LOWER, UPPER, HalfVQVAE
 from memmlp.runs.run import Run
-from memmlp.training.loop import StepResult, train
+from memmlp.training.loop import StepResult, TrainingTask, train
+from memmlp.training.losses.terms import Body
 from memmlp.training.optim import Optim
-from memmlp.training.sage_part_losses import Objective, objective
 from memmlp.training.train_network import NetworkTraining
 
 PARTS = ("upper_codes", "lower_codes", "upper_diffusion", "lower_diffusion", "decoder")
 """In the order of their training; each builds upon the one before."""
 
 VALIDATION_WINDOWS = 256
+HIDDEN_SHARE = 0.5  # of a half's joints, which its VQ-VAE has to guess
+HIDDEN_COUNT = 2  # joints of the diffusion models' condition, drawn with replacement
+CODE_WEIGHTS = {"orientation": 0.2, "rotation": 1.0, "position": 5.0, "hand": 5.0, "codebook": 0.25}
 
 _SIZES = ("name", "frames", "code_width", "code_depth", "code_heads", "dropout")
 _DENOISER = (*_SIZES, "width", "depth", "heads", "diffusion_steps")
@@ -46,10 +53,8 @@ ACTING: dict[str, tuple[str, ...]] = {
     "decoder": _ALL,
 }
 """The keys of the model that act in the training of each part."""
-
-
 WHOLE = ("warmup", "ema", "clip_norm", "weight_decay", "compile")
-"""The keys of optim, beside the optimiser, that act for the whole network alone: parts have defaults."""
+"""The keys of optim, besides the optimiser, that only act for the whole network: parts have defaults."""
 
 
 @dataclass(frozen=True)
@@ -93,18 +98,18 @@ class SAGEUpstream:
             betas = (0.9, 0.99) if kind in ("upper_codes", "lower_codes") else (0.9, 0.999)
             optim = DroppingOptim(**own, **often, betas=betas, validate_every=own["steps"])
             make = DecoderTraining if kind == "decoder" else PartTraining
-            only = of_whole(config["optim"]["name"], network.optim, optim)
-            yield make(kind, acting(kind, config), replace(network, optim=optim), only)
+            unused = list_unused(config["optim"]["name"], network.optim, optim)
+            yield make(kind, select_config(kind, config), replace(network, optim=optim), unused)
 
 
-def of_whole(name: str, whole: Optim, part: Optim) -> tuple[str, ...]:
+def list_unused(name: str, whole: Optim, part: Optim) -> tuple[str, ...]:
     """Return the settings of optim that a part does not use, such as "optim.warmup=100"."""
     other = () if name == "adamw" else (f"optim={name}",)
     own = {key: getattr(whole, key, None) for key in WHOLE}
     return (*other, *(f"optim.{key}={own[key]}" for key in WHOLE if own[key] != getattr(part, key)))
 
 
-def acting(kind: str, config: Mapping[str, Any]) -> dict[str, Any]:
+def select_config(kind: str, config: Mapping[str, Any]) -> dict[str, Any]:
     """Return those keys of a network's config that determine the result of training one of its parts."""
     upstream = {key: config["upstream"][key] for key in ("name", "_target_", kind)}
     own = {key: config[key] for key in ("profile", "data", "normalizer", "seed")}
@@ -125,20 +130,20 @@ class PartTraining:
         kind: which of PARTS.
         config: the part of the resolved config that determines the result.
         network: seed, optimisation, and how windows are drawn.
-        of_whole: settings of optim that act in the training of the whole network alone.
+        unused: settings of optim that act only in the training of the whole network.
     """
 
     kind: str
     config: dict[str, Any]
     network: NetworkTraining
-    of_whole: tuple[str, ...] = ()
+    unused: tuple[str, ...] = ()
 
     @property
-    def told(self) -> str:
-        """What the training does, in words, and which settings it leaves to that of the whole."""
+    def description(self) -> str:
+        """What the training does, in words, and which settings it does not use."""
         steps = f"{self.kind.replace('_', ' ')}: train it for {self.network.optim.steps} steps"
-        left = f" by AdamW; {', '.join(self.of_whole)}: of the whole alone" if self.of_whole else ""
-        return steps + left
+        unused = f" by AdamW; without {', '.join(self.unused)}, for the whole network" if self.unused else ""
+        return steps + unused
 
     def train(
         self,
@@ -172,7 +177,7 @@ class PartTraining:
         halves = nn.ModuleDict({"net": net, "upper": parts["codes.upper"], "lower": parts["codes.lower"]})
         halves.eval().requires_grad_(False).to(device)
         windows = Windows(self.network, dataset, data.open("val").to(device), net.frames)
-        task = PartTask(part.requires_grad_(True), objective(self.kind, halves), windows)
+        task = PartTask(part.requires_grad_(True), make_objective(self.kind, halves), windows)
         train(task, self.network.optim, run, self.network.seed, self.kind.replace("_", " "))
         if distributed.first():
             checkpoint.write(run.model, before | checkpoint.module_tensors(name, part), {})
@@ -222,16 +227,12 @@ class Windows:
         return self.dataset.stretches(clips, end, self.frames), clips
 
 
-class PartTask:
+class PartTask(TrainingTask):
     """The training task of a part: the sum of an objective's losses."""
 
     def __init__(self, part: nn.Module, objective: Objective, windows: Windows):
         self.module, self.objective, self.windows = part, objective, windows
         self.dataset = windows.dataset
-
-    def parameter_groups(self) -> list[dict]:
-        """Return the part's parameters."""
-        return [{"params": list(self.module.parameters())}]
 
     def step(self, step: int) -> StepResult:
         """Compute the losses on a batch of windows."""
@@ -239,11 +240,132 @@ class PartTask:
         terms = self.objective(frames, True)
         return StepResult(torch.stack(list(terms.values())).sum(), terms, clips)
 
-    def report(self) -> dict[str, float]:
-        """Return nothing: no values are logged besides the loss terms."""
-        return {}
-
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
         """Compute the losses on the validation windows, with no joints hidden and with sampled latents."""
         return {name: float(term) for name, term in self.objective(self.windows.validation, False).items()}
+
+
+Objective = Callable[[Tensor, bool], dict[str, Tensor]]
+"""Maps world windows (B, T, 252), and whether it is for training, to weighted losses by name."""
+
+
+def make_objective(kind: str, halves: nn.ModuleDict) -> Objective:
+    """Return the objective that trains a part.
+
+    Args:
+        kind: one of PARTS, except "decoder".
+        halves: the network ("net"), and the VQ-VAE of each half ("upper", "lower").
+    """
+    half, of = kind.split("_")
+    net, codes = halves["net"], halves[half]
+    assert isinstance(net, SAGENet)
+    assert isinstance(codes, HalfVQVAE)
+    return partial(compute_code_losses if of == "codes" else LATENT_LOSSES[half], net, codes)
+
+
+def compute_code_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool) -> dict[str, Tensor]:
+    """Return the losses of a VQ-VAE: of the last frame's rotations and joints, and of its codebooks.
+
+    In training, random joints of its half except the first are hidden, so that the VQ-VAE has to guess them.
+    The half with the hands has a loss of the hands' positions, too.
+
+    Args:
+        net: the network, whose space the VQ-VAE works in.
+        codes: the VQ-VAE.
+        frames: world windows (B, T, 252).
+        training: whether joints are hidden.
+    """
+    rotation, encoded = encode_windows(net, frames)
+    sixd = rotation.unflatten(-1, (N_JOINTS, 6))
+    hidden = distributed.drawn(torch.rand_like, sixd[:, 0, :, 0]) < HIDDEN_SHARE
+    hidden[:, codes.joints[0]] = False
+    shown = sixd.masked_fill(hidden[:, None, :, None], HIDDEN) if training else sixd
+    latent, codebook = codes.encode(shown.flatten(-2), encoded)
+    made = codes.decode(latent)[:, -1].unflatten(-1, (-1, 6))
+    errors = measure_half(net, codes.joints, made, frames[:, -1], sixd[:, -1])
+    return {name: CODE_WEIGHTS[name] * term for name, term in (errors | {"codebook": codebook}).items()}
+
+
+def measure_half(
+    net: SAGENet, joints: tuple[int, ...], made: Tensor, frame: Tensor, true: Tensor
+) -> dict[str, Tensor]:
+    """Return errors of a half's rotations and of its joints by forward kinematics (smooth L1).
+
+    A half contains all ancestors of its joints, so the other joints' rotations do not matter.
+
+    Args:
+        net: the network, whose space the rotations are in.
+        joints: the half's joints.
+        made: the half's predicted rotations (B, J, 6).
+        frame: world frames (B, 252).
+        true: the true rotations (B, 22, 6) of all joints.
+    """
+    sparse, own = frame[:, None, :SPARSE_DIM], list(joints)
+    full = true.clone()
+    full[:, own] = made.to(true)
+    motions = [net.normalizer.posed(sixd.flatten(-2)[:, None], sparse) for sixd in (full, true)]
+    bodies = [Body(motion, net.normalizer) for motion in motions]
+    with in_float32(frame.device):
+        (found, placed), (expected, true_placed) = [(one.sixd, one.posed[1]) for one in bodies]
+    errors = {
+        "orientation": F.smooth_l1_loss(found[..., ROOT, :], expected[..., ROOT, :]),
+        "rotation": F.smooth_l1_loss(found[..., own[1:], :], expected[..., own[1:], :]),
+        "position": F.smooth_l1_loss(placed[..., own, :], true_placed[..., own, :]),
+    }
+    if set(HANDS) <= set(joints):
+        head, *hands = sparse[..., SPARSE_POSITION].unflatten(-1, (-1, 3)).unbind(-2)
+        moved = placed + (head - placed[..., HEAD, :])[..., None, :]
+        errors["hand"] = F.smooth_l1_loss(moved[..., list(HANDS), :], torch.stack(hands, -2))
+    return errors
+
+
+def compute_upper_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool) -> dict[str, Tensor]:
+    """Return the error of the upper half's latents (smooth L1); arguments as in `compute_code_losses`."""
+    rotation, encoded = encode_windows(net, frames)
+    clean = encode_latents(codes, rotation, encoded)
+    if not training:
+        return {"latent": F.smooth_l1_loss(net.upper_latent(encoded), clean)}
+    noisy, time, hidden = add_noise(net, clean)
+    return {"latent": F.smooth_l1_loss(net.upper(noisy, time, encoded, hidden), clean)}
+
+
+def compute_lower_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool) -> dict[str, Tensor]:
+    """Return the error of the lower half's latents (smooth L1), given sampled latents of the upper half."""
+    rotation, encoded = encode_windows(net, frames)
+    clean = encode_latents(codes, rotation, encoded)
+    with torch.no_grad():
+        upper = net.upper_latent(encoded)
+    if not training:
+        return {"latent": F.smooth_l1_loss(net.lower_latent(upper, encoded), clean)}
+    noisy, time, hidden = add_noise(net, clean)
+    found = net.lower(net.lower.joined(noisy, upper), time, encoded, hidden)
+    return {"latent": F.smooth_l1_loss(found, clean)}
+
+
+LATENT_LOSSES = {"upper": compute_upper_losses, "lower": compute_lower_losses}
+
+
+def encode_windows(net: SAGENet, frames: Tensor) -> tuple[Tensor, Tensor]:
+    """Return world windows (B, T, 252) in network space: rotations (B, T, 132) and inputs (B, T, 54)."""
+    sparse, motion = net.normalizer.encode(frames).tensor_split([SPARSE_DIM], -1)
+    return motion[..., ROTATION], sparse
+
+
+@torch.no_grad()
+def encode_latents(codes: HalfVQVAE, rotation: Tensor, encoded: Tensor) -> Tensor:
+    """Return a trained VQ-VAE's latents (B, T // 2, 384) of rotations (B, T, 132) and inputs (B, T, 54).
+
+    They are computed in float32 in a mixed-precision training, too: rounded ones have other code-vectors.
+    """
+    assert not codes.training
+    with in_float32(rotation.device):
+        return codes.encode(rotation, encoded)[0]
+
+
+def add_noise(net: SAGENet, clean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return noisy latents (B, T // 2, 384), their random times (B,), and random hidden joints (B, 22)."""
+    time = distributed.drawn(net.diffusion.random_times, clean)
+    noisy = net.diffusion.noised(clean, time, distributed.drawn(torch.randn_like, clean))
+    drawn = distributed.drawn(lambda like: torch.rand_like(like[:, 0, :HIDDEN_COUNT]), clean) * N_JOINTS
+    return noisy, time, F.one_hot(drawn.long(), N_JOINTS).sum(1) > 0

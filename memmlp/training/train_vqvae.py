@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from memmlp.common import distributed
 from memmlp.motion.dataset import MotionDataset, WindowSampler
@@ -19,7 +19,7 @@ from memmlp.networks import checkpoint
 from memmlp.networks.architectures import Architecture
 from memmlp.networks.vqvae import VQVAE, rotation_error
 from memmlp.runs.run import Run
-from memmlp.training.loop import StepResult, train
+from memmlp.training.loop import StepResult, TrainingTask, train
 from memmlp.training.optim import Optim
 
 
@@ -27,8 +27,8 @@ from memmlp.training.optim import Optim
 class VQVAETraining:
     """How a VQ-VAE is trained.
 
-    All frames of the training part are equally likely, whatever `data.drawn_by` and the weights of sources
-    are, as an epoch has each once (reading 5). So networks that draw windows otherwise share their VQ-VAE.
+    All frames of the training part are equally likely, whatever `data.drawn_by` and the sources' weights are,
+    since an epoch has each once (reading 5). So networks that draw windows in other ways share their VQ-VAE.
 
     Attributes:
         config: the part of the resolved config that determines the result.
@@ -42,7 +42,7 @@ class VQVAETraining:
     optim: Callable[[int], Optim]
     mirror: bool = False
     kind: ClassVar[str] = "vqvae"
-    told: ClassVar[str] = "VQ-VAE: train it, whose code-vectors the network's memory uses"
+    description: ClassVar[str] = "VQ-VAE: train it, since the network's memory uses its code-vectors"
 
     def train(
         self,
@@ -65,19 +65,16 @@ class VQVAETraining:
         normalizer = architecture.normalizer(data.manifest, dataset.frames).to(device)
         model = architecture.vqvae().to(device)
         optim = self.optim(len(dataset.frames))
-        shown = MirroredDataset(dataset) if self.mirror else dataset
-        task = VQVAETask(model, normalizer, shown, validation, optim, self.seed)
+        training = MirroredDataset(dataset) if self.mirror else dataset
+        task = VQVAETask(model, normalizer, training, validation, optim, self.seed)
         train(task, optim, run, self.seed, "VQ-VAE")
         if distributed.first():
             checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
         return task.validate()
 
 
-class VQVAETask:
-    """The training task of a VQ-VAE (App.
-
-    A): Eq. 1 on the reconstructed rotations, and the codebook's loss.
-    """
+class VQVAETask(TrainingTask):
+    """The training task of a VQ-VAE: Eq. 1 on the reconstructed rotations, and the codebook loss (App. A)."""
 
     def __init__(
         self,
@@ -89,13 +86,9 @@ class VQVAETask:
         seed: int,
     ):
         self.model, self.normalizer, self.dataset, self.validation = model, normalizer, dataset, validation
-        self.module: nn.Module = model
+        self.module = model
         self.sampler = WindowSampler(dataset, batch=optim.batch, window=1, seed=seed)
         self.used = torch.zeros(len(model.codebook.vectors))
-
-    def parameter_groups(self) -> list[dict]:
-        """Return all trainable parameters."""
-        return [{"params": [p for p in self.model.parameters() if p.requires_grad]}]
 
     def step(self, step: int) -> StepResult:
         """Compute the loss on a batch of single frames."""

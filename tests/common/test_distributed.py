@@ -20,7 +20,7 @@ from memmlp.common import distributed
 from memmlp.common.errors import InputError
 from memmlp.networks import checkpoint, layers
 from memmlp.runs.run import Run
-from memmlp.training.loop import check_divisible, train
+from memmlp.training.loop import check_processes, train
 
 NAMES = ("streams", "joint", "avatar_poser", "agrol_diffusion", "muon", "schedule_free", "vqvae")
 """Tasks with all that could differ: states, blends, passes, codes that restart, dropout, noise, averages."""
@@ -120,9 +120,9 @@ def test_dropout_is_that_of_the_whole_batch(two: None):
 
 def test_a_batch_that_cannot_be_shared_is_refused(two: None):
     task = motion_task()
-    with pytest.raises(InputError, match=r"network: a batch of 5 .* on 2 .*: allowed is a multiple of 2"):
-        check_divisible(task, replace(STEPS, batch=5), "network")
-    check_divisible(task, STEPS, "network")
+    with pytest.raises(InputError, match=r"optim.batch or vqvae.batch=5"):
+        check_processes(task, replace(STEPS, batch=5), "network")
+    check_processes(task, STEPS, "network")
 
 
 @pytest.mark.parametrize(
@@ -136,11 +136,13 @@ def test_layers_that_would_draw_or_count_by_themselves_are_refused(two: None, la
     task = motion_task()
     task.module.add_module("own", layer)
     with pytest.raises(InputError, match=f"{name} on 2 processes"):
-        check_divisible(task, STEPS, "network")
+        check_processes(task, STEPS, "network")
 
 
 def test_layers_that_draw_for_the_whole_batch_or_nothing_are_not():
-    assert layers.undivided(nn.Sequential(layers.Dropout(0.1), nn.Dropout(0.0), nn.LSTM(3, 3))) == []
+    assert (
+        layers.find_batch_dependent(nn.Sequential(layers.Dropout(0.1), nn.Dropout(0.0), nn.LSTM(3, 3))) == []
+    )
 
 
 def test_one_process_shares_nothing(monkeypatch: pytest.MonkeyPatch):

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from memmlp.networks import sage_parts
-from memmlp.networks.layers import undivided
+from memmlp.networks.layers import find_batch_dependent
 
 SIZES = {
     "upper codes": (lambda: sage_parts.HalfVQVAE(sage_parts.UPPER), 7_239_436),
@@ -73,5 +73,5 @@ def test_codes_that_nothing_uses_come_alive_and_gradients_pass_straight_through(
 
 def test_several_processes_would_count_codes_each_by_itself():
     small = {"width": 16, "depth": 1, "heads": 2}
-    assert undivided(sage_parts.HalfVQVAE(sage_parts.LOWER, **small)) == ["ProductQuantiser"]
-    assert undivided(sage_parts.LowerDenoiser(**small)) == []
+    assert find_batch_dependent(sage_parts.HalfVQVAE(sage_parts.LOWER, **small)) == ["ProductQuantiser"]
+    assert find_batch_dependent(sage_parts.LowerDenoiser(**small)) == []

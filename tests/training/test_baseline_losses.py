@@ -8,7 +8,8 @@ from plain_body import posed
 
 from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.network_coordinates import World
-from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, RPMLoss, SAGERefinerLoss
+from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, RPMLoss
+from memmlp.training.train_refiner import SAGERefinerLoss
 
 CLIP = tiny.clip(40)
 SPARSE = CLIP[None, :, :SPARSE_DIM]

@@ -16,7 +16,7 @@ from memmlp.config.compose import composed
 from memmlp.networks.layers import TimeMix
 from memmlp.networks.recurrent_poser import CELLS
 from memmlp.runs.run import Run
-from memmlp.training.loop import Watch, train, unwatched
+from memmlp.training.loop import ValidationCallback, train
 from memmlp.training.optim import Muon, Optim, ScheduleFree
 from memmlp.training.train_network import MotionTask
 
@@ -39,11 +39,13 @@ def kill(step: int, values: dict[str, float]) -> None:
     raise Kill
 
 
-def trained(optim: Optim, folder: Path, watch: Watch = unwatched) -> tuple[MotionTask, Run]:
+def trained(
+    optim: Optim, folder: Path, on_validation: ValidationCallback | None = None
+) -> tuple[MotionTask, Run]:
     """A task after its training, and the run."""
     folder.mkdir(exist_ok=True)
     task, run = motion_task("forced", optim), Run(folder)
-    train(task, optim, run, 0, "optim", watch)
+    train(task, optim, run, 0, "optim", on_validation)
     return task, run
 
 
@@ -82,27 +84,21 @@ def test_the_weights_that_are_validated_are_kept(name: str, averaged: bool, tmp_
     assert torch.equal(seen[-1], weights(run)["module.model.stem.weight"]) is not averaged
 
 
-@pytest.mark.parametrize(
-    ("name", "changes"),
-    [
-        ("muon", {"momentum": 0.5}), ("muon", {"other_lr": 1e-3}), ("muon", {"weight_decay": 0.5}),
-        ("muon", {"lr": 2e-2}), ("schedule_free", {"lr": 2e-2}), ("schedule_free", {"warmup": 0}),
-        ("schedule_free", {"weight_decay": 0.5}), ("ema", {"ema": 0.3}), ("ema", {"ema": None}),
-        ("warmup", {"warmup": 0}),
-    ],
-    ids=str,
-)  # fmt: skip
-def test_every_knob_changes_the_weights(name: str, changes: dict, tmp_path: Path):
+KNOBS = {
+    "muon": ({"momentum": 0.5}, {"other_lr": 1e-3}, {"weight_decay": 0.5}, {"lr": 2e-2}),
+    "schedule_free": ({"lr": 2e-2}, {"warmup": 0}, {"weight_decay": 0.5}),
+    "ema": ({"ema": 0.3}, {"ema": None}),
+    "warmup": ({"warmup": 0},),
+}
+
+
+@pytest.mark.parametrize("name", KNOBS)
+def test_every_knob_changes_the_weights(name: str, tmp_path: Path):
     optim = replace(OPTIMS[name], steps=4)
-    one, other = trained(optim, tmp_path / "a")[0], trained(replace(optim, **changes), tmp_path / "b")[0]
-    assert not torch.equal(one.model.stem.weight, other.model.stem.weight)
-
-
-@pytest.mark.slow
-def test_optimisers_are_not_the_same(tmp_path: Path):
-    every = {"adamw": Optim(**COMMON), "muon": Muon(**COMMON), "free": ScheduleFree(**COMMON)}
-    found = [trained(optim, tmp_path / name)[0].model.stem.weight for name, optim in every.items()]
-    assert not any(torch.equal(found[i], found[j]) for i, j in ((0, 1), (0, 2), (1, 2)))
+    plain = trained(optim, tmp_path / "plain")[0].model.stem.weight
+    for number, changes in enumerate(KNOBS[name]):
+        other = trained(replace(optim, **changes), tmp_path / str(number))[0].model.stem.weight
+        assert not torch.equal(plain, other), changes
 
 
 def test_muon_has_the_matrices_and_adamw_the_rest():
@@ -155,16 +151,16 @@ def test_at_another_rate_the_course_is_the_same():
 
 def test_a_library_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(__import__("sys").modules, "schedulefree", None)
-    with pytest.raises(InputError, match=r"optim=schedule_free: .* pip install 'memmlp\[schedulefree\]'"):
+    with pytest.raises(InputError, match="optim=schedule_free"):
         OPTIMS["schedule_free"].check_installed()
     monkeypatch.delattr(torch.optim, "Muon")
-    with pytest.raises(InputError, match=r"optim=muon: .*2\.9 or newer"):
+    with pytest.raises(InputError, match="optim=muon"):
         OPTIMS["muon"].check_installed()
     OPTIM.check_installed()
 
 
-@pytest.mark.parametrize("name", ["adamw", "muon", "schedule_free"])
-def test_an_option_builds_the_optimiser_of_its_name(name: str):
-    cfg = composed([f"optim={name}", "optim.warmup=7"])
-    optim = build_experiment(cfg).training.optim
-    assert (optim.warmup, optim.steps, type(optim)) == (7, cfg.optim.steps, KINDS[name])
+def test_an_option_builds_the_optimiser_of_its_name():
+    for name, kind in KINDS.items():
+        cfg = composed([f"optim={name}", "optim.warmup=7"])
+        optim = build_experiment(cfg).training.optim
+        assert (optim.warmup, optim.steps, type(optim)) == (7, cfg.optim.steps, kind)

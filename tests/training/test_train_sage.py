@@ -19,7 +19,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import checkpoint
 from memmlp.networks.architectures import PartedArchitecture
 from memmlp.networks.sage_parts import LOWER, UPPER
-from memmlp.training import sage_part_losses
+from memmlp.training import train_sage
 from memmlp.training.loop import train_step
 from memmlp.training.train_sage import PARTS, DroppingOptim
 
@@ -37,13 +37,13 @@ def parts(kind: str) -> tuple[nn.Module, nn.Module]:
 @pytest.mark.parametrize("half", JOINTS)
 def test_a_vqvae_sees_and_is_scored_on_its_half_alone(half):
     net, codes = parts(f"{half}_codes")
-    before = sage_part_losses.code_losses(net, codes, FRAMES, False)
+    before = train_sage.compute_code_losses(net, codes, FRAMES, False)
     others = [joint for joint in range(N_JOINTS) if joint not in JOINTS[half]]
     for joints, same in ((others, True), (JOINTS[half][1:], False)):
         turned = FRAMES.clone()
         motion = turned[..., SPARSE_DIM:][..., ROTATION].unflatten(-1, (N_JOINTS, 6))
         motion[..., list(joints), :] = motion[..., list(joints), :].roll(3, -1)
-        after = sage_part_losses.code_losses(net, codes, turned, False)
+        after = train_sage.compute_code_losses(net, codes, turned, False)
         assert all(torch.equal(before[name], after[name]) for name in before) == same
     assert ("hand" in before) == (half == "upper")
 
@@ -53,11 +53,11 @@ def test_a_true_pose_has_no_error_and_hands_are_where_the_trackers_are():
     net = tiny.baseline("sage")
     net.normalizer = Normalizer.raw(World(), tiny.REST)
     true = FRAMES[:, -1, SPARSE_DIM:][..., ROTATION].unflatten(-1, (N_JOINTS, 6))
-    errors = sage_part_losses.half_errors(net, UPPER, true[:, list(UPPER)], FRAMES[:, -1], true)
+    errors = train_sage.measure_half(net, UPPER, true[:, list(UPPER)], FRAMES[:, -1], true)
     assert {name: round(float(value), 6) for name, value in errors.items()} == dict.fromkeys(errors, 0.0)
     turned = true.clone()
     turned[:, HEAD] = turned[:, HEAD].roll(3, -1)  # joints hang on the head's tracker, and none on the head
-    found = sage_part_losses.half_errors(net, UPPER, turned[:, list(UPPER)], FRAMES[:, -1], true)
+    found = train_sage.measure_half(net, UPPER, turned[:, list(UPPER)], FRAMES[:, -1], true)
     assert float(found["rotation"]) > 0.01
     assert float(found["position"]) == pytest.approx(0, abs=1e-6)
     assert float(found["hand"]) == pytest.approx(0, abs=1e-6)
@@ -78,14 +78,14 @@ def test_joints_are_hidden_in_training_alone_and_never_the_first():
     net, codes = parts("upper_codes")
     codes.encode = Watched(codes.encode)
     for training in (True, False):
-        sage_part_losses.code_losses(net, codes, FRAMES, training)
+        train_sage.compute_code_losses(net, codes, FRAMES, training)
     seen = [rotation.unflatten(-1, (N_JOINTS, 6)) for rotation, _ in codes.encode.calls]
-    hidden, shown = ((one == sage_part_losses.HIDDEN).all(-1) for one in seen)
+    hidden, shown = ((one == train_sage.HIDDEN).all(-1) for one in seen)
     assert not shown.any()
     assert not hidden[..., 0].any()
     assert 0.2 < hidden[..., 1:].float().mean() < 0.8
     assert (hidden == hidden[:, :1]).all()  # in all frames of a window
-    assert (sage_part_losses.noised(net, torch.zeros(99, 4, 384))[2].sum(1) <= 2).all()
+    assert (train_sage.add_noise(net, torch.zeros(99, 4, 384))[2].sum(1) <= 2).all()
 
 
 def every_tensor(*modules: nn.Module) -> dict[str, torch.Tensor]:
@@ -108,11 +108,11 @@ def test_a_step_changes_the_part_and_nothing_else(kind):
 def test_the_upper_half_is_validated_on_what_it_samples():
     """Not on one step of denoising, whose error depends on the noise that was drawn."""
     net, codes = parts("upper_diffusion")
-    rotation, encoded = sage_part_losses.seen(net, FRAMES)
-    error = net.upper_latent(encoded) - sage_part_losses.latents(codes, rotation, encoded)
+    rotation, encoded = train_sage.encode_windows(net, FRAMES)
+    error = net.upper_latent(encoded) - train_sage.encode_latents(codes, rotation, encoded)
     expected = nn.functional.smooth_l1_loss(error, torch.zeros_like(error))
-    assert torch.equal(sage_part_losses.upper_losses(net, codes, FRAMES, False)["latent"], expected)
-    assert not torch.equal(sage_part_losses.upper_losses(net, codes, FRAMES, True)["latent"], expected)
+    assert torch.equal(train_sage.compute_upper_losses(net, codes, FRAMES, False)["latent"], expected)
+    assert not torch.equal(train_sage.compute_upper_losses(net, codes, FRAMES, True)["latent"], expected)
 
 
 def test_the_lower_half_is_given_what_the_upper_one_samples():
@@ -122,7 +122,7 @@ def test_the_lower_half_is_given_what_the_upper_one_samples():
     net.lower.joined = Watched(net.lower.joined)
     with torch.no_grad():
         for training in (True, False):
-            sage_part_losses.lower_losses(net, codes, FRAMES, training)
+            train_sage.compute_lower_losses(net, codes, FRAMES, training)
         net.rotations(encoded)
         expected = net.upper_latent(encoded)
     assert len(net.lower.joined.calls) == 1 + 2 * len(net.diffusion.times)
@@ -156,15 +156,14 @@ def test_the_learning_rate_falls_where_it_is_told():
     assert [OPTIM.factor(step) for step in range(4)] == pytest.approx([1, 1, 0.2, 0.04])
 
 
-def test_a_part_tells_which_settings_of_optim_are_of_the_whole_alone():
+def test_parts_are_trained_by_adamw_and_name_what_they_do_not_use():
     words = ["model=sage", "profile=tiny"]
-    plain = build_experiment(composed(words)).upstream
-    assert [training.told for training in plain if "alone" in training.told] == []
-    changed = build_experiment(
-        composed([*words, "optim=muon", "optim.warmup=5", "optim.precision=bf16"])
-    ).upstream
-    assert all("by AdamW; optim=muon, optim.warmup=5: of the whole alone" in one.told for one in changed)
-    assert all(one.network.optim.precision == "bf16" for one in changed)
+    assert not any(training.unused for training in build_experiment(composed(words)).upstream)
+    words += ["optim=muon", "optim.warmup=5", "optim.precision=bf16"]
+    for training in build_experiment(composed(words)).upstream:
+        assert training.unused == ("optim=muon", "optim.warmup=5")
+        assert "optim=muon, optim.warmup=5" in training.description
+        assert training.network.optim.precision == "bf16"
 
 
 @pytest.mark.parametrize("kind", PARTS[:-1])
@@ -182,5 +181,5 @@ def test_latents_to_learn_from_are_those_of_float32_in_a_mixed_precision_trainin
     _, codes = parts(f"{half}_diffusion")
     rotation, encoded = 3 * torch.randn(500, 8, ROTATION.stop), 3 * torch.randn(500, 8, SPARSE_DIM)
     with torch.autocast("cpu", torch.bfloat16):
-        found = sage_part_losses.latents(codes, rotation, encoded)
-    torch.testing.assert_close(found, sage_part_losses.latents(codes, rotation, encoded), rtol=0, atol=0)
+        found = train_sage.encode_latents(codes, rotation, encoded)
+    torch.testing.assert_close(found, train_sage.encode_latents(codes, rotation, encoded), rtol=0, atol=0)

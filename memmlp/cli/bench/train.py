@@ -136,7 +136,7 @@ def measure_seed(
     from memmlp.common.errors import InputError
     from memmlp.common.progress import progress_bar
     from memmlp.pipeline.run_stages import make_upstream_runs
-    from memmlp.training.time_to_error import Learner, first_at, in_turn
+    from memmlp.training.time_to_error import Learner, find_first, train_in_turn
     from memmlp.training.train_network import NetworkTraining
 
     data = {name: experiment.motion.prepare() for name, experiment in experiments.items()}
@@ -160,10 +160,12 @@ def measure_seed(
         task = training.task(experiment.architecture, data[name], weights, experiment.device)
         learners[name] = Learner(task, training.optim, training.seed, f"rotation {error}")
     pieces = sum(math.ceil(one.optim.steps / every) for one in learners.values())
-    turns = in_turn([learners["recipe"], learners["current"]], every)  # the current one has no cold start
+    turns = train_in_turn(
+        [learners["recipe"], learners["current"]], every
+    )  # the current one has no cold start
     deque(progress_bar(turns, f"seed {seed}", pieces), maxlen=0)
     target = learners["current"].validations[-1].error
-    reached = {name: first_at(one.validations, target) for name, one in learners.items()}
+    reached = {name: find_first(one.validations, target) for name, one in learners.items()}
     marks = {name: one._asdict() if one else None for name, one in reached.items()}
     return {"seed": seed, "runs": ids, "target": target, **marks}
 

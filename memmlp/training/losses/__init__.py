@@ -5,7 +5,6 @@ from memmlp.training.losses.baseline_losses import (
     AvatarPoserLoss,
     LossOfNetwork,
     RPMLoss,
-    SAGERefinerLoss,
 )
 from memmlp.training.losses.loss import (
     Fixed,
@@ -33,7 +32,6 @@ __all__ = [
     "MotionLoss",
     "NoHand",
     "RPMLoss",
-    "SAGERefinerLoss",
     "Term",
     "Terms",
     "TermsLoss",

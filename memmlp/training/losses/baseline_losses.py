@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import torch.nn.functional as F
 from torch import Tensor
 
-from memmlp.motion.body import HANDS, HEAD, N_JOINTS, ROOT, ROTATION
+from memmlp.motion.body import N_JOINTS, ROOT, ROTATION
 from memmlp.motion.normalizer import Normalizer
 from memmlp.training.losses.loss import Fixed, Loss, Terms, joints
-from memmlp.training.losses.terms import Comparison, jerk_of
+from memmlp.training.losses.terms import Comparison
 
 
 def joint_norms(error: Tensor) -> Tensor:
@@ -138,38 +137,6 @@ class RPMLoss(Loss):
             "world_position": joint_sums(positions),
             "velocity": joint_sums_of_steps(positions),
         }
-
-
-class SAGERefinerLoss(Loss):
-    """What SAGE-Net's refiner is trained with (CVPR 2024, released code): mostly how rotations move.
-
-    Errors of 6D rotations, and of their movement over one frame and over three, are smooth L1 over all
-    components; positions are by forward kinematics from the pelvis, and those of head and hands with the head
-    on its tracker.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        weights = {"rotation_all": 0.01, "rotation_velocity": 60.0, "rotation_velocity_3": 20.0}
-        self.weighting = Fixed({**weights, "position_from_pelvis": 0.01, "trackers": 0.01, "jerk": 0.03})
-
-    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
-        error, pair = (motion - truth)[..., ROTATION], Comparison(motion, truth, sparse, normalizer)
-        tracked, rooted = [HEAD, *HANDS], pair.made.posed[1]
-        return {
-            "rotation_all": _smooth(error),
-            "rotation_velocity": _smooth(error.diff(dim=1)),
-            "rotation_velocity_3": _smooth(error[:, ::3].diff(dim=1)),
-            "position_from_pelvis": (rooted - from_pelvis(pair.true_positions)).norm(dim=-1).mean(),
-            "trackers": _smooth((pair.positions - pair.true_positions)[..., tracked, :]),
-            "jerk": jerk_of(rooted),
-        }
-
-
-def _smooth(error: Tensor) -> Tensor:
-    """Return Huber's mean error, as torch's smooth L1."""
-    return F.smooth_l1_loss(error, error.new_zeros(()).expand_as(error))
 
 
 class LossOfNetwork(Loss):

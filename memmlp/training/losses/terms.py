@@ -157,10 +157,10 @@ def acceleration(pair: Comparison, error: Error) -> Tensor:
 
 def jerk(pair: Comparison, error: Error) -> Tensor:
     """Return the mean norm of the predicted joints' third differences in time; the truth is not used."""
-    return jerk_of(pair.positions)
+    return measure_jerk(pair.positions)
 
 
-def jerk_of(positions: Tensor) -> Tensor:
+def measure_jerk(positions: Tensor) -> Tensor:
     """Return the mean norm of the third differences in time of positions (B, T, 22, 3)."""
     return positions.diff(3, dim=1).norm(dim=-1).mean()
 
