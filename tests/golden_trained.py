@@ -71,7 +71,7 @@ class Line(MotionModel):
         self.map = nn.Linear(SPARSE_DIM, 198)
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        inputs, kept = self.taken_in(sparse, state)
+        inputs, kept = self.append_inputs(sparse, state)
         return self.map(inputs[:, -(newest or self.frames) :]), kept
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:

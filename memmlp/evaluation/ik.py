@@ -22,7 +22,7 @@ from memmlp.motion.geometry import (
     sixd_to_matrix,
 )
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.limb_solver import reached, tracked
+from memmlp.networks.limb_solver import reach_hands, use_tracker_rotations
 
 Objective = Callable[[Tensor, Tensor], Tensor]
 
@@ -101,8 +101,8 @@ class Arms:
         """
         local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6)))
         rotations, _ = forward_kinematics(local, torch.zeros_like(sparse[:, :3]), normalizer.rest)
-        turned = tracked(matrix_to_sixd(rotations).flatten(1), sparse)
-        solved = normalizer.posed_in_world(turned, sparse, reached)
+        turned = use_tracker_rotations(matrix_to_sixd(rotations).flatten(1), sparse)
+        solved = normalizer.posed_in_world(turned, sparse, reach_hands)
         return {"combined": torch.cat([solved[:, ROTATION], motion[:, POSITION]], -1)}
 
 

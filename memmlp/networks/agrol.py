@@ -125,7 +125,7 @@ class AGRoLDiffusionGraph(AGRoLGraph):
         """Sample by DDIM; the denoiser's last call computes the newest frame (1, 132) alone."""
         diffusion, noisy = self.model.diffusion, self.model.noise
         for index in range(len(diffusion.times) - 1):
-            noisy = diffusion.stepped(noisy, self._denoised(noisy, window, index, self.frames), index)
+            noisy = diffusion.step(noisy, self._denoised(noisy, window, index, self.frames), index)
         return self._denoised(noisy, window, len(diffusion.times) - 1, 1)
 
     def _denoised(self, noisy: Tensor, window: Tensor, index: int, count: int) -> Tensor:
@@ -213,9 +213,9 @@ class AGRoLDiffusion(WholeWindow):
             state: what the last call returned, or `initial_state`.
             true_frames: world frames [X | Theta] (B, T, 252) of the window.
         """
-        _, kept = self.taken_in(sparse, state)
+        _, kept = self.append_inputs(sparse, state)
         window, frames = true_frames[..., :SPARSE_DIM], self.normalizer.encode(true_frames)
         encoded, clean = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:][..., ROTATION]
         time = distributed.drawn(self.diffusion.random_times, true_frames)
-        noisy = self.diffusion.noised(clean, time, distributed.drawn(torch.randn_like, clean))
+        noisy = self.diffusion.add_noise(clean, time, distributed.drawn(torch.randn_like, clean))
         return TrainingOutputs(self.normalizer.posed(self.denoise(noisy, time, encoded), window), kept, {})

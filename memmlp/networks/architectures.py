@@ -57,7 +57,7 @@ class Architecture:
         """
         raise NotImplementedError
 
-    def begun(self, normalizer: Normalizer, upstream: Path | None) -> MotionModel:
+    def build_for_training(self, normalizer: Normalizer, upstream: Path | None) -> MotionModel:
         """Build the network as its training begins.
 
         Args:
@@ -164,7 +164,7 @@ class PartedArchitecture(PlainArchitecture):
 
     finished: tuple[str, ...] = ()
 
-    def begun(self, normalizer: Normalizer, upstream: Path | None) -> MotionModel:
+    def build_for_training(self, normalizer: Normalizer, upstream: Path | None) -> MotionModel:
         """Build the network with the weights of its parts; see Architecture."""
         assert upstream is not None
         model, (tensors, _) = self.build(normalizer, None), checkpoint.read(upstream)

@@ -39,21 +39,21 @@ GROUPS = 8  # of the regressor's normalisation
 TRACKER_FEATURES = (SPARSE_ROTATION, SPARSE_ANGULAR_VELOCITY, SPARSE_POSITION, SPARSE_VELOCITY)
 
 
-def tracker_features(encoded: Tensor) -> Tensor:
+def group_by_tracker(encoded: Tensor) -> Tensor:
     """Return inputs (..., 54) grouped by tracker (..., 3, 18)."""
     return torch.cat([encoded[..., part].unflatten(-1, (len(TRACKED), -1)) for part in TRACKER_FEATURES], -1)
 
 
-def joint_features(encoded: Tensor) -> Tensor:
+def spread_over_joints(encoded: Tensor) -> Tensor:
     """Spread inputs (..., 54) over the joints (..., 22 x 18); joints without a tracker hold a constant."""
-    trackers = tracker_features(encoded)
+    trackers = group_by_tracker(encoded)
     unseen = torch.full_like(trackers[..., :1, :], UNSEEN)
     seen = dict(zip(TRACKED, trackers.split(1, -2), strict=True))
     rows = [seen.get(joint, unseen) for joint in range(N_JOINTS)]
     return torch.cat(rows, -2).flatten(-2)
 
 
-def with_tracked(joints: Tensor, tracked: Tensor) -> Tensor:
+def replace_tracked(joints: Tensor, tracked: Tensor) -> Tensor:
     """Return features of all joints (..., 22, n), those of the tracked joints replaced by (..., 3, n)."""
     rows = list(joints.unbind(-2))
     for joint, row in zip(TRACKED, tracked.unbind(-2), strict=True):
@@ -98,10 +98,10 @@ class AvatarJLMGraph(StreamingGraph):
         for index, layer in enumerate(self.layers[:-1]):
             turned = h if index % 2 == 0 else h.transpose(0, 1)
             made = attended(layer, turned, turned)
-            h = self.model.renewed(made if index % 2 == 0 else made.transpose(0, 1), first)
+            h = self.model.reset_input_token(made if index % 2 == 0 else made.transpose(0, 1), first)
         by_token = h.transpose(0, 1)
         newest = attended(self.layers[-1], by_token[:, -1:], by_token).transpose(0, 1)
-        features = self.model.renewed(newest, first[-1:]).flatten(1)
+        features = self.model.reset_input_token(newest, first[-1:]).flatten(1)
         return self.normalizer.posed(self.rotation(features, encoded), sparse), {"tokens": window[1:]}
 
     def rotation(self, features: Tensor, encoded: Tensor) -> Tensor:
@@ -167,7 +167,7 @@ class AvatarJLM(WholeWindow):
         )
         draw_weights(self)
 
-    def coarse_joints(self, embedded: Tensor) -> tuple[Tensor, Tensor]:
+    def place_coarse_joints(self, embedded: Tensor) -> tuple[Tensor, Tensor]:
         """Return the coarse pose of embeddings (..., 2 d), in the network's coordinates without z-scores.
 
         Returns:
@@ -183,12 +183,12 @@ class AvatarJLM(WholeWindow):
 
     def tokens(self, encoded: Tensor) -> Tensor:
         """Map inputs (..., 54) in network space to tokens (..., 45, d), without position embeddings."""
-        embedded = self.embedding(joint_features(encoded))
-        positions, rotations = self.coarse_joints(embedded)
+        embedded = self.embedding(spread_over_joints(encoded))
+        positions, rotations = self.place_coarse_joints(embedded)
         seen = encoded * self.normalizer.std[:SPARSE_DIM] + self.normalizer.mean[:SPARSE_DIM]
         tracked = [seen[..., part].unflatten(-1, (len(TRACKED), -1)) for part in TRACKER_FEATURES]
-        positions = with_tracked(positions, tracked[2] - tracked[2][..., :1, :])
-        rotations = with_tracked(rotations, tracked[0])
+        positions = replace_tracked(positions, tracked[2] - tracked[2][..., :1, :])
+        rotations = replace_tracked(rotations, tracked[0])
         whole = self.input_token(embedded.detach())[..., None, :]
         return torch.cat([self.position_token(positions), self.rotation_token(rotations), whole], -2)
 
@@ -197,7 +197,7 @@ class AvatarJLM(WholeWindow):
         return tokens + self.joint_places + self.time_places[: tokens.shape[-3]]
 
     @staticmethod
-    def renewed(h: Tensor, first: Tensor) -> Tensor:
+    def reset_input_token(h: Tensor, first: Tensor) -> Tensor:
         """Return tokens (..., 45, d) with `first` (..., 1, d) in place of the last, the token of the inputs.
 
         `first` is that token before any block. It is detached: no gradient flows through it.
@@ -206,9 +206,9 @@ class AvatarJLM(WholeWindow):
 
     def rotations(self, encoded: Tensor) -> Tensor:
         """Map inputs (B, T, 54) to rotations (B, T, 132), both in network space."""
-        return self.regressed(encoded)
+        return self.regress(encoded)
 
-    def regressed(self, encoded: Tensor) -> Tensor:
+    def regress(self, encoded: Tensor) -> Tensor:
         """Map inputs (B, T, 54) in network space to what the regressor reads from their tokens (B, T, n)."""
         h = self.placed(self.tokens(encoded))
         first = h[..., -1:, :]
@@ -217,14 +217,14 @@ class AvatarJLM(WholeWindow):
                 h = layer(h.flatten(0, 1)).unflatten(0, encoded.shape[:2])
             else:
                 h = layer(h.transpose(1, 2).flatten(0, 1)).unflatten(0, (-1, TOKENS)).transpose(1, 2)
-            h = self.renewed(h, first)
+            h = self.reset_input_token(h, first)
         return self.regressor(h.flatten(-2).flatten(0, 1)).unflatten(0, encoded.shape[:2])
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call, which adds a loss of the coarse pose; see MotionModel."""
-        return TrainingOutputs(*self.advance(sparse, state), self.coarse_loss(true_frames))
+        return TrainingOutputs(*self.advance(sparse, state), self.compute_coarse_loss(true_frames))
 
-    def coarse_loss(self, true_frames: Tensor) -> dict[str, Tensor]:
+    def compute_coarse_loss(self, true_frames: Tensor) -> dict[str, Tensor]:
         """Return the mean absolute error of the coarse pose's joints relative to the head, weighted.
 
         Args:
@@ -233,7 +233,7 @@ class AvatarJLM(WholeWindow):
         sparse, motion = true_frames[..., :SPARSE_DIM], true_frames[..., SPARSE_DIM:]
         origin = self.normalizer.origin(sparse)
         encoded = self.normalizer.encode_sparse(sparse, origin)
-        made, _ = self.coarse_joints(self.embedding(joint_features(encoded)))
+        made, _ = self.place_coarse_joints(self.embedding(spread_over_joints(encoded)))
         true = self.normalizer.coordinates.motion_in(motion, origin)[..., POSITION]
         joints = true.unflatten(-1, (N_JOINTS, 3))
         error = made - (joints - joints[..., HEAD : HEAD + 1, :])

@@ -227,12 +227,12 @@ class BoDiffusion(WholeWindow):
             state: what the last call returned, or `initial_state`.
             true_frames: world frames [X | Theta] (B, T, 252) of the window.
         """
-        _, kept = self.taken_in(sparse, state)
+        _, kept = self.append_inputs(sparse, state)
         window, frames = true_frames[..., :SPARSE_DIM], self.normalizer.encode(true_frames)
         encoded, clean = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:][..., ROTATION]
         time = distributed.drawn(self.diffusion.random_times, true_frames)
         noise = distributed.drawn(torch.randn_like, clean)
-        noisy = self.diffusion.noised(clean, time, noise)
+        noisy = self.diffusion.add_noise(clean, time, noise)
         made = self.denoise(noisy, time, encoded)
         error, bound = self.diffusion.losses(clean, noise, time, made, self.limits())
         found = self.diffusion.clean(noisy, made.noise, time).clamp(*self.limits())

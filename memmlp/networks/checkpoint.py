@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -45,32 +43,10 @@ def module_tensors(prefix: str, module: nn.Module) -> dict[str, Tensor]:
 
 def load_module(prefix: str, module: nn.Module, tensors: dict[str, Tensor]) -> None:
     """Load into a module those of the tensors that `module_tensors` named with this prefix."""
-    own = {name.removeprefix(f"{prefix}."): t for name, t in tensors.items() if name.startswith(f"{prefix}.")}
-    known = module.state_dict().keys()
-    module.load_state_dict({_current(name, known): tensor for name, tensor in own.items()})
-
-
-WEIGHTS = (
-    ("rotation", "rotation_all"),
-    ("position", "position_branch"),
-    ("position", "position_from_pelvis"),
-    ("velocity", "velocity_lower_body"),
-)
-"""Terms of losses by their names up to version 0.2 and the present ones, of Mem-MLP's and the library's.
-
-They sort alike: torch keeps the learned weights by their names, and the optimiser's state by their order.
-"""
-
-
-def _current(name: str, known: Collection[str]) -> str:
-    """Return the name that a tensor has in this version.
-
-    Version 0.1 called the normalizer `frame`; the learned weights of a loss have the terms' names.
-    """
-    name = re.sub(r"(^|\.)frame\.(rest|mean|std)$", r"\1normalizer.\2", name)
-    above, _, term = name.rpartition(".")
-    renamed = (f"{above}.{now}" for former, now in WEIGHTS if former == term and name not in known)
-    return next((one for one in renamed if one in known), name)
+    start = f"{prefix}."
+    module.load_state_dict(
+        {name.removeprefix(start): tensor for name, tensor in tensors.items() if name.startswith(start)}
+    )
 
 
 def optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:

@@ -55,7 +55,7 @@ class Noising(nn.Module):
         """Draw a time (B,) for each signal of a batch (B, ...)."""
         return torch.randint(self.steps, (len(clean),), device=clean.device)
 
-    def noised(self, clean: Tensor, time: Tensor, noise: Tensor) -> Tensor:
+    def add_noise(self, clean: Tensor, time: Tensor, noise: Tensor) -> Tensor:
         """Mix clean signals (B, ...) with standard normal noise (B, ...) as the times (B,) demand."""
         signal = at(self.signal, time, clean)
         return signal.sqrt() * clean + (1 - signal).sqrt() * noise
@@ -88,10 +88,10 @@ class Diffusion(Noising):
         for index, time in enumerate(self.times):
             clean = denoise(x, torch.full((len(x),), time, device=x.device))
             if index + 1 < len(self.times):
-                x = self.stepped(x, clean, index)
+                x = self.step(x, clean, index)
         return clean
 
-    def stepped(self, x: Tensor, clean: Tensor, index: int) -> Tensor:
+    def step(self, x: Tensor, clean: Tensor, index: int) -> Tensor:
         """Take one sampling step.
 
         Args:
@@ -193,14 +193,14 @@ class AncestralDiffusion(Noising):
             The mean squared error of the noise, and the variational bound in bits, whose gradient reaches the
             variances only.
         """
-        noisy = self.noised(clean, time, noise)
+        noisy = self.add_noise(clean, time, noise)
         first, second, least, largest = at(self.trained, time, clean)
         found = first * self.clean(noisy, made.noise.detach(), time) + second * noisy
         true = first * clean + second * noisy
         log_variance = least + (made.share + 1) / 2 * (largest - least)
         spread = log_variance - least
         divergence = (spread + (-spread).exp() + (true - found).square() * (-log_variance).exp() - 1) / 2
-        surprise = binned_surprise(clean, found, log_variance, limits)
+        surprise = measure_surprise(clean, found, log_variance, limits)
         bound = torch.where(time.view_as(first) == 0, surprise, divergence)
         return (noise - made.noise).square().mean(), bound.mean() / math.log(2)
 
@@ -235,7 +235,7 @@ class AncestralDiffusion(Noising):
         return x
 
 
-def binned_surprise(
+def measure_surprise(
     clean: Tensor, mean: Tensor, log_variance: Tensor, limits: tuple[Tensor, Tensor]
 ) -> Tensor:
     """Return how surprising clean signals (B, ...) are to a Gaussian, in nats, by bins of 2/255 (Ho et al.).

@@ -16,12 +16,12 @@ from memmlp.motion.body import SPARSE_DIM, SPARSE_POSITION, TRACKED
 from memmlp.motion.network_coordinates import HeadRelative
 from memmlp.networks.avatar_poser import AvatarPoser
 from memmlp.networks.motion_model import State, StreamingGraph, filled
-from memmlp.networks.transformer import EncoderLayer, newest_frame
+from memmlp.networks.transformer import EncoderLayer, encode_newest_frame
 
 PLACES = 2 * len(TRACKED)  # components of the trackers' places on the floor
 
 
-def beside_head(sparse: Tensor) -> Tensor:
+def center_on_head(sparse: Tensor) -> Tensor:
     """Return inputs (..., 54) with positions on the floor relative to the head in the same frame."""
     space = HeadRelative()
     return space.sparse_in(sparse, space.origin(sparse))
@@ -54,7 +54,7 @@ class EgoPoserGraph(StreamingGraph):
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
-        local = beside_head(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
+        local = center_on_head(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
         place = places(local)
         entering = {"embedded": self.model.embedding(torch.cat([local, place], -1)), "places": place}
         window = {
@@ -62,7 +62,7 @@ class EgoPoserGraph(StreamingGraph):
         }
         slow, fast = self.model.views(window["embedded"])
         first = F.linear(window["places"][:1], self.model.embedding.weight[:, SPARSE_DIM:])
-        newest = newest_frame(self.layers, slow + fast - 2 * first)
+        newest = encode_newest_frame(self.layers, slow + fast - 2 * first)
         kept = {name: frames[1:] for name, frames in window.items()}
         return self.normalizer.posed(self.model.read(newest), sparse), kept
 
@@ -82,7 +82,7 @@ class EgoPoser(AvatarPoser):
 
     def rotations(self, encoded: Tensor) -> Tensor:
         """Map windows (B, T, 54) to their last frames' rotations (B, 132), both in network space."""
-        local = beside_head(encoded)
+        local = center_on_head(encoded)
         moved = places(local) - places(local[:, :1])
         slow, fast = self.views(torch.cat([local, moved], -1))
         return self.encode(self.embedding(slow) + self.embedding(fast))

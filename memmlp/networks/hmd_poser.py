@@ -36,7 +36,7 @@ SHAPE = 16  # components of a body's shape
 warnings.filterwarnings("ignore", message="RNN module weights are not part of single contiguous chunk")
 
 
-def by_tracker(sparse: Tensor) -> list[Tensor]:
+def split_by_tracker(sparse: Tensor) -> list[Tensor]:
     """Split inputs (..., 54) by tracker: rotations (..., 3, 6), angular velocities (..., 3, 6), positions
     (..., 3, 3) and velocities (..., 3, 3).
     """
@@ -56,13 +56,13 @@ def in_head(rotation: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
     return back @ rotation[..., 1:, :, :], (back @ away[..., None])[..., 0]
 
 
-def hands_in_head(sparse: Tensor) -> list[Tensor]:
-    """Return what `by_tracker` returns, for both hands in the head's frame, from world inputs (..., 54).
+def locate_hands(sparse: Tensor) -> list[Tensor]:
+    """Return `split_by_tracker` of both hands in the head's frame, from world inputs (..., 54).
 
     The previous frame is reconstructed from the velocities in the inputs. All is computed in float32 in a
     mixed-precision training, too: velocities are small differences.
     """
-    rotation, turn, position, velocity = by_tracker(sparse)
+    rotation, turn, position, velocity = split_by_tracker(sparse)
     with in_float32(sparse.device):
         now = sixd_to_matrix(rotation)
         before = now @ sixd_to_matrix(turn).transpose(-1, -2)
@@ -235,8 +235,8 @@ class HMDPoser(WindowlessModel):
         nothing = [encoded.new_zeros(*encoded.shape[:-1], OTHERS, size) for size in (6, 6, 3)]
         found = []
         for layers, parts in (
-            (self.trackers, by_tracker(encoded)),
-            (self.hands, hands_in_head(sparse)),
+            (self.trackers, split_by_tracker(encoded)),
+            (self.hands, locate_hands(sparse)),
             (self.others, nothing),
         ):
             each = zip(layers, *(part.unbind(-2) for part in parts), strict=True)

@@ -37,7 +37,7 @@ def dot(one: Tensor, other: Tensor) -> Tensor:
     return (one * other).sum(-1, keepdim=True)
 
 
-def of_joints(joints: Tensor, which: Sequence[int], axis: int = -2) -> Tensor:
+def select_joints(joints: Tensor, which: Sequence[int], axis: int = -2) -> Tensor:
     """Return the entries of a tensor for some joints, which are indexed along the given axis."""
     return joints.index_select(axis, torch.tensor(which, device=joints.device))
 
@@ -49,10 +49,10 @@ def skew(vector: Tensor) -> Tensor:
 
 def cross(one: Tensor, other: Tensor) -> Tensor:
     """Return the cross products (..., 3) of vectors (..., 3)."""
-    return applied(skew(one), other)
+    return rotate(skew(one), other)
 
 
-def applied(rotation: Tensor, vector: Tensor) -> Tensor:
+def rotate(rotation: Tensor, vector: Tensor) -> Tensor:
     """Apply rotations (..., 3, 3) to vectors (..., 3)."""
     return (rotation @ vector[..., None])[..., 0]
 
@@ -63,7 +63,7 @@ def about(axis: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
     return identity + sine[..., None] * across + (1 - cosine)[..., None] * (across @ across)
 
 
-def aligning(start: Tensor, goal: Tensor) -> Tensor:
+def align(start: Tensor, goal: Tensor) -> Tensor:
     """Return the smallest rotations (..., 3, 3) that turn unit vectors (..., 3) onto others."""
     across, identity = skew(cross(start, goal)), goal.new_tensor(IDENTITY)
     return identity + across + across @ across / (1 + dot(start, goal)).clamp_min(1e-6)[..., None]
@@ -85,7 +85,7 @@ def circle(axis: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
     return start, cross(start, axis)
 
 
-def swivels(base: Tensor, middle: Tensor, end: Tensor, up: Tensor) -> Tensor:
+def measure_swivels(base: Tensor, middle: Tensor, end: Tensor, up: Tensor) -> Tensor:
     """Return the cosines and sines (..., 2) of swivels, from limbs' joints (..., 3) and the bases' Y axes."""
     axis = F.normalize(end - base, dim=-1)
     start, quarter = circle(axis, up)
@@ -93,13 +93,15 @@ def swivels(base: Tensor, middle: Tensor, end: Tensor, up: Tensor) -> Tensor:
     return F.normalize(torch.cat([dot(away, start), dot(away, quarter)], -1), dim=-1)
 
 
-def bend_direction(axis: Tensor, up: Tensor, swivel: Tensor) -> Tensor:
+def find_bend_direction(axis: Tensor, up: Tensor, swivel: Tensor) -> Tensor:
     """Return the unit vectors (..., 3) from the axis to the middle, for swivels (..., 2), cosine and sine."""
     start, quarter = circle(axis, up)
     return swivel[..., :1] * start + swivel[..., 1:] * quarter
 
 
-def middle_at(base: Tensor, end: Tensor, up: Tensor, swivel: Tensor, upper: Tensor, lower: Tensor) -> Tensor:
+def place_middle(
+    base: Tensor, end: Tensor, up: Tensor, swivel: Tensor, upper: Tensor, lower: Tensor
+) -> Tensor:
     """Return the middle joints (..., 3) of limbs, metres.
 
     Args:
@@ -113,7 +115,7 @@ def middle_at(base: Tensor, end: Tensor, up: Tensor, swivel: Tensor, upper: Tens
     axis = away / reach
     cosine = ((upper.square() + reach.square() - lower.square()) / (2 * upper * reach)).clamp(-1, 1)
     sine = (1 - cosine.square()).clamp_min(1e-6).sqrt()
-    return base + upper * (cosine * axis + sine * bend_direction(axis, up, swivel))
+    return base + upper * (cosine * axis + sine * find_bend_direction(axis, up, swivel))
 
 
 def bones(rest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -122,7 +124,7 @@ def bones(rest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return middle - base, end - middle, F.normalize(rest.new_tensor(FLEXION), dim=-1)
 
 
-def flexed(upper: Tensor, lower: Tensor, axis: Tensor, reach: Tensor) -> Tensor:
+def flex(upper: Tensor, lower: Tensor, axis: Tensor, reach: Tensor) -> Tensor:
     """Return the rotations (..., 4, 3, 3) of elbows and knees that bring hands and feet to a given reach.
 
     Of the two ways to bend, each limb takes the one about its own axis of flexion. If the reach is out of a
@@ -151,12 +153,12 @@ def twist(rotation: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
     """
     flat = rotation.flatten(-2)
     turned, trace = flat @ flat.new_tensor(SKEW).T, flat @ flat.new_tensor(IDENTITY).flatten()[:, None]
-    both = torch.cat([trace - dot(axis, applied(rotation, axis)), dot(axis, turned)], -1)
+    both = torch.cat([trace - dot(axis, rotate(rotation, axis)), dot(axis, turned)], -1)
     cosine, sine = F.normalize(both, dim=-1).split(1, -1)
     return cosine, sine
 
 
-def untwisting(local: Tensor, bone: Tensor, axis: Tensor) -> Tensor:
+def limit_twist(local: Tensor, bone: Tensor, axis: Tensor) -> Tensor:
     """Return rotations (..., 4, 3, 3) about the limbs' axes that bring the bases' twists within limits.
 
     Each is the smallest that does.
@@ -183,18 +185,18 @@ def untwisting(local: Tensor, bone: Tensor, axis: Tensor) -> Tensor:
     return about(axis, 2 / size - 1, 2 * half / size)
 
 
-def chain_frame(bent: Tensor, rest: Tensor) -> Tensor:
+def find_chain_frame(bent: Tensor, rest: Tensor) -> Tensor:
     """Return the orientation of limbs with bent middles (..., 4, 3, 3), in the frames of their bases.
 
     The first columns of these rotations (..., 4, 3, 3) point to the ends, the second ones out to the middles.
     """
     upper, lower, flexion = bones(rest)
-    chain = F.normalize(upper + applied(bent, lower), dim=-1)
+    chain = F.normalize(upper + rotate(bent, lower), dim=-1)
     side = upper + OFFSET * cross(chain, flexion)
     return frame(chain, F.normalize(side - dot(side, chain) * chain, dim=-1))
 
 
-def handed(arms: Tensor, hands: Tensor, forearm: Tensor) -> tuple[Tensor, Tensor]:
+def split_hand_rotations(arms: Tensor, hands: Tensor, forearm: Tensor) -> tuple[Tensor, Tensor]:
     """Divide each hand's rotation: the roll of the forearm goes to the elbow, the rest stays at the wrist.
 
     Args:
@@ -211,7 +213,7 @@ def handed(arms: Tensor, hands: Tensor, forearm: Tensor) -> tuple[Tensor, Tensor
     return rolled, rolled.transpose(-1, -2) @ seen
 
 
-def footed(shins: Tensor, toe: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
+def find_toe_directions(shins: Tensor, toe: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
     """Return unit vectors (..., 2, 3) in the knees' frames: to the toe at rest, and to where it should be.
 
     Args:
@@ -220,11 +222,11 @@ def footed(shins: Tensor, toe: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
         rest: rest positions (22, 3), metres.
     """
     bone = F.normalize(rest[list(TOES)] - rest[list(ANKLES)], dim=-1)
-    goal = applied(shins.transpose(-1, -2), F.normalize(toe, dim=-1))
+    goal = rotate(shins.transpose(-1, -2), F.normalize(toe, dim=-1))
     return bone.expand(goal.shape), goal
 
 
-def solved(
+def solve_limbs(
     local: Tensor,
     turned: Tensor,
     base: Tensor,
@@ -251,15 +253,15 @@ def solved(
     """
     upper, lower, _ = bones(rest)
     away = end - base
-    bent = flexed(*bones(rest), away.norm(dim=-1, keepdim=True))
-    back = of_joints(turned, [PARENTS[joint] for joint in BASES], -3).transpose(-1, -2)
+    bent = flex(*bones(rest), away.norm(dim=-1, keepdim=True))
+    back = select_joints(turned, [PARENTS[joint] for joint in BASES], -3).transpose(-1, -2)
     axis = F.normalize(away, dim=-1)
-    direction = bend_direction(axis, of_joints(turned[..., 1], BASES), swivel)
-    bases = back @ frame(axis, direction) @ chain_frame(bent, rest).transpose(-1, -2)
-    bases = untwisting(bases, F.normalize(upper, dim=-1), applied(back, axis)) @ bases
+    direction = find_bend_direction(axis, select_joints(turned[..., 1], BASES), swivel)
+    bases = back @ frame(axis, direction) @ find_chain_frame(bent, rest).transpose(-1, -2)
+    bases = limit_twist(bases, F.normalize(upper, dim=-1), rotate(back, axis)) @ bases
     arms, shins = (back.transpose(-1, -2) @ bases @ bent).split(2, -3)
-    rolled, wrists = handed(arms, hands, lower[:2])
-    ankles = aligning(*footed(shins, toe, rest))
+    rolled, wrists = split_hand_rotations(arms, hands, lower[:2])
+    ankles = align(*find_toe_directions(shins, toe, rest))
     middles = torch.cat([bent[..., :2, :, :] @ rolled, bent[..., 2:, :, :]], -3)
     rows = list(local.unbind(-3))
     groups = ((BASES, bases), (MIDDLES, middles), (ENDS, torch.cat([wrists, ankles], -3)))
@@ -276,7 +278,7 @@ BEGINNING, ENDING = slice(SHOULDERS.start, ELBOWS.stop), slice(ELBOWS.start, WRI
 SLACK = 1e-3  # the part of its reach by which an arm is never quite straight, nor folded: so it has a side
 
 
-def tracked(rotations: Tensor, sparse: Tensor) -> Tensor:
+def use_tracker_rotations(rotations: Tensor, sparse: Tensor) -> Tensor:
     """Replace the rotations of head and wrists by those of their trackers.
 
     Args:
@@ -290,7 +292,7 @@ def tracked(rotations: Tensor, sparse: Tensor) -> Tensor:
     )
 
 
-def reached(rotations: Tensor, joints: Tensor, sparse: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
+def reach_hands(rotations: Tensor, joints: Tensor, sparse: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
     """Bend the arms of a body so that its wrists get to their trackers, as far as the arms reach.
 
     Each elbow stays on its side of the line from shoulder to hand; the elbow of a straight arm goes to the
@@ -310,15 +312,15 @@ def reached(rotations: Tensor, joints: Tensor, sparse: Tensor, rest: Tensor) -> 
     bones = joints[..., ENDING, :] - joints[..., BEGINNING, :]
     lengths = (rest[ENDING] - rest[BEGINNING]).norm(dim=-1, keepdim=True)
     side = bones[..., :2, :] - OFFSET * arms[..., :2, :, 2]  # the upper arms' third axes point to the front
-    elbow, wrist = bent_to(hands - shoulder, side, *lengths.split(2))
+    elbow, wrist = bend_arms(hands - shoulder, side, *lengths.split(2))
     bent = torch.cat([elbow, wrist - elbow], -2)
-    arms = aligning(bones / lengths, bent / lengths) @ arms
+    arms = align(bones / lengths, bent / lengths) @ arms
     turned = [rotations[..., : BEGINNING.start, :, :], arms, rotations[..., BEGINNING.stop :, :, :]]
     placed = [joints[..., : ENDING.start, :], shoulder + elbow, shoulder + wrist]
     return torch.cat(turned, -3), torch.cat(placed, -2)
 
 
-def bent_to(goal: Tensor, side: Tensor, upper: Tensor, lower: Tensor) -> tuple[Tensor, Tensor]:
+def bend_arms(goal: Tensor, side: Tensor, upper: Tensor, lower: Tensor) -> tuple[Tensor, Tensor]:
     """Return the positions of elbows and wrists of arms that reach to a goal, all relative to the shoulders.
 
     Args:

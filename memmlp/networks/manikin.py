@@ -41,10 +41,10 @@ from memmlp.networks.limb_solver import (
     IDENTITY,
     MIDDLES,
     TOES,
-    middle_at,
-    of_joints,
-    solved,
-    swivels,
+    measure_swivels,
+    place_middle,
+    select_joints,
+    solve_limbs,
 )
 from memmlp.networks.motion_model import MotionModel, State, TrainingOutputs
 from memmlp.networks.transformer import draw_weights
@@ -118,10 +118,10 @@ class PredictedParts(NamedTuple):
         trunk, turned, joints = self.body(normalizer.rest)
         anchor = places[..., :1, :]
         joints = joints + (anchor - joints[..., HEAD : HEAD + 1, :])
-        local = solved(
+        local = solve_limbs(
             trunk,
             turned,
-            of_joints(joints, BASES),
+            select_joints(joints, BASES),
             torch.cat([places[..., 1:, :], anchor + self.ankle], -2),
             F.normalize(self.swivel, dim=-1),
             trackers[..., 1:, :, :],
@@ -169,11 +169,11 @@ class Manikin(MotionModel):
     parts_weight: float
     turned: bool
 
-    def predicted(self, encoded: Tensor) -> Tensor:
+    def predict_parts(self, encoded: Tensor) -> Tensor:
         """Map windows (B, T, 54) in network space to outputs (B, n, 86 or more) for their last n frames."""
         raise NotImplementedError
 
-    def losses_of_parts(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
+    def compute_part_losses(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
         """Return the losses of the parts in outputs (B, n, 86 or more), weighted as in the authors' work."""
         raise NotImplementedError
 
@@ -187,11 +187,11 @@ class Manikin(MotionModel):
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call in which each window is turned by its own random heading; see MotionModel."""
-        inputs, kept = self.taken_in(sparse, state)
+        inputs, kept = self.append_inputs(sparse, state)
         heading, space = self.heading(true_frames), Heading()
         window = space.sparse_in(inputs[:, -self.frames :], heading)
         encoded = self.normalizer.encode_sparse(window, self.normalizer.origin(window))
-        made = self.predicted(encoded)
+        made = self.predict_parts(encoded)
         count = made.shape[1]
         rotation = self.posed(made, encoded[:, -count:])
         motion = space.motion_out(self.normalizer.posed(rotation, window[:, -count:]), heading)
@@ -209,7 +209,7 @@ class Manikin(MotionModel):
             true[..., SPARSE_DIM:], self.normalizer.origin(true[..., :SPARSE_DIM])
         )
         with in_float32(made.device):
-            parts = self.losses_of_parts(made.to(true.dtype), Truth(motion[:, -made.shape[1] :]))
+            parts = self.compute_part_losses(made.to(true.dtype), Truth(motion[:, -made.shape[1] :]))
         return {name: self.parts_weight * term for name, term in parts.items()}
 
 
@@ -275,15 +275,15 @@ class ManikinS(Manikin, AvatarPoser):
         """Map the newest frame's feature (..., d) to outputs (..., 86)."""
         return torch.cat([super().read(newest), self.swivel(newest), self.places(newest)], -1)
 
-    def predicted(self, encoded: Tensor) -> Tensor:
+    def predict_parts(self, encoded: Tensor) -> Tensor:
         """Map windows (B, T, 54) in network space to outputs (B, 1, 86) for their last frame."""
         return self.encode(self.embedding(encoded))[:, None]
 
     def rotations(self, encoded: Tensor) -> Tensor:
         """Map windows (B, T, 54) to their last frames' rotations (B, 132), both in network space."""
-        return self.posed(self.predicted(encoded), encoded[:, -1:])[:, 0]
+        return self.posed(self.predict_parts(encoded), encoded[:, -1:])[:, 0]
 
-    def losses_of_parts(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
+    def compute_part_losses(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
         """Return the losses of the parts in outputs (B, 1, 86), weighted as in the authors' work.
 
         Swivels are measured from the predicted shoulders and hips, to which no gradient flows from them: it
@@ -300,8 +300,8 @@ class ManikinS(Manikin, AvatarPoser):
         return {
             "trunk_rotation": F.l1_loss(parts.sixd[..., 1:, :], true.sixd[..., list(KEPT), :]),
             "trunk_position": 5 * F.l1_loss(joints[..., PLACED, :], rooted),
-            "swivel": 0.1 * 2 * limbs * F.l1_loss(parts.swivel, swivels(base, middle, end, up)),
-            "middle": limbs * F.l1_loss(middle_at(base, end, up, angle, *lengths), middle),
+            "swivel": 0.1 * 2 * limbs * F.l1_loss(parts.swivel, measure_swivels(base, middle, end, up)),
+            "middle": limbs * F.l1_loss(place_middle(base, end, up, angle, *lengths), middle),
             "ankle": 5 * F.l1_loss(parts.ankle, true.between((HEAD,), ANKLES)),
             "toe": 0.3 * F.l1_loss(parts.toe, true.between(ANKLES, TOES)),
         }
@@ -373,19 +373,19 @@ class ManikinL(Manikin, AvatarJLM):
         """Whether each frame is predicted without later ones; false for MANIKIN-LN."""
         return not self.offline
 
-    def predicted(self, encoded: Tensor) -> Tensor:
+    def predict_parts(self, encoded: Tensor) -> Tensor:
         """Map windows (B, T, 54) in network space to outputs (B, T, 212) for all their frames."""
-        return self.regressed(encoded)
+        return self.regress(encoded)
 
     def rotations(self, encoded: Tensor) -> Tensor:
         """Map inputs (B, T, 54) to rotations (B, T, 132), both in network space."""
-        return self.posed(self.predicted(encoded), encoded)
+        return self.posed(self.predict_parts(encoded), encoded)
 
     def losses(self, made: Tensor, true: Tensor) -> dict[str, Tensor]:
         """Return the weighted losses of the parts and of the coarse pose; see Manikin."""
-        return super().losses(made, true) | self.coarse_loss(true)
+        return super().losses(made, true) | self.compute_coarse_loss(true)
 
-    def losses_of_parts(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
+    def compute_part_losses(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
         """Return the losses of the parts in outputs (B, T, 212), weighted as in the authors' work.
 
         Swivels are compared as angles, measured from the true shoulders and hips. Toes are compared with the
@@ -395,7 +395,7 @@ class ManikinL(Manikin, AvatarJLM):
         turned, _ = forward_kinematics(
             sixd_to_matrix(true.sixd), torch.zeros_like(true.joints[..., ROOT, :]), self.normalizer.rest
         )
-        wanted = swivels(*true.limbs(), turned[..., list(BASES), :, 1])
+        wanted = measure_swivels(*true.limbs(), turned[..., list(BASES), :, 1])
         (x, y), (cosine, sine) = parts.swivel.unbind(-1), wanted.unbind(-1)
         toe = true.between((HEAD,), TOES)
         return {

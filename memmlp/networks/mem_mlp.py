@@ -301,7 +301,7 @@ class MemMLP(MotionModel):
         others.
         """
         new = sparse.shape[1]
-        inputs, kept = self.taken_in(sparse, state)
+        inputs, kept = self.append_inputs(sparse, state)
         origin = self.normalizer.origin(inputs)
         encoded = self.normalizer.encode_sparse(inputs, origin)
         past = self.memory.recall(encoded, state, new)

@@ -111,7 +111,7 @@ class MotionModel(nn.Module):
         """Return the state after true world frames [X | Theta] (B, past, 252), the truth as its history."""
         return self.running_state(frames[..., :SPARSE_DIM])
 
-    def taken_in(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
+    def append_inputs(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
         """Return past and new inputs together (B, past + n, 54), and the buffers after them.
 
         Args:
@@ -202,7 +202,7 @@ class WholeWindow(MotionModel):
 
         By default all T frames are returned. The work is always that of the whole window, as published.
         """
-        inputs, kept = self.taken_in(sparse, state)
+        inputs, kept = self.append_inputs(sparse, state)
         window = inputs[:, -self.frames :]
         rotation = self.rotations(self.normalizer.encode_sparse(window, self.normalizer.origin(window)))
         wanted = self.frames if newest is None else newest
@@ -224,7 +224,7 @@ class OwnWindows(MotionModel):
 
         By default the n new frames are returned, which are the most that this network can make.
         """
-        inputs, kept = self.taken_in(sparse, state)
+        inputs, kept = self.append_inputs(sparse, state)
         wanted = sparse.shape[1] if newest is None else newest
         ends = torch.arange(inputs.shape[1] - wanted, inputs.shape[1], device=inputs.device)
         window = ends[:, None] + torch.arange(1 - self.frames, 1, device=inputs.device)

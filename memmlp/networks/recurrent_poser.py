@@ -14,7 +14,7 @@ from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.layers import gru_step, products
-from memmlp.networks.limb_solver import reached, tracked
+from memmlp.networks.limb_solver import reach_hands, use_tracker_rotations
 from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel
 from memmlp.networks.streaming import OneFrameNormalizer
 
@@ -256,7 +256,7 @@ class GlobalRotations(RotationOutput):
 
 
 class ReachingArms(GlobalRotations):
-    """Global rotations, and arms that reach to the hands' trackers (`reached`).
+    """Global rotations, and arms that reach to the hands' trackers (`reach_hands`).
 
     The losses compare the arms before they reach: with losses after it, rotations and positions had larger
     errors.
@@ -265,8 +265,8 @@ class ReachingArms(GlobalRotations):
     def posed(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
         """Map a member's outputs (..., 132) to world motion (..., 198), given inputs (..., 54)."""
         with in_float32(made.device):
-            rotations = tracked(self.in_world(made, sparse, normalizer), sparse)
-            return normalizer.posed_in_world(rotations, sparse, reached)
+            rotations = use_tracker_rotations(self.in_world(made, sparse, normalizer), sparse)
+            return normalizer.posed_in_world(rotations, sparse, reach_hands)
 
     def learned(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
         """Map a member's outputs (..., 132) to world motion whose arms have not been made to reach."""

@@ -108,7 +108,7 @@ class RPM(WindowlessModel):
         }
         return {name: torch.zeros(batch, *size).to(self.normalizer.mean) for name, size in sizes.items()}
 
-    def predicted(self, motion: Tensor, encoded: Tensor) -> Tensor:
+    def predict(self, motion: Tensor, encoded: Tensor) -> Tensor:
         """Predict W frames (B, W, 132) from past motion (B, context, 132) and inputs (B, context + 1, 54)."""
         future = motion.new_zeros(len(motion), self.horizon, ROTATION.stop)
         queries = self.motion(torch.cat([motion, future], 1)) + self.places
@@ -120,7 +120,7 @@ class RPM(WindowlessModel):
             h = layer(h)
         return self.head(h[..., -self.horizon :, :]).view(future.shape)
 
-    def rolled(self, encoded: Tensor, state: State) -> tuple[Tensor, State]:
+    def roll(self, encoded: Tensor, state: State) -> tuple[Tensor, State]:
         """Take in one frame.
 
         Args:
@@ -132,7 +132,7 @@ class RPM(WindowlessModel):
         """
         before = torch.where(state["started"][..., None] > 0, state["sparse"], encoded)
         inputs = torch.cat([before, encoded], 1)
-        made = self.predicted(state["motion"], inputs)
+        made = self.predict(state["motion"], inputs)
         known = torch.cat([state["prediction"][:, 1:], made[:, -1:]], 1)
         known = torch.where(state["predicted"][..., None] > 0, known, made)
         made = known + self.freedom * (made - known).tanh()
@@ -155,7 +155,7 @@ class RPM(WindowlessModel):
         """
         shown = []
         for frame in self.encoded(sparse).split(1, 1):
-            made, state = self.rolled(frame, state)
+            made, state = self.roll(frame, state)
             shown.append(made[:, :1])
         wanted = sparse.shape[1] if newest is None else newest
         return self.normalizer.posed(torch.cat(shown[-wanted:], 1), sparse[:, -wanted:]), state
@@ -175,18 +175,18 @@ class RPM(WindowlessModel):
         begin = now - int(torch.randint(now - self.context + 1, ()))
         encoded = self.encoded(sparse)
         past = slice(begin - self.context, begin)
-        state = self.begun(state, encoded[:, past], true_frames[:, past])
+        state = self.start_windows(state, encoded[:, past], true_frames[:, past])
         training = self.training
         self.train(training and self.own_dropout)
         with torch.no_grad():
             for index in range(begin, now):
-                _, state = self.rolled(encoded[:, index : index + 1], state)
+                _, state = self.roll(encoded[:, index : index + 1], state)
         self.train(training)
         torch.clear_autocast_cache()  # weights that were cast without a gradient would have none below
-        made, state = self.rolled(encoded[:, now : now + 1], state)
+        made, state = self.roll(encoded[:, now : now + 1], state)
         return TrainingOutputs(self.normalizer.posed(made, sparse[:, now:]), state, {})
 
-    def begun(self, fresh: State, encoded: Tensor, true_frames: Tensor) -> State:
+    def start_windows(self, fresh: State, encoded: Tensor, true_frames: Tensor) -> State:
         """Return the state after true frames, or a fresh start for a randomly drawn share of the windows.
 
         Args:

@@ -118,7 +118,7 @@ class SAGENetGraph(StreamingGraph):
         for index in range(len(self.diffusion.times)):
             clean = sampler(joined(noisy), condition, index)
             if index + 1 < len(self.diffusion.times):
-                noisy = self.diffusion.stepped(noisy, clean, index)
+                noisy = self.diffusion.step(noisy, clean, index)
         return clean
 
 

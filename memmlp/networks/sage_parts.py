@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from memmlp.common.float32_regions import in_float32
 from memmlp.motion.body import N_JOINTS, ROTATION, TRACKED
-from memmlp.networks.avatar_jlm import JOINT_DIM, tracker_features
+from memmlp.networks.avatar_jlm import JOINT_DIM, group_by_tracker
 from memmlp.networks.bodiffusion import SINES
 from memmlp.networks.diffusion import TimeEmbedding
 from memmlp.networks.layers import Dropout
@@ -46,7 +46,7 @@ class Mixture(nn.Module):
 
     def forward(self, encoded: Tensor) -> Tensor:
         """Map inputs (..., 54) to features of joints (..., J, 18)."""
-        return self.spread(tracker_features(encoded).transpose(-1, -2)).transpose(-1, -2)
+        return self.spread(group_by_tracker(encoded).transpose(-1, -2)).transpose(-1, -2)
 
 
 class AttentionBlock(nn.Module):

@@ -103,7 +103,7 @@ def draw_weights(part: nn.Module) -> None:
                 layer.weight.copy_(weight)
 
 
-def newest_frame(layers: list[EncoderLayer], h: Tensor) -> Tensor:
+def encode_newest_frame(layers: list[EncoderLayer], h: Tensor) -> Tensor:
     """Apply encoder layers to features (T, d); the last layer computes the newest frame (1, d) alone."""
     *earlier, last = layers
     for layer in earlier:

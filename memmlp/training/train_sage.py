@@ -366,6 +366,6 @@ def encode_latents(codes: HalfVQVAE, rotation: Tensor, encoded: Tensor) -> Tenso
 def add_noise(net: SAGENet, clean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return noisy latents (B, T // 2, 384), their random times (B,), and random hidden joints (B, 22)."""
     time = distributed.drawn(net.diffusion.random_times, clean)
-    noisy = net.diffusion.noised(clean, time, distributed.drawn(torch.randn_like, clean))
+    noisy = net.diffusion.add_noise(clean, time, distributed.drawn(torch.randn_like, clean))
     drawn = distributed.drawn(lambda like: torch.rand_like(like[:, 0, :HIDDEN_COUNT]), clean) * N_JOINTS
     return noisy, time, F.one_hot(drawn.long(), N_JOINTS).sum(1) > 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from memmlp.networks.diffusion import AncestralDiffusion, Denoised, binned_surprise, linear_schedule
+from memmlp.networks.diffusion import AncestralDiffusion, Denoised, linear_schedule, measure_surprise
 
 OPEN = torch.tensor(-9.0), torch.tensor(9.0)
 
@@ -94,7 +94,7 @@ def test_the_losses_are_an_independent_numpy_computation():
     diffusion, draw = AncestralDiffusion(20, 2).double(), torch.Generator().manual_seed(0)
     clean, noise = (torch.randn(3, 1, 1, generator=draw).double() for _ in range(2))
     time = torch.tensor([19, 7, 2])
-    noisy = diffusion.noised(clean, time, noise)
+    noisy = diffusion.add_noise(clean, time, noise)
     guess = Denoised(*(part.requires_grad_() for part in made(noisy, time)))
     error, bound = diffusion.losses(clean, noise, time, guess, OPEN)
     first, second, least, largest = (table[time][:, None, None] for table in tables(kept(20)))
@@ -125,7 +125,7 @@ def test_at_the_first_step_the_bound_is_the_surprise_of_the_true_signal():
         signal = float(diffusion.signal[0])
         mean = 0.3 - offset * math.sqrt(1 - signal) / math.sqrt(signal)
         log_variance = torch.tensor(tables(kept(20))[2][0]).log()
-        expected = binned_surprise(torch.tensor(0.3), torch.tensor(mean), log_variance, OPEN)
+        expected = measure_surprise(torch.tensor(0.3), torch.tensor(mean), log_variance, OPEN)
         assert float(bound) == pytest.approx(float(expected) / math.log(2), rel=1e-3)
 
 
@@ -134,5 +134,5 @@ def test_the_bins_of_a_gaussian_are_all_there_is():
     limits = torch.tensor(-1.0), torch.tensor(1.0)
     values = torch.linspace(-1, 1, 256).double()
     for mean, log_variance in ((0.2, -3.0), (-0.9, -1.0), (1.2, -2.0)):
-        surprise = binned_surprise(values, torch.tensor(mean), torch.tensor(log_variance), limits)
+        surprise = measure_surprise(values, torch.tensor(mean), torch.tensor(log_variance), limits)
         assert float((-surprise).exp().sum()) == pytest.approx(1)

@@ -12,7 +12,7 @@ SPARSE = TRUTH[..., :SPARSE_DIM]
 
 
 def test_joints_without_a_tracker_hold_a_constant():
-    rows = avatar_jlm.joint_features(SPARSE).unflatten(-1, (22, 18)).numpy()
+    rows = avatar_jlm.spread_over_joints(SPARSE).unflatten(-1, (22, 18)).numpy()
     for joint in range(22):
         if joint not in (15, 20, 21):
             assert np.all(rows[..., joint, :] == np.float32(0.01))
@@ -32,7 +32,7 @@ def test_tracked_joints_stand_in_the_tokens_as_they_are():
     model.rotation_token.register_forward_hook(lambda _, given, made: seen.update(rotation=given[0]))
     encoded = model.normalizer.encode_sparse(SPARSE.double(), model.normalizer.origin(SPARSE.double()))
     model.tokens(encoded)
-    joints, turns = model.coarse_joints(model.embedding(avatar_jlm.joint_features(encoded)))
+    joints, turns = model.place_coarse_joints(model.embedding(avatar_jlm.spread_over_joints(encoded)))
     true = SPARSE[..., 36:45].unflatten(-1, (3, 3)).double()
     torch.testing.assert_close(seen["position"][..., [15, 20, 21], :], true - true[..., :1, :])
     torch.testing.assert_close(
@@ -79,12 +79,12 @@ def test_the_coarse_poses_loss_is_of_joints_relative_to_the_head():
     true = model.normalizer.encode(truth)[..., SPARSE_DIM:][..., ROTATION]
     coarse = model.coarse
     model.coarse = Always(true)
-    assert float(model.coarse_loss(truth)["coarse"]) < 1e-6
+    assert float(model.compute_coarse_loss(truth)["coarse"]) < 1e-6
     model.coarse = coarse
     found = model.training_call(truth[:, -1:, :SPARSE_DIM], model.true_state(truth[:, :-1]), truth).losses[
         "coarse"
     ]
-    assert float(found) == float(model.coarse_loss(truth)["coarse"]) > 0.1
+    assert float(found) == float(model.compute_coarse_loss(truth)["coarse"]) > 0.1
 
 
 @torch.no_grad()
@@ -92,5 +92,5 @@ def test_coarse_joints_follow_from_their_rotations_in_float32_in_a_mixed_precisi
     model, rotations = tiny.baseline("avatar_jlm"), torch.randn(50, ROTATION.stop)
     model.coarse = torch.nn.Identity()
     with torch.autocast("cpu", torch.bfloat16):
-        found = model.coarse_joints(rotations)
-    torch.testing.assert_close(found, model.coarse_joints(rotations), rtol=0, atol=0)
+        found = model.place_coarse_joints(rotations)
+    torch.testing.assert_close(found, model.place_coarse_joints(rotations), rtol=0, atol=0)

@@ -1,57 +1,41 @@
-"""Tensors of earlier versions' files, which had other names."""
-
-from __future__ import annotations
-
-from collections.abc import Iterable
+"""Checkpoints: damage is refused, and a file that changes while it is read is read as one version."""
 
 import pytest
 import torch
 
-from memmlp.networks.checkpoint import WEIGHTS, load_module, module_tensors
-from memmlp.training.losses import LearnedWeights, Uncertainty
-from memmlp.training.losses.terms import TERMS
-
-FORMER = ("rotation", "rotation_velocity", "position", "velocity", "hand")
-NOW = ("rotation_all", "rotation_velocity", "position_branch", "velocity_lower_body", "hand")
+from memmlp.common.errors import InputError
+from memmlp.networks import checkpoint
 
 
-def weighting(names: Iterable[str]) -> Uncertainty:
-    """A weighting of these terms, each with another weight."""
-    made = Uncertainty()
-    made.build(list(names))
-    for number, s in enumerate(made.s.values()):
-        torch.nn.init.constant_(s, number + 1)
-    return made
+def test_a_checkpoint_survives_a_torn_write_and_refuses_damage(tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    checkpoint.write(path, {"a": torch.arange(3)}, {"step": 3})
+    (tmp_path / ".checkpoint.safetensors.1.tmp").write_bytes(b"half")
+    tensors, values = checkpoint.read(path)
+    assert values == {"step": 3}
+    assert torch.equal(tensors["a"], torch.arange(3))
+    path.write_bytes(path.read_bytes()[:20])
+    with pytest.raises(InputError, match=r"checkpoint\.safetensors"):
+        checkpoint.read(path)
 
 
-def test_learned_weights_of_mem_mlps_terms_are_found_by_their_former_names():
-    former = weighting(FORMER)
-    now = weighting(NOW)
-    expected = now.weights()
-    torch.nn.init.zeros_(now.s["position_branch"])
-    load_module("loss", now, module_tensors("loss", former))
-    assert now.weights() == expected
+def test_a_checkpoint_that_is_replaced_while_it_is_read_is_the_old_one(tmp_path, monkeypatch):
+    """It was opened twice, for its header and for its tensors, which were another file's by then."""
+    path, load = tmp_path / "checkpoint.safetensors", checkpoint.load
+    checkpoint.write(path, {"a": torch.arange(30)}, {"step": 3})
+
+    def replaced(content: bytes) -> dict[str, torch.Tensor]:
+        checkpoint.write(path, {"a": torch.arange(3)}, {"step": 4})
+        return load(content)
+
+    monkeypatch.setattr(checkpoint, "load", replaced)
+    tensors, values = checkpoint.read(path)
+    assert values == {"step": 3}
+    assert torch.equal(tensors["a"], torch.arange(30))
 
 
-@pytest.mark.parametrize("now", [NOW, tuple(TERMS)], ids=["Mem-MLP", "library"])
-def test_learned_weights_are_in_the_order_of_their_former_names(now: tuple[str, ...]):
-    """An optimiser's state has no names, so that in another order it would be of other weights."""
-    renamed = {present: former for former, present in WEIGHTS}
-    former = [renamed.get(name, name) for name in now]
-    assert [renamed.get(name, name) for name in weighting(now).s] == list(weighting(former).s)
-
-
-def test_weights_of_the_library_s_terms_are_found_by_their_former_names():
-    """`rotation` is a term of the library, which has another meaning than Mem-MLP's of that name."""
-    given = LearnedWeights({"rotation": 2.0, "position": 3.0, "velocity": 5.0})
-    loaded = LearnedWeights({"rotation": 1.0, "position_from_pelvis": 1.0, "velocity": 1.0})
-    load_module("loss", loaded, module_tensors("loss", given))
-    expected = {"rotation": 2.0, "position_from_pelvis": 3.0, "velocity": 5.0}
-    assert loaded.weights() == pytest.approx(expected)
-
-
-def test_the_normalizer_of_version_0_1_is_found():
-    module = torch.nn.ModuleDict({"normalizer": torch.nn.Module()})
-    module["normalizer"].register_buffer("mean", torch.zeros(2))
-    load_module("model", module, {"model.frame.mean": torch.ones(2)})
-    torch.testing.assert_close(module["normalizer"].mean, torch.ones(2))
+def test_a_module_is_loaded_from_its_own_tensors_alone():
+    module, other = torch.nn.Linear(2, 1), torch.nn.Linear(2, 1)
+    tensors = checkpoint.module_tensors("model", other) | checkpoint.module_tensors("modelling", module)
+    checkpoint.load_module("model", module, tensors)
+    assert torch.equal(module.weight, other.weight)

@@ -39,7 +39,7 @@ def test_ddim_is_an_independent_numpy_computation(steps):
 def test_training_noise_has_the_schedules_variance():
     diffusion = Diffusion(10, 2)
     clean, noise = torch.full((10, 3), 2.0), torch.full((10, 3), 0.5)
-    noisy = diffusion.noised(clean, torch.arange(10), noise).numpy()
+    noisy = diffusion.add_noise(clean, torch.arange(10), noise).numpy()
     signal = cosine_schedule(10).numpy()
     expected = (np.sqrt(signal) * 2 + np.sqrt(1 - signal) * 0.5)[:, None].repeat(3, 1)
     np.testing.assert_allclose(noisy, expected, rtol=1e-5)

@@ -50,7 +50,7 @@ class Attentive(MotionModel):
 
     def advance(self, sparse, state, newest=None):
         """Return the motion of the window's newest frames, and the state."""
-        inputs, state = self.taken_in(sparse, state)
+        inputs, state = self.append_inputs(sparse, state)
         made = self.head(self.mixed(self.stem(inputs[:, -T:])))
         return made[:, -(newest or T) :], state
 

@@ -7,7 +7,7 @@ import torch
 
 from memmlp.motion.body import SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.geometry import sixd_to_matrix
-from memmlp.networks.hmd_poser import NormedLSTM, hands_in_head
+from memmlp.networks.hmd_poser import NormedLSTM, locate_hands
 
 CLIP = tiny.clip(20)
 SPARSE = CLIP[None, :, :SPARSE_DIM]
@@ -15,7 +15,7 @@ SPARSE = CLIP[None, :, :SPARSE_DIM]
 
 def test_hands_in_the_heads_frame_are_those_of_consecutive_frames():
     """The frame before is found from the velocities; here it is taken from the clip itself."""
-    rotations, turns, positions, velocities = (part[0].double().numpy() for part in hands_in_head(SPARSE))
+    rotations, turns, positions, velocities = (part[0].double().numpy() for part in locate_hands(SPARSE))
     poses = sixd_to_matrix(CLIP[:, :18].unflatten(-1, (3, 6))).double().numpy()
     places = CLIP[:, SPARSE_POSITION].unflatten(-1, (3, 3)).double().numpy()
     own = [
@@ -85,5 +85,5 @@ def test_the_shape_is_trained_to_be_the_same_within_a_window():
 
 def test_hands_in_the_heads_frame_are_those_of_float32_in_a_mixed_precision_training():
     with torch.autocast("cpu", torch.bfloat16):
-        found = hands_in_head(SPARSE)
-    torch.testing.assert_close(found, hands_in_head(SPARSE), rtol=0, atol=0)
+        found = locate_hands(SPARSE)
+    torch.testing.assert_close(found, locate_hands(SPARSE), rtol=0, atol=0)

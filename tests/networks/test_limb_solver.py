@@ -68,7 +68,7 @@ def test_elbows_and_knees_bend_about_their_axes_and_roll_about_their_forearms(bo
     knees = body["made"][:, list(MIDDLES[2:])]
     torch.testing.assert_close(limbs.applied(knees, axis[2:]), axis[2:].expand(40, -1, -1))
     elbows = body["made"][:, list(MIDDLES[:2])]
-    bent = limbs.flexed(*limbs.bones(REST), (body["end"] - body["base"]).norm(dim=-1, keepdim=True))[:, :2]
+    bent = limbs.flex(*limbs.bones(REST), (body["end"] - body["base"]).norm(dim=-1, keepdim=True))[:, :2]
     rolled = bent.mT @ elbows
     torch.testing.assert_close(
         limbs.applied(rolled, lower[:2]), lower[:2].expand(40, -1, -1), atol=1e-9, rtol=0
@@ -94,7 +94,7 @@ def test_a_middle_is_where_its_swivel_says_unless_its_twist_is_limited(body):
 
 def test_the_smallest_turn_to_a_limit_is_what_a_search_finds():
     local, bone, axis = sixd_to_matrix(drawn(6, 4, 6)), unit(4, 3), unit(6, 4, 3)
-    turn = limbs.untwisting(local, bone, axis)
+    turn = limbs.limit_twist(local, bone, axis)
     tried = torch.linspace(-math.pi, math.pi, 7201).double()[:, None, None, None]
     every = limbs.about(axis.expand(7201, 6, 4, 3), tried.cos(), tried.sin()) @ local
     cosine, sine = limbs.twist(every, bone.expand(7201, 6, 4, 3))
@@ -111,7 +111,7 @@ def test_swivels_are_an_independent_computation():
     base, middle, end, up = (drawn(5, 4, 3) for _ in range(4))
     found = limbs.swivels(base, middle, end, up).numpy()
     lengths = [(one - other).norm(dim=-1, keepdim=True) for one, other in ((base, middle), (middle, end))]
-    again = limbs.middle_at(base, end, up, torch.tensor(found), *lengths)
+    again = limbs.place_middle(base, end, up, torch.tensor(found), *lengths)
     torch.testing.assert_close(again, middle)
     for index in np.ndindex(5, 4):
         a, m, e, y = (part.numpy()[index] for part in (base, middle, end, up))

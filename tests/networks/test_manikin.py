@@ -79,7 +79,9 @@ def test_manikin_s_losses_are_an_independent_computation():
     made = (
         outputs()[:, -1:] + 0.1 * torch.randn(2, 1, 86, generator=torch.Generator().manual_seed(1)).double()
     )
-    found = {name: float(term) for name, term in model.losses_of_parts(made, Truth(MOTION[:, -1:])).items()}
+    found = {
+        name: float(term) for name, term in model.compute_part_losses(made, Truth(MOTION[:, -1:])).items()
+    }
     raw = made[:, 0].numpy()
     true = MOTION[:, -1, POSITION].unflatten(-1, (22, 3)).numpy()
     sixd = MOTION[:, -1, ROTATION].unflatten(-1, (22, 6)).numpy()
@@ -115,7 +117,7 @@ def test_manikin_s_standing_legs_teach_without_bound_nothing():
     """The axis that a swivel is counted from is nearly along a standing leg; none learns by it."""
     model = tiny.baseline("manikin_s", World())
     torch.manual_seed(0)
-    made = model.predicted(torch.randn(1, model.frames, SPARSE_DIM)).detach()
+    made = model.predict_parts(torch.randn(1, model.frames, SPARSE_DIM)).detach()
     mean, std = (
         part[SPARSE_DIM:][ROTATION].unflatten(0, (N_JOINTS, 6))[[0, *KEPT]].flatten()
         for part in (model.normalizer.mean, model.normalizer.std)
@@ -129,7 +131,7 @@ def test_manikin_s_standing_legs_teach_without_bound_nothing():
         joints[..., base, :] = 0
     sixd = torch.tensor([1.0, 0, 0, 0, 1, 0]).repeat(N_JOINTS)
     motion = torch.cat([sixd.expand(1, 1, -1), joints.flatten(-2)], -1)
-    sum(model.losses_of_parts(made, Truth(motion)).values()).backward()
+    sum(model.compute_part_losses(made, Truth(motion)).values()).backward()
     assert made.grad.abs().max() < 10
 
 
@@ -139,14 +141,14 @@ def test_manikin_l_losses_are_nothing_for_the_truth_and_count_angles_the_short_w
     auxiliary = MOTION[..., ROTATION][..., 6:]
     made = torch.cat([outputs(), auxiliary], -1)
     true = Truth(MOTION)
-    assert all(float(term) < 1e-5 for term in model.losses_of_parts(made, true).values())
+    assert all(float(term) < 1e-5 for term in model.compute_part_losses(made, true).values())
     turned = made.clone()
     swivel = made[..., 66:74].unflatten(-1, (2, 4))
     angle = torch.atan2(swivel[..., 1, :], swivel[..., 0, :]) + 0.3
     turned[..., 66:74] = 2 * torch.stack([angle.cos(), angle.sin()], -2).flatten(-2)
     turned[..., 74:77] += 0.1
     turned[..., 86:] += 0.05
-    found = {name: float(term) for name, term in model.losses_of_parts(turned, true).items()}
+    found = {name: float(term) for name, term in model.compute_part_losses(turned, true).items()}
     expected = {"trunk_rotation": 0, "swivel": 0.03, "ankle": 0.25, "toe": 0.25, "auxiliary": 0.1}
     assert found == pytest.approx(expected, abs=1e-5)
 

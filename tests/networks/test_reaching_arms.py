@@ -8,7 +8,7 @@ from memmlp.motion.body import HANDS, HEAD, N_JOINTS, POSITION, ROTATION, SPARSE
 from memmlp.motion.body import SPARSE_POSITION as PLACES
 from memmlp.motion.body import SPARSE_ROTATION as TURNS
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
-from memmlp.networks.limb_solver import ELBOWS, SHOULDERS, SLACK, WRISTS, reached, tracked
+from memmlp.networks.limb_solver import ELBOWS, SHOULDERS, SLACK, WRISTS, reach_hands, use_tracker_rotations
 
 REST = tiny.REST.double()
 LENGTHS = [
@@ -45,7 +45,7 @@ def test_hands_come_to_their_trackers_and_bones_keep_their_lengths(share: float)
     """Of a hand that is too far away the arm points at it, all but straight."""
     rotations, joints = body()
     hands = within_reach(joints, share)
-    turned, placed = reached(rotations, joints, inputs(joints, hands), REST)
+    turned, placed = reach_hands(rotations, joints, inputs(joints, hands), REST)
     away = hands - joints[:, SHOULDERS]
     nearest = joints[:, SHOULDERS] + away * min(1, (1 - SLACK) / share)
     torch.testing.assert_close(placed[:, WRISTS], nearest)
@@ -61,7 +61,7 @@ def test_hands_come_to_their_trackers_and_bones_keep_their_lengths(share: float)
 def test_a_hand_on_its_shoulder_leaves_bones_as_long_and_turned_as_they_lie():
     """As near as that, an arm is folded in the hand's direction."""
     rotations, joints = body()
-    turned, placed = reached(rotations, joints, inputs(joints, within_reach(joints, 1e-6)), REST)
+    turned, placed = reach_hands(rotations, joints, inputs(joints, within_reach(joints, 1e-6)), REST)
     for joint, child, length in zip((SHOULDERS, ELBOWS), (ELBOWS, WRISTS), LENGTHS, strict=True):
         bones = turned[:, joint] @ (REST[child] - REST[joint])[..., None]
         torch.testing.assert_close(placed[:, joint] + bones[..., 0], placed[:, child])
@@ -71,7 +71,7 @@ def test_a_hand_on_its_shoulder_leaves_bones_as_long_and_turned_as_they_lie():
 def test_the_elbow_stays_on_its_side_of_the_way_to_the_hand():
     rotations, joints = body()
     hands = within_reach(joints, 0.7)
-    _, placed = reached(rotations, joints, inputs(joints, hands), REST)
+    _, placed = reach_hands(rotations, joints, inputs(joints, hands), REST)
     axis = torch.nn.functional.normalize(hands - joints[:, SHOULDERS], dim=-1)
 
     def off_axis(positions: torch.Tensor) -> torch.Tensor:
@@ -86,13 +86,15 @@ def test_the_elbow_stays_on_its_side_of_the_way_to_the_hand():
 def test_head_and_wrists_turn_as_their_trackers_and_the_rest_stays():
     rotations, joints = body()
     sparse = inputs(joints, within_reach(joints, 0.7))
-    seen = sixd_to_matrix(tracked(matrix_to_sixd(rotations).flatten(1), sparse).unflatten(-1, (N_JOINTS, 6)))
+    seen = sixd_to_matrix(
+        use_tracker_rotations(matrix_to_sixd(rotations).flatten(1), sparse).unflatten(-1, (N_JOINTS, 6))
+    )
     torch.testing.assert_close(
         seen[:, [HEAD, *HANDS]], sixd_to_matrix(sparse[:, TURNS].unflatten(-1, (3, 6)))
     )
     others = [joint for joint in range(N_JOINTS) if joint not in (HEAD, *HANDS)]
     torch.testing.assert_close(seen[:, others], rotations[:, others])
-    turned, placed = reached(seen, joints, sparse, REST)
+    turned, placed = reach_hands(seen, joints, sparse, REST)
     kept = [joint for joint in range(N_JOINTS) if not SHOULDERS.start <= joint < ELBOWS.stop]
     assert torch.equal(turned[:, kept], seen[:, kept])
     assert torch.equal(placed[:, : ELBOWS.start], joints[:, : ELBOWS.start])
@@ -101,7 +103,7 @@ def test_head_and_wrists_turn_as_their_trackers_and_the_rest_stays():
 def test_bones_are_turned_the_least_way():
     """The angle of each turn is that between the bone as it was and as it is."""
     rotations, joints = body()
-    turned, placed = reached(rotations, joints, inputs(joints, within_reach(joints, 0.6)), REST)
+    turned, placed = reach_hands(rotations, joints, inputs(joints, within_reach(joints, 0.6)), REST)
     for joint, child in ((SHOULDERS, ELBOWS), (ELBOWS, WRISTS)):
         change = turned[:, joint] @ rotations[:, joint].mT
         angle = torch.acos(((change.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1))
@@ -118,7 +120,7 @@ def test_an_arm_that_is_right_stays_as_it_is():
     local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6)))
     rotations, _ = forward_kinematics(local, torch.zeros(120, 3).double(), REST)
     joints = motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
-    turned, placed = reached(rotations, joints, sparse, REST)
+    turned, placed = reach_hands(rotations, joints, sparse, REST)
     bent = (joints[:, WRISTS] - joints[:, SHOULDERS]).norm(dim=-1) < 0.98 * sum(LENGTHS)
     assert bent.sum() > 20
     off = (placed - joints).norm(dim=-1)
@@ -138,7 +140,7 @@ def test_a_straight_arm_bends_about_its_axis_and_gradients_are_finite():
     rotations = torch.eye(3).double().expand(1, N_JOINTS, 3, 3).clone().requires_grad_()
     joints = rest[None].clone().requires_grad_()
     hands = rest[None, SHOULDERS] + 0.7 * (rest[None, WRISTS] - rest[None, SHOULDERS])
-    turned, placed = reached(rotations, joints, inputs(joints.detach(), hands), rest)
+    turned, placed = reach_hands(rotations, joints, inputs(joints.detach(), hands), rest)
     assert (placed[0, ELBOWS, 2] - rest[ELBOWS, 2] < -0.1).all()  # Z is to the front in the rest pose
     (turned.sum() + placed.sum()).backward()
     assert rotations.grad.isfinite().all()

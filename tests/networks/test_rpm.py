@@ -20,7 +20,7 @@ def test_predictions_roll_as_an_independent_computation():
     model.predicted = lambda *given: (news.append((given, made := 3 * predicted(*given))), made)[1]
     state, shown = model.initial_state(1), []
     for frame in SPARSE[:1].double().split(1, 1):
-        made, state = model.rolled(model.encoded(frame), state)
+        made, state = model.roll(model.encoded(frame), state)
         shown.append(made[0].numpy())
     share = 1 - np.cos(np.arange(1, 5) / 4 * np.pi / 2)[:, None]
     expected = news[0][1][0].numpy()

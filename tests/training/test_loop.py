@@ -9,11 +9,10 @@ import torch
 from tiny_tasks import OPTIM, ROLLOUTS, TASKS, motion_task, weights
 
 from memmlp.common import progress
-from memmlp.common.errors import InputError, TrainingDiverged
+from memmlp.common.errors import TrainingDiverged
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.motion.dataset import WindowSampler
-from memmlp.networks import checkpoint
 from memmlp.runs.run import Run
 from memmlp.training import loop
 from memmlp.training.loop import train
@@ -208,33 +207,6 @@ def test_schedules():
 def test_perplexity():
     assert perplexity(torch.ones(8)) == pytest.approx(8)
     assert perplexity(torch.tensor([5.0, 0, 0])) == pytest.approx(1)
-
-
-def test_a_checkpoint_survives_a_torn_write_and_refuses_damage(tmp_path):
-    path = tmp_path / "checkpoint.safetensors"
-    checkpoint.write(path, {"a": torch.arange(3)}, {"step": 3})
-    (tmp_path / ".checkpoint.safetensors.1.tmp").write_bytes(b"half")
-    tensors, values = checkpoint.read(path)
-    assert values == {"step": 3}
-    assert torch.equal(tensors["a"], torch.arange(3))
-    path.write_bytes(path.read_bytes()[:20])
-    with pytest.raises(InputError, match="not a checkpoint"):
-        checkpoint.read(path)
-
-
-def test_a_checkpoint_that_is_replaced_while_it_is_read_is_the_old_one(tmp_path, monkeypatch):
-    """It was opened twice, for its header and for its tensors, which were another file's by then."""
-    path, load = tmp_path / "checkpoint.safetensors", checkpoint.load
-    checkpoint.write(path, {"a": torch.arange(30)}, {"step": 3})
-
-    def replaced(content: bytes) -> dict[str, torch.Tensor]:
-        checkpoint.write(path, {"a": torch.arange(3)}, {"step": 4})
-        return load(content)
-
-    monkeypatch.setattr(checkpoint, "load", replaced)
-    tensors, values = checkpoint.read(path)
-    assert values == {"step": 3}
-    assert torch.equal(tensors["a"], torch.arange(30))
 
 
 def test_what_is_counted_in_a_validation_says_so(monkeypatch: pytest.MonkeyPatch):

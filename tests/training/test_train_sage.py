@@ -144,7 +144,9 @@ def test_it_begins_with_the_weights_of_its_parts(tmp_path: Path):
     network = tiny.BASELINES["sage"]
     architecture = PartedArchitecture(World(), normalize=False, vqvae=tiny.vqvae, network=network)
     for finished in ((), ("upper", "lower")):
-        net = replace(architecture, finished=finished).begun(tiny.normalizer(), tmp_path / "model")
+        net = replace(architecture, finished=finished).build_for_training(
+            tiny.normalizer(), tmp_path / "model"
+        )
         stems = {name: net.get_submodule(name).stem.weight for name in ("upper", "lower", "decoder")}
         known = {name: kept.get_submodule(name).stem.weight for name in stems}
         same = {name for name, stem in stems.items() if torch.equal(stem, known[name])}
