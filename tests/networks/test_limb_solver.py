@@ -44,7 +44,7 @@ def body() -> dict[str, torch.Tensor]:
     base = joints[:, list(BASES)]
     given = {"end": reachable(base), "swivel": unit(40, 4, 2), "hands": sixd_to_matrix(drawn(40, 2, 6))}
     given["toe"] = drawn(40, 2, 3)
-    made = limbs.solved(local, turned, base, *given.values(), REST)
+    made = limbs.solve_limbs(local, turned, base, *given.values(), REST)
     after = forward_kinematics(made, torch.zeros(40, 3).double(), REST)
     up = turned[:, list(BASES), :, 1]
     return {"made": made, "turned": after[0], "joints": after[1], "base": base, "up": up, **given}
@@ -66,12 +66,12 @@ def test_elbows_and_knees_bend_about_their_axes_and_roll_about_their_forearms(bo
     """The knee's rotation keeps the axis of flexion; the elbow's is such a bend and then a roll."""
     _, lower, axis = limbs.bones(REST)
     knees = body["made"][:, list(MIDDLES[2:])]
-    torch.testing.assert_close(limbs.applied(knees, axis[2:]), axis[2:].expand(40, -1, -1))
+    torch.testing.assert_close(limbs.rotate(knees, axis[2:]), axis[2:].expand(40, -1, -1))
     elbows = body["made"][:, list(MIDDLES[:2])]
     bent = limbs.flex(*limbs.bones(REST), (body["end"] - body["base"]).norm(dim=-1, keepdim=True))[:, :2]
     rolled = bent.mT @ elbows
     torch.testing.assert_close(
-        limbs.applied(rolled, lower[:2]), lower[:2].expand(40, -1, -1), atol=1e-9, rtol=0
+        limbs.rotate(rolled, lower[:2]), lower[:2].expand(40, -1, -1), atol=1e-9, rtol=0
     )
 
 
@@ -87,7 +87,7 @@ def test_a_middle_is_where_its_swivel_says_unless_its_twist_is_limited(body):
     free = found < limit - 1e-6
     assert 20 < int(free.sum()) < 140
     joints = [body["joints"][:, list(of)] for of in (BASES, MIDDLES, ENDS)]
-    swivel = limbs.swivels(*joints, body["up"])
+    swivel = limbs.measure_swivels(*joints, body["up"])
     torch.testing.assert_close(swivel[free], body["swivel"][free], atol=0.02, rtol=0)
     torch.testing.assert_close(found[~free], limit.expand(40, 4)[~free])
 
@@ -109,7 +109,7 @@ def test_the_smallest_turn_to_a_limit_is_what_a_search_finds():
 def test_swivels_are_an_independent_computation():
     """In NumPy, limb by limb: the angle of the middle about the axis, from below the base's Y axis."""
     base, middle, end, up = (drawn(5, 4, 3) for _ in range(4))
-    found = limbs.swivels(base, middle, end, up).numpy()
+    found = limbs.measure_swivels(base, middle, end, up).numpy()
     lengths = [(one - other).norm(dim=-1, keepdim=True) for one, other in ((base, middle), (middle, end))]
     again = limbs.place_middle(base, end, up, torch.tensor(found), *lengths)
     torch.testing.assert_close(again, middle)
@@ -130,7 +130,7 @@ def test_what_is_out_of_reach_is_a_limb_as_straight_or_bent_as_can_be_with_finit
     end = (base + share * limbs.bones(REST)[0]).requires_grad_()
     swivel, toe = unit(3, 4, 2).requires_grad_(), drawn(3, 2, 3).requires_grad_()
     hands = sixd_to_matrix(drawn(3, 2, 6))
-    made = limbs.solved(local, turned, base, end, swivel, hands, toe, REST)
+    made = limbs.solve_limbs(local, turned, base, end, swivel, hands, toe, REST)
     assert torch.isfinite(made).all()
     (made * drawn(*made.shape)).sum().backward()
     assert all(torch.isfinite(part.grad).all() for part in (end, swivel, toe))
@@ -148,5 +148,6 @@ def test_slopes_are_right():
     given = reachable(base), unit(2, 4, 2), sixd_to_matrix(drawn(2, 2, 6)), unit(2, 2, 3)
     chosen = [part.requires_grad_() for part in (given[0], given[1], given[3])]
     assert torch.autograd.gradcheck(
-        lambda end, swivel, toe: limbs.solved(local, turned, base, end, swivel, given[2], toe, REST), chosen
+        lambda end, swivel, toe: limbs.solve_limbs(local, turned, base, end, swivel, given[2], toe, REST),
+        chosen,
     )

@@ -27,7 +27,7 @@ def outputs() -> torch.Tensor:
     """What a network should predict of the true motion (2, 7, 86)."""
     true = Truth(MOTION)
     turned = posed_globally(MOTION)
-    swivel = manikin.swivels(*true.limbs(), turned[..., list(BASES), :, 1])
+    swivel = manikin.measure_swivels(*true.limbs(), turned[..., list(BASES), :, 1])
     places = [true.between((15,), (7, 8)), true.between((7, 8), (10, 11))]
     parts = [true.sixd[..., [0, *KEPT], :], swivel.transpose(-1, -2), *places]
     return torch.cat([part.flatten(-2) for part in parts], -1)
@@ -165,8 +165,8 @@ def test_training_is_on_windows_turned_by_any_heading_and_the_motion_is_turned_b
     torch.testing.assert_close(motion, expected[:, -motion.shape[1] :], atol=1e-6, rtol=0)
     world = tiny.baseline(name, World()).double()
     world.normalizer = Normalizer.raw(World(), tiny.REST).double()
-    predicted = world.predicted
-    world.predicted = lambda encoded: (seen.append(encoded), predicted(encoded))[1]
+    predicted = world.predict_parts
+    world.predict_parts = lambda encoded: (seen.append(encoded), predicted(encoded))[1]
     world.training_call(SPARSE, state, TRUTH)
     heads = [window[..., 36:39][:, -world.frames :] for window in (SPARSE, seen[0])]
     torch.testing.assert_close(heads[0][..., 2], heads[1][..., 2])

@@ -16,8 +16,8 @@ SPARSE = TRUTH[..., :SPARSE_DIM]
 def test_predictions_roll_as_an_independent_computation():
     """In NumPy: shifted by a frame at each step, moved by tanh of the difference, the nearest the least."""
     model, news = tiny.baseline("rpm").double(), []
-    predicted = model.predicted
-    model.predicted = lambda *given: (news.append((given, made := 3 * predicted(*given))), made)[1]
+    predicted = model.predict
+    model.predict = lambda *given: (news.append((given, made := 3 * predicted(*given))), made)[1]
     state, shown = model.initial_state(1), []
     for frame in SPARSE[:1].double().split(1, 1):
         made, state = model.roll(model.encoded(frame), state)
@@ -39,8 +39,8 @@ def test_predictions_roll_as_an_independent_computation():
 @torch.no_grad()
 def test_before_the_first_frame_are_its_inputs():
     model, seen = tiny.baseline("rpm"), []
-    predicted = model.predicted
-    model.predicted = lambda motion, inputs: (seen.append(inputs), predicted(motion, inputs))[1]
+    predicted = model.predict
+    model.predict = lambda motion, inputs: (seen.append(inputs), predicted(motion, inputs))[1]
     model.advance(SPARSE, model.initial_state(2))
     encoded = model.encoded(SPARSE)
     torch.testing.assert_close(seen[0], encoded[:, :1].expand(-1, 4, -1))
@@ -51,10 +51,10 @@ def test_before_the_first_frame_are_its_inputs():
 def test_training_predicts_the_last_frames_after_free_running(monkeypatch, own_dropout):
     """The one step with gradient sees the inputs up to its own frame, and motion that has no gradient."""
     model, steps, training = tiny.baseline("rpm", own_dropout=own_dropout).train(), [], []
-    rolled = model.rolled
-    model.rolled = lambda *given: (steps.append((torch.is_grad_enabled(), given)), rolled(*given))[1]
-    predicted = model.predicted
-    model.predicted = lambda *given: (training.append(model.layers[0].training), predicted(*given))[1]
+    rolled = model.roll
+    model.roll = lambda *given: (steps.append((torch.is_grad_enabled(), given)), rolled(*given))[1]
+    predicted = model.predict
+    model.predict = lambda *given: (training.append(model.layers[0].training), predicted(*given))[1]
     monkeypatch.setattr(torch, "rand_like", lambda like: torch.tensor([[0.1], [0.9]]))
     for running in range(3):
         steps.clear()
