@@ -1,13 +1,11 @@
 """AGRoL's networks, part by part."""
 
-import numpy as np
 import pytest
 import tiny
 import torch
 
 from memmlp.evaluation import modes as evaluation
 from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM
-from memmlp.networks.diffusion import TimeEmbedding
 
 CLIP = tiny.clip(40)
 SPARSE = CLIP[None, :, :SPARSE_DIM]
@@ -41,14 +39,6 @@ def test_the_denoiser_learns_from_the_noised_truth_of_the_window():
     assert len(set(time.tolist())) > 20
     assert float(noise.mean()) == pytest.approx(0, abs=0.02)
     assert float(noise.std()) == pytest.approx(1, abs=0.02)
-
-
-def test_time_embedding_is_of_sines_and_cosines():
-    embedding = TimeEmbedding(8)
-    embedding.mlp = torch.nn.Identity()
-    angles = 7 * 10_000 ** -(np.arange(4) / 4)
-    expected = np.concatenate([np.cos(angles), np.sin(angles)])
-    np.testing.assert_allclose(embedding(torch.tensor([7]))[0].numpy(), expected, rtol=1e-5)
 
 
 def test_sampling_draws_nothing():

@@ -1,10 +1,20 @@
 """The schedule of noise and DDIM, computed independently."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
 
-from memmlp.networks.diffusion import Diffusion, cosine_schedule
+from memmlp.networks.diffusion import (
+    AncestralDiffusion,
+    Denoised,
+    Diffusion,
+    TimeEmbedding,
+    cosine_schedule,
+    linear_schedule,
+    measure_surprise,
+)
 
 
 def test_cosine_schedule_is_the_papers():
@@ -49,3 +59,141 @@ def test_a_perfect_denoiser_is_found_again():
     """Whatever the noise and the steps, a denoiser that knows the answer gives it."""
     answer = torch.randn(2, 5)
     torch.testing.assert_close(Diffusion(50, 4).sample(lambda x, t: answer, torch.randn(2, 5)), answer)
+
+
+OPEN = torch.tensor(-9.0), torch.tensor(9.0)
+
+
+def tables(kept: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Coefficients of the clean and of the noisy signal, least and largest variance, by step."""
+    before = np.append(1.0, kept[:-1])
+    added = 1 - kept / before
+    least = added * (1 - before) / (1 - kept)
+    least[0] = least[1]
+    clean = np.sqrt(before) * added / (1 - kept)
+    return clean, np.sqrt(1 - added) * (1 - before) / (1 - kept), least, added
+
+
+def kept(steps: int) -> np.ndarray:
+    """Signal's share of the variance."""
+    return np.cumprod(1 - np.linspace(0.1 / steps, 20 / steps, steps))
+
+
+def test_the_linear_schedule_is_the_papers():
+    np.testing.assert_allclose(linear_schedule(1000).numpy(), kept(1000), rtol=1e-9)
+    assert torch.all(linear_schedule(5).diff() < 0)
+    assert torch.all(linear_schedule(5) > 0)
+
+
+def made(noisy: torch.Tensor, time: torch.Tensor) -> Denoised:
+    """An affine map of the noisy signal and the time."""
+    return Denoised(0.7 * noisy + 0.01 * time.view(-1, 1, 1), 0.1 * noisy - 0.3)
+
+
+@pytest.mark.parametrize("count", [1, 4, 53])
+def test_sampling_is_an_independent_numpy_computation(count):
+    """Estimates are kept within limits but for the last; noise is added but at the end and below time 50."""
+    diffusion, rng = AncestralDiffusion(60, count).double(), np.random.default_rng(0)
+    noise = rng.normal(size=(diffusion.draws, 2, 4, 3))
+    limits = torch.tensor(-1.0), torch.tensor(1.5)
+
+    def step(x: torch.Tensor, index: int) -> tuple[torch.Tensor, torch.Tensor]:
+        times = torch.full((2,), diffusion.times[index])
+        mean, variance = diffusion.step(x, made(x, times), index, limits)
+        return mean, variance.sqrt()
+
+    found = diffusion.sample(step, torch.tensor(noise))
+    times = [60 * k // count - 1 for k in range(1, count + 1)]
+    first, second, least, largest = tables(kept(60)[times]) if count > 1 else (np.ones(1), *np.zeros((3, 1)))
+    x = noise[0]
+    for i, t in reversed(list(enumerate(times))):
+        clean = (x - np.sqrt(1 - kept(60)[t]) * (0.7 * x + 0.01 * t)) / np.sqrt(kept(60)[t])
+        share = (0.1 * x - 0.3 + 1) / 2
+        x = first[i] * (np.clip(clean, -1, 1.5) if i else clean) + second[i] * x
+        if i and t >= 50:
+            x = x + np.sqrt(largest[i] ** share * least[i] ** (1 - share)) * noise[count - i]
+    assert len(noise) == {1: 1, 4: 2, 53: 9}[count]
+    np.testing.assert_allclose(found.numpy(), x, atol=1e-4)
+
+
+def spread_of_samples(count: int, spread: float) -> float:
+    """The spread of a Gaussian's samples of so many steps, by the best denoiser that there is for it."""
+    diffusion = AncestralDiffusion(1000, count).double()
+
+    def step(x: torch.Tensor, index: int) -> tuple[torch.Tensor, torch.Tensor]:
+        signal = diffusion.signal[diffusion.times[index]]
+        best = (1 - signal).sqrt() / (signal * spread**2 + 1 - signal) * x
+        mean, variance = diffusion.step(x, Denoised(best, -torch.ones_like(x)), index, OPEN)
+        return mean, variance.sqrt()
+
+    noise = torch.randn(diffusion.draws, 4000, generator=torch.Generator().manual_seed(0)).double()
+    return float(diffusion.sample(step, noise).std())
+
+
+def test_few_steps_sample_what_many_do():
+    """By means alone, without noise, samples are all alike: their spread is 0.003 of the Gaussian's."""
+    assert 0.3 < spread_of_samples(10, 0.5) < spread_of_samples(1000, 0.5) < 0.5
+
+
+def test_the_share_says_where_a_variance_lies_between_the_least_and_the_largest():
+    diffusion, share = AncestralDiffusion(60, 3).double(), torch.tensor([0.5, -1.0, 1.0]).double()
+    _, variance = diffusion.step(share, Denoised(share, share), 0, OPEN)
+    _, _, least, largest = (table[-1] for table in tables(kept(60)[[19, 39, 59]]))
+    np.testing.assert_allclose(variance, [largest**0.75 * least**0.25, least, largest], rtol=1e-5)
+
+
+def test_the_losses_are_an_independent_numpy_computation():
+    """Beyond the first step the bound is the divergence of two Gaussians, by their densities on a grid."""
+    diffusion, draw = AncestralDiffusion(20, 2).double(), torch.Generator().manual_seed(0)
+    clean, noise = (torch.randn(3, 1, 1, generator=draw).double() for _ in range(2))
+    time = torch.tensor([19, 7, 2])
+    noisy = diffusion.add_noise(clean, time, noise)
+    guess = Denoised(*(part.requires_grad_() for part in made(noisy, time)))
+    error, bound = diffusion.losses(clean, noise, time, guess, OPEN)
+    first, second, least, largest = (table[time][:, None, None] for table in tables(kept(20)))
+    share = (guess.share.detach().numpy() + 1) / 2
+    estimate = first * diffusion.clean(noisy, guess.noise, time).detach().numpy() + second * noisy.numpy()
+    grid = np.linspace(-12, 12, 200_001)
+
+    def density(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
+        return np.exp(-((grid - mean) ** 2) / 2 / variance) / np.sqrt(2 * np.pi * variance)
+
+    true = density(first * clean.numpy() + second * noisy.numpy(), least)
+    found = density(estimate, largest**share * least ** (1 - share))
+    ratio = np.log(np.maximum(true, 1e-300)) - np.log(np.maximum(found, 1e-300))
+    expected = np.trapezoid(true * ratio, grid, axis=-1)
+    assert float(bound.detach()) == pytest.approx(expected.mean() / math.log(2), rel=1e-3)
+    assert float(error.detach()) == pytest.approx(float((noise - guess.noise.detach()).square().mean()))
+    bound.backward()
+    assert guess.noise.grad is None  # the variances alone learn from it
+    assert guess.share.grad.all()
+
+
+def test_at_the_first_step_the_bound_is_the_surprise_of_the_true_signal():
+    diffusion, clean = AncestralDiffusion(20, 2).double(), torch.tensor([[0.3], [0.3]]).double()
+    noise, share = torch.zeros(2, 1).double(), -torch.ones(2, 1).double()
+    for offset in (0.0, 0.5):
+        guess = Denoised(noise + offset, share)
+        _, bound = diffusion.losses(clean, noise, torch.zeros(2).long(), guess, OPEN)
+        signal = float(diffusion.signal[0])
+        mean = 0.3 - offset * math.sqrt(1 - signal) / math.sqrt(signal)
+        log_variance = torch.tensor(tables(kept(20))[2][0]).log()
+        expected = measure_surprise(torch.tensor(0.3), torch.tensor(mean), log_variance, OPEN)
+        assert float(bound) == pytest.approx(float(expected) / math.log(2), rel=1e-3)
+
+
+def test_the_bins_of_a_gaussian_are_all_there_is():
+    """Their chances add up to 1, the outermost of them without end."""
+    limits = torch.tensor(-1.0), torch.tensor(1.0)
+    values = torch.linspace(-1, 1, 256).double()
+    for mean, log_variance in ((0.2, -3.0), (-0.9, -1.0), (1.2, -2.0)):
+        surprise = measure_surprise(values, torch.tensor(mean), torch.tensor(log_variance), limits)
+        assert float((-surprise).exp().sum()) == pytest.approx(1)
+
+
+def test_time_embedding_is_of_sines_and_cosines():
+    embedding = TimeEmbedding(8)
+    embedding.mlp = torch.nn.Identity()
+    angles = 7 * 10_000 ** -(np.arange(4) / 4)
+    expected = np.concatenate([np.cos(angles), np.sin(angles)])
+    np.testing.assert_allclose(embedding(torch.tensor([7]))[0].numpy(), expected, rtol=1e-5)

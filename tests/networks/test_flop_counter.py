@@ -74,19 +74,16 @@ def test_an_lstms_gradients_are_counted():
     assert counter.get_total_flops() == 3 * forward
 
 
-def test_products_without_a_formula_are_told_once(capsys: pytest.CaptureFixture[str]):
+def test_a_warning_names_products_without_a_formula_once(capsys: pytest.CaptureFixture[str]):
     for _ in range(2):
         with counting_flops():
             nn.Bilinear(3, 3, 4)(torch.randn(2, 3), torch.randn(2, 3))
             torch.lgamma(torch.ones(2)), F.interpolate(torch.ones(1, 1, 3), scale_factor=2, mode="linear")
-    assert capsys.readouterr().err == (
-        "memmlp: warning: MACs and FLOPs lack those of _trilinear, for which there is no formula\n"
-    )
+    assert capsys.readouterr().err.count("_trilinear") == 1
 
 
-@pytest.mark.parametrize("name", ["mem_mlp", *tiny.BASELINES])
-def test_every_product_of_the_networks_has_a_formula(name: str, capsys: pytest.CaptureFixture[str]):
-    model = tiny.model() if name == "mem_mlp" else tiny.baseline(name)
-    assert macs(model.eval()) > 0
-    assert macs(streaming(model).eval()) > 0
-    assert capsys.readouterr().err == ""
+def test_every_product_of_the_networks_has_a_formula(capsys: pytest.CaptureFixture[str]):
+    for model in (tiny.model(), *map(tiny.baseline, tiny.BASELINES)):
+        assert macs(model.eval()) > 0
+        assert macs(streaming(model).eval()) > 0
+        assert capsys.readouterr().err == ""

@@ -6,9 +6,6 @@ import tiny
 import torch
 from plain_body import posed
 
-from memmlp.common.errors import InputError
-from memmlp.evaluation.evaluation import Evaluation
-from memmlp.evaluation.ik import NoIK
 from memmlp.motion.body import N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.geometry import forward_kinematics, sixd_to_matrix
 from memmlp.motion.network_coordinates import Heading, World
@@ -16,7 +13,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import manikin
 from memmlp.networks.limb_solver import BASES, ENDS, MIDDLES
 from memmlp.networks.manikin import KEPT, PLACED, PredictedParts, Truth
-from memmlp.networks.streaming import has_stream, streaming
+from memmlp.networks.streaming import has_stream
 
 TRUTH = torch.stack([tiny.clip(7, seed) for seed in (1, 2)]).double()
 SPARSE, MOTION = TRUTH[..., :SPARSE_DIM], TRUTH[..., SPARSE_DIM:]
@@ -193,15 +190,10 @@ def test_the_losses_of_the_parts_have_a_weight(name):
     )
 
 
-def test_offline_it_is_no_stream():
+def test_offline_it_is_not_a_stream():
     model = tiny.baseline("manikin_l", offline=True)
     assert not model.is_stream
     assert not has_stream(model)
-    evaluation = Evaluation(["window"], 4, NoIK(), 0)
-    assert evaluation.report(model, tiny.frames((20,)), "window")["offline"]
-    assert "offline" not in evaluation.report(tiny.baseline("manikin_l"), tiny.frames((20,)), "window")
-    with pytest.raises(InputError, match=r"model\.offline=true"):
-        streaming(model)
     assert tiny.baseline("manikin_l").is_stream
 
 

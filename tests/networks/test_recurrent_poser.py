@@ -1,11 +1,11 @@
 """RecurrentPoser: a stream whatever the calls, its graph, its sizes, its switches."""
 
+import numpy as np
 import onnx
 import pytest
 import tiny
 import torch
 
-from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment, untrained
 from memmlp.config.compose import composed
 from memmlp.deploy.export import export
@@ -15,7 +15,7 @@ from memmlp.evaluation import modes as evaluation
 from memmlp.motion.body import HANDS, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.network_coordinates import Heading
 from memmlp.networks import checkpoint
-from memmlp.networks.recurrent_poser import CELLS, OUTPUTS
+from memmlp.networks.recurrent_poser import CELLS, OUTPUTS, RecurrentCell, scan
 from memmlp.networks.streaming import streaming
 
 CLIP = tiny.clip(24)
@@ -147,28 +147,15 @@ def test_cells_stay_exact_where_layers_are_rounded(cell):
         torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
 
 
-CHANGES = [
-    {"width": 12},
-    {"depth": 1},
-    {"expansion": 1},
-    {"cell": "lstm"},
-    {"cell": "mingru"},
-    {"cell": "lru"},
-    {"output": "global"},
-    {"members": 2},
-]
-
-
-@pytest.mark.parametrize("change", CHANGES, ids=str)
 @torch.no_grad()
-def test_every_knob_changes_the_motion(change):
-    base, other = (evaluation.stream(tiny.recurrent_poser(**c), [CLIP])[0] for c in ({}, change))
-    assert not torch.allclose(base, other, atol=1e-4)
-
-
-def test_a_training_window_is_all_that_a_step_moves_by():
-    model = tiny.recurrent_poser(frames=9)
-    assert (model.frames, model.stride, model.past_frames) == (9, 9, 0)
+def test_every_knob_changes_the_motion():
+    changes = [
+        {"width": 12}, {"depth": 1}, {"expansion": 1}, {"cell": "lstm"}, {"cell": "mingru"}, {"cell": "lru"},
+        {"output": "global"}, {"members": 2},
+    ]  # fmt: skip
+    base, *others = (evaluation.stream(tiny.recurrent_poser(**c), [CLIP])[0] for c in ({}, *changes))
+    for change, other in zip(changes, others, strict=True):
+        assert not torch.allclose(base, other, atol=1e-4), change
 
 
 @pytest.mark.parametrize(
@@ -204,51 +191,91 @@ def test_the_file_is_the_network_and_its_cells_become_int8(tmp_path):
     assert kinds[False] == {onnx.TensorProto.FLOAT}
 
 
-@pytest.mark.parametrize("weighting", ["fixed", "learned"])
-def test_it_sees_the_world_as_the_head_looks_and_weighs_the_terms_of_its_loss(weighting):
-    cfg = composed(["model=recurrent_poser", "profile=tiny", f"loss.weighting={weighting}"])
-    assert (cfg.normalizer.coordinates, cfg.normalizer.z_scores) == ("heading", True)
-    assert (cfg.memory, cfg.predictor, cfg.hand) == (None, None, None)
-    loss = build_experiment(cfg).training.loss(frozenset({"rotation"}))
-    begun = {name: value for name, value in cfg.loss.items() if name in loss.weighting.weights()}
-    assert loss.weighting.weights() == pytest.approx(begun)
-    assert set(begun) == {
-        "orientation", "rotation", "angle", "world_position", "velocity", "velocity_3", "velocity_5", "jerk"
-    }  # fmt: skip
-    assert bool(list(loss.weighting.parameters())) == (weighting == "learned")
+X = torch.randn(2, 9, 4, generator=torch.Generator().manual_seed(1)).double()
 
 
-REFUSED = [
-    (["model.cell=rnn"], "model.cell=rnn"),
-    (["model.expansion=0"], "model.expansion=0"),
-    (["memory=none"], "memory"),
-    (["rollout=own_predictions"], "rollout"),
-    (["rollout=streams", "rollout.streams=7"], "rollout.streams=7"),
-    (["loss.weighting=free"], "loss.weighting=free"),
-    (["loss.lr=0"], "loss.lr=0"),
-]
+def cell(name: str) -> tuple[RecurrentCell, torch.Tensor]:
+    """A cell of width 4 with random weights, and a random state."""
+    torch.manual_seed(2)
+    made = CELLS[name](4).double()
+    return made, torch.randn(2, made.size).double()
 
 
-@pytest.mark.parametrize(("overrides", "word"), REFUSED, ids=[" ".join(words) for words, _ in REFUSED])
-def test_what_makes_no_sense_is_refused_in_one_line(overrides, word):
-    with pytest.raises(InputError) as refusal:
-        composed(["model=recurrent_poser", "profile=tiny", *overrides])
-    assert word in str(refusal.value)
-    assert "\n" not in str(refusal.value)
+def sigmoid(x: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(-x))
 
 
-def test_its_state_may_be_carried_through_training():
-    cfg = composed(["model=recurrent_poser", "profile=tiny", "rollout=streams"])
-    assert build_experiment(cfg).training.rollout.streams == 16
+@pytest.mark.parametrize("name", CELLS)
+@torch.no_grad()
+def test_steps_are_the_sequence_however_it_is_cut(name):
+    made, state = cell(name)
+    whole, last = made(X, state)
+    first, between = made(X[:, :5], state)
+    second, end = made(X[:, 5:], between)
+    torch.testing.assert_close(torch.cat([first, second], 1), whole, atol=1e-12, rtol=0)
+    stepped = []
+    for frame in X.unbind(1):
+        out, state = made.step(frame, state)
+        stepped.append(out)
+    torch.testing.assert_close(torch.stack(stepped, 1), whole, atol=1e-12, rtol=0)
+    for found in (end, state):
+        torch.testing.assert_close(found, last, atol=1e-12, rtol=0)
 
 
-def test_each_cell_is_a_run_of_its_own():
-    def identity(*words: str) -> str:
-        return build_experiment(composed(["model=recurrent_poser", "profile=tiny", *words])).identity("d").id
+@pytest.mark.parametrize("name", CELLS)
+@torch.no_grad()
+def test_a_state_counts_and_each_frame_does(name):
+    made, state = cell(name)
+    base = made(X, state)[0]
+    assert (made(X, state + 1)[0] - base).abs().amax(-1).min() > 1e-6
+    later = X.clone()
+    later[:, 4] += 1
+    changed = (made(later, state)[0] - base).abs().amax((0, 2))
+    assert changed[:4].max() == 0
+    assert changed[4:].min() > 1e-6
 
-    ids = [identity(f"model.cell={cell}") for cell in CELLS]
-    learned = "loss.weighting=learned"
-    ids += [identity(learned), identity(learned, "loss.lr=0.1"), identity("rollout=streams")]
-    ids += [identity("data.mirror=true")]
-    assert len(set(ids)) == len(ids)
-    assert identity("loss.lr=0.1") == identity()
+
+@pytest.mark.parametrize("length", [1, 2, 7, 8])
+def test_the_scan_is_the_recurrence(length):
+    random = np.random.default_rng(0)
+    keep, new, state = (
+        random.random((2, length, 3)),
+        random.normal(size=(2, length, 3)),
+        random.normal(size=(2, 3)),
+    )
+    found = scan(*map(torch.tensor, (keep, new, state)))
+    for t in range(length):
+        state = keep[:, t] * state + new[:, t]
+        np.testing.assert_allclose(found[:, t], state, atol=1e-12)
+
+
+@torch.no_grad()
+def test_a_minimal_gru_is_its_equation():
+    """h = (1 - z) h + z W x with z = sigmoid(V x)."""
+    made, state = cell("mingru")
+    found, h = made(X, state)[0], state.numpy()
+    (gate, new), (gate_bias, new_bias) = (
+        np.split(part.numpy(), 2) for part in (made.linear.weight, made.linear.bias)
+    )
+    for t, x in enumerate(X.numpy().swapaxes(0, 1)):
+        z = sigmoid(x @ gate.T + gate_bias)
+        h = (1 - z) * h + z * (x @ new.T + new_bias)
+        np.testing.assert_allclose(found[:, t], h, atol=1e-12)
+
+
+@torch.no_grad()
+def test_a_linear_recurrent_unit_is_its_equation():
+    """h = a h + sqrt(1 - a^2) i x with a = exp(-softplus(decay) r), gates r and i by sigmoids."""
+    made, state = cell("lru")
+    found, h = made(X, state)[0], state.numpy()
+    weights, biases = (np.split(part.numpy(), 3) for part in (made.linear.weight, made.linear.bias))
+    for t, x in enumerate(X.numpy().swapaxes(0, 1)):
+        r, i, new = (x @ weight.T + bias for weight, bias in zip(weights, biases, strict=True))
+        a = np.exp(-np.log1p(np.exp(made.decay.numpy())) * sigmoid(r))
+        h = a * h + np.sqrt(1 - a**2) * sigmoid(i) * new
+        np.testing.assert_allclose(found[:, t], h, atol=1e-9)
+
+
+def test_a_fresh_linear_recurrent_unit_keeps_a_little_or_nearly_all():
+    kept = torch.exp(-torch.nn.functional.softplus(CELLS["lru"](5).decay))
+    torch.testing.assert_close(kept, torch.linspace(0.9, 0.999, 5))

@@ -22,7 +22,7 @@ from memmlp.networks.motion_model import StreamingGraph
 from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, NoCodesMemory
 from memmlp.networks.predictor import RotationOnly, TwoBranch, TwoBranchMemory
 from memmlp.networks.recurrent_memory import GRUMemory, LSTMMemory
-from memmlp.networks.streaming import streaming
+from memmlp.networks.streaming import has_stream, streaming
 
 MEMORIES = [
     (NoMemory, {}),
@@ -49,12 +49,16 @@ def largest_difference(model, sparse: torch.Tensor) -> float:
     return worst
 
 
-@pytest.mark.parametrize("predictor", [TwoBranch, RotationOnly, TwoBranchMemory])
-@pytest.mark.parametrize(("kind", "changes"), MEMORIES)
+@pytest.mark.parametrize(
+    ("kind", "changes", "predictor"),
+    [
+        *((kind, changes, TwoBranch) for kind, changes in MEMORIES),
+        (NoMemory, {}, RotationOnly), (CodeMemory, {}, RotationOnly), (CodeMemory, {}, TwoBranchMemory),
+        (NoCodesMemory, {"fusion": "plain"}, TwoBranchMemory), (LSTMMemory, {}, TwoBranchMemory),
+    ],
+)  # fmt: skip
 @torch.no_grad()
 def test_the_stream_is_the_network(kind, changes, predictor):
-    if kind is NoMemory and predictor is TwoBranchMemory:
-        return
     model = tiny.model(kind, predictor, **changes).double()
     assert largest_difference(model, CLIP[:, :TWICE].double()) < 1e-11
 
@@ -99,22 +103,31 @@ def test_the_network_itself_stays_as_it_is():
     assert any(parameter.requires_grad for parameter in model.parameters())
 
 
-@pytest.mark.parametrize("name", ["mem_mlp", *tiny.BASELINES])
 @torch.no_grad()
-def test_less_work(name):
+def test_less_work():
     """Less than for a whole window; the same where there is no window."""
-    model = tiny.model() if name == "mem_mlp" else tiny.baseline(name)
-    counts = []
-    for network in (model, streaming(model)):
-        with counting_flops() as counter:
-            network.advance(CLIP[:, :1], network.initial_state(1), 1)
-        counts.append(counter.get_total_flops())
-    assert counts[1] == counts[0] if name in tiny.WINDOWLESS else counts[1] < counts[0]
+    for name in ("mem_mlp", *tiny.BASELINES):
+        model = tiny.model() if name == "mem_mlp" else tiny.baseline(name)
+        counts = []
+        for network in (model, streaming(model)):
+            with counting_flops() as counter:
+                network.advance(CLIP[:, :1], network.initial_state(1), 1)
+            counts.append(counter.get_total_flops())
+        assert counts[1] == counts[0] if name in tiny.WINDOWLESS else counts[1] < counts[0], name
+
+
+class Different(type(tiny.baseline("avatar_poser"))):
+    """A network that extends another one, and inherits its graph."""
 
 
 def test_what_has_no_stream_is_refused():
     with pytest.raises(InputError, match=r"memory\.history=latest"):
         streaming(tiny.model(CodeMemory, history="latest"))
+    model = tiny.baseline("avatar_poser")
+    model.__class__ = Different
+    assert not has_stream(model)
+    with pytest.raises(InputError, match=r"export\.graph=streaming"):
+        streaming(model)
 
 
 @pytest.mark.slow
