@@ -11,8 +11,8 @@ import tiny
 from golden_numbers import Numbers, summary
 
 from memmlp.deploy import latency
-from memmlp.deploy.deployment import lower
 from memmlp.deploy.export import export
+from memmlp.deploy.lower_precision import lower
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import streamed
 from memmlp.networks.streaming import streaming

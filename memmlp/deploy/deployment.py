@@ -1,4 +1,4 @@
-"""How a trained network is deployed: its live step as ONNX, checked and timed, and int8 or fp16 if asked."""
+"""Deployment of a trained network: its live step as ONNX, checked and timed, also in lower precision."""
 
 from __future__ import annotations
 
@@ -12,13 +12,9 @@ from torch import Tensor
 
 from memmlp.common.progress import tell
 from memmlp.deploy import latency
-from memmlp.deploy.block_quantization import quantise_blocks
-from memmlp.deploy.half_precision import halve
-from memmlp.deploy.network_alone import network_alone
+from memmlp.deploy.lower_precision import compare_accuracy, lower
 from memmlp.deploy.opsets import NATIVE
-from memmlp.deploy.parity import TOLERANCE, clips_to_check, frames_of_full_past, parity, tolerated
-from memmlp.deploy.precision_cost import compared
-from memmlp.deploy.quantization import quantise
+from memmlp.deploy.parity import TOLERANCE, clips_to_check, differences, frames_of_full_past, matches
 from memmlp.networks.motion_model import MotionModel, StreamingGraph
 from memmlp.networks.streaming import has_stream, streaming
 from memmlp.runs.deployment_folder import DeploymentFolder
@@ -83,8 +79,9 @@ class Deployment:
         (clip,) = clips_to_check(model, test)
         if len(clip) < frames_of_full_past(model):
             tell(f"export: the longest test clip has {len(clip)} frames, too few to compare with a full past")
-        worst = parity(model, deployed.onnx, clip)
-        if not tolerated(model, deployed.onnx, clip, worst):
+        apart = differences(model, deployed.onnx, clip)
+        worst = float(apart.max())
+        if not matches(model, deployed.onnx, clip, apart):
             raise RuntimeError(
                 f"{deployed.onnx}: ONNX Runtime differs from torch by {worst:.2e} (> {TOLERANCE:.0e}), "
                 "which is more than rounding explains"
@@ -95,56 +92,25 @@ class Deployment:
             "onnx_parity": worst,
             "parity_frames": len(clip),
         }
-        if self.precision != "fp32":
-            if isinstance(network, StreamingGraph):
-                record[self.precision] = self._less_precise(network, deployed, train, test)
-            else:
-                tell(f"export: no file in {self.precision}, as {type(model).__name__} has no streaming graph")
+        if isinstance(network, StreamingGraph) and self.precision != "fp32":
+            path = deployed.file(self.precision)
+            lower(self.precision, deployed.onnx, path, network, train)
+            cost = compare_accuracy(deployed.onnx, path, self.precision, network.normalizer, test)
+            times = latency.measure_step(path, self.latency_steps)
+            record[self.precision] = {**cost, **times, "onnx_bytes": path.stat().st_size}
+        elif self.precision != "fp32":
+            tell(f"export: no file in {self.precision}; {type(model).__name__} has no streaming graph")
         return record
 
     def times(self, model: MotionModel, path: Path) -> dict[str, float]:
-        """Time a step of a network's exported file, and of the network alone if that is asked for."""
-        record = latency.measure_step(path, self.latency_steps)
-        return record | self._alone(model) if self.alone else record
-
-    def _alone(self, model: MotionModel) -> dict[str, float]:
-        """Return the times of the network alone, from features to its own outputs; its file is deleted."""
+        """Time a step of a network's exported file, and of the network alone if that is requested."""
         from memmlp.deploy.export import export
 
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "alone.onnx"
-            export(network_alone(model), path, "", self.opset)
-            times = latency.measure_step(path, self.latency_steps)
-        return {f"alone_{name}": value for name, value in times.items()}
-
-    def _less_precise(
-        self,
-        network: StreamingGraph,
-        deployed: DeploymentFolder,
-        train: Sequence[Tensor],
-        test: Sequence[Tensor],
-    ) -> dict[str, Any]:
-        """Write the file with lower precision beside the other; return its accuracy, times and size."""
-        path = deployed.file(self.precision)
-        lower(self.precision, deployed.onnx, path, network, train)
-        cost = compared(deployed.onnx, path, self.precision, network.normalizer, test)
-        measured = latency.measure_step(path, self.latency_steps)
-        return {**cost, **measured, "onnx_bytes": path.stat().st_size}
-
-
-def lower(precision: str, source: Path, path: Path, network: StreamingGraph, train: Sequence[Tensor]) -> None:
-    """Write a file with lower precision.
-
-    Args:
-        precision: "int8", "int8_blocks" or "fp16".
-        source: the float32 ONNX file of a streaming graph.
-        path: the file to write.
-        network: the graph, which says which of its modules stay in float32.
-        train: training clips (N, 252), to calibrate int8.
-    """
-    if precision == "int8":
-        quantise(source, path, network.float32_modules, train)
-    elif precision == "int8_blocks":
-        quantise_blocks(source, path, network.float32_modules)
-    else:
-        halve(source, path, network.float32_modules)
+        record = latency.measure_step(path, self.latency_steps)
+        if self.alone:
+            with tempfile.TemporaryDirectory() as folder:
+                alone = Path(folder) / "alone.onnx"
+                export(latency.strip_conversions(model), alone, "", self.opset)
+                times = latency.measure_step(alone, self.latency_steps)
+            record |= {f"alone_{name}": value for name, value in times.items()}
+        return record

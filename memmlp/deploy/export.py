@@ -24,14 +24,14 @@ from torch import Tensor, nn
 
 from memmlp import __version__
 from memmlp.common.lease import publish, temporary
-from memmlp.deploy.opsets import NATIVE, converted
+from memmlp.deploy.opsets import NATIVE, convert
 from memmlp.deploy.parity import deterministic
 from memmlp.motion.body import FEATURES, FPS, JOINTS, N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.networks.motion_model import MotionModel, StreamingGraph
 
 
 class OneStep(nn.Module):
-    """One step of the live stream with flat inputs and outputs, as ONNX wants them."""
+    """One step of the live stream with flat inputs and outputs, which ONNX needs."""
 
     def __init__(self, model: MotionModel | StreamingGraph):
         super().__init__()
@@ -89,7 +89,7 @@ def save(
     Raises:
         InputError: for an opset to which the step can't be converted.
     """
-    with silenced(), deterministic(step):
+    with silence_exporter(), deterministic(step):
         program = torch.onnx.export(
             step,
             arguments,
@@ -102,7 +102,7 @@ def save(
         )
         assert program is not None
         simplify(program.model)
-    graph = converted(program.model_proto, opset)
+    graph = convert(program.model_proto, opset)
     onnx.helper.set_model_props(graph, meta)
     unfinished = temporary(path)
     try:
@@ -113,7 +113,7 @@ def save(
 
 
 @contextmanager
-def silenced() -> Iterator[None]:
+def silence_exporter() -> Iterator[None]:
     """Keep the exporter's warnings from users, who can do nothing about them."""
     loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnx_ir", "onnxscript")]
     levels = [logger.level for logger in loggers]
@@ -128,6 +128,29 @@ def silenced() -> Iterator[None]:
             logger.setLevel(level)
 
 
+def simplify(model: onnx_ir.Model) -> None:
+    """Fold a graph's constants, and remove unused and duplicate parts and the exporter's notes.
+
+    The exporter's own optimiser does the same, but also tries its rewriting rules, which find next to nothing
+    in these graphs and take up to half of an export's time. The notes hold paths of the exporting machine
+    and lines of source code, and were more than half of a small network's file.
+    """
+    common.InlinePass()(model)
+    for node in model.graph:
+        # Some layers are a transpose and a product. Folding renames the transposed weight; its name has to
+        # begin with the weight's, by which lower precisions find layers.
+        weight = node.inputs[0] if node.op_type == "Transpose" else None
+        if weight and weight.is_initializer() and str(weight.name).endswith("weight"):
+            node.outputs[0].name = f"{weight.name}.{node.outputs[0].name}"
+    fold_constants(model, onnx_shape_inference=True)
+    SIMPLER(model)
+    graph = model.graph
+    graph.metadata_props.clear()
+    made = (value for node in graph for value in node.outputs)
+    for noted in (*graph, *made, *graph.inputs, *graph.outputs, *graph.initializers.values()):
+        noted.metadata_props.clear()
+
+
 SIMPLER = onnx_ir.passes.Sequential(
     common.RemoveUnusedNodesPass(),
     common.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
@@ -136,48 +159,11 @@ SIMPLER = onnx_ir.passes.Sequential(
     common.OutputFixPass(),
     common.NameFixPass(),
 )
-"""What is done to a graph once its constants are folded."""
-
-
-def simplify(model: onnx_ir.Model) -> None:
-    """Fold a graph's constants, and remove what is unused or a duplicate.
-
-    The exporter's own optimiser does the same, but also tries its rewriting rules, which find next to nothing
-    in these graphs and take up to half of an export's time.
-    """
-    common.InlinePass()(model)
-    name_transposed(model.graph)
-    fold_constants(model, onnx_shape_inference=True)
-    SIMPLER(model)
-    remove_notes(model.graph)
-
-
-def name_transposed(graph: onnx_ir.Graph) -> None:
-    """Begin the name of each transposed weight with the weight's, by which lower precisions find layers.
-
-    Some layers are exported as a transpose and a product. The transpose is folded to a constant, whose name
-    would otherwise say nothing.
-    """
-    for node in graph:
-        weight = node.inputs[0] if node.op_type == "Transpose" else None
-        if weight and weight.is_initializer() and str(weight.name).endswith("weight"):
-            node.outputs[0].name = f"{weight.name}.{node.outputs[0].name}"
-
-
-def remove_notes(graph: onnx_ir.Graph) -> None:
-    """Remove what the exporter notes about the origin of each node and value.
-
-    The notes hold paths of the machine that exports, and lines of the source code; a file is given to others.
-    Of a small network's file they were more than half.
-    """
-    graph.metadata_props.clear()
-    made = (value for node in graph for value in node.outputs)
-    for noted in (*graph, *made, *graph.inputs, *graph.outputs, *graph.initializers.values()):
-        noted.metadata_props.clear()
+"""The passes that simplify a graph once its constants are folded."""
 
 
 def metadata(model: MotionModel | StreamingGraph, run_id: str) -> dict[str, str]:
-    """Return the metadata that tell a program how to drive the file."""
+    """Return the metadata by which a program drives the file."""
     return {
         "joints": json.dumps(JOINTS),
         "parents": json.dumps(PARENTS),

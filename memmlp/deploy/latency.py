@@ -1,11 +1,9 @@
-"""How long one streaming step takes on a CPU, and how many operations it needs."""
+"""The time of a streaming step on a CPU, and its number of operations."""
 
 from __future__ import annotations
 
-import json
-import tempfile
+import copy
 import time
-from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -14,11 +12,14 @@ import numpy as np
 import onnx
 import onnxruntime
 import torch
+import torch.nn.functional as F
 from onnx import TensorProto, helper
+from torch import Tensor
 
 from memmlp.common.thread_core_share import CoreClock
 from memmlp.deploy.onnx_stream import OnnxStream
-from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.body import MOTION_DIM, N_JOINTS, POSITION, ROTATION, SPARSE_DIM
+from memmlp.motion.normalizer import Change, Normalizer
 from memmlp.networks.flop_counter import counting_flops
 from memmlp.networks.motion_model import MotionModel, StreamingGraph
 from memmlp.networks.vqvae import EMACodebook
@@ -26,6 +27,7 @@ from memmlp.networks.vqvae import EMACodebook
 WARM_UP = 30  # steps before the timed ones
 SETTLING = 3  # untimed steps of a file at the start of each round
 Key = TypeVar("Key", bound=Hashable)
+Model = TypeVar("Model", bound=MotionModel)
 YARDSTICK_SHAPE = (41, 512, 8)  # rows, width, layers: 86 M multiply-adds of plain matrix products
 
 
@@ -115,36 +117,13 @@ def in_turn(keys: Iterable[Key], rounds: int, time_round: Callable[[Key], np.nda
     return {key: InTurn(np.array(seconds[key]), np.array(shares[key])) for key in seconds}
 
 
-def profiled(path: Path, steps: int = 100) -> list[tuple[str, str, float, float]]:
-    """Measure where a step's time goes, by ONNX Runtime's own profile.
-
-    The profile adds one or two microseconds to each operation.
-
-    Returns:
-        For each kind of operation its name, the shape of its first input, how often it runs in a step, and
-        the median microseconds of one run; the costliest kind first.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        stream = OnnxStream(path, profile=Path(folder) / "profile")
-        for _ in range(WARM_UP + steps):
-            stream.step(np.zeros((1, SPARSE_DIM), np.float32))
-        events = json.loads(Path(stream.session.end_profiling()).read_text())
-    found: dict[tuple[str, str], list[float]] = defaultdict(list)
-    for event in events:
-        if event.get("cat") == "Node" and event["name"].endswith("kernel_time"):
-            shapes = [next(iter(shape.values())) for shape in event["args"].get("input_type_shape", [])]
-            found[event["args"]["op_name"], str(shapes[0]) if shapes else ""].append(event["dur"])
-    rows = [(*key, len(us) / (WARM_UP + steps), float(np.median(us))) for key, us in found.items()]
-    return sorted(rows, key=lambda row: -row[2] * row[3])
-
-
 def size(model: MotionModel, step: MotionModel | StreamingGraph, path: Path) -> dict[str, Any]:
     """Measure a network: its parameters, MACs and FLOPs, the MACs of its exported step, the file's bytes.
 
     "parameters" are those that training changes; "parameters_with_vqvae" are all, with frozen ones and
     code-vectors. "macs" and "flops" are the network's, which papers count; "step_macs" are those of the
-    exported graph.
-    Only matrix products are counted; a FLOP is one multiplication or addition, a MAC is one of each.
+    exported graph. Only matrix products are counted; a FLOP is one multiplication or addition, a MAC is one
+    of each.
 
     Args:
         model: the network as it was trained.
@@ -152,19 +131,16 @@ def size(model: MotionModel, step: MotionModel | StreamingGraph, path: Path) -> 
         path: the exported file.
     """
     multiplied = macs(model.cpu().eval())
+    books = [part for part in model.modules() if isinstance(part, EMACodebook)]
+    running_means = sum(book.vectors.numel() for book in books)  # learned, but not by gradients
     return {
         "parameters": model.count_parameters(),
-        "parameters_with_vqvae": sum(p.numel() for p in model.parameters()) + running_means(model),
+        "parameters_with_vqvae": sum(p.numel() for p in model.parameters()) + running_means,
         "macs": multiplied,
         "flops": 2 * multiplied,
         "step_macs": macs(step.cpu().eval()),
         "onnx_bytes": path.stat().st_size,
     }
-
-
-def running_means(model: MotionModel) -> int:
-    """Count the numbers of code-vectors that are learned as running means, and so are no parameters."""
-    return sum(part.vectors.numel() for part in model.modules() if isinstance(part, EMACodebook))
 
 
 @torch.no_grad()
@@ -210,3 +186,49 @@ def _milliseconds(prefix: str, seconds: list[float]) -> dict[str, float]:
         f"{prefix}median_ms": 1000 * float(np.median(seconds)),
         f"{prefix}p95_ms": 1000 * float(np.percentile(seconds, 95)),
     }
+
+
+class NoConversion(Normalizer):
+    """A normalizer that changes nothing: inputs are features already, outputs stay in network space."""
+
+    def encode_sparse(self, sparse: Tensor, origin: Tensor) -> Tensor:
+        """Return the inputs (..., 54) unchanged."""
+        return sparse
+
+    def encode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
+        """Return the motion (..., 198) unchanged."""
+        return motion
+
+    def decode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
+        """Return the motion (..., 198) unchanged."""
+        return motion
+
+    def rotations_out(self, rotations: Tensor, origin: Tensor) -> Tensor:
+        """Return the rotations (..., 6 n) unchanged."""
+        return rotations
+
+    def posed(self, rotation: Tensor, sparse: Tensor) -> Tensor:
+        """Return the rotations (..., 132) as motion (..., 198) whose positions are zeros."""
+        return F.pad(rotation, (0, MOTION_DIM - ROTATION.stop))
+
+    def posed_in_world(self, rotations: Tensor, sparse: Tensor, change: Change | None = None) -> Tensor:
+        """Return the rotations (..., 132) as motion (..., 198) whose positions are zeros."""
+        return self.posed(rotations, sparse)
+
+    def pose(self, motion: Tensor, sparse: Tensor) -> Tensor:
+        """Return zeros (..., 22, 3) in place of joint positions."""
+        return torch.zeros_like(motion[..., POSITION]).unflatten(-1, (N_JOINTS, 3))
+
+
+def strip_conversions(model: Model) -> Model:
+    """Copy a network without the conversions before and after it and without its forward kinematics.
+
+    Papers time this: from features to the network's own outputs. Computations with joints between the
+    network's layers (AvatarJLM's tokens, MANIKIN's limbs) stay. The copy is only good for timing.
+    """
+    made = copy.deepcopy(model)
+    for module in list(made.modules()):
+        for name, child in module.named_children():
+            if isinstance(child, Normalizer):
+                setattr(module, name, NoConversion(child.coordinates, child.rest, child.mean, child.std))
+    return made

@@ -21,7 +21,6 @@ class OnnxStream:
 
     Args:
         path: the ONNX file.
-        profile: start of the path to which ONNX Runtime writes its profile; None for no profile.
 
     Attributes:
         inputs: arrays of the other inputs, to be written before a step.
@@ -32,32 +31,36 @@ class OnnxStream:
             exported step.
     """
 
-    def __init__(self, path: Path, profile: Path | None = None):
+    def __init__(self, path: Path):
         self.path = path
-        self.session = open_session(path, profile)
-        self._check()
-        given = {i.name: np.zeros(i.shape, np.float32) for i in self.session.get_inputs()}
-        self.inputs = {name: array for name, array in given.items() if not name.startswith(STATE)}
-        self._state = {name: array for name, array in given.items() if name.startswith(STATE)}
-        self._other = {name: np.zeros_like(array) for name, array in self._state.items()}
-        made = {o.name: o.shape for o in self.session.get_outputs() if not o.name.endswith(NEXT)}
-        self.outputs = {name: np.zeros(shape, np.float32) for name, shape in made.items()}
-        self._binding = self._bound(self._state, self._other)
-        self._other_binding = self._bound(self._other, self._state)
-
-    def _check(self) -> None:
-        """Raise InputError if the file's inputs and outputs are not those of an exported step."""
-        inputs = {i.name: i.shape for i in self.session.get_inputs()}
-        outputs = {o.name: o.shape for o in self.session.get_outputs()}
+        self.session = open_session(path)
         ends = [*self.session.get_inputs(), *self.session.get_outputs()]
-        arrays = all(e.type == "tensor(float)" and all(isinstance(n, int) for n in e.shape) for e in ends)
-        states = {f"{name}{NEXT}": shape for name, shape in inputs.items() if name.startswith(STATE)}
-        if not arrays or any(outputs.get(name) != shape for name, shape in states.items()):
-            raise InputError(f"{self.path}: no network of memmlp's; allowed is what memmlp export writes")
+        given = {i.name: i.shape for i in self.session.get_inputs()}
+        made = {o.name: o.shape for o in self.session.get_outputs()}
+        states = {name: shape for name, shape in given.items() if name.startswith(STATE)}
+        floats = all(e.type == "tensor(float)" and all(isinstance(n, int) for n in e.shape) for e in ends)
+        if not floats or any(made.get(name + NEXT) != shape for name, shape in states.items()):
+            raise InputError(f"{path}: is not a network of memmlp; expected a file that memmlp export writes")
+        self.inputs = {name: np.zeros(s, np.float32) for name, s in given.items() if name not in states}
+        self._state = {name: np.zeros(shape, np.float32) for name, shape in states.items()}
+        self._other = {name: np.zeros_like(array) for name, array in self._state.items()}
+        self.outputs = {n: np.zeros(s, np.float32) for n, s in made.items() if not n.endswith(NEXT)}
+        self._binding = self._bind(self._state, self._other)
+        self._other_binding = self._bind(self._other, self._state)
+
+    def _bind(self, old: Arrays, new: Arrays) -> onnxruntime.IOBinding:
+        """Bind a step that reads the state from one set of arrays and writes it to the other."""
+        binding = self.session.io_binding()
+        for name, array in {**self.inputs, **old}.items():
+            binding.bind_input(name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
+        following = {name + NEXT: array for name, array in new.items()}
+        for name, array in {**self.outputs, **following}.items():
+            binding.bind_output(name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
+        return binding
 
     @property
     def state(self) -> Arrays:
-        """A copy of the present state."""
+        """A copy of the current state."""
         return {name: array.copy() for name, array in self._state.items()}
 
     def reset(self) -> None:
@@ -87,37 +90,26 @@ class OnnxStream:
         self.advance()
         return [array.copy() for array in self.outputs.values()]
 
-    def _bound(self, old: Arrays, new: Arrays) -> onnxruntime.IOBinding:
-        """Bind a step that reads the state from one set of arrays and writes it to the other."""
-        binding = self.session.io_binding()
-        for name, array in {**self.inputs, **old}.items():
-            binding.bind_input(name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
-        following = {name + NEXT: array for name, array in new.items()}
-        for name, array in {**self.outputs, **following}.items():
-            binding.bind_output(name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
-        return binding
-
 
 def check_file(path: Path) -> None:
     """Raise InputError if there is no such file."""
     if not path.is_file():
-        raise InputError(f"{path}: no such file; allowed: what memmlp export writes, or a run's folder")
+        raise InputError(
+            f"{path}: no such file; expected a file that memmlp export writes, or a run's folder"
+        )
 
 
-def open_session(path: Path, profile: Path | None = None) -> onnxruntime.InferenceSession:
+def open_session(path: Path) -> onnxruntime.InferenceSession:
     """Open an ONNX file in ONNX Runtime on one thread.
 
     Raises:
-        InputError: if there is no such file, or it is no ONNX file that runs here.
+        InputError: if there is no such file, or ONNX Runtime cannot run it.
     """
     check_file(path)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
-    if profile is not None:
-        options.enable_profiling, options.profile_file_prefix = True, str(profile)
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # ONNX Runtime's own exceptions have no common base class
-        raise InputError(
-            f"{path}: no ONNX file that runs here ({' '.join(str(error).split())[:120]})"
-        ) from error
+        reason = " ".join(str(error).split())[:120]
+        raise InputError(f"{path}: is not an ONNX file that runs here ({reason})") from error

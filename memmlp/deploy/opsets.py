@@ -1,33 +1,65 @@
-"""Conversion of exported graphs to other operator sets: older ones for older engines, newer ones on demand.
+"""Conversion of exported graphs to other ONNX operator sets: older ones for older engines, newer on demand.
 
-torch's exporter writes opset 18. Newer sets are made by onnx's own converter. That converter cannot go down
-for the operators that these graphs have, so this module does it: the few operators with another form in the
-older opset are rewritten, and a graph with any other operator that differs is refused.
+torch's exporter writes opset 18. onnx's own converter makes newer sets. It cannot go down for the operators
+of these graphs, so this module does: it rewrites the few operators that have another form in the older opset,
+and rejects a graph with any other operator that differs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import onnx
-from onnx import ModelProto, NodeProto, helper, version_converter
+from onnx import GraphProto, ModelProto, NodeProto, helper, numpy_helper, version_converter
 
 from memmlp.common.errors import InputError
-from memmlp.deploy.graph_constants import Constants
 
 NATIVE = 18
 """The opset that torch's exporter writes."""
 
 OPSETS = range(15, 27)
-"""The opsets that a graph can be brought to; ONNX Runtime 1.31 reads no newer one."""
+"""The opsets to which a graph can be converted; ONNX Runtime 1.31 does not read newer ones."""
 
 WIDENED = ("Identity", "LeakyRelu", "Where")
-"""Operators whose newer versions only take more types of numbers."""
+"""Operators whose newer versions only take more number types."""
 
 
-def converted(model: ModelProto, opset: int) -> ModelProto:
+class Constants:
+    """The constants of a graph; new ones can be added."""
+
+    def __init__(self, graph: GraphProto):
+        self.graph = graph
+        self.known = {tensor.name: tensor for tensor in graph.initializer}
+
+    def __contains__(self, name: str) -> bool:
+        """Return whether a constant has that name."""
+        return name in self.known
+
+    def value(self, name: str) -> np.ndarray:
+        """Return the value of a constant."""
+        return numpy_helper.to_array(self.known[name])
+
+    def add(self, name: str, value: np.ndarray) -> str:
+        """Add a constant unless one has that name, and return its name."""
+        if name not in self.known:
+            self.graph.initializer.append(numpy_helper.from_array(value, name))
+            self.known[name] = self.graph.initializer[-1]
+        return name
+
+    def replace_nodes(self, nodes: list[NodeProto]) -> None:
+        """Replace the graph's nodes, and remove the constants that none of them uses."""
+        del self.graph.node[:]
+        self.graph.node.extend(nodes)
+        used = {name for node in nodes for name in node.input}
+        used |= {output.name for output in self.graph.output}
+        kept = [tensor for tensor in self.graph.initializer if tensor.name in used]
+        del self.graph.initializer[:]
+        self.graph.initializer.extend(kept)
+
+
+def convert(model: ModelProto, opset: int) -> ModelProto:
     """Return a graph of opset 18 in another opset; it computes the same.
 
     Raises:
@@ -35,79 +67,50 @@ def converted(model: ModelProto, opset: int) -> ModelProto:
     """
     newest = min(OPSETS[-1], onnx.defs.onnx_opset_version())
     if not OPSETS[0] <= opset <= newest:
-        raise InputError(f"opset {opset}: allowed is {OPSETS[0]} to {newest}")
-    if opset < NATIVE:
-        return _lowered(model, opset)
+        raise InputError(f"opset={opset}: must be {OPSETS[0]} to {newest}")
     if opset > NATIVE:
         model = version_converter.convert_version(model, opset)
-        needed = helper.find_min_ir_version_for(model.opset_import)
-        model.ir_version = max(model.ir_version, needed)
-    return model
+        model.ir_version = max(model.ir_version, helper.find_min_ir_version_for(model.opset_import))
+    if opset >= NATIVE:
+        return model
+    lowered = ModelProto()
+    lowered.CopyFrom(model)
+    constants = Constants(lowered.graph)
+    constants.replace_nodes([node for old in model.graph.node for node in _rewrite(old, opset, constants)])
+    del lowered.opset_import[:]
+    lowered.opset_import.append(helper.make_opsetid("", opset))
+    lowered.ir_version = helper.find_min_ir_version_for(lowered.opset_import)
+    return lowered
 
 
-def _lowered(model: ModelProto, opset: int) -> ModelProto:
-    """Return a graph of opset 18 in an older opset."""
-    made = ModelProto()
-    made.CopyFrom(model)
-    graph, constants = made.graph, Constants(made.graph)
-    nodes = [node for old in model.graph.node for node in _rewritten(old, opset, constants)]
-    del graph.node[:]
-    graph.node.extend(nodes)
-    del made.opset_import[:]
-    made.opset_import.append(helper.make_opsetid("", opset))
-    made.ir_version = helper.find_min_ir_version_for(made.opset_import)
-    constants.remove_unused()
-    return made
-
-
-Rewriting = Callable[[NodeProto, Constants], Iterator[NodeProto]]
-
-
-def _rewritten(node: NodeProto, opset: int, constants: Constants) -> Iterator[NodeProto]:
+def _rewrite(node: NodeProto, opset: int, constants: Constants) -> Iterator[NodeProto]:
     """Yield the nodes by which an older opset expresses a node of opset 18."""
-    kind = node.op_type
+    kind, attributes = node.op_type, {a.name: helper.get_attribute_value(a) for a in node.attribute}
     if kind in WIDENED or _since(kind, opset) == _since(kind, NATIVE):
         yield node
-    elif kind.startswith("Reduce"):
-        yield from _reduced(node, constants)
-    elif kind in REWRITINGS:
-        yield from REWRITINGS[kind](node, constants)
+    elif kind.startswith("Reduce"):  # whose axes were an attribute
+        keep, axes = attributes.get("keepdims", 1), constants.value(node.input[1]).tolist()
+        yield helper.make_node(kind, node.input[:1], node.output, node.name, axes=axes, keepdims=keep)
+    elif kind == "Split":  # without sizes, the parts are equal; their number was not given
+        yield helper.make_node(kind, node.input, node.output, node.name, axis=attributes.get("axis", 0))
+    elif kind == "Pad":  # which had no axes
+        assert len(node.input) <= 3 or not node.input[3]
+        yield node
+    elif kind == "LayerNormalization":
+        yield from _write_out_normalization(node, attributes, constants)
     else:
-        raise InputError(f"opset {opset}: has another {kind}, which this graph needs; allowed is {NATIVE}")
+        raise InputError(f"opset={opset}: has another form of {kind}, which this graph needs; use {NATIVE}")
 
 
 def _since(kind: str, opset: int) -> int:
-    """Return the opset that introduced an operator's form in a given opset; 0 if it has no such operator."""
-    if not onnx.defs.has(kind, opset):
-        return 0
-    return onnx.defs.get_schema(kind, opset).since_version
+    """Return the opset that introduced an operator's form in a given opset; 0 if it lacks the operator."""
+    return onnx.defs.get_schema(kind, opset).since_version if onnx.defs.has(kind, opset) else 0
 
 
-def _attributes(node: NodeProto) -> dict[str, Any]:
-    return {attribute.name: helper.get_attribute_value(attribute) for attribute in node.attribute}
-
-
-def _reduced(node: NodeProto, constants: Constants) -> Iterator[NodeProto]:
-    """Yield a reduction as before opset 18: its axes are an attribute."""
-    keep = _attributes(node).get("keepdims", 1)
-    axes = constants.value(node.input[1]).tolist()
-    yield helper.make_node(node.op_type, node.input[:1], node.output, node.name, axes=axes, keepdims=keep)
-
-
-def _split(node: NodeProto, constants: Constants) -> Iterator[NodeProto]:
-    """Yield a split as before opset 18: without sizes the parts are equal, and their number is not given."""
-    yield helper.make_node("Split", node.input, node.output, node.name, axis=_attributes(node).get("axis", 0))
-
-
-def _padded(node: NodeProto, constants: Constants) -> Iterator[NodeProto]:
-    """Yield a padding as before opset 18, where it has no axes; the node stays as it is."""
-    assert len(node.input) <= 3 or not node.input[3]
-    yield node
-
-
-def _normalised(node: NodeProto, constants: Constants) -> Iterator[NodeProto]:
-    """Yield a LayerNormalization as before opset 17: written out, in a form that runtimes fuse again."""
-    attributes = _attributes(node)
+def _write_out_normalization(
+    node: NodeProto, attributes: dict[str, Any], constants: Constants
+) -> Iterator[NodeProto]:
+    """Yield a LayerNormalization in the operators before opset 17, in a form that runtimes fuse again."""
     assert attributes.get("axis", -1) == -1
     name, x = node.output[0], node.input[0]
     epsilon = constants.add(f"{name}.epsilon", np.array(attributes.get("epsilon", 1e-5), np.float32))
@@ -127,10 +130,3 @@ def _normalised(node: NodeProto, constants: Constants) -> Iterator[NodeProto]:
     yield step("Mul", [f"{name}.normal", node.input[1]], scaled)
     if scaled != name:
         yield step("Add", [scaled, node.input[2]], name)
-
-
-REWRITINGS: dict[str, Rewriting] = {
-    "Split": _split,
-    "Pad": _padded,
-    "LayerNormalization": _normalised,
-}

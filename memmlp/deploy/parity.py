@@ -3,29 +3,27 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from memmlp.common.progress import progress_bar
-from memmlp.deploy.onnx_stream import OnnxStream
+from memmlp.deploy.onnx_stream import NEXT, Arrays, OnnxStream
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.torch_threads import one_thread
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.own_past_memory import Blend
-from memmlp.networks.vqvae import Codebook
 
 TOLERANCE = 1e-4  # on 6D components and metres
-ROUNDING = 10 * TOLERANCE  # the most that is put down to rounding; see `tolerated`
-DRAWS = 4  # float32 computations whose errors tell how a frame is conditioned; see `each_within_rounding`
-SPREAD = 4  # how far above the largest of these errors a difference may be
+ROUNDING = 10 * TOLERANCE  # the largest median difference that rounding explains; see `is_rounding`
 MARGIN = 60  # frames that are compared with a full past
-TIE = 1e-4  # the margin below which rounding may choose another code-vector; see `Codebook.margins`
+FATAL = 4  # the severity of messages of ONNX Runtime that are shown
 
 
 @contextmanager
@@ -43,7 +41,7 @@ def deterministic(model: nn.Module) -> Iterator[None]:
 
 
 def clips_to_check(model: MotionModel, clips: Sequence[Tensor], count: int = 1) -> list[Tensor]:
-    """Return the longest clips (N, 252), each as far as it takes to see the network with a full past.
+    """Return the longest clips (N, 252), each cut to a length that shows the network with a full past.
 
     On a short clip a graph that forgets its past, or never drops it, computes what the network does. They are
     at least as long as the first clip, where they can be.
@@ -51,7 +49,7 @@ def clips_to_check(model: MotionModel, clips: Sequence[Tensor], count: int = 1) 
     Args:
         model: the trained network.
         clips: test clips (N, 252).
-        count: how many are wanted; 0 for all, whole.
+        count: how many clips to return; 0 for all, whole.
     """
     if not count:
         return list(clips)
@@ -65,13 +63,7 @@ def frames_of_full_past(model: MotionModel) -> int:
 
 
 def parity(model: MotionModel, path: Path, clip: Tensor) -> float:
-    """Return the largest difference between torch and ONNX Runtime over a clip, each on its own history.
-
-    Args:
-        model: the trained network.
-        path: the exported file.
-        clip: the clip's frames (N, 252).
-    """
+    """Return the largest difference between torch and ONNX Runtime over a clip (N, 252)."""
     return float(differences(model, path, clip).max())
 
 
@@ -79,133 +71,61 @@ def parity(model: MotionModel, path: Path, clip: Tensor) -> float:
 def differences(model: MotionModel, path: Path, clip: Tensor) -> Tensor:
     """Return each frame's largest difference (N,) between torch and ONNX Runtime over a clip (N, 252).
 
-    The positions of a network without a position branch are compared with the positions that follow, in
-    float64, from ONNX Runtime's rotations. Where 6D columns are almost parallel, which an untrained network
-    produces now and then, a difference between rotations within float32's rounding would otherwise be
-    amplified a hundredfold.
+    Each has its own history. The positions of a network without a position branch are compared with the
+    positions that follow, in float64, from ONNX Runtime's rotations. Where 6D columns are almost parallel,
+    which an untrained network sometimes produces, forward kinematics would amplify rounding a hundredfold.
     """
     model, clip = model.cpu().eval(), clip.cpu()
-    made, found = in_torch(model, clip), streamed(OnnxStream(path), clip)
+    expected, found = in_torch(model, clip), streamed(OnnxStream(path), clip)
     if "position" not in model.branches:
         exact = copy.deepcopy(model.normalizer).double()
         positions = exact.pose(found.double(), clip[:, :SPARSE_DIM].double())
-        made = torch.cat([made[:, ROTATION], positions.flatten(1)], 1)
-    return (made - found).abs().amax(1)
+        expected = torch.cat([expected[:, ROTATION], positions.flatten(1)], 1)
+    return (expected - found).abs().amax(1)
 
 
-@torch.no_grad()
-def tolerated(model: MotionModel, path: Path, clip: Tensor, apart: float) -> bool:
-    """Return whether a difference between torch and ONNX Runtime over a clip (N, 252) is due to rounding.
+def matches(model: MotionModel, path: Path, clip: Tensor, apart: Tensor) -> bool:
+    """Return whether `differences` (N,) over a clip (N, 252) are due to rounding; see `is_rounding`."""
 
-    A difference of at most TOLERANCE always is. One of at most ROUNDING may be, where a rotation is
-    ill-conditioned, such as that of a hip whose swivel about a straight leg is measured from an axis along
-    the leg (MANIKIN), or where many steps follow each other (a diffusion): it is accepted if torch's own
-    rotations in float32 differ from those in float64 by at least half as much, or by a SPREADth where the
-    file's graph and the network are the same in float64. A larger one is accepted if every frame that
-    differs is as ill-conditioned as that (`each_within_rounding`), or if rounding chose another code-vector
-    (`begins_at_ties`).
+    def exact() -> float:
+        wide, frames = copy.deepcopy(model).cpu().double().eval(), clip.cpu().double()
+        made = in_float64(path, {"sparse": frames[:, :SPARSE_DIM].numpy()})
+        found = torch.cat([torch.from_numpy(part).flatten(1) for part in made.values()], 1)
+        return float((in_torch(wide, frames) - found).abs().max())
+
+    return is_rounding(apart, exact)
+
+
+def is_rounding(apart: Tensor, exact: Callable[[], float]) -> bool:
+    """Return whether each frame's differences (N,) between torch and ONNX Runtime are due to rounding.
+
+    Differences of at most TOLERANCE are. Larger ones are if graph and network agree in float64 and most
+    frames differ by at most ROUNDING in float32. A rotation can be ill-conditioned, such as a hip's swivel
+    about a straight leg. Many steps can follow each other (a diffusion). A latent can be equally far from two
+    code-vectors, so that rounding chooses.
+
+    Args:
+        apart: the differences in float32.
+        exact: returns the largest difference in float64.
     """
-    if not apart > TOLERANCE:  # NaN is not
-        return apart <= TOLERANCE
-    model, clip = model.cpu().eval(), clip.cpu()
-    if apart <= ROUNDING:
-        exact = in_torch(copy.deepcopy(model).double(), clip.double())
-        rounding = float((in_torch(model, clip) - exact)[:, ROTATION].abs().max())
-        if apart <= 2 * rounding or (apart <= SPREAD * rounding and same_in_float64(path, clip, exact)):
-            return True
-    each = differences(model, path, clip)
-    if each_within_rounding(model, clip, each):
+    if apart.max() <= TOLERANCE:
         return True
-    return bool(codebooks(model)) and begins_at_ties(model, clip, each)
-
-
-def same_in_float64(path: Path, clip: Tensor, exact: Tensor) -> bool:
-    """Return whether a file's graph makes the rotations of `exact` (N, 198) of a clip (N, 252) in float64."""
-    from memmlp.deploy.float64_graph import in_float64  # imports onnx, and is seldom needed
-
-    return bool((in_float64(path, clip) - exact)[:, ROTATION].abs().max() <= TOLERANCE)
-
-
-@torch.no_grad()
-def each_within_rounding(model: MotionModel, clip: Tensor, apart: Tensor) -> bool:
-    """Return whether each difference (N,) over a clip (N, 252) is such as rounding makes in its frame.
-
-    How far float32 is from float64 in a frame is found by DRAWS computations whose inputs are moved by a
-    rounding each, so that everything after them is rounded otherwise. A frame that differs by more than
-    TOLERANCE may differ by SPREAD times the largest of these errors, and by the size of a rotation's
-    components at most; nine in ten frames must not differ.
-    """
-    differ = apart > TOLERANCE
-    if not 0 < int(differ.sum()) <= len(apart) // 10 or float(apart.max()) > 1:
-        return False
-    exact = in_torch(copy.deepcopy(model).double(), clip.double())
-    draw = torch.Generator().manual_seed(0)
-    errors = torch.zeros(len(apart), dtype=exact.dtype)
-    for _ in range(DRAWS):
-        moved = clip * (1 + torch.finfo(clip.dtype).eps * torch.randint(-1, 2, clip.shape, generator=draw))
-        errors = errors.maximum((in_torch(model, moved) - exact).abs().amax(1))
-    return bool((apart <= SPREAD * errors)[differ].all())
-
-
-@torch.no_grad()
-def begins_at_ties(model: MotionModel, clip: Tensor, apart: Tensor | np.ndarray) -> bool:
-    """Return whether differences (N,) over a clip (N, 252 or 54) come from ties between code-vectors.
-
-    Where a latent is equally far from two code-vectors, rounding decides. Two programs then differ for as
-    long as the frame is in the window, and agree again after it. So each frame that differs by more than
-    TOLERANCE has to follow another such frame, or lie within a window after a tie, and most frames must not
-    differ.
-    """
-    since_tie, explained = float("inf"), False
-    for margin, one in zip(smallest_margins(model, clip), apart.tolist(), strict=True):
-        since_tie = 0 if margin < TIE else since_tie + 1
-        explained = one > TOLERANCE and (explained or since_tie < model.frames)
-        if not (one <= TOLERANCE or explained):
-            return False
-    return int((apart > TOLERANCE).sum()) <= len(apart) // 2
-
-
-def smallest_margins(model: MotionModel, clip: Tensor) -> list[float]:
-    """Return the smallest margin of a latent (`Codebook.margins`) for each frame of inputs (N, 252 or 54)."""
-    found: list[float] = []
-    smallest = []
-
-    def note(book: nn.Module, given: tuple[Tensor], _: object) -> None:
-        found.append(float(cast(Codebook, book).margins(given[0]).min()))
-
-    hooks = [book.register_forward_hook(note) for book in codebooks(model)]
-    try:
-        for _ in motions(model, clip):
-            smallest.append(min(found, default=float("inf")))
-            found.clear()
-    finally:
-        for hook in hooks:
-            hook.remove()
-    return smallest
-
-
-def codebooks(model: MotionModel) -> list[Codebook]:
-    """Return the codebooks that a network contains."""
-    return [module for module in model.modules() if isinstance(module, Codebook)]
+    return bool(apart.median() <= ROUNDING) and exact() <= TOLERANCE
 
 
 @torch.no_grad()
 def in_torch(model: MotionModel, clip: Tensor) -> Tensor:
-    """Return the world motion (N, 198) that torch's network streams for a clip's inputs (N, 252 or 54)."""
-    return torch.stack(list(motions(model, clip)))
-
-
-def motions(model: MotionModel, clip: Tensor) -> Iterator[Tensor]:
-    """Yield the world motion (198,) that the network streams, for each frame of a clip (N, 252 or 54).
+    """Return the world motion (N, 198) that torch's network streams for a clip's inputs (N, 252 or 54).
 
     One thread computes it: a frame is little work, which several threads do more slowly, and far more slowly
     on a busy machine.
     """
-    state = model.initial_state(1)
+    state, motions = model.initial_state(1), []
     with deterministic(model), one_thread():
         for sparse in progress_bar(clip[:, None, None, :SPARSE_DIM], "check"):
             motion, state = model.advance(sparse, state)
-            yield motion[0, -1]
+            motions.append(motion[0, -1])
+    return torch.stack(motions)
 
 
 def streamed(stream: OnnxStream, clip: Tensor) -> Tensor:
@@ -213,3 +133,62 @@ def streamed(stream: OnnxStream, clip: Tensor) -> Tensor:
     stream.reset()
     outputs = [stream.step(sparse) for sparse in clip[:, None, :SPARSE_DIM].numpy()]
     return torch.tensor(np.stack([np.concatenate([r.ravel(), p.ravel()]) for r, p in outputs]))
+
+
+def in_float64(path: Path, inputs: Mapping[str, np.ndarray]) -> Arrays:
+    """Stream inputs through a float32 file whose graph is widened to float64.
+
+    Constants that the export has folded keep the rounding with which it computed them.
+
+    Args:
+        path: the exported file.
+        inputs: the inputs by name, each (N, ...), one frame after the other.
+
+    Returns:
+        The outputs by name, each (N, ...), without states.
+    """
+    import onnx
+    import onnxruntime
+    from onnx import TensorProto, helper, numpy_helper
+    from onnx.reference import ReferenceEvaluator
+
+    model = onnx.load(path)
+    graph = model.graph
+    constants = [a.t for node in graph.node for a in node.attribute if a.HasField("t")]
+    for tensor in (*graph.initializer, *constants):
+        if tensor.data_type == TensorProto.FLOAT:
+            wide = numpy_helper.to_array(tensor).astype(np.float64)
+            tensor.CopyFrom(numpy_helper.from_array(wide, tensor.name))
+    for node in graph.node:
+        if node.op_type == "ConstantOfShape" and not node.attribute:  # whose default is float32's 0
+            node.attribute.append(helper.make_attribute("value", numpy_helper.from_array(np.zeros(1))))
+        for attribute in node.attribute:
+            if node.op_type == "Cast" and attribute.name == "to" and attribute.i == TensorProto.FLOAT:
+                attribute.i = TensorProto.DOUBLE
+    for value in (*graph.input, *graph.output, *graph.value_info):
+        if value.type.tensor_type.elem_type == TensorProto.FLOAT:
+            value.type.tensor_type.elem_type = TensorProto.DOUBLE
+
+    shapes = {i.name: [d.dim_value for d in i.type.tensor_type.shape.dim] for i in graph.input}
+    names = [output.name for output in graph.output]
+    given = {name: np.zeros(shape) for name, shape in shapes.items()}
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = FATAL
+    run: Callable[[Arrays], Any]
+    try:
+        session = onnxruntime.InferenceSession(
+            model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+        )
+        run = partial(session.run, None)
+        run(given)
+    except Exception:  # it lacks an operator in float64; its exceptions have no common base class
+        run = partial(ReferenceEvaluator(model).run, None)  # slower by an order of magnitude
+    made: dict[str, list[np.ndarray]] = {name: [] for name in names if not name.endswith(NEXT)}
+    for index in range(len(next(iter(inputs.values())))):
+        frame = {name: part[index].reshape(shapes[name]) for name, part in inputs.items()}
+        outputs = dict(zip(names, run(given | frame), strict=True))
+        given = {name: outputs.get(name + NEXT, array) for name, array in given.items()}
+        for name, parts in made.items():
+            parts.append(outputs[name])
+    return {name: np.concatenate(parts) for name, parts in made.items()}

@@ -4,10 +4,10 @@
 Inputs are one frame at 60 Hz: `tracker_positions` (1, 3, 3), metres, and `tracker_rotations` (1, 3, 3, 3),
 matrices, of head, left and right wrist; and the states `state.*`, all zeros for a fresh start.
 
-Outputs are `rotations` (1, 22, 3, 3), local matrices, or, if asked for, (1, 22, 4), unit quaternions x, y, z,
-w whose w is not negative; the root's are global. `positions` (1, 22, 3), metres, by forward kinematics with
-the head on its tracker; `joints` (1, 22, 3), metres, the network's own positions; and the new states, under
-the same names with the suffix `.next`.
+Outputs are `rotations` (1, 22, 3, 3), local matrices, or, on request, (1, 22, 4), unit quaternions x, y, z, w
+whose w is not negative; the root's are global. `positions` (1, 22, 3), metres, by forward kinematics with the
+head on its tracker; `joints` (1, 22, 3), metres, the network's own positions; and the new states, under the
+same names with the suffix `.next`.
 
 All inputs and outputs are in the chosen frame of reference (memmlp.live.spaces). Lost trackers, other rates
 and gaps (memmlp.live.tracker_resampling) are left to the caller: NaN in is NaN out.
@@ -27,7 +27,7 @@ from memmlp.common.errors import InputError
 from memmlp.deploy.export import metadata, save
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.opsets import NATIVE
-from memmlp.deploy.parity import ROUNDING, TOLERANCE, begins_at_ties, in_torch
+from memmlp.deploy.parity import in_float64, in_torch, is_rounding
 from memmlp.live.rotations import BodyTree, quaternion_to_matrix
 from memmlp.live.spaces import Space, space_of
 from memmlp.motion.body import (
@@ -45,7 +45,6 @@ from memmlp.motion.body import (
 )
 from memmlp.motion.features import sparse_features
 from memmlp.motion.geometry import sixd_to_matrix
-from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import MotionModel, StreamingGraph
 
 INPUTS = ("tracker_positions", "tracker_rotations")
@@ -53,11 +52,6 @@ OUTPUTS = ("rotations", "positions", "joints")
 UNIT = 1e-4  # how far a quaternion's norm may be from 1
 OWN = {"seen": (1, 1), "positions": (1, 3, 3), "rotations": (1, 3, 3, 3)}
 """States besides the network's: whether there was an earlier frame, and its trackers in AMASS' world."""
-
-
-def as_they_are(rotations: Tensor) -> Tensor:
-    """Return matrices (..., 3, 3) unchanged."""
-    return rotations
 
 
 def quaternions(rotations: Tensor) -> Tensor:
@@ -81,7 +75,10 @@ def quaternions(rotations: Tensor) -> Tensor:
     return chosen / (chosen * chosen).sum(-1, keepdim=True).sqrt()
 
 
-FORMATS: dict[str, Callable[[Tensor], Tensor]] = {"matrix": as_they_are, "quaternion": quaternions}
+FORMATS: dict[str, Callable[[Tensor], Tensor]] = {
+    "matrix": lambda matrices: matrices,
+    "quaternion": quaternions,
+}
 """The formats of output rotations, by name."""
 
 
@@ -91,21 +88,16 @@ class FullStep(nn.Module):
     Args:
         model: the network, as it was trained or as its streaming graph.
         space: the frame of reference of inputs and outputs.
-        rotated: converts rotation matrices to the format of the outputs; one of FORMATS.
+        output: converts rotation matrices to the format of the outputs; one of FORMATS.
     """
 
     world: Tensor
     body: Tensor
     bones: Tensor
 
-    def __init__(
-        self,
-        model: MotionModel | StreamingGraph,
-        space: Space,
-        rotated: Callable[[Tensor], Tensor] = as_they_are,
-    ):
+    def __init__(self, model: MotionModel | StreamingGraph, space: Space, output: Callable[[Tensor], Tensor]):
         super().__init__()
-        self.model, self.rotated = model, rotated
+        self.model, self.output = model, output
         self.names = list(model.initial_state(1))
         self.register_buffer("world", torch.tensor(space.world, dtype=torch.float32))
         self.register_buffer("body", torch.tensor(space.body, dtype=torch.float32))
@@ -132,9 +124,10 @@ class FullStep(nn.Module):
         motion, after = self.model.advance(sparse[:, None], before, 1)
         # A first frame has no velocity: it is shown, but is not part of the network's past, as in training.
         kept = [after[name] * seen.view(-1, *[1] * (after[name].ndim - 1)) for name in self.names]
-        return *self.posed(motion[:, -1], positions[:, 0]), seen.clamp_min(1), positions, rotations, *kept
+        pose = self.convert_out(motion[:, -1], positions[:, 0])
+        return *pose, seen.clamp_min(1), positions, rotations, *kept
 
-    def posed(self, motion: Tensor, head: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def convert_out(self, motion: Tensor, head: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return rotations, positions and joints in the graph's frame of reference.
 
         Args:
@@ -142,24 +135,19 @@ class FullStep(nn.Module):
             head: the head tracker's position (1, 3), metres, AMASS' world.
         """
         local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6)))
-        reached = self.reached(local)
-        positions = reached + (head - reached[:, HEAD])[:, None]
-        joints = motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
-        root = self.world.T @ local[:, :1] * self.body
-        turned = torch.cat([root, local[:, 1:] * torch.outer(self.body, self.body)], 1)
-        return self.rotated(turned), positions @ self.world, joints @ self.world
-
-    def reached(self, local: Tensor) -> Tensor:
-        """Return positions (1, 22, 3) relative to the root, by the products of `BodyTree.positions`.
-
-        These products are few operations on large arrays, which run faster in a graph than many small ones.
-        """
+        # Forward kinematics by the products of `BodyTree.positions`: few operations on large arrays, which
+        # run faster in a graph than many small ones.
         bottom = torch.tensor([0.0, 0.0, 0.0, 1.0]).expand(1, N_JOINTS, 1, 4)
         transforms = torch.cat([torch.cat([local, self.bones], -1), bottom], -2)
         transforms = torch.cat([transforms, torch.eye(4).expand(1, 1, 4, 4)], 1)
         for ancestor in self.ancestors:
             transforms = transforms.index_select(1, ancestor) @ transforms
-        return transforms[:, :N_JOINTS, :3, 3]
+        reached = transforms[:, :N_JOINTS, :3, 3]
+        positions = reached + (head - reached[:, HEAD])[:, None]
+        joints = motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
+        root = self.world.T @ local[:, :1] * self.body
+        turned = torch.cat([root, local[:, 1:] * torch.outer(self.body, self.body)], 1)
+        return self.output(turned), positions @ self.world, joints @ self.world
 
 
 def export_full(
@@ -177,7 +165,7 @@ def export_full(
             converted.
     """
     if rotations not in FORMATS:
-        raise InputError(f"rotations={rotations}: no such format; allowed: {', '.join(FORMATS)}")
+        raise InputError(f"rotations={rotations}: must be one of {', '.join(FORMATS)}")
     step = FullStep(model.cpu().eval(), space_of(space), FORMATS[rotations]).eval()
     state = step.initial_state()
     names = [f"state.{name}" for name in state]
@@ -205,68 +193,56 @@ def trackers_of(frames: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat([positions[:1] - velocity, positions]), torch.cat([before, rotations])
 
 
-def full_parity(model: MotionModel, path: Path, clip: Tensor, space: str = "amass") -> float:
-    """Return the largest difference between torch and the file over a clip (N, 252).
+def full_differences(model: MotionModel, path: Path, clip: Tensor, space: str = "amass") -> Tensor:
+    """Return each frame's largest difference (N,) between torch and the file over a clip (N, 252).
 
     Each of them has its own history. Torch computes what evaluation does: the features of the same trackers,
-    the network, and `Normalizer.pose`. Quaternions are converted to matrices for the comparison.
+    the network, and `Normalizer.pose`. Quaternions are converted to matrices for the comparison; others than
+    unit quaternions differ by infinity.
     """
-    trackers, there = trackers_of(clip[:, :SPARSE_DIM].cpu()), space_of(space)
-    found = _streamed(path, trackers, there)
-    return float("inf") if found is None else float(_apart(_in_torch(model, trackers, there), found).max())
+    trackers, reference = trackers_of(clip[:, :SPARSE_DIM].cpu()), space_of(space)
+    stream, inputs = OnnxStream(path), _inputs(trackers, reference)
+    steps = [
+        stream.step(*(part[index : index + 1] for part in inputs.values())) for index in range(len(clip) + 1)
+    ]
+    found = [np.concatenate(parts) for parts in zip(*steps, strict=True)]
+    return _compare(found, _in_torch(model, trackers, reference))
 
 
-def full_tolerated(model: MotionModel, path: Path, clip: Tensor, apart: float, space: str = "amass") -> bool:
-    """Return whether a difference between torch and the file over a clip (N, 252) is due to rounding.
+def full_matches(model: MotionModel, path: Path, clip: Tensor, apart: Tensor, space: str = "amass") -> bool:
+    """Return whether `full_differences` (N,) over a clip (N, 252) are due to rounding; see `is_rounding`."""
 
-    A difference of at most TOLERANCE always is. One of at most ROUNDING may be, where 6D columns are almost
-    parallel, so that earlier rounding errors are magnified: it is accepted if the file is within TOLERANCE of
-    torch in float64, or at most twice as far from it as torch in float32 is. A difference of any size is
-    accepted if rounding chose another code-vector (`begins_at_ties`).
-    """
-    if not apart > TOLERANCE:  # NaN is not
-        return apart <= TOLERANCE
-    trackers, there = trackers_of(clip[:, :SPARSE_DIM].cpu()), space_of(space)
-    found = _streamed(path, trackers, there)
-    if found is None:
-        return False
-    made = _in_torch(model, trackers, there)
-    if apart <= ROUNDING:
-        positions, rotations = trackers
-        exact = _in_torch(copy.deepcopy(model).double(), (positions.double(), rotations.double()), there)
-        if _apart(exact, found).max() <= max(TOLERANCE, 2 * _apart(exact, made).max()):
-            return True
-    return begins_at_ties(model, sparse_features(*reversed(trackers)), _apart(made, found))
+    def exact() -> float:
+        positions, rotations = trackers_of(clip[:, :SPARSE_DIM].cpu().double())
+        reference, wide = space_of(space), copy.deepcopy(model).double()
+        found = in_float64(path, _inputs((positions, rotations), reference))
+        return float(_compare(list(found.values()), _in_torch(wide, (positions, rotations), reference)).max())
+
+    return is_rounding(apart, exact)
 
 
-def _streamed(path: Path, trackers: tuple[Tensor, Tensor], space: Space) -> list[np.ndarray] | None:
-    """Return the file's rotations, positions and joints for trackers; None for wrong quaternions."""
-    stream, (positions, rotations) = OnnxStream(path), trackers
-    given = [space.positions_out(positions.numpy()), space.rotations_out(rotations.numpy())]
-    made = [stream.step(*(part[index : index + 1] for part in given)) for index in range(len(positions))]
-    found = [np.concatenate(parts) for parts in zip(*made[1:], strict=True)]
-    if found[0].shape[-1] == 4:
-        if not np.abs(np.linalg.norm(found[0], axis=-1) - 1).max() <= UNIT:
-            return None
-        found[0] = quaternion_to_matrix(found[0].astype(np.float64))
-    return found
+def _inputs(trackers: tuple[Tensor, Tensor], space: Space) -> dict[str, np.ndarray]:
+    positions, rotations = trackers
+    parts = space.positions_out(positions.numpy()), space.rotations_out(rotations.numpy())
+    return dict(zip(INPUTS, parts, strict=True))
 
 
 def _in_torch(model: MotionModel, trackers: tuple[Tensor, Tensor], space: Space) -> list[np.ndarray]:
     """Return the model's rotations, positions and joints for trackers, in a frame of reference."""
     positions, rotations = trackers
     sparse = sparse_features(rotations, positions)
-    return _expected(model.normalizer, in_torch(model.cpu().eval(), sparse), sparse, space)
-
-
-def _apart(some: list[np.ndarray], others: list[np.ndarray]) -> np.ndarray:
-    """Return each frame's largest difference (N,) between two lists of arrays (N, ...)."""
-    apart = [np.abs(one - other).reshape(len(one), -1) for one, other in zip(some, others, strict=True)]
-    return np.concatenate(apart, 1).max(1)
-
-
-def _expected(normalizer: Normalizer, motion: Tensor, sparse: Tensor, space: Space) -> list[np.ndarray]:
-    """Return rotations, positions and joints in a space, from world motion (N, 198) and inputs (N, 54)."""
+    motion = in_torch(model.cpu().eval(), sparse)
     local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6))).numpy()
-    positions = [normalizer.pose(motion, sparse), motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))]
-    return [space.pose_out(local), *(space.positions_out(part.numpy()) for part in positions)]
+    joints = [model.normalizer.pose(motion, sparse), motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))]
+    return [space.pose_out(local), *(space.positions_out(part.numpy()) for part in joints)]
+
+
+def _compare(found: list[np.ndarray], expected: list[np.ndarray]) -> Tensor:
+    """Return each frame's largest difference (N,); the found arrays (N + 1, ...) begin a step earlier."""
+    found = [part[1:] for part in found]
+    if found[0].shape[-1] == 4:
+        if not np.abs(np.linalg.norm(found[0], axis=-1) - 1).max() <= UNIT:
+            return torch.full((len(found[0]),), torch.inf)
+        found[0] = quaternion_to_matrix(found[0].astype(np.float64))
+    apart = [np.abs(one - other).reshape(len(one), -1) for one, other in zip(found, expected, strict=True)]
+    return torch.from_numpy(np.concatenate(apart, 1).max(1))

@@ -17,9 +17,9 @@ import memmlp as package
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.deploy.deployment import GRAPHS, Deployment
+from memmlp.deploy.lower_precision import lower
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import streamed
-from memmlp.deploy.quantization import quantise
 from memmlp.networks.motion_model import StreamingGraph
 from memmlp.networks.own_past_memory import CodeMemory
 from memmlp.networks.streaming import streaming
@@ -35,7 +35,7 @@ CLIPS = [tiny.clip(60, seed=seed) for seed in range(3)]
 def pair(step_files, tmp_path_factory) -> tuple[Path, Path]:
     """The first tiny network's stream in float32 and in int8."""
     exact, quantised = step_files("mem_mlp"), tmp_path_factory.mktemp("pair") / "int8.onnx"
-    quantise(exact, quantised, streaming(exported.NETWORKS["mem_mlp"]()).float32_modules, CLIPS)
+    lower("int8", exact, quantised, streaming(exported.NETWORKS["mem_mlp"]()), CLIPS)
     return exact, quantised
 
 
@@ -63,7 +63,7 @@ def weights(graph: onnx.ModelProto) -> dict[str, int]:
 @pytest.mark.parametrize("network", ["mem_mlp", *exported.BASELINES])
 def test_inner_layers_are_int8_and_the_ends_are_not(step_files, tmp_path, network):
     quantised, stream = tmp_path / "int8.onnx", streaming(exported.NETWORKS[network]())
-    quantise(step_files(network), quantised, stream.float32_modules, [CLIPS[0][:20]])
+    lower("int8", step_files(network), quantised, stream, [CLIPS[0][:20]])
     kinds = weights(onnx.load(quantised))
     inner = [kind for name, kind in kinds.items() if ".blocks." in name or ".layers." in name]
     assert inner
@@ -139,7 +139,7 @@ def test_a_run_in_int8_records_what_it_costs(home, memmlp, monkeypatch):
     assert refused.code == 1
     assert "not written" in refused.err
     assert sorted(path.name for path in home.iterdir()) == ["out.txt", "outputs"]
-    assert one_line(memmlp(*line, "--graph", "naive"), "allowed")
+    assert one_line(memmlp(*line, "--graph", "naive"), "--precision int8")
 
 
 def test_the_naive_graph_by_switch(small_yardstick, tmp_path):

@@ -16,15 +16,15 @@ import wearer
 
 from memmlp.common.errors import InputError
 from memmlp.deploy.onnx_stream import OnnxStream
-from memmlp.deploy.opsets import OPSETS, converted
-from memmlp.deploy.parity import ROUNDING, TOLERANCE
+from memmlp.deploy.opsets import OPSETS, convert
+from memmlp.deploy.parity import TOLERANCE
 from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream
 from memmlp.live.trackers_to_body_graph import (
     export_full,
-    full_parity,
-    full_tolerated,
+    full_differences,
+    full_matches,
     quaternions,
     trackers_of,
 )
@@ -65,7 +65,7 @@ def test_it_is_the_stream(name, folder: Path, step_files):
     network = exported.NETWORKS[kind]()
     if not file.exists():
         export_full(network, file, RUN, name)
-    assert full_parity(network, file, PERSON.frames, name) <= TOLERANCE
+    assert full_differences(network, file, PERSON.frames, name).max() <= TOLERANCE
     positions, rotations = space.positions_out(PERSON.positions), space.rotations_out(PERSON.rotations)
     poses = wearer.play(Stream(step_files(kind), space=name), positions, rotations)
     full = OnnxStream(file)
@@ -86,15 +86,15 @@ def test_baselines_have_it_too(name: str, tmp_path: Path):
     native = onnx.load(file)
     assert exported.data_dependent(native.graph) == set()
     for opset in (15, 18, OPSETS[-1]):
-        onnx.save(converted(native, opset), file)
-        assert full_parity(network, file, PERSON.frames[:30], "unity") <= TOLERANCE
+        onnx.save(convert(native, opset), file)
+        assert full_differences(network, file, PERSON.frames[:30], "unity").max() <= TOLERANCE
 
 
 def test_quaternions_come_out_on_demand(folder: Path):
     """They are those of the live stream, up to the sign."""
     file, network = folder / "quaternion.onnx", exported.NETWORKS["no_memory"]()
     export_full(streaming(network), file, RUN, "openxr", "quaternion", opset=15)
-    assert full_parity(network, file, PERSON.frames, "openxr") <= TOLERANCE
+    assert full_differences(network, file, PERSON.frames, "openxr").max() <= TOLERANCE
     graph = onnx.load(file)
     onnx.checker.check_model(graph, full_check=True)
     (output,) = (output for output in graph.graph.output if output.name == "rotations")
@@ -126,21 +126,20 @@ def test_quaternions_are_exact_at_every_angle():
 
 
 def test_an_unknown_format_is_refused(tmp_path: Path):
-    with pytest.raises(InputError, match=r"rotations=euler.*matrix, quaternion"):
+    with pytest.raises(InputError, match="rotations=euler"):
         export_full(tiny.model(), tmp_path / "full.onnx", RUN, "unity", "euler")
 
 
 def test_parity_sees_a_difference(network, folder: Path):
     file = folder / "unity.onnx"
-    assert full_parity(network, file, PERSON.frames, "openxr") > TOLERANCE
+    assert full_differences(network, file, PERSON.frames, "openxr").max() > TOLERANCE
     other = copy.deepcopy(network)
     with torch.no_grad():
         other.stem.bias += 0.1
-    assert full_parity(other, file, PERSON.frames, "unity") > TOLERANCE
+    assert full_differences(other, file, PERSON.frames, "unity").max() > TOLERANCE
 
 
-def test_a_difference_of_torchs_own_rounding_is_tolerated_and_no_other(network, folder: Path):
-    """Where torch in float32 alone is off, the file is right; where float64 is off, too, it is not."""
+def test_a_difference_that_float64_does_not_have_is_rounding(network, folder: Path):
     file, clip = folder / "unity.onnx", PERSON.frames
 
     class Rounded(type(network)):
@@ -152,20 +151,11 @@ def test_a_difference_of_torchs_own_rounding_is_tolerated_and_no_other(network, 
 
     rounded = copy.deepcopy(network)
     rounded.__class__ = Rounded
-    apart = full_parity(rounded, file, clip, "unity")
-    assert TOLERANCE < apart < ROUNDING
-    assert full_tolerated(rounded, file, clip, apart, "unity")
-    assert not full_tolerated(rounded, file, clip, 1.1 * ROUNDING, "unity")
-    Rounded.off = {torch.float32: 0.0, torch.float64: 5e-6}  # as far from exact as torch in float32
-    assert full_tolerated(rounded, file, clip, 2 * TOLERANCE, "unity")
-    Rounded.off = {torch.float32: 4e-6, torch.float64: 5e-6}  # five times as far
-    assert not full_tolerated(rounded, file, clip, 2 * TOLERANCE, "unity")
-    other = copy.deepcopy(network)
-    with torch.no_grad():
-        other.stem.bias += 2e-5
-    apart = full_parity(other, file, clip, "unity")
-    assert TOLERANCE < apart < ROUNDING
-    assert not full_tolerated(other, file, clip, apart, "unity")
+    apart = full_differences(rounded, file, clip, "unity")
+    assert apart.max() > TOLERANCE
+    assert full_matches(rounded, file, clip, apart, "unity")
+    Rounded.off = {torch.float32: 5e-6, torch.float64: 5e-6}
+    assert not full_matches(rounded, file, clip, apart, "unity")
 
 
 def test_interface_and_metadata(folder: Path):
@@ -186,7 +176,7 @@ def test_interface_and_metadata(folder: Path):
     }
     props = {p.key: p.value for p in graph.metadata_props}
     assert (props["scope"], props["space"], props["run_id"]) == ("full", "unity", RUN)
-    with pytest.raises(InputError, match="scope full; allowed here is one of scope step"):
+    with pytest.raises(InputError, match="scope full"):
         Stream(folder / "unity.onnx")
 
 

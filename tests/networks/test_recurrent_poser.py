@@ -9,8 +9,8 @@ import torch
 from memmlp.config.build import build_experiment, untrained
 from memmlp.config.compose import composed
 from memmlp.deploy.export import export
+from memmlp.deploy.lower_precision import lower
 from memmlp.deploy.parity import TOLERANCE, parity
-from memmlp.deploy.quantization import quantise
 from memmlp.evaluation import modes as evaluation
 from memmlp.motion.body import HANDS, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.network_coordinates import Heading
@@ -179,7 +179,7 @@ def test_the_file_is_the_network_and_its_cells_become_int8(tmp_path):
     stream = streaming(model)
     export(stream, exact, "0" * 16)
     assert parity(model, exact, CLIP) <= TOLERANCE
-    quantise(exact, int8, stream.float32_modules, [CLIP[:20]])
+    lower("int8", exact, int8, stream, [CLIP[:20]])
     graph = onnx.load(int8).graph
     types = {tensor.name: tensor.data_type for tensor in graph.initializer}
     given = {node.output[0]: node.input[0] for node in graph.node if node.op_type == "DequantizeLinear"}

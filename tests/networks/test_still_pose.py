@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,11 +9,9 @@ import tiny
 import torch
 
 from memmlp.common.errors import InputError
-from memmlp.deploy.block_quantization import quantise_blocks
 from memmlp.deploy.export import export
-from memmlp.deploy.half_precision import halve
+from memmlp.deploy.lower_precision import lower
 from memmlp.deploy.parity import TOLERANCE, parity
-from memmlp.deploy.quantization import quantise
 from memmlp.evaluation import modes
 from memmlp.motion.body import HEAD, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.geometry import sixd_to_matrix
@@ -81,17 +77,14 @@ def test_at_first_it_is_the_average():
     torch.testing.assert_close(motion[:, 6 : ROTATION.stop], mean.expand(len(CLIP), -1), atol=1e-5, rtol=0)
 
 
-LOWER = [partial(quantise, clips=[CLIP]), quantise_blocks, halve]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("write", LOWER, ids=["int8", "int8_blocks", "fp16"])
+@pytest.mark.parametrize("precision", ["int8", "int8_blocks", "fp16"])
 def test_its_file_is_the_network_and_has_nothing_in_a_lower_precision(
-    model: StillPose, tmp_path: Path, write: Callable[[Path, Path, Sequence[str]], None]
+    model: StillPose, tmp_path: Path, precision: str
 ):
     path, stream = tmp_path / "step.onnx", streaming(model)
     export(stream, path, "0123456789abcdef")
     assert parity(model, path, CLIP) <= TOLERANCE
-    with pytest.raises(InputError, match="no layer lies between"):
-        write(path, tmp_path / "lower.onnx", stream.float32_modules)
+    with pytest.raises(InputError, match=r"export\.precision"):
+        lower(precision, path, tmp_path / "lower.onnx", stream, [CLIP])
     assert {file.name for file in tmp_path.iterdir()} == {"step.onnx"}

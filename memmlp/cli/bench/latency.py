@@ -78,9 +78,9 @@ def export_all(
 
     from memmlp.common.progress import progress_bar
     from memmlp.config.build import untrained
-    from memmlp.deploy.deployment import lower
     from memmlp.deploy.export import export
-    from memmlp.deploy.network_alone import network_alone
+    from memmlp.deploy.latency import strip_conversions
+    from memmlp.deploy.lower_precision import lower
     from memmlp.motion.body import FRAME_DIM
     from memmlp.networks.streaming import has_stream, streaming
 
@@ -90,7 +90,7 @@ def export_all(
         size = (f"model.frames={frames}",) if frames else ()
         model = untrained(("profile=paper", *overrides, f"model={option}", *size))
         files = {graph: folder / f"{name}.{graph}.onnx" for graph in GRAPHS}
-        export(network_alone(model), files["network"], "random")
+        export(strip_conversions(model), files["network"], "random")
         export(model, files["naive"], "random")
         if has_stream(model):
             stream = streaming(model)

@@ -14,8 +14,8 @@ import onnx
 from torch import Tensor
 
 from memmlp.common.progress import tell
-from memmlp.deploy.deployment import lower
 from memmlp.deploy.export import export
+from memmlp.deploy.lower_precision import lower
 from memmlp.live.rotations import BodyTree
 from memmlp.live.spaces import SPACES
 from memmlp.live.trackers_to_body_graph import export_full

@@ -1,0 +1,147 @@
+"""Times and sizes of a step, and the network alone, which computes what the network does."""
+
+import numpy as np
+import pytest
+import tiny
+import torch
+
+from memmlp.common import thread_core_share
+from memmlp.deploy import latency
+from memmlp.deploy.export import export
+from memmlp.deploy.latency import NoConversion, macs, strip_conversions
+from memmlp.motion.body import POSITION, ROTATION, SPARSE_DIM
+from memmlp.motion.network_coordinates import Heading, World
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.memory import NoMemory
+from memmlp.networks.vqvae import VQVAE
+
+NETWORKS = {
+    **{name: lambda name=name: tiny.baseline(name) for name in tiny.BASELINES},
+    "mem_mlp": tiny.model,
+    "recurrent_poser": tiny.recurrent_poser,
+    "refined": tiny.refined,
+}
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@torch.no_grad()
+def test_without_conversions_it_is_the_same_network(name):
+    """In the world's coordinates, without z-scores, features are the world's inputs."""
+    model = NETWORKS[name]()
+    for module in model.modules():
+        if isinstance(module, Normalizer):
+            module.coordinates = World()
+            module.mean.zero_(), module.std.fill_(1)
+    alone = strip_conversions(model)
+    clip = tiny.clip(4)[None, :, :SPARSE_DIM]
+    ours, theirs = model.initial_state(), alone.initial_state()
+    for t in range(clip.shape[1]):
+        whole, ours = model.advance(clip[:, t : t + 1], ours, 1)
+        bare, theirs = alone.advance(clip[:, t : t + 1], theirs, 1)
+        torch.testing.assert_close(bare[..., ROTATION], whole[..., ROTATION], atol=1e-5, rtol=1e-5)
+    assert macs(alone) <= macs(model)
+
+
+@torch.no_grad()
+def test_rotations_of_the_world_stay_as_members_make_them():
+    """What follows from them, rotations in the parents' frames and positions, is kinematics."""
+    model = tiny.recurrent_poser(Heading(), output="global", members=2)
+    alone, x = strip_conversions(model), torch.randn(1, 1, SPARSE_DIM)
+    made, _ = alone.advance(x, alone.initial_state(), 1)
+    members = [one(x, one.initial_state(x, 1), 1)[0] for _, one in model.named_members()]
+    torch.testing.assert_close(made[..., ROTATION], sum(members) / 2)
+    assert (made[..., POSITION] == 0).all()
+
+
+@torch.no_grad()
+def test_a_refiner_alone_has_no_kinematics():
+    alone = strip_conversions(tiny.refined(tiny.baseline("avatar_poser")))
+    made, _ = alone.advance(torch.randn(1, 1, SPARSE_DIM), alone.initial_state(), 1)
+    assert (made[..., POSITION] == 0).all()
+
+
+@torch.no_grad()
+def test_neither_conversion_nor_kinematics_are_left():
+    model = tiny.baseline("avatar_poser")
+    alone = strip_conversions(model)
+    window = torch.randn(1, 7, SPARSE_DIM)
+    made, _ = alone.advance(window, alone.initial_state(), 1)
+    torch.testing.assert_close(made[0, :, ROTATION], model.rotations(window))
+    assert (made[..., POSITION] == 0).all()
+    assert isinstance(alone.normalizer, NoConversion)
+    assert not isinstance(model.normalizer, NoConversion)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    model, path = tiny.model(), tmp_path_factory.mktemp("onnx") / "step.onnx"
+    export(model, path, "0123456789abcdef")
+    return model, path
+
+
+@pytest.mark.slow
+def test_latency_and_size(exported, small_yardstick):
+    model, path = exported
+    measured = latency.measure_step(path, steps=1)
+    assert measured["steps"] == 200
+    assert 0 < measured["median_ms"] <= measured["p95_ms"]
+    assert measured["ratio_to_yardstick"] > 0
+    assert 0 < measured["core_share"] < 1.01
+    size = latency.size(model, model, path)
+    assert size["flops"] == 2 * size["macs"] > 0
+    assert size["onnx_bytes"] == path.stat().st_size
+
+
+@pytest.mark.parametrize("codebook", ["ema", "gradient"])
+def test_code_vectors_are_counted_however_they_are_learned(codebook, tmp_path):
+    model = tiny.model(codes=VQVAE(codes=5, width=16, encoder_depth=1, codebook=codebook))
+    (file := tmp_path / "step.onnx").touch()
+    size = latency.size(model, model, file)
+    encoder, decoder = 252 * 16 + 16 + 2 * 16 + 16 * 16 + 16, 2 * 16 + 16 * 16 + 16 + 16 * 132 + 132
+    assert size["parameters_with_vqvae"] - size["parameters"] == encoder + 5 * 16 + decoder
+
+
+@pytest.mark.slow
+def test_a_thread_without_a_core_is_seen(exported, small_yardstick, monkeypatch):
+    clock = iter([5.0, 5.0 + 1e-9])
+    monkeypatch.setattr(latency.time, "thread_time", lambda: next(clock))
+    assert latency.measure_step(exported[1], steps=1)["core_share"] < 1e-6
+
+
+def test_the_order_of_files_is_reversed_and_each_rounds_share_of_a_core_is_kept(monkeypatch):
+    """By clocks of the test's own: a step is 2 s, and the second round's `b` waits 6 s more for a core."""
+    clock, order = {"passed": 0.0, "busy": 0.0}, []
+    monkeypatch.setattr(thread_core_share.time, "perf_counter", lambda: clock["passed"])
+    monkeypatch.setattr(thread_core_share.time, "thread_time", lambda: clock["busy"])
+
+    def time_round(key):
+        order.append(key)
+        clock["busy"] += 2
+        clock["passed"] += 8 if order == ["a", "b", "b"] else 2
+        return np.array([2.0])
+
+    found = latency.in_turn("ab", 3, time_round)
+    assert order == ["a", "b", "b", "a", "a", "b"]
+    assert found["a"].core_shares.tolist() == [1, 1, 1]
+    assert found["b"].core_shares.tolist() == [1, 0.25, 1]
+    assert found["b"].seconds.tolist() == [[2], [2], [2]]
+
+
+@pytest.mark.slow
+def test_files_are_timed_in_turn(exported):
+    found = latency.time_in_turn({"a": exported[1], "b": exported[1]}, 2, 3)
+    assert all(times.seconds.shape == (2, 3) and (times.seconds > 0).all() for times in found.values())
+    assert all(times.core_shares.shape == (2,) for times in found.values())
+
+
+def test_macs_are_counted_by_hand():
+    """The network has a stem, 4 blocks of time and channel mixing, and two branches of a block and a
+    linear.
+    """
+    model = tiny.model(NoMemory)
+    frames, hidden = model.frames, model.hidden
+    block = frames * frames * hidden + frames * hidden * hidden
+    newest = frames * hidden + hidden * hidden  # the branches' last block makes the newest frame alone
+    expected = frames * 54 * hidden + 4 * block + 2 * newest + hidden * (132 + 66)
+    with torch.no_grad():
+        assert latency.macs(model) == expected

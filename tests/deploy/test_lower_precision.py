@@ -1,0 +1,261 @@
+"""Lower precisions: which layers have them, what they compute, and what they cost."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+
+import exported
+import numpy as np
+import onnx
+import pytest
+import tiny
+import torch
+from onnx import TensorProto, numpy_helper
+from onnxruntime import InferenceSession
+
+from memmlp.common.errors import InputError
+from memmlp.deploy.export import export
+from memmlp.deploy.lower_precision import (
+    BLOCK,
+    LEVELS,
+    ZERO,
+    blocks,
+    compare_accuracy,
+    halve,
+    inner_layers,
+    lower,
+    measure_accuracy,
+    round_on_cpu,
+    store_in_blocks,
+)
+from memmlp.deploy.onnx_stream import OnnxStream
+from memmlp.deploy.opsets import Constants
+from memmlp.deploy.parity import streamed
+from memmlp.evaluation import modes as evaluation
+from memmlp.motion.network_coordinates import Heading
+from memmlp.networks.streaming import streaming
+
+pytestmark = pytest.mark.slow
+
+CLIP = tiny.clip(40)
+CLIPS = [tiny.clip(60, seed=seed) for seed in range(3)]
+
+
+@pytest.mark.parametrize("network", exported.NETWORKS)
+def test_every_layer_between_the_ends_is_an_inner_one(step_files, network: str):
+    """By the weights' values, whatever the exporter calls them, and whether it transposes them or not."""
+    stream, graph = streaming(exported.NETWORKS[network]()), onnx.load(step_files(network))
+    weights = {
+        name: weight.detach().numpy()
+        for name, weight in stream.named_parameters()
+        if name.endswith("weight") and weight.ndim == 2
+    }
+    ends = [weight for name, weight in weights.items() if name.startswith(stream.float32_modules)]
+    inner, constants = set(inner_layers(graph, stream.float32_modules)), Constants(graph.graph)
+    left = [
+        node.name
+        for node in graph.graph.node
+        if node.op_type in ("Gemm", "MatMul") and node.name not in inner and node.input[1] in constants
+        if _is_of(constants.value(node.input[1]), weights.values())
+        and not _is_of(constants.value(node.input[1]), ends)
+    ]
+    assert left == []
+
+
+def _is_of(constant: np.ndarray, weights: Iterable[np.ndarray]) -> bool:
+    return any(np.array_equal(constant, one) or np.array_equal(constant, one.T) for one in weights)
+
+
+@pytest.mark.parametrize("network", ["mem_mlp", "refined", "avatar_poser", "hmd_poser"])
+def test_the_products_of_inner_layers_are_fp16(step_files, tmp_path: Path, network: str):
+    source, path = step_files(network), tmp_path / "half.onnx"
+    stream = streaming(exported.NETWORKS[network]())
+    lower("fp16", source, path, stream, [])
+    made, inner = onnx.load(path), set(inner_layers(onnx.load(source), stream.float32_modules))
+    onnx.checker.check_model(made, full_check=True)
+    kinds = {tensor.name: tensor.data_type for tensor in made.graph.initializer}
+    products = [node for node in made.graph.node if node.op_type in ("Gemm", "MatMul")]
+    halves = {node.name for node in products if kinds.get(node.input[1]) == TensorProto.FLOAT16}
+    assert halves == inner != set()
+    ends_of_file = (*made.graph.input, *made.graph.output)
+    assert {end.type.tensor_type.elem_type for end in ends_of_file} == {TensorProto.FLOAT}
+    assert path.stat().st_size < source.stat().st_size + 200 * len(made.graph.node)
+    apart = (streamed(OnnxStream(source), CLIP) - streamed(OnnxStream(path), CLIP)).abs()
+    assert 1e-7 < float(apart.mean()) < 1e-3
+
+
+def one_product(weight: np.ndarray, rows: int, bias: np.ndarray | None = None) -> onnx.ModelProto:
+    """A graph of one layer: y = x @ weight.T + bias, x (rows, inputs)."""
+    outputs, inputs = weight.shape
+    stored = {"model.inner.weight": weight} | ({} if bias is None else {"model.inner.bias": bias})
+    node = onnx.helper.make_node("Gemm", ["x", *stored], ["y"], "product", transB=1)
+    ends = [
+        onnx.helper.make_tensor_value_info(*end)
+        for end in (("x", 1, [rows, inputs]), ("y", 1, [rows, outputs]))
+    ]
+    tensors = [numpy_helper.from_array(value, name) for name, value in stored.items()]
+    graph = onnx.helper.make_graph([node], "one", ends[:1], ends[1:], tensors)
+    return onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=10)
+
+
+@pytest.mark.parametrize("size", [1.0, 5000.0])
+def test_a_cpu_rounds_as_fp16_does(size: float):
+    """Of small products, and of some that sixteen bits do not hold."""
+    values = size * np.random.default_rng(0).normal(size=(3, 8)).astype(np.float32)
+    weight = np.random.default_rng(1).normal(size=(4, 8)).astype(np.float32) * 10
+    made = round_on_cpu(halve(one_product(weight, 3), ["product"]))
+    onnx.checker.check_model(made, full_check=True)
+    (found,) = InferenceSession(made.SerializeToString()).run(None, {"x": values})
+    halves = values.astype(np.float16).astype(np.float32) @ weight.T.astype(np.float16).astype(np.float32)
+    with np.errstate(over="ignore"):
+        expected = halves.astype(np.float16).astype(np.float32)
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
+    assert np.isinf(found).any() == (size > 1)
+
+
+def test_states_stay_float32(tmp_path: Path):
+    """A recurrent cell's sums are below the resolution of sixteen bits."""
+    graph = streaming(tiny.recurrent_poser(Heading(), cell="lru", width=40))
+    export(graph, tmp_path / "step.onnx", "0" * 16)
+    lower("fp16", tmp_path / "step.onnx", tmp_path / "half.onnx", graph, [])
+    made = onnx.shape_inference.infer_shapes(onnx.load(tmp_path / "half.onnx")).graph
+    types = {value.name: value.type.tensor_type.elem_type for value in made.value_info}
+    types |= {tensor.name: tensor.data_type for tensor in made.initializer}
+    sums = [node for node in made.node if node.op_type in ("Add", "Sub", "LayerNormalization", "Concat")]
+    assert len(sums) > 10
+    assert TensorProto.FLOAT16 not in {types.get(name) for node in sums for name in node.input}
+
+
+def test_weights_that_do_not_fit_fp16_are_rejected():
+    with pytest.raises(InputError, match=r"model\.inner\.weight"):
+        halve(one_product(np.full((2, 3), 1e5, np.float32), 1), ["product"])
+
+
+def restored(codes: np.ndarray, scales: np.ndarray, inputs: int) -> np.ndarray:
+    whole = (codes.astype(float) - ZERO) * scales[..., None]
+    return whole.reshape(len(codes), -1)[:, :inputs]
+
+
+@pytest.mark.parametrize(("outputs", "inputs"), [(1, 1), (3, 32), (5, 80), (2, 33)])
+def test_a_weight_in_blocks_is_within_half_a_step(outputs: int, inputs: int):
+    weight = np.random.default_rng(inputs).standard_normal((outputs, inputs)).astype(np.float32)
+    codes, scales = blocks(weight)
+    assert codes.shape == (outputs, -(-inputs // BLOCK), BLOCK)
+    steps = np.repeat(scales, BLOCK, 1)[:, :inputs]
+    assert (np.abs(restored(codes, scales, inputs) - weight) <= 0.501 * steps).all()
+    assert scales.max() == pytest.approx(np.abs(weight).max() / LEVELS)
+
+
+def test_a_block_of_zeros_stays_one():
+    codes, scales = blocks(np.zeros((2, 40), np.float32))
+    assert (codes == ZERO).all()
+    assert (scales == 0).all()
+
+
+def test_a_product_in_blocks_is_that_of_the_rounded_weight():
+    """Computed independently, with inputs rounded as the operator rounds them: in blocks, to eight bits."""
+    rng = np.random.default_rng(0)
+    weight, bias = rng.standard_normal((24, 70)).astype(np.float32), np.ones(24, np.float32)
+    values = rng.standard_normal((1, 70)).astype(np.float32)
+    graph = store_in_blocks(one_product(weight, 1, bias), ["product"])
+    made = InferenceSession(graph.SerializeToString()).run(None, {"x": values})[0]
+    rounded = restored(*blocks(values), 70) @ restored(*blocks(weight), 70).T + bias
+    np.testing.assert_allclose(made, rounded, atol=2e-3)
+    assert np.abs(made - (values @ weight.T + bias)).max() > 2e-3
+
+
+@pytest.mark.parametrize("cell", ["gru", "lru"])
+def test_only_cells_are_in_blocks_and_the_motion_is_near(tmp_path: Path, cell: str):
+    stream = streaming(tiny.recurrent_poser(Heading(), cell=cell, width=40))
+    exact, path = tmp_path / "exact.onnx", tmp_path / "blocks.onnx"
+    export(stream, exact, "0" * 16)
+    lower("int8_blocks", exact, path, stream, [])
+    before, after = (Counter(node.op_type for node in onnx.load(file).graph.node) for file in (exact, path))
+    graph = onnx.load(path).graph
+    layers = {n.input[1].removesuffix(".blocks") for n in graph.node if n.op_type == "MatMulNBits"}
+    stored = {tensor.name for tensor in graph.initializer}
+    assert layers
+    assert all(".cell." in name for name in layers)
+    assert not layers & stored  # the float32 weights are gone
+    member = "model.model.members.member1"
+    assert {f"{member}.stem.weight", f"{member}.head.weight"} <= stored
+    assert sum(before.values()) == sum(after.values())
+    apart = streamed(OnnxStream(exact), CLIP) - streamed(OnnxStream(path), CLIP)
+    assert 1e-6 < float(apart.abs().mean()) < 0.005
+
+
+# Cost
+
+
+@pytest.fixture(scope="module")
+def pair(step_files, tmp_path_factory) -> tuple[Path, Path]:
+    """The first tiny network's stream in float32 and in fp16."""
+    exact, half = step_files("mem_mlp"), tmp_path_factory.mktemp("pair") / "half.onnx"
+    lower("fp16", exact, half, streaming(exported.NETWORKS["mem_mlp"]()), [])
+    return exact, half
+
+
+def test_lower_precision_replaces_float32_only_if_it_is_as_good(pair, step_files):
+    normalizer = exported.NETWORKS["mem_mlp"]().normalizer
+    exact, half = pair
+    cost = compare_accuracy(exact, half, "fp16", normalizer, CLIPS)
+    growth = {name: cost["fp16"][name] / cost["fp32"][name] - 1 for name in cost["fp32"]}
+    assert cost["growth"] == pytest.approx(max(growth["MPJPE"], growth["position MPJPE"]))
+    assert cost["jitter_growth"] == pytest.approx(growth["Jitter"])
+    assert cost["default"] == (cost["growth"] <= 0.01 and cost["jitter_growth"] <= 0.1)
+    other = step_files("rotation_only")  # of two networks only the better one may replace the other
+    both = [compare_accuracy(*files, "fp16", normalizer, CLIPS) for files in ((exact, other), (other, exact))]
+    assert sorted(cost["default"] for cost in both) == [False, True]
+
+
+def test_a_spoiled_position_branch_is_no_default(pair, tmp_path):
+    """Its rotations are those of the exact file."""
+    graph, normalizer = onnx.load(pair[0]), exported.NETWORKS["mem_mlp"]().normalizer
+    for node in graph.graph.node:
+        for names in (node.input, node.output):
+            names[:] = ["unmoved" if name == "position" else name for name in names]
+    graph.graph.initializer.append(numpy_helper.from_array(np.float32(100), "far"))
+    graph.graph.node.append(onnx.helper.make_node("Add", ["unmoved", "far"], ["position"]))
+    onnx.save(graph, tmp_path / "spoiled.onnx")
+    cost = compare_accuracy(pair[0], tmp_path / "spoiled.onnx", "int8", normalizer, CLIPS)
+    assert cost["int8"]["MPJPE"] == cost["fp32"]["MPJPE"]
+    assert cost["growth"] > 0.01
+    assert not cost["default"]
+
+
+def test_a_product_beyond_the_range_of_fp16_is_no_default(pair, tmp_path):
+    """The values of a layer grow by 1e5 and shrink again behind it, which does not affect float32."""
+    graph, model = onnx.load(pair[0]), exported.NETWORKS["mem_mlp"]()
+    products = {node.input[1]: node for node in graph.graph.node if node.op_type == "Gemm"}
+    node = products["model.blocks.0.linear.weight"]
+    for one in (one for one in graph.graph.initializer if one.name in node.input):
+        one.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(one) * np.float32(1e5), one.name))
+    output, node.output[0] = node.output[0], "grown"
+    graph.graph.initializer.append(numpy_helper.from_array(np.float32(1e-5), "less"))
+    place = list(graph.graph.node).index(node) + 1
+    graph.graph.node.insert(place, onnx.helper.make_node("Mul", ["grown", "less"], [output]))
+    onnx.save(graph, tmp_path / "grown.onnx")
+    lower("fp16", tmp_path / "grown.onnx", tmp_path / "half.onnx", streaming(model), [])
+    exact = compare_accuracy(pair[0], tmp_path / "grown.onnx", "int8", model.normalizer, CLIPS)
+    assert abs(exact["growth"]) < 1e-4
+    assert not compare_accuracy(pair[0], tmp_path / "half.onnx", "fp16", model.normalizer, CLIPS)["default"]
+
+
+def away(motion: torch.Tensor, clip: torch.Tensor) -> float:
+    """The mean distance of the positions in motion (N, 198) from those in a clip (N, 252), cm."""
+    apart = (motion[:, 132:] - clip[:, 54 + 132 :]).unflatten(-1, (22, 3))
+    return 100 * float(apart.norm(dim=-1).mean())
+
+
+def test_accuracy_is_that_of_the_evaluation(pair):
+    model = exported.NETWORKS["mem_mlp"]()
+    found = measure_accuracy(pair[0], model.normalizer, CLIPS)
+    motions = evaluation.stream(model, CLIPS)
+    rows = [
+        evaluation.rotations_report(model.normalizer, motion, clip) | {"position MPJPE": away(motion, clip)}
+        for motion, clip in zip(motions, CLIPS, strict=True)
+    ]
+    for name, value in found.items():
+        assert value == pytest.approx(np.mean([row[name] for row in rows]), rel=1e-3), name
