@@ -27,7 +27,7 @@ from memmlp.networks.motion_model import (
     StreamingGraph,
     TrainingOutputs,
     WholeWindow,
-    filled,
+    fill_past,
 )
 from memmlp.networks.transformer import EncoderLayer, draw_weights
 
@@ -92,7 +92,7 @@ class AvatarJLMGraph(StreamingGraph):
         """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
         entering = self.model.tokens(encoded).flatten(1)
-        window = torch.cat([filled(state["tokens"], entering, fresh), entering])
+        window = torch.cat([fill_past(state["tokens"], entering, fresh), entering])
         h = self.model.placed(window.unflatten(-1, (TOKENS, -1)))
         first = h[:, -1:]
         for index, layer in enumerate(self.layers[:-1]):

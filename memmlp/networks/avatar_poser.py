@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from memmlp.motion.body import N_JOINTS, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.motion_model import OwnWindows, State, StreamingGraph, slid
+from memmlp.networks.motion_model import OwnWindows, State, StreamingGraph, slide_window
 from memmlp.networks.transformer import EncoderLayer, draw_weights
 
 ROOT = 6  # components of the root's orientation, the first of the rotations
@@ -47,7 +47,7 @@ class AvatarPoserGraph(StreamingGraph):
         entering = torch.cat(
             [embedded, attention.query(embedded), attention.key(embedded), attention.value(embedded)], -1
         )
-        first = slid(state["first"], entering, entering, fresh)
+        first = slide_window(state["first"], entering, entering, fresh)
         h, query, key, value = first.chunk(4, -1)
         for layer, following in zip(earlier, self.layers[1:], strict=True):
             h = layer.finish(h, layer.attention.attend(query[None], key[None], value[None])[0])

@@ -40,7 +40,7 @@ class Noising(nn.Module):
     Args:
         signal: share (steps,) of signal in the noisy signal's variance, by step.
         sampling_steps: number of denoiser calls for a sample, evenly spaced, from the noise schedule's last
-            step down (Song et al. 2021, App. D.2: linear), so that the first one sees noise alone.
+            step down (Song et al. 2021, App. D.2: linear), so that the first one sees pure noise.
     """
 
     signal: Tensor
@@ -168,7 +168,7 @@ class AncestralDiffusion(Noising):
         """How many draws of noise a sample takes: one for its start, one for each step that adds noise.
 
         The last step adds none, nor do those in the last 50 times of the schedule, of which a sample of few
-        steps has hardly any: without noise its steps' means are no sample of what the network has learned.
+        steps has hardly any: the means alone would not be a sample of what the network has learned.
         """
         return 1 + sum(time >= QUIET for time in self.times[:-1])
 
@@ -210,7 +210,7 @@ class AncestralDiffusion(Noising):
         """Return the mean and the variance (B, ...) of the signal after a sampling step.
 
         The last step's estimate is not clamped to the limits: if the network has not learned a rotation,
-        clamping could make the two columns of its 6D form parallel, which is no rotation.
+        clamping could make the two columns of its 6D form parallel, which is not a rotation.
 
         Args:
             noisy: the noisy signal (B, ...) at sampling step `index`.

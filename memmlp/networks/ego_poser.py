@@ -15,7 +15,7 @@ from torch import Tensor
 from memmlp.motion.body import SPARSE_DIM, SPARSE_POSITION, TRACKED
 from memmlp.motion.network_coordinates import HeadRelative
 from memmlp.networks.avatar_poser import AvatarPoser
-from memmlp.networks.motion_model import State, StreamingGraph, filled
+from memmlp.networks.motion_model import State, StreamingGraph, fill_past
 from memmlp.networks.transformer import EncoderLayer, encode_newest_frame
 
 PLACES = 2 * len(TRACKED)  # components of the trackers' places on the floor
@@ -58,7 +58,7 @@ class EgoPoserGraph(StreamingGraph):
         place = places(local)
         entering = {"embedded": self.model.embedding(torch.cat([local, place], -1)), "places": place}
         window = {
-            name: torch.cat([filled(state[name], frame, fresh), frame]) for name, frame in entering.items()
+            name: torch.cat([fill_past(state[name], frame, fresh), frame]) for name, frame in entering.items()
         }
         slow, fast = self.model.views(window["embedded"])
         first = F.linear(window["places"][:1], self.model.embedding.weight[:, SPARSE_DIM:])

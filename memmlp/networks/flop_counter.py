@@ -1,7 +1,7 @@
 """Counts the FLOPs of the matrix products that networks compute on a CPU.
 
-torch's own counter (torch.utils.flop_counter) takes each operator that it does not know for free. Here it has
-the formulas of the CPU's kernels that it lacks, and products that are left out all the same are told.
+torch's own counter (torch.utils.flop_counter) counts 0 for operators without a formula. This module adds
+formulas for CPU kernels, and warns about products that still lack one.
 """
 
 from __future__ import annotations
@@ -28,18 +28,15 @@ PRODUCTS = frozenset(
 
 
 @contextmanager
-def counting_flops(with_gradients_alone: bool = False) -> Iterator[FlopCounterMode]:
+def counting_flops() -> Iterator[FlopCounterMode]:
     """Count the FLOPs of matrix products within the context; a multiplication and an addition are two.
 
     Products in operators without a formula are not counted, and named in a warning on stderr; torch's
     `register_flop_formula` adds a formula.
-
-    Args:
-        with_gradients_alone: leaves out what is computed without gradients, as the backward pass itself is.
     """
-    known = {**flop_registry, **_OF_CPU}
-    formulas = {operator: _formula(count, with_gradients_alone) for operator, count in known.items()}
-    counter, left_out = FlopCounterMode(display=False, custom_mapping=formulas), _Uncounted(formulas)
+    counter = FlopCounterMode(display=False)
+    counter.flop_registry = formulas = {**flop_registry, **_CPU_FORMULAS}
+    left_out = _Uncounted(formulas)
     fast = mha.get_fastpath_enabled()
     mha.set_fastpath_enabled(False)  # whole layers as one kernel, without its products
     try:
@@ -52,7 +49,7 @@ def counting_flops(with_gradients_alone: bool = False) -> Iterator[FlopCounterMo
 
 
 class _Uncounted(TorchDispatchMode):
-    """Collects the names of products that run and have no formula."""
+    """Collects the names of products that run without a formula."""
 
     supports_higher_order_operators = True
 
@@ -68,19 +65,9 @@ class _Uncounted(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-@cache  # said once, however often a network is counted
+@cache  # once, however often a network is counted
 def _warn(names: str) -> None:
-    to_stderr(f"memmlp: warning: MACs and FLOPs lack those of {names}, for which there is no formula")
-
-
-def _formula(count: Callable[..., int], with_gradients_alone: bool) -> Callable[..., int]:
-    """Return an operator's formula as torch's counter takes it; see `counting_flops`."""
-
-    def counted(*args: Any, **kwargs: Any) -> int:
-        return count(*args, **kwargs) if torch.is_grad_enabled() or not with_gradients_alone else 0
-
-    counted._get_raw = True  # type: ignore[attr-defined]  # it is given tensors, as the registry's are
-    return counted
+    to_stderr(f"memmlp: warning: MACs and FLOPs do not count {names}, which have no formula")
 
 
 def _lstm_flops(x: Sequence[int], to_gates: Sequence[int], again: Sequence[int], *shapes, **rest) -> int:
@@ -98,7 +85,7 @@ def _lstm_backward_flops(*shapes, **rest) -> int:
 
 
 _aten = torch.ops.aten
-_OF_CPU = {
+_CPU_FORMULAS = {
     _aten.mkldnn_rnn_layer: shape_wrapper(_lstm_flops),
     _aten.mkldnn_rnn_layer_backward: shape_wrapper(_lstm_backward_flops),
     # the same arguments as a GPU's kernel has; backward, the scores are computed again

@@ -1,6 +1,6 @@
 """The MLP block of the backbone and the predictor, and its two forms that take in a memory feature.
 
-This file also says which layers several processes can't train together.
+This file also finds layers that several processes cannot train together.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class MLPBlock(nn.Module):
 
 
 class ResidualFusion(MLPBlock):
-    """An MLP block whose linear layer takes in the memory feature as well: h + f([h; z]) (reading 3).
+    """An MLP block whose linear layer also sees the memory feature: h + f([h; z]) (reading 3).
 
     Args:
         hidden: d.

@@ -13,7 +13,14 @@ from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.layers import MLPBlock, PlainFusion, ResidualFusion
 from memmlp.networks.memory import Memory, MemoryBlock
-from memmlp.networks.motion_model import MotionModel, State, StreamingGraph, TrainingOutputs, filled, slid
+from memmlp.networks.motion_model import (
+    MotionModel,
+    State,
+    StreamingGraph,
+    TrainingOutputs,
+    fill_past,
+    slide_window,
+)
 from memmlp.networks.predictor import Branch, Predictor
 from memmlp.networks.streaming import OneFrameNormalizer
 
@@ -219,12 +226,12 @@ class MemMLPGraph(StreamingGraph):
         memory = self.recall.memory
         origin = self.normalizer.origin(sparse)
         encoded = self.conversions.encode_sparse(sparse, origin)
-        queue = torch.cat([filled(state["sparse"], encoded, fresh), encoded[None]], 1)
+        queue = torch.cat([fill_past(state["sparse"], encoded, fresh), encoded[None]], 1)
         past = memory.recall(queue, state, 1)
         stem = self.stem(encoded)
-        kept = {"stem": slid(state["stem"], stem, stem, fresh)}
+        kept = {"stem": slide_window(state["stem"], stem, stem, fresh)}
         for name, contribution, before in zip(self.contributions, *self.recall(past), strict=True):
-            kept[name] = slid(state[name], contribution, before, fresh)
+            kept[name] = slide_window(state[name], contribution, before, fresh)
         h, *contributions = kept.values()
         for block in self.blocks:
             h = block(h, contributions)

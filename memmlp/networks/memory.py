@@ -1,4 +1,4 @@
-"""The memory slot: what the backbone sees of the past, and what is kept for the next call.
+"""The memory slot: what the backbone sees of the past, and what it keeps for the next call.
 
 A memory makes the backbone's blocks (`block`), turns the buffers of past frames into what those blocks see
 (`recall`), and updates its buffers with the network's output (`remember`). All of these values are in network
@@ -206,7 +206,7 @@ class NoMemory(Memory):
 
     def memory_block(self) -> nn.Module:
         """Raise InputError, since this memory has no memory blocks."""
-        raise InputError("memory=none has no memory blocks: allowed is a predictor without memory")
+        raise InputError("memory=none: must be a memory with blocks for this predictor, which uses them")
 
 
 class FeatureMemory(Memory):
@@ -229,7 +229,7 @@ class FeatureMemory(Memory):
     ):
         super().__init__()
         if not set(layers) <= set(range(1, depth + 1)):
-            raise InputError(f"memory.layers: {list(layers)} is not within the backbone's 1..{depth}")
+            raise InputError(f"memory.layers={list(layers)}: must be layers of the backbone, 1 to {depth}")
         self.layers, self.width, self.fusion = tuple(layers), width, FUSIONS[fusion]
         self.hidden, self.frames = hidden, frames
 

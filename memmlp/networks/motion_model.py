@@ -33,9 +33,8 @@ class TrainingOutputs(NamedTuple):
 class MotionModel(nn.Module):
     """A network that takes in frames by calls of `advance`; the interface of all networks.
 
-    Evaluation, export, timing and training know no more of a network than this. In this base class a
-    network sees a window, the last T frames, and its state is only the buffer of past inputs (WindowlessModel
-    has none).
+    Evaluation, export, timing and training use only this interface. In this base class a network sees a
+    window, the last T frames, and its state is only the buffer of past inputs. WindowlessModel has no buffer.
 
     Args:
         normalizer: converts between the world and network space.
@@ -44,8 +43,8 @@ class MotionModel(nn.Module):
     Attributes:
         branches: the parts of the motion that are learned, out of "rotation" and "position"; positions that
             are not learned follow from the rotations.
-        graph: the class of the streaming graph; None if the network has none. A subclass names its own, since
-            it may compute something else than its base.
+        graph: the class of the streaming graph, or None. A subclass names its own, since it may compute
+            something else than its base.
     """
 
     branches: frozenset[str] = frozenset({"rotation"})
@@ -127,7 +126,7 @@ class MotionModel(nn.Module):
 
         Args:
             sparse: world inputs (B, n, 54) of the n newest frames: n is 1 for a live stream, T for windows,
-                and fewer for what is left at a clip's end.
+                and fewer at a clip's end.
             state: what the last call returned, or `initial_state`.
             newest: how many of the newest frames are wanted; by default all that the network predicts.
 
@@ -234,7 +233,7 @@ class OwnWindows(MotionModel):
         return self.normalizer.posed(rotation, inputs[:, -wanted:]), kept
 
 
-def filled(earlier: Tensor, first: Tensor, fresh: Tensor) -> Tensor:
+def fill_past(earlier: Tensor, first: Tensor, fresh: Tensor) -> Tensor:
     """Return a window's earlier frames, which at a fresh start are all copies of the first frame.
 
     The carried frames are zeros then, so a sum is enough; a condition is not available in every runtime.
@@ -247,17 +246,12 @@ def filled(earlier: Tensor, first: Tensor, fresh: Tensor) -> Tensor:
     return earlier + fresh * first
 
 
-def slid(window: Tensor, entering: Tensor, before: Tensor, fresh: Tensor) -> Tensor:
+def slide_window(window: Tensor, entering: Tensor, before: Tensor, fresh: Tensor) -> Tensor:
     """Return a window (T, size) without its oldest frame and with a new one (1, size) at its end.
 
-    At a fresh start `before` (1, size) stands for the frames before it; see `filled`.
+    At a fresh start `before` (1, size) stands for the frames before it; see `fill_past`.
     """
-    return torch.cat([filled(window[1:], before, fresh), entering])
-
-
-def counted(count: Tensor, frames: int) -> Tensor:
-    """Return the count (1,) of frames taken in, after one more step; it grows no further than `frames`."""
-    return count.clamp_max(frames - 1) + 1
+    return torch.cat([fill_past(window[1:], before, fresh), entering])
 
 
 class StreamingGraph(nn.Module):
@@ -317,11 +311,11 @@ class StreamingGraph(nn.Module):
         Returns:
             Motion (1, 1, 198) in the world, and the new state.
         """
-        # Parts of the state that are empty (a queue of no frames) are no inputs of the exported graph, so
-        # they are taken out of the new state and put back from `windows` here.
+        # An exported graph has no empty inputs, so empty parts of the state (a queue of 0 frames) are dropped
+        # from the new state and put back from `windows` here.
         fresh = 1 - state["count"].clamp_max(1)
         motion, kept = self.step(sparse[0], self.windows() | state, fresh)
-        kept["count"] = counted(state["count"], self.frames)
+        kept["count"] = state["count"].clamp_max(self.frames - 1) + 1  # stops at T
         return motion[None], {name: tensor for name, tensor in kept.items() if tensor.numel()}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.diffusion import Diffusion
-from memmlp.networks.motion_model import OwnWindows, State, StreamingGraph, TrainingOutputs, slid
+from memmlp.networks.motion_model import OwnWindows, State, StreamingGraph, TrainingOutputs, slide_window
 from memmlp.networks.sage_parts import LATENT, Decoder, HalfVQVAE, LowerDenoiser, UpperDenoiser, places
 from memmlp.networks.streaming import linear
 from memmlp.networks.transformer import DiTBlock
@@ -91,7 +91,7 @@ class SAGENetGraph(StreamingGraph):
         """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
         entering = self.sparse(encoded)
-        seen = slid(state["seen"], entering, entering, fresh)
+        seen = slide_window(state["seen"], entering, entering, fresh)
         rotation = self.decoded(*seen.split(self.widths, -1))
         return self.normalizer.posed(rotation, sparse), {"seen": seen}
 

@@ -170,7 +170,7 @@ class ProductQuantiser(nn.Module):
     def forward(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return the quantised latents (..., 384), with straight-through gradients, and their loss.
 
-        They are compared with the code-vectors in float32 in a mixed-precision training, too.
+        Distances to the code-vectors are in float32, also in mixed-precision training.
         """
         with in_float32(z.device):
             return self.quantised(z.to(self.vectors.dtype))

@@ -1,6 +1,6 @@
 """Streaming graphs, from which the live step is exported: a network that computes nothing twice.
 
-What depends on one frame alone is computed when the frame enters the window, and carried in the state. The
+What depends on a single frame is computed when the frame enters the window, and carried in the state. The
 last layers compute only what the newest frame needs.
 """
 
@@ -17,41 +17,37 @@ from memmlp.common.errors import InputError
 from memmlp.motion.body import MOTION_DIM, POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.layers import gru_step
-from memmlp.networks.motion_model import MotionModel, State, StreamingGraph, filled
+from memmlp.networks.motion_model import MotionModel, State, StreamingGraph, fill_past
 
 
 def streaming(model: MotionModel) -> StreamingGraph:
     """Make the streaming graph of a trained network, without changing the network.
 
     Raises:
-        InputError: if the network has no streaming graph: estimates of past frames change at each step
-            (`memory.history=latest`), so nothing can be carried; frames are made with later ones, so it is no
-            stream; or a custom part has no graph.
+        InputError: if the network does not have a streaming graph. Its estimates of past frames may change at
+            each step (`memory.history=latest`), it may use future frames, or a custom part may lack a graph.
     """
     if not model.settled:
         raise InputError(
-            "export.graph=streaming: estimates of past frames change at each step (memory.history=latest, or "
-            "a memory of one's own), which no such graph can carry; allowed is export.graph=naive, or "
-            "memory.history=first"
+            "export.graph=streaming: must be naive with memory.history=latest or such a custom memory, since "
+            "estimates of past frames change at each step; or set memory.history=first"
         )
     check_streams(model)
     if not has_stream(model):
-        raise InputError(
-            "export.graph=streaming: a part of one's own has none; allowed is export.graph=naive"
-        )
+        raise InputError("export.graph=streaming: must be naive, since a custom part has no streaming graph")
     graph = vars(type(model))["graph"]
     return graph(model)
 
 
 def check_streams(model: MotionModel) -> None:
-    """Raise InputError for a network that makes frames with later ones: no live step makes its motion."""
+    """Raise InputError for an offline network, which uses future frames."""
     if not model.is_stream:
-        raise InputError("model.offline=true: makes frames with later ones; allowed is model.offline=false")
+        raise InputError("model.offline=true: must be false for a stream, since it uses future frames")
 
 
 def has_stream(model: MotionModel) -> bool:
-    """Return whether there is a streaming graph for a network; custom parts may have none."""
-    graph: type[StreamingGraph] | None = vars(type(model)).get("graph")  # an inherited one does not count
+    """Return whether a network has a streaming graph; custom parts may lack one."""
+    graph: type[StreamingGraph] | None = vars(type(model)).get("graph")  # not the graph of a base class
     return graph is not None and model.settled and model.is_stream and graph.fits(model)
 
 
@@ -185,7 +181,7 @@ class AGRoLGraph(StreamingGraph):
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         entering = self.entering(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
-        window = torch.cat([filled(state["stem"], entering, fresh), entering])
+        window = torch.cat([fill_past(state["stem"], entering, fresh), entering])
         return self.normalizer.posed(self.rotation(window), sparse), {"stem": window[1:]}
 
     def entering(self, encoded: Tensor) -> Tensor:

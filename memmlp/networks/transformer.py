@@ -16,7 +16,7 @@ GAIN = 0.2  # by which the weights at the beginning are smaller than Kaiming's
 class Attention(nn.Module):
     """Multi-head self-attention over the frames of a window (Vaswani et al. 2017, Sec. 3.2).
 
-    Windows without a batch axis are allowed, too.
+    Windows may lack a batch axis.
 
     Args:
         width: d, the width of the features.
@@ -104,7 +104,7 @@ def draw_weights(part: nn.Module) -> None:
 
 
 def encode_newest_frame(layers: list[EncoderLayer], h: Tensor) -> Tensor:
-    """Apply encoder layers to features (T, d); the last layer computes the newest frame (1, d) alone."""
+    """Apply encoder layers to features (T, d); the last layer only computes the newest frame (1, d)."""
     *earlier, last = layers
     for layer in earlier:
         h = layer(h)

@@ -1,7 +1,7 @@
 """Which weights a training validates and keeps: those of the last step, or an average over the steps.
 
-These are called the weights that count. A checkpoint has the last step's weights as well as the average, so
-that a resumed training goes on as if it had never stopped. Only parameters are averaged; buffers, such as a
+These are called the weights that count. A checkpoint has both the last step's weights and the average, so
+that a resumed training continues as if it had never stopped. Only parameters are averaged; buffers, such as a
 codebook's statistics, are the last step's.
 """
 
@@ -121,7 +121,7 @@ class ScheduleFreeAverage(Average):
     """
 
     COUNTERS = ("k", "weight_sum", "lr_max")
-    """What its groups count beside their settings: steps, sum of the average's weights, largest rate."""
+    """What its groups count besides their settings: steps, sum of the average's weights, largest rate."""
 
     def __init__(self, module: nn.Module, optimiser: torch.optim.Optimizer):
         super().__init__(module)

@@ -1,7 +1,7 @@
 """The training loop of VQ-VAEs and motion networks: steps, checkpoints, validation, log.
 
-A step's randomness comes from (seed, step) alone, so a run that was killed and resumed ends in the same
-weights, bit for bit on a CPU, as one that was not. Several processes may train one run together
+A step's randomness only depends on (seed, step). A run that was killed and resumed ends in the same weights,
+bit for bit on a CPU, as one that was not. Several processes may train one run together
 (memmlp.common.distributed); the first of them writes.
 """
 
@@ -219,7 +219,7 @@ def save(
 ) -> None:
     """Write a checkpoint from which another process can resume after `step` steps, which took `seconds`.
 
-    Of several processes the first one writes, and the others go on with its weights.
+    Of several processes the first one writes, and the others continue with its weights.
     """
     distributed.align(task.module)
     if not distributed.first():

@@ -1,6 +1,6 @@
 """The rollout slot: draws the training batch of a step, and makes the history that it sees.
 
-A network that is trained on true history alone comes to rely on it, but has none at run time (exposure bias).
+A network that is only trained on true history comes to rely on it, but lacks it at run time (exposure bias).
 So the history may be made by the network itself, as it will be in a live stream.
 """
 

@@ -268,7 +268,7 @@ def compute_code_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training
     """Return the losses of a VQ-VAE: of the last frame's rotations and joints, and of its codebooks.
 
     In training, random joints of its half except the first are hidden, so that the VQ-VAE has to guess them.
-    The half with the hands has a loss of the hands' positions, too.
+    The half with the hands also has a loss of the hands' positions.
 
     Args:
         net: the network, whose space the VQ-VAE works in.

@@ -37,7 +37,7 @@ class Fixed(nn.Module):
         """
         self.values = {**self.values, **(own or {})}
         if lacking := [name for name in names if name not in self.values]:
-            raise InputError(f"loss: term '{lacking[0]}' has no weight; allowed are {', '.join(self.values)}")
+            raise InputError(f"loss.{lacking[0]}: must have a weight; known are {', '.join(self.values)}")
 
     def parameter_groups(self) -> list[dict]:
         """Return no parameters, since there is nothing to learn."""
@@ -78,7 +78,7 @@ class Uncertainty(nn.Module):
     """Weights by homoscedastic uncertainty (Kendall et al. 2018, reading 8): e^-s L + s, with one s per term.
 
     A term that is exactly 0, such as penetration where no foot is below the floor, leaves its s as it is: no
-    weight would be the largest beside it, and e^-s would grow without bound.
+    weight would be largest, and e^-s would grow without bound.
 
     Args:
         lr: learning rate of the s; with the model's learning rate they would settle too slowly.
@@ -122,9 +122,7 @@ class LearnedWeights(Uncertainty):
     def __init__(self, values: Mapping[str, float], lr: float = 1e-2):
         super().__init__(lr)
         if none := [name for name, value in values.items() if not value]:
-            raise InputError(
-                f"loss.{none[0]}=0: allowed with loss.weighting=learned is a weight above 0, or null"
-            )
+            raise InputError(f"loss.{none[0]}=0: must be above 0, or null, with loss.weighting=learned")
         self.s = nn.ParameterDict(
             {name: nn.Parameter(-torch.tensor(float(value)).log()) for name, value in values.items()}
         )

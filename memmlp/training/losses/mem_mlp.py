@@ -110,14 +110,14 @@ class MotionLoss(Loss):
         super().__init__()
         self.weighting, self.hand, self.branches = weighting, hand, branches
         self.term = term or Term()
-        # The terms of two frames of zeros tell the weighting which names there are.
+        # The weighting gets the terms' names from two frames of zeros.
         probe = torch.zeros(1, 2, FRAME_DIM)
         normalizer = Normalizer.raw(World(), torch.zeros(N_JOINTS, 3))
         motion = probe[..., SPARSE_DIM:]
         probed = motion, motion, probe[..., :SPARSE_DIM], normalizer
         own = dict.fromkeys(self._own(*probed), self.term.weight)
         if twice := own.keys() & self._paper(*probed).keys():
-            raise InputError(f"term: '{min(twice)}' is a term of the loss already; allowed is another name")
+            raise InputError(f"term: '{min(twice)}' must have another name, since the loss has such a term")
         weighting.build(list(self.terms(*probed)), own)
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
