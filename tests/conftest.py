@@ -102,9 +102,9 @@ processes.mark()
 # Begun first, so that no process is left alone with one of them at the end. Those that mostly wait for other
 # processes stand among those that compute.
 LONGEST = (
-    "cli/test_sweep", "deploy/test_deployment", "config/test_build", "pipeline/test_run_stages",
-    "kills/test_search", "pipeline/test_experiment", "live/test_trackers_to_body_graph",
-    "pipeline/test_baselines", "networks/test_streaming", "training/test_loop", "config/test_baselines",
+    "cli/test_sweep", "deploy/test_deployment", "config/test_build", "training/test_run_stages",
+    "kills/test_search", "training/test_experiment", "live/test_trackers_to_body_graph",
+    "training/test_baselines", "networks/test_streaming", "training/test_loop", "config/test_baselines",
     "live/web/test_page", "test_example_package",
     "kills/test_rounds", "config/test_compose", "cli/test_main", "live/test_stream",
     "kills/test_sweep", "tables/test_seed_rounds", "networks/test_baselines", "deploy/test_export",

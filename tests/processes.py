@@ -97,7 +97,7 @@ def started(line: Sequence[str], **options: Any) -> Iterator[subprocess.Popen]:
 
 
 PRELOADED = [
-    "memmlp.config.build", "memmlp.pipeline.run_stages", "memmlp.deploy.export", "memmlp.motion.synthetic",
+    "memmlp.config.build", "memmlp.training.run_stages", "memmlp.deploy.export", "memmlp.motion.synthetic",
     "memmlp.report.pictures.clip_pictures", "torch.onnx", "torch._dynamo", "submitit.local.local",
     "memmlp.cli.sweep", "memmlp.config.worker_process", "memmlp.sweep.controller",
     "memmlp.sweep.executors.local", "memmlp.tables.build_table", "memmlp.tables.sweep_summary",

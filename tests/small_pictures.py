@@ -14,7 +14,7 @@ from PIL import Image
 
 
 def small_picture(model: Any, test: Any, path: Path) -> None:
-    """Write a picture of one pixel, in place of `memmlp.pipeline.run_stages.draw_first_clip`."""
+    """Write a picture of one pixel, in place of `memmlp.training.run_stages.draw_first_clip`."""
     Image.new("RGB", (1, 1)).save(path)
 
 
@@ -23,7 +23,7 @@ original: Any = None
 
 def draw_small() -> None:
     """Runs of this process have both small from now on, if what makes them is imported by now."""
-    if stages := sys.modules.get("memmlp.pipeline.run_stages"):
+    if stages := sys.modules.get("memmlp.training.run_stages"):
         global original
         if stages.draw_first_clip is not small_picture:
             original = stages.draw_first_clip
@@ -34,7 +34,7 @@ def draw_small() -> None:
 
 def draw_large() -> None:
     """Draw real pictures again; no test looks at the times of a yardstick."""
-    from memmlp.pipeline import run_stages
+    from memmlp.training import run_stages
 
     if original is not None:
         run_stages.draw_first_clip = original

@@ -15,7 +15,7 @@ import click
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-    from memmlp.pipeline.run_stages import Outcome
+    from memmlp.training.request import Outcome
 
 NETWORKS = ("Mem-MLP", "RecurrentPoser")
 RECURRENT_POSER = "model=recurrent_poser"

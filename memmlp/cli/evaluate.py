@@ -50,7 +50,8 @@ def evaluate(
     from memmlp.common.files import write_json
     from memmlp.config.open_run import open_run
     from memmlp.evaluation.predictions import save_predictions as write_predictions
-    from memmlp.pipeline.run_stages import clip_rows, complete_stages
+    from memmlp.training.request import clip_rows
+    from memmlp.training.run_stages import complete_stages
 
     _check_places(json_path, save_predictions)
     found = open_run(outputs, run, device, overrides)

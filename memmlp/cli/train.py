@@ -29,7 +29,7 @@ from memmlp.config.config_errors import explain
 from memmlp.config.package_data import packaged
 
 if TYPE_CHECKING:
-    from memmlp.pipeline.run_stages import Outcome
+    from memmlp.training.request import Outcome
 
 
 @click.command(
@@ -155,11 +155,19 @@ def run_training(cfg: DictConfig) -> Outcome | None:
         The outcome; None in the processes that trained along.
     """
     from memmlp.cli.train_summary import show
-    from memmlp.config.build import build_experiment
-    from memmlp.pipeline.devices import use_threads
-    from memmlp.pipeline.run_in_processes import run_in_processes
+    from memmlp.config.build_request import build_request
+    from memmlp.training.request import finished_outcome
 
-    use_threads(cfg.threads)
-    if outcome := run_in_processes(build_experiment(cfg)):
+    outcome = None
+    if distributed.size() == 1:
+        outcome = finished_outcome(build_request(cfg))  # needs no torch
+    if outcome is None:
+        from memmlp.config.build import build_experiment
+        from memmlp.training.devices import use_threads
+        from memmlp.training.run_stages import run_in_processes
+
+        use_threads(cfg.threads)
+        outcome = run_in_processes(build_experiment(cfg))
+    if outcome:
         show(outcome)
     return outcome

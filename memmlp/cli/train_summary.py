@@ -12,7 +12,6 @@ from rich.table import Table
 
 from memmlp.common.thread_core_share import LEAST_CORE_SHARE
 from memmlp.evaluation.metric_facts import UNITS
-from memmlp.pipeline.run_stages import Outcome
 from memmlp.runs.deployment_folder import (
     INT8_PRECISIONS,
     MAX_GROWTH,
@@ -25,6 +24,7 @@ from memmlp.runs.motion_seen import frames_seen, hardly_trained
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import BRANCHES
 from memmlp.tables.measured_run import CORE_SHARES, SAME, SHARED, Errors, load
+from memmlp.training.request import Outcome
 
 STAGES = ("training", "evaluation", "deployment")
 COLUMNS = [(mode, branch) for mode in ("stream", "window") for branch in BRANCHES]

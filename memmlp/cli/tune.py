@@ -20,10 +20,10 @@ from memmlp.common.overrides import Override
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
 
-    from memmlp.pipeline.experiment import Experiment
     from memmlp.sweep.plan import RunTask
     from memmlp.sweep.search.search_file import Search, Value
     from memmlp.sweep.search.study import Study
+    from memmlp.training.request import RunRequest
 
 
 @click.command("tune")
@@ -146,14 +146,14 @@ def _check_space(setup: Setup) -> str:
     for word in setup.words:
         if Override.parse(word).key in {one.key for one in space}:
             raise InputError(f"{word}: is searched; leave it out of the space with search.space....=null")
-    experiments = [_experiments(setup, {})[0]]
+    requests = [_requests(setup, {})[0]]
     for number in range(max(len(one.corners()) for one in space)):
         corner = {one.key: one.corners()[number % len(one.corners())] for one in space}
         try:
-            experiments.append(_experiments(setup, corner)[0])
+            requests.append(_requests(setup, corner)[0])
         except InputError as error:
             raise InputError(f"search.space: {error}") from None
-    configs = [experiment.config for experiment in experiments]
+    configs = [request.config for request in requests]
     _check_validation(configs)
     for one in space:
         # Some change it at other values than 0.
@@ -162,7 +162,7 @@ def _check_space(setup: Setup) -> str:
             raise InputError(f"search.space: {one.key}: changes no training; allowed are keys that do")
     first = _tasks(setup, next(iter(setup.search.first_trials()), {}))[0][-1]
     often = f"validated every {first.config['optim']['validate_every']} steps"  # when trials may be pruned
-    trained = digest([one.identity("").id for one in experiments])  # what the first trial need not have
+    trained = digest([one.identity("").id for one in requests])  # what the first trial need not have
     return f"{first.id}, {often}, used with {inference(first.config)}, trained with {trained}"
 
 
@@ -185,13 +185,13 @@ def _tasks(setup: Setup, values: Mapping[str, Value]) -> list[Sequence[RunTask]]
     """Return the runs of a trial with these values, as a list of tasks for each seed; prepares the data."""
     from memmlp.config.compose_plan import tasks_of
 
-    experiments = _experiments(setup, values)
-    return [tasks_of(experiment, experiment.motion.prepare().digest) for experiment in experiments]
+    requests = _requests(setup, values)
+    return [tasks_of(request, request.motion.prepare().digest) for request in requests]
 
 
-def _experiments(setup: Setup, values: Mapping[str, Value]) -> list[Experiment]:
-    """Build the checked experiments of a trial: one for the config's seed, and one for each further seed."""
-    from memmlp.config.build import build_experiment
+def _requests(setup: Setup, values: Mapping[str, Value]) -> list[RunRequest]:
+    """Return the checked requests of a trial: one for the config's seed, and one for each further seed."""
+    from memmlp.config.build_request import build_request
     from memmlp.config.compose import composed
 
     own = ["--config-dir", str(setup.config_dir)] if setup.config_dir else []
@@ -200,7 +200,7 @@ def _experiments(setup: Setup, values: Mapping[str, Value]) -> list[Experiment]:
     first, found = cfg.seed, []
     for number in range(setup.search.seeds):
         cfg.seed = first + number
-        found.append(build_experiment(cfg, elsewhere=True))
+        found.append(build_request(cfg))
     return found
 
 
@@ -222,14 +222,14 @@ def search(setup: Setup, study: Study, workers: Workers) -> None:
     from memmlp.sweep.search.progress_table import SearchBoard
 
     plan = Plan(setup.folder.name, setup.outputs, (), (), open=True)
-    base = _experiments(setup, {})[0]
+    base = _requests(setup, {})[0]
     check = partial(_check_same_clips, base, base.motion.prepare().digest)
     director = Director(study, partial(_tasks, setup), plan, check)
     path, fleet = hire(setup.folder, plan, workers, {base.config["device"]})
     direct(director, fleet, SearchBoard(setup.outputs), path)
 
 
-def _check_same_clips(base: Experiment, digest: str) -> None:
+def _check_same_clips(base: RunRequest, digest: str) -> None:
     """Raise InputError if the data has another digest now, so that further trials would be judged by it."""
     if base.motion.prepare().digest != digest:
         raise InputError(
@@ -248,7 +248,7 @@ def write_results(setup: Setup, study: Study) -> None:
     results.write_trials(study, setup.folder / "trials.csv")
     groups = [path.name for path in packaged("conf").iterdir() if path.is_dir()]
     results.write_experiments(study, setup.folder, groups)
-    model = option_in_slot(_experiments(setup, {})[0].config, "model")
+    model = option_in_slot(_requests(setup, {})[0].config, "model")
     if model == USUAL["model"]:  # Table 5 is of no other network
         table = f"table{results.TABLE:02d}.yaml"
         results.write_table(study, packaged("sweeps") / table, setup.folder / table, setup.words)
@@ -263,9 +263,9 @@ def summary(setup: Setup, study: Study) -> None:
     from rich.console import Console
     from rich.text import Text
 
-    from memmlp.pipeline.data_remarks import partial_words
     from memmlp.sweep.search.progress_table import counts, figures, row, trials_table
     from memmlp.sweep.search.results import IMPORTANCE, at_an_end, importances, too_few_trials
+    from memmlp.training.data_remarks import partial_words
 
     console = Console(highlight=False)
     best = study.best()
@@ -282,8 +282,8 @@ def summary(setup: Setup, study: Study) -> None:
     for line in at_an_end(study.study):
         click.echo(line)
     click.echo(counts(study))
-    experiment = _experiments(setup, {})[0]
-    if part := partial_words(experiment, experiment.motion.prepare()):
+    request = _requests(setup, {})[0]
+    if part := partial_words(request.config, request.motion.prepare()):
         click.echo(f"on a part of the data: {part}")
     click.echo(f"in {setup.folder}")
     if best:
@@ -313,14 +313,13 @@ def training(setup: Setup, trial: FrozenTrial) -> list[str]:
 
 def _makes(setup: Setup, words: Sequence[str], run_id: str) -> bool:
     """Return whether `memmlp train` with these words makes the run with that id."""
-    from memmlp.config.build import build_experiment
+    from memmlp.config.build_request import build_request
     from memmlp.config.compose import composed
-    from memmlp.config.compose_plan import tasks_of
 
     try:
         cfg = composed(words)
         cfg.paths.outputs = str(setup.outputs)
-        experiment = build_experiment(cfg, elsewhere=True)
-        return tasks_of(experiment, experiment.motion.prepare().digest)[-1].id == run_id
+        request = build_request(cfg)
+        return request.identity(request.motion.prepare().digest).id == run_id
     except InputError:
         return False

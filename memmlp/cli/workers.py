@@ -117,7 +117,7 @@ def check_devices(wanted: Iterable[str], gpus: Share, executor: str) -> None:
         if executor == "local" and name == "cuda" and not gpus:
             raise InputError("device=cuda: no GPU is visible here; allowed here is device=cpu or device=auto")
     if gpus and wanted:
-        from memmlp.pipeline.devices import missing_gpu
+        from memmlp.training.devices import missing_gpu
 
         if line := missing_gpu():
             raise InputError(line)

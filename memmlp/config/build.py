@@ -18,7 +18,8 @@ from omegaconf.errors import OmegaConfBaseException
 from memmlp.common.errors import InputError
 from memmlp.common.plugin import METRICS
 from memmlp.config import plugins
-from memmlp.config.build_motion import build_motion, shares
+from memmlp.config.build_motion import shares
+from memmlp.config.build_request import build_request
 from memmlp.config.compose import composed
 from memmlp.config.instantiate import built, located
 from memmlp.config.name_from_config import readable_name
@@ -32,7 +33,6 @@ from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.network_coordinates import Coordinates, Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.architectures import (
-    VQVAE_SETTINGS,
     Architecture,
     MemMLPArchitecture,
     PartedArchitecture,
@@ -42,10 +42,11 @@ from memmlp.networks.architectures import (
 from memmlp.networks.memory import Memory
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.vqvae import VQVAE
-from memmlp.pipeline.devices import device
-from memmlp.pipeline.experiment import Experiment, UpstreamTraining
+from memmlp.runs.identity import VQVAE_SHAPE
 from memmlp.runs.lookup import check_trained
 from memmlp.runs.run import Run
+from memmlp.training.devices import device
+from memmlp.training.experiment import Experiment, PrerequisiteTraining
 from memmlp.training.losses import Loss, MotionLoss, Term
 from memmlp.training.optim import Optim, vqvae_optim
 from memmlp.training.train_network import NetworkTraining
@@ -70,19 +71,15 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
     Raises:
         InputError: if the config's device, or the code of a custom component, does not exist here.
     """
-    outputs = Path(cfg.paths.outputs)
     unrefined = build_experiment(_unrefined(cfg), elsewhere) if cfg.refiner is not None else None
-    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-    config["plugins"] = plugins.used(config)
+    request = build_request(cfg)
     metrics = build_metrics(cfg.evaluation.metrics)
     return Experiment(
-        config=config,
-        outputs=outputs,
+        config=request.config,
+        motion=request.motion,
         device=torch.device("cpu") if elsewhere else device(cfg.device),
-        force=cfg.force,
-        motion=build_motion(cfg),
         architecture=build_architecture(cfg),
-        upstream=build_upstream(cfg, config),
+        prerequisites=build_prerequisites(cfg, request.config),
         training=build_training(cfg, metrics),
         evaluation=Evaluation(
             modes=list(cfg.evaluation.modes),
@@ -92,9 +89,8 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
             metrics=metrics,
         ),
         deployment=build_deployment(cfg),
-        predictions=Path(cfg.save_predictions) if cfg.save_predictions else None,
         loggers=build_loggers(cfg),
-        called=readable_name,
+        make_name=readable_name,
         unrefined=unrefined,
     )
 
@@ -106,10 +102,10 @@ def _unrefined(cfg: DictConfig) -> DictConfig:
     return bare
 
 
-def build_upstream(cfg: DictConfig, config: dict[str, Any]) -> tuple[UpstreamTraining, ...]:
-    """Build the trainings of the upstream runs of a checked config's network, in order.
+def build_prerequisites(cfg: DictConfig, config: dict[str, Any]) -> tuple[PrerequisiteTraining, ...]:
+    """Build the trainings of the runs that a checked config's network builds upon, in order.
 
-    The only run upstream of a refiner is its network's.
+    The only prerequisite of a refiner is its network's run.
 
     Args:
         cfg: the config.
@@ -123,10 +119,8 @@ def build_upstream(cfg: DictConfig, config: dict[str, Any]) -> tuple[UpstreamTra
         return tuple(built(cfg.upstream).trainings(config, training))
     if cfg.memory is None or not memory_class(cfg).uses_codes:
         return ()
-    codes = {"normalizer": config["normalizer"], "vqvae": config["vqvae"]}
-    codes |= {"data": {"mirror": True}} if cfg.data.mirror else {}
     optim = partial(build_vqvae_optim, cfg)
-    return (VQVAETraining(codes, seed=cfg.vqvae.seed, optim=optim, mirror=cfg.data.mirror),)
+    return (VQVAETraining(seed=cfg.vqvae.seed, optim=optim, mirror=cfg.data.mirror),)
 
 
 def build_training(cfg: DictConfig, metrics: dict[str, UserMetric]) -> NetworkTraining | RefinerTraining:
@@ -165,7 +159,7 @@ def build_architecture(cfg: DictConfig) -> Architecture:
 
 def build_unrefined_architecture(cfg: DictConfig) -> Architecture:
     """Build the architecture of a checked config's network, without a refiner."""
-    vqvae = partial(VQVAE, **{name: cfg.vqvae[name] for name in VQVAE_SETTINGS})
+    vqvae = partial(VQVAE, **{name: cfg.vqvae[name] for name in VQVAE_SHAPE})
     coordinates = build_coordinates(cfg.normalizer.coordinates)
     common = {"coordinates": coordinates, "normalize": cfg.normalizer.z_scores, "vqvae": vqvae}
     if "_target_" in cfg.model:

@@ -27,7 +27,7 @@ from memmlp.sweep.sweep_json import keep_sweep
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-    from memmlp.pipeline.experiment import Experiment
+    from memmlp.training.request import RunRequest
 
 
 def find_sweep(name: str, overrides: Sequence[str] = ()) -> Sweep:
@@ -199,11 +199,11 @@ def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[s
     data: dict[str, dict[str, Any]] = {}
     complete = True
     for arm in sweep.runnable():
-        for seed, experiment in _experiments(sweep, arm, outputs):
-            known = _data_digest(experiment, prepare, data)
+        for seed, request in _requests(sweep, arm, outputs):
+            known = _data_digest(request, prepare, data)
             complete &= known is not None
             if known is not None:
-                found = tasks_of(experiment, known)
+                found = tasks_of(request, known)
                 planned.append((Entry(arm.label, seed, found[-1].id, found[-1].stages), found))
     planned.sort(key=lambda one: sweep.seeds.index(one[0].seed))  # a half-done sweep then has every arm
     tasks = unique(task for _, found in planned for task in found)
@@ -211,48 +211,47 @@ def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[s
     return plan, list(data.values()) if complete else None
 
 
-def _experiments(sweep: Sweep, arm: Variant, outputs: Path) -> Iterable[tuple[int, Experiment]]:
-    """Yield the checked experiments of an arm, with their seeds."""
-    from memmlp.config.build import build_experiment
+def _requests(sweep: Sweep, arm: Variant, outputs: Path) -> Iterable[tuple[int, RunRequest]]:
+    """Yield the checked requests of an arm, with their seeds."""
+    from memmlp.config.build_request import build_request
     from memmlp.config.compose import composed
 
     try:
         cfg = composed(list(sweep.all_overrides(arm)))
         if cfg.force:  # arms that share a run would make it again and again
-            raise InputError("force=true: allowed is --again, which does a sweep's finished runs again")
+            raise InputError("force=true: use --again, which makes a sweep's finished runs again")
         for seed in sweep.seeds_of(arm):
             cfg.seed, cfg.paths.outputs = seed, str(outputs)
-            yield seed, build_experiment(cfg, elsewhere=True)
+            yield seed, build_request(cfg)
     except InputError as error:
         raise InputError(f"sweep {sweep.name}, variant '{arm.label}': {error}") from None
 
 
-def tasks_of(experiment: Experiment, data: str) -> list[RunTask]:
-    """Return the runs that an experiment needs on data with this digest, its own run last."""
-    own = experiment.identity(data)
-    upstream = [
-        RunTask(one.id, one.kind, experiment.config, one.upstream.id if one.upstream else None)
-        for one in experiment.upstream_identities(data)
-    ]
-    if experiment.unrefined:  # the network's training is enough of it
-        *upstream, network = tasks_of(experiment.unrefined, data)
-        upstream = [*upstream, replace(network, stages=())]
-    last = upstream[-1].id if upstream else None
-    return [*upstream, RunTask(own.id, own.kind, experiment.config, last, experiment.stage_ids, own.what)]
+def tasks_of(request: RunRequest, data: str) -> list[RunTask]:
+    """Return the runs that a request needs on data with this digest, its own run last."""
+    from memmlp.training.request import without_refiner
+
+    bare = without_refiner(request.config) if request.config["refiner"] is not None else request.config
+    *before, own = request.identities(data)
+    tasks = [RunTask(one.id, one.kind, bare, one.upstream.id if one.upstream else None) for one in before]
+    if bare is not request.config:  # the training of the network that is refined is enough
+        tasks[-1] = replace(tasks[-1], what=before[-1].what)
+    last = before[-1].id if before else None
+    return [*tasks, RunTask(own.id, own.kind, request.config, last, request.stage_ids, own.what)]
 
 
-def _data_digest(experiment: Experiment, prepare: bool, known: dict[str, dict[str, Any]]) -> str | None:
-    """Return the digest of the experiment's prepared data; None if it is not prepared.
+def _data_digest(request: RunRequest, prepare: bool, known: dict[str, dict[str, Any]]) -> str | None:
+    """Return the digest of the request's prepared data; None if it is not prepared.
 
     The digest is looked up once for each data config and kept in `known`.
     """
-    config = {"data": experiment.config["data"], "paths": experiment.config["paths"]}
+    config = {"data": request.config["data"], "paths": request.config["paths"]}
     key = digest(config)
     if key not in known:
-        found = experiment.motion.prepare().digest if prepare else experiment.motion.digest()
+        found = request.motion.prepare().digest if prepare else request.motion.digest()
         if found is None:
             return None
-        known[key] = {"config": config, "digest": found, "groups": experiment.motion.groups_digest}
+        known[key] = {"config": config, "digest": found, "groups": request.motion.groups_digest}
     return known[key]["digest"]
 
 

@@ -17,11 +17,11 @@ from memmlp.config.build import build_experiment, config_of
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.motion_source import Prepared
 from memmlp.networks.motion_model import MotionModel
-from memmlp.pipeline.devices import device
-from memmlp.pipeline.experiment import Experiment
 from memmlp.runs.identity import DEPLOYMENT, EVALUATION, INFERENCE, training_config
 from memmlp.runs.lookup import find_run
 from memmlp.runs.run import Run
+from memmlp.training.devices import device
+from memmlp.training.experiment import Experiment
 
 ACTING = (*EVALUATION, *DEPLOYMENT, "data", "paths", "plugins", "loggers")
 """The groups whose keys have an effect on a finished run; so have the keys of INFERENCE."""

@@ -7,14 +7,11 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from memmlp.common.errors import InputError
 from memmlp.sweep.plan import Plan, RunTask
 from memmlp.sweep.worker import Cancelled, Presence, directed, work_off
-
-if TYPE_CHECKING:
-    from memmlp.pipeline.experiment import Experiment
+from memmlp.training.request import RunRequest
 
 
 def work_under_controller(path: str, threads: int, controller: str, gpu: bool) -> str | None:
@@ -56,7 +53,7 @@ def work_alone(path: str, gpu: bool) -> str | None:
 
 def missing_gpu() -> str | None:
     """Return a line that says that torch finds no GPU in a worker that should have one; None if it does."""
-    from memmlp.pipeline import devices  # it imports torch
+    from memmlp.training import devices  # it imports torch
 
     return devices.missing_gpu()
 
@@ -76,26 +73,25 @@ def perform(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
 
     from memmlp.config.build import build_experiment
     from memmlp.config.plugins import activate
-    from memmlp.pipeline.devices import use_threads
-    from memmlp.pipeline.run_stages import make_upstream_runs, run_experiment
     from memmlp.runs.identity import NETWORK
+    from memmlp.training.devices import use_threads
+    from memmlp.training.run_stages import make_prerequisites, run_experiment
 
     activate(task.config.get("plugins") or ())
     experiment = build_experiment(OmegaConf.create(dict(task.config)))
     check_identity(experiment, task)
     use_threads(experiment.config["threads"] or threads)
     if task.kind != NETWORK:
-        make_upstream_runs(experiment, experiment.motion.prepare(), task.id)
+        make_prerequisites(experiment, experiment.motion.prepare(), task.id)
     else:
         run_experiment(experiment, partial(check_wanted, path, task.id))
 
 
-def check_identity(experiment: Experiment, task: RunTask) -> None:
+def check_identity(request: RunRequest, task: RunTask) -> None:
     """Prepare the data, and raise InputError if the task's identity is no longer the plan's."""
     from memmlp.config.compose_plan import tasks_of
 
-    digest = experiment.motion.prepare().digest
-    known = tasks_of(experiment, digest)
+    known = tasks_of(request, request.motion.prepare().digest)
     if task.key not in {key for found in known for key in (found.id, found.key)}:
         raise InputError(f"run {task.id}: the data or the code changed since the sweep began; start it again")
 

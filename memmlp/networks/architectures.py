@@ -21,8 +21,6 @@ from memmlp.networks.predictor import Predictor
 from memmlp.networks.refiner import Refined, SAGERefiner
 from memmlp.networks.vqvae import VQVAE
 
-VQVAE_SETTINGS = ("codes", "width", "encoder_depth", "decoder_depth", "commitment", "decay", "codebook")
-
 
 @dataclass(frozen=True)
 class Architecture:

@@ -62,6 +62,9 @@ DRAWS = re.compile(r"data\.(drawn_by|mirror|split\.train_fraction|sources\..+\.w
 
 SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term", "refiner", "upstream", "optim")
 
+VQVAE_SHAPE = ("codes", "width", "encoder_depth", "decoder_depth", "commitment", "decay", "codebook")
+"""The keys of a VQ-VAE that count if it is trained with the network; the others are of its own training."""
+
 UNNAMED = {"optim": "adamw"}
 """The options of slots that runs have from before these were slots; their names do not count."""
 

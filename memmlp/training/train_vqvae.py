@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -31,13 +31,11 @@ class VQVAETraining:
     since an epoch has each once (reading 5). So networks that draw windows in other ways share their VQ-VAE.
 
     Attributes:
-        config: the part of the resolved config that determines the result.
         seed: seed of the weights and batches.
         optim: makes the optimisation, given the number of training frames.
         mirror: whether half of the training frames are mirrored (see MirroredDataset).
     """
 
-    config: dict[str, Any]
     seed: int
     optim: Callable[[int], Optim]
     mirror: bool = False

@@ -37,7 +37,7 @@ def test_threads_that_one_job_asks_for_are_not_those_of_the_next(monkeypatch: py
     before, used = torch.get_num_threads(), []
     monkeypatch.setattr("memmlp.config.build.build_experiment", lambda cfg: cfg)
     monkeypatch.setattr(
-        "memmlp.pipeline.run_in_processes.run_in_processes", lambda _: used.append(torch.get_num_threads())
+        "memmlp.training.run_stages.run_in_processes", lambda _: used.append(torch.get_num_threads())
     )
     try:
         train(["-m", f"threads=0,{before + 1},0"])

@@ -13,8 +13,8 @@ from fake_runs import fake_run
 from rich.console import Console
 
 from memmlp.cli.train_summary import show, show_latency, show_side_by_side, size, source_tables
-from memmlp.pipeline.run_stages import Outcome
 from memmlp.runs.evaluation_file import write_report
+from memmlp.training.request import Outcome
 
 MEASURED = {"parameters": 19_238, "parameters_with_vqvae": 27_050, "macs": 218_048, "onnx_bytes": 995_047}
 

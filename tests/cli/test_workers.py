@@ -11,8 +11,8 @@ from memmlp.cli import workers as workers_module
 from memmlp.cli.workers import Workers, check_devices, hire, split_executor
 from memmlp.common.errors import InputError
 from memmlp.config import worker_process
-from memmlp.pipeline import devices
 from memmlp.sweep.plan import Plan
+from memmlp.training import devices
 
 
 @pytest.fixture

@@ -21,9 +21,9 @@ from memmlp.evaluation import modes as evaluation
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
-from memmlp.pipeline.experiment import Experiment
-from memmlp.pipeline.run_stages import make_upstream_runs
 from memmlp.runs.run import Run
+from memmlp.training.experiment import Experiment
+from memmlp.training.run_stages import make_prerequisites
 
 TINY = [
     "profile=tiny", "data.synth.minutes=0.1", "loggers=none", "threads=1", "optim.steps=2", "vqvae.steps=2",
@@ -125,7 +125,7 @@ def trained(overrides: list[str]) -> Arm:
 def train_and_stream(cfg: DictConfig) -> Arm:
     experiment = build_experiment(cfg)
     data = experiment.motion.prepare()
-    above = make_upstream_runs(experiment, data)
+    above = make_prerequisites(experiment, data)
     run = Run(Path(mkdtemp(dir=".", prefix="arm-")))
     weights = above.model if above else None
     model = experiment.training.train(experiment.architecture, data, weights, run, experiment.device)
@@ -355,7 +355,7 @@ def test_a_joint_vqvae_is_part_of_the_runs_identity_and_its_own_stage_is_not():
     base = identity()
     assert all(identity(change) != base for change in ("vqvae.codes=32", "vqvae.encoder_depth=2"))
     assert all(identity(change) == base for change in ("vqvae.steps=7", "vqvae.lr=0.5", "loggers=none"))
-    assert experiment_of().upstream_identities("data") == []
+    assert experiment_of().identities("data") == [experiment_of().identity("data")]
 
 
 def test_a_refiner_has_a_rate_of_its_own_and_its_network_keeps_its():

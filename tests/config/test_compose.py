@@ -113,12 +113,12 @@ def test_a_network_without_positions_has_no_inverse_kinematics_in_the_literal_re
 
 def test_a_vqvaes_epochs_are_of_the_training_frames():
     """100 epochs of 1000 frames in batches of 256 are 390.6 steps; steps are steps, whatever the frames."""
-    optim = build_experiment(composed(["profile=paper"])).upstream[0].optim
+    optim = build_experiment(composed(["profile=paper"])).prerequisites[0].optim
     assert [optim(frames).steps for frames in (1000, 5_000_000)] == [391, 1_953_125]
     assert optim(1000).validate_every == 391
-    half = build_experiment(composed(["vqvae.epochs=0.5", "vqvae.steps=null"])).upstream[0].optim
+    half = build_experiment(composed(["vqvae.epochs=0.5", "vqvae.steps=null"])).prerequisites[0].optim
     assert half(5120).steps == 10
-    steps = build_experiment(composed([])).upstream[0].optim
+    steps = build_experiment(composed([])).prerequisites[0].optim
     assert [steps(frames).steps for frames in (1000, 5_000_000)] == [2000, 2000]
 
 

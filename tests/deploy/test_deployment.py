@@ -128,7 +128,7 @@ def test_a_run_in_int8_records_what_it_costs(home, memmlp, monkeypatch):
     deployed.int8.write_bytes(b"")
     assert made.verify() == [f"deployments/{deployed.folder.name}/step.int8.onnx"]
 
-    # The float32 file is exported as it is without int8 (tests/pipeline/test_run_stages.py).
+    # The float32 file is exported as it is without int8 (tests/training/test_run_stages.py).
     monkeypatch.setattr(
         "memmlp.deploy.export.export", lambda model, path, run, opset: copyfile(deployed.onnx, path)
     )

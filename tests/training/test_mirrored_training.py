@@ -13,8 +13,8 @@ from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.networks import checkpoint
-from memmlp.pipeline.experiment import Experiment
 from memmlp.runs.run import Run
+from memmlp.training.experiment import Experiment
 
 DATA = SimpleNamespace(manifest=SimpleNamespace(rest=builtin_rest_joints()), open=lambda split: tiny.frames())
 SHORT = [
@@ -40,12 +40,12 @@ def differ(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool
 def test_a_vqvae_learns_mirrored_frames_and_is_another_run(tmp_path: Path):
     plain, mirrored = experiment(False), experiment(True)
     made = {
-        name: trained(one.upstream[0], one.architecture, None, tmp_path / name)
+        name: trained(one.prerequisites[0], one.architecture, None, tmp_path / name)
         for name, one in (("plain", plain), ("again", plain), ("mirrored", mirrored))
     }
     assert not differ(made["plain"], made["again"])
     assert differ(made["plain"], made["mirrored"])
-    (one,), (other,) = (found.upstream_identities("d") for found in (plain, mirrored))
+    (one, _), (other, _) = (found.identities("d") for found in (plain, mirrored))
     assert one.id != other.id
 
 

@@ -160,9 +160,9 @@ def test_the_learning_rate_falls_where_it_is_told():
 
 def test_parts_are_trained_by_adamw_and_name_what_they_do_not_use():
     words = ["model=sage", "profile=tiny"]
-    assert not any(training.unused for training in build_experiment(composed(words)).upstream)
+    assert not any(training.unused for training in build_experiment(composed(words)).prerequisites)
     words += ["optim=muon", "optim.warmup=5", "optim.precision=bf16"]
-    for training in build_experiment(composed(words)).upstream:
+    for training in build_experiment(composed(words)).prerequisites:
         assert training.unused == ("optim=muon", "optim.warmup=5")
         assert "optim=muon, optim.warmup=5" in training.description
         assert training.network.optim.precision == "bf16"

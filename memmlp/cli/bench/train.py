@@ -11,7 +11,7 @@ import click
 from memmlp.cli.options import Finite, config_dir_option, plugins_option
 
 if TYPE_CHECKING:
-    from memmlp.pipeline.experiment import Experiment
+    from memmlp.training.experiment import Experiment
 
 ERRORS = ("MPJRE", "MPJPE", "MPJVE", "Jitter")
 BASE = ("profile=small", "device=cpu", "loggers=none")
@@ -135,7 +135,7 @@ def measure_seed(
 
     from memmlp.common.errors import InputError
     from memmlp.common.progress import progress_bar
-    from memmlp.pipeline.run_stages import make_upstream_runs
+    from memmlp.training.run_stages import make_prerequisites
     from memmlp.training.time_to_error import Learner, find_first, train_in_turn
     from memmlp.training.train_network import NetworkTraining
 
@@ -155,7 +155,7 @@ def measure_seed(
         training = experiment.training
         assert isinstance(training, NetworkTraining)
         training.optim.check_installed()
-        above = make_upstream_runs(experiment, data[name])
+        above = make_prerequisites(experiment, data[name])
         weights = above.weights() if above else None
         task = training.task(experiment.architecture, data[name], weights, experiment.device)
         learners[name] = Learner(task, training.optim, training.seed, f"rotation {error}")

@@ -8,7 +8,7 @@ import torch
 from memmlp.common import distributed
 from memmlp.common.errors import InputError
 from memmlp.config.schema.value_rules import DEVICE
-from memmlp.pipeline.devices import described, device, missing_gpu, overlooked_gpu, use_threads
+from memmlp.training.devices import described, device, missing_gpu, overlooked_gpu, use_threads
 
 
 @pytest.fixture
@@ -109,7 +109,7 @@ def test_a_gpu_that_torch_cannot_use_is_told(gpus, monkeypatch, tmp_path, name, 
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     if visible is not None:
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-    monkeypatch.setattr("memmlp.pipeline.devices.NVIDIA", tmp_path / ("." if driver else "none"))
+    monkeypatch.setattr("memmlp.training.devices.NVIDIA", tmp_path / ("." if driver else "none"))
     assert bool(line := overlooked_gpu(name)) == said
     assert not line or "cannot use this machine's GPU; device=cpu" in line
 

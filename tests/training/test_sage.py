@@ -15,8 +15,8 @@ from memmlp.config.compose_plan import tasks_of
 from memmlp.config.worker_process import check_identity
 from memmlp.networks import checkpoint
 from memmlp.networks.sage_net import SAGENet
-from memmlp.pipeline.run_stages import make_upstream_runs
 from memmlp.runs.lookup import check_trained, list_runs
+from memmlp.training.run_stages import make_prerequisites
 from memmlp.training.train_sage import PARTS
 
 SHORT = [
@@ -66,7 +66,7 @@ def test_one_command_trains_each_part_and_then_the_whole(memmlp):
     weights = chain[2].model.read_bytes()
     chain[2].reset()
     experiment = build_experiment(composed(SHORT))
-    made = make_upstream_runs(experiment, experiment.motion.prepare(), chain[2].id)
+    made = make_prerequisites(experiment, experiment.motion.prepare(), chain[2].id)
     assert (made.id, made.model.read_bytes()) == (chain[2].id, weights)
     assert "finished already" in memmlp("train", *SHORT).out
 
@@ -104,7 +104,7 @@ def test_a_key_changes_the_runs_in_which_it_acts_and_all_that_build_upon_them():
 
 def chain_of(cfg) -> list[str]:
     experiment = build_experiment(cfg)
-    return [identity.id for identity in (*experiment.upstream_identities("d"), experiment.identity("d"))]
+    return [identity.id for identity in experiment.identities("d")]
 
 
 @pytest.mark.slow

@@ -13,8 +13,8 @@ from memmlp.config.compose import composed
 from memmlp.config.compose_plan import tasks_of
 from memmlp.config.worker_process import check_identity
 from memmlp.networks.refiner import Refined
-from memmlp.pipeline.run_in_processes import run_in_processes
 from memmlp.runs.lookup import list_runs
+from memmlp.training.run_stages import run_in_processes
 
 SHORT = [
     "profile=tiny", "data.synth.minutes=0.05", "loggers=none", "threads=1", "optim.steps=2",

@@ -21,10 +21,10 @@ from memmlp.deploy.deployment import GRAPHS
 from memmlp.evaluation import modes as evaluation
 from memmlp.experiment_tracking.follower_pipe import Loggers
 from memmlp.motion.dataset import MotionDataset
-from memmlp.pipeline.experiment import Experiment
-from memmlp.pipeline.run_stages import make_upstream_runs
 from memmlp.runs.identity import NEUTRAL, Identity, deployment_id, evaluation_id, flatten
 from memmlp.runs.run import Run
+from memmlp.training.experiment import Experiment
+from memmlp.training.run_stages import make_prerequisites
 
 BASE = [
     "profile=tiny", "data=mocap", "data.root=clips", "data.split.groups=[]", "memory.shift=frame",
@@ -74,8 +74,8 @@ UNTRIED = {
     "plugins": "changes no run by itself: tests/config/test_plugins.py",
     "term": "one of a package of one's own: tests/config/test_plugins.py",
     "evaluation.metrics": "of a package of one's own: tests/config/test_plugins.py",
-    "upstream": "parts of SAGE-Net, each a run of its own: tests/pipeline/test_sage.py",
-    "refiner": "a run of its own, behind the network's: tests/pipeline/test_refiner.py",
+    "upstream": "parts of SAGE-Net, each a run of its own: tests/training/test_sage.py",
+    "refiner": "a run of its own, behind the network's: tests/training/test_refiner.py",
     "vqvae.epochs": "steps by another name: the two exclude each other (tests/config/test_compose.py)",
 }
 LAST_DIGITS = {
@@ -138,10 +138,11 @@ def base(home: Path) -> Outcome:
 
 def outcome(folder: Path, overrides: list[str]) -> Outcome:
     """Make everything but the data in an empty folder, so that no run can be found by a wrong identity."""
-    experiment = replace(build_experiment(composed([*BASE, *overrides])), outputs=folder)
+    experiment = build_experiment(composed([*BASE, *overrides]))
+    experiment.config["paths"]["outputs"] = str(folder)
     data = experiment.motion.prepare()
     identity = experiment.identity(data.digest)
-    codes = make_upstream_runs(replace(experiment, loggers=Loggers((), folder)), data).model
+    codes = make_prerequisites(replace(experiment, loggers=Loggers((), folder)), data).model
     run = Run(folder / "run")
     run.folder.mkdir(parents=True)
     model = experiment.training.train(experiment.architecture, data, codes, run, experiment.device)
@@ -155,7 +156,7 @@ def outcome(folder: Path, overrides: list[str]) -> Outcome:
         for mode in settings.modes
     }
     return Outcome(
-        {"training": identity.id, **experiment.evaluations, "deployment": next(iter(experiment.deployments))},
+        {"training": identity.id, **experiment.evaluations, "deployment": experiment.deployment_id},
         {
             "training": digest([t.tolist() for t in model.state_dict().values()]),
             **{mode: digest(rows) for mode, rows in reports.items()},

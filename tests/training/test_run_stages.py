@@ -27,8 +27,6 @@ from memmlp.config.package_data import packaged
 from memmlp.experiment_tracking.follower_pipe import Loggers
 from memmlp.live.stream import Stream
 from memmlp.motion.dataset import MotionDataset
-from memmlp.pipeline import run_stages
-from memmlp.pipeline.run_stages import make_upstream_runs, recording_outcome
 from memmlp.runs import environment
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.lookup import list_runs
@@ -36,6 +34,8 @@ from memmlp.runs.recipe_versions import RECIPES
 from memmlp.runs.run import Run
 from memmlp.sweep.worker import Cancelled, deaths
 from memmlp.tables.measured_run import load
+from memmlp.training import run_stages
+from memmlp.training.run_stages import make_prerequisites, recording_outcome
 
 
 def motion_run(folder: Path) -> Run:
@@ -85,7 +85,7 @@ def test_a_training_says_on_a_terminal_what_is_odd_about_its_data(capsys, monkey
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
     with telling(), pytest.raises(AttributeError, match="outputs"):  # it comes no further than to the run
         run_stages.run_experiment(experiment)
-    said = "data: 1 clip is unusual, first a (Z is not up); memmlp data inspect tells more\n"
+    said = "data: 1 clip is unusual, first a (Z is not up); details: memmlp data inspect\n"
     assert capsys.readouterr().err == said
 
 
@@ -106,7 +106,7 @@ def test_the_same_command_finds_the_run_and_others_share_the_vqvae(home, monkeyp
     assert len(codes) == 1
     monkeypatch.chdir(home)
     experiment = build_experiment(composed([*TINY, "seed=1"]))  # by default a VQ-VAE follows its run's seed
-    assert make_upstream_runs(experiment, experiment.motion.prepare()).id not in codes
+    assert make_prerequisites(experiment, experiment.motion.prepare()).id not in codes
 
 
 def test_what_a_finished_run_was_built_upon_is_not_trained_again(home):
@@ -269,7 +269,7 @@ def test_every_experiment_trains_and_streams(home, name, monkeypatch: pytest.Mon
     cfg = composed([f"experiment={name}", *TINY, "optim.steps=2"])
     experiment = build_experiment(cfg)
     data = experiment.motion.prepare()
-    above = make_upstream_runs(experiment, data)
+    above = make_prerequisites(experiment, data)
     run = Run(home / "variants" / name)
     run.folder.mkdir(parents=True, exist_ok=True)
     weights = above.model if above else None
