@@ -185,47 +185,6 @@ def limit_twist(local: Tensor, bone: Tensor, axis: Tensor) -> Tensor:
     return about(axis, 2 / size - 1, 2 * half / size)
 
 
-def find_chain_frame(bent: Tensor, rest: Tensor) -> Tensor:
-    """Return the orientation of limbs with bent middles (..., 4, 3, 3), in the frames of their bases.
-
-    The first columns of these rotations (..., 4, 3, 3) point to the ends, the second ones out to the middles.
-    """
-    upper, lower, flexion = bones(rest)
-    chain = F.normalize(upper + rotate(bent, lower), dim=-1)
-    side = upper + OFFSET * cross(chain, flexion)
-    return frame(chain, F.normalize(side - dot(side, chain) * chain, dim=-1))
-
-
-def split_hand_rotations(arms: Tensor, hands: Tensor, forearm: Tensor) -> tuple[Tensor, Tensor]:
-    """Divide each hand's rotation: the roll of the forearm goes to the elbow, the rest stays at the wrist.
-
-    Args:
-        arms: global rotations (..., 2, 3, 3) of elbows that are bent and not yet rolled.
-        hands: global rotations (..., 2, 3, 3) of the wrists.
-        forearm: the forearms (2, 3) in the rest pose.
-
-    Returns:
-        The elbows' roll about their forearms, and the wrists' local rotations, (..., 2, 3, 3) each.
-    """
-    seen = arms.transpose(-1, -2) @ hands
-    axis = F.normalize(forearm, dim=-1).expand(*seen.shape[:-2], 3)
-    rolled = about(axis, *twist(seen, axis))
-    return rolled, rolled.transpose(-1, -2) @ seen
-
-
-def find_toe_directions(shins: Tensor, toe: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
-    """Return unit vectors (..., 2, 3) in the knees' frames: to the toe at rest, and to where it should be.
-
-    Args:
-        shins: global rotations (..., 2, 3, 3) of the knees.
-        toe: vectors (..., 2, 3) from the ankles to the toes, of any length.
-        rest: rest positions (22, 3), metres.
-    """
-    bone = F.normalize(rest[list(TOES)] - rest[list(ANKLES)], dim=-1)
-    goal = rotate(shins.transpose(-1, -2), F.normalize(toe, dim=-1))
-    return bone.expand(goal.shape), goal
-
-
 def solve_limbs(
     local: Tensor,
     turned: Tensor,
@@ -251,17 +210,26 @@ def solve_limbs(
         toe: vectors (..., 2, 3) from the ankles to the toes, of any length.
         rest: rest positions (22, 3), metres.
     """
-    upper, lower, _ = bones(rest)
+    upper, lower, flexion = bones(rest)
     away = end - base
-    bent = flex(*bones(rest), away.norm(dim=-1, keepdim=True))
+    bent = flex(upper, lower, flexion, away.norm(dim=-1, keepdim=True))
     back = select_joints(turned, [PARENTS[joint] for joint in BASES], -3).transpose(-1, -2)
     axis = F.normalize(away, dim=-1)
     direction = find_bend_direction(axis, select_joints(turned[..., 1], BASES), swivel)
-    bases = back @ frame(axis, direction) @ find_chain_frame(bent, rest).transpose(-1, -2)
+    # Before a base is turned, its end lies along `chain`, and its middle to the side of that line.
+    chain = F.normalize(upper + rotate(bent, lower), dim=-1)
+    side = upper + OFFSET * cross(chain, flexion)
+    unturned = frame(chain, F.normalize(side - dot(side, chain) * chain, dim=-1))
+    bases = back @ frame(axis, direction) @ unturned.transpose(-1, -2)
     bases = limit_twist(bases, F.normalize(upper, dim=-1), rotate(back, axis)) @ bases
     arms, shins = (back.transpose(-1, -2) @ bases @ bent).split(2, -3)
-    rolled, wrists = split_hand_rotations(arms, hands, lower[:2])
-    ankles = align(*find_toe_directions(shins, toe, rest))
+    seen = arms.transpose(-1, -2) @ hands
+    forearm = F.normalize(lower[:2], dim=-1).expand(*seen.shape[:-2], 3)
+    rolled = about(forearm, *twist(seen, forearm))
+    wrists = rolled.transpose(-1, -2) @ seen
+    goal = rotate(shins.transpose(-1, -2), F.normalize(toe, dim=-1))
+    foot = F.normalize(rest[list(TOES)] - rest[list(ANKLES)], dim=-1).expand(goal.shape)
+    ankles = align(foot, goal)
     middles = torch.cat([bent[..., :2, :, :] @ rolled, bent[..., 2:, :, :]], -3)
     rows = list(local.unbind(-3))
     groups = ((BASES, bases), (MIDDLES, middles), (ENDS, torch.cat([wrists, ankles], -3)))

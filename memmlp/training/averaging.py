@@ -8,7 +8,6 @@ codebook's statistics, are the last step's.
 from __future__ import annotations
 
 import contextlib
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
 
 import torch
@@ -16,8 +15,10 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 
-class Average(ABC):
+class Average:
     """The weights of a module that count: they are validated, and kept at the end.
+
+    In this base class they are the weights of the last step, without an average.
 
     Args:
         module: the module that is trained.
@@ -26,19 +27,16 @@ class Average(ABC):
     def __init__(self, module: nn.Module):
         self.parameters = dict(module.named_parameters())
 
-    @abstractmethod
     def update(self, steps: int) -> None:
         """Update the average with the module's weights after `steps` steps."""
 
-    @abstractmethod
     def put_in_place(self) -> None:
         """Put the weights that count into the module, for good."""
 
-    @abstractmethod
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors that a checkpoint must hold, their names preceded by "average."."""
+        return {}
 
-    @abstractmethod
     def load(self, tensors: dict[str, Tensor]) -> None:
         """Load from a checkpoint's tensors those that `tensors` returned."""
 
@@ -54,26 +52,8 @@ class Average(ABC):
 
     @torch.no_grad()
     def _put(self, values: dict[str, Tensor]) -> None:
-        """Copy values by name into the module's parameters."""
         for name, one in self.parameters.items():
             one.copy_(values[name])
-
-
-class LastWeights(Average):
-    """No average: the weights of the last step."""
-
-    def update(self, steps: int) -> None:
-        """Do nothing."""
-
-    def put_in_place(self) -> None:
-        """Do nothing: the weights that count are in the module."""
-
-    def tensors(self) -> dict[str, Tensor]:
-        """Return no tensors."""
-        return {}
-
-    def load(self, tensors: dict[str, Tensor]) -> None:
-        """Do nothing."""
 
 
 class EMA(Average):
@@ -126,9 +106,6 @@ class ScheduleFreeAverage(Average):
     def __init__(self, module: nn.Module, optimiser: torch.optim.Optimizer):
         super().__init__(module)
         self.optimiser = optimiser
-
-    def update(self, steps: int) -> None:
-        """Do nothing: the optimiser's step has updated the average."""
 
     def put_in_place(self) -> None:
         """Put the average into the module."""

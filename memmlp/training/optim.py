@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from memmlp.common.errors import InputError
-from memmlp.training.averaging import EMA, Average, LastWeights, ScheduleFreeAverage
+from memmlp.training.averaging import EMA, Average, ScheduleFreeAverage
 from memmlp.training.muon import ComposedOptimiser
 
 SCHEDULES: dict[str, Callable[[float, float, float], float]] = {
@@ -97,7 +97,7 @@ class Optim:
 
     def average(self, module: nn.Module, optimiser: torch.optim.Optimizer) -> Average:
         """Make the object that says which weights of the module count."""
-        return EMA(module, self.ema) if self.ema else LastWeights(module)
+        return EMA(module, self.ema) if self.ema else Average(module)
 
 
 @dataclass(frozen=True)
