@@ -1,4 +1,4 @@
-"""Loggers for tests: one in memory that can be down, one that writes a file or hangs in another process."""
+"""A logger in memory, which can be down or hang, and runs to show in it."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from memmlp.experiment_tracking.logged_values import CurvePoint, RunFacts, SweepFacts
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.identity import evaluation_id_of
+from memmlp.runs.loggers.facts import CurvePoint, RunFacts, SweepFacts
 from memmlp.runs.run import Run
 
 
@@ -19,14 +19,18 @@ class Server:
 
     down: bool = False
     drops: bool = False
+    gate: threading.Event | None = None  # a logger hangs until it is set
     status: dict[str, str] = field(default_factory=dict)
     values: dict[str, list[tuple[str, int, float]]] = field(default_factory=dict)
     results: dict[str, list[str]] = field(default_factory=dict)
+    fingerprints: dict[str, str] = field(default_factory=dict)
     sweeps: list[str] = field(default_factory=list)
     begun: int = 0
 
     def ask(self) -> None:
         """Refuse while the server is down."""
+        if self.gate:
+            self.gate.wait()
         if self.down:
             raise ConnectionError("connection refused")
 
@@ -34,23 +38,23 @@ class Server:
 class FakeLogger:
     """A logger in memory."""
 
-    name = "fake"
     place = "memory"
 
-    def __init__(self, server: Server | None = None):
-        self.server = server or Server()
+    def __init__(self, server: Server | None = None, name: str = "fake"):
+        self.server, self.name = server or Server(), name
 
-    def has(self, run_id: str) -> bool:
-        """Whether the server has the run."""
+    def fingerprint(self, run_id: str) -> str | None:
+        """With what the run ended."""
         self.server.ask()
-        return run_id in self.server.status
+        return self.server.fingerprints.get(run_id)
 
     def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> FakeShown:
-        """Show it anew."""
+        """Replace what there is of the run."""
         self.server.ask()
         self.server.begun += 1
         self.server.status[facts.id] = facts.status
         self.server.values[facts.id] = []
+        self.server.fingerprints.pop(facts.id, None)
         shown = FakeShown(self.server, facts.id)
         shown.log(points)
         return shown
@@ -75,62 +79,15 @@ class FakeShown:
             self.server.drops = False
             raise ConnectionError("connection reset")
 
-    def end(self, facts: RunFacts, results: Sequence[CurvePoint]) -> None:
+    def end(self, facts: RunFacts) -> None:
         """Note how it ended."""
         self.server.ask()
         self.server.status[facts.id] = facts.status
-        self.server.results[facts.id] = [point.key for point in results]
+        self.server.results[facts.id] = [point.key for point in facts.results]
+        self.server.fingerprints[facts.id] = facts.fingerprint
 
-    def leave(self) -> None:
+    def close(self) -> None:
         """Nothing."""
-
-
-@dataclass(frozen=True)
-class FileLogger:
-    """Writes lines into a file, from whatever process; with `hangs` it never comes back from a beginning."""
-
-    path: Path
-    hangs: bool = False
-
-    name = "file"
-
-    @property
-    def place(self) -> str:
-        """The file."""
-        return str(self.path)
-
-    def has(self, run_id: str) -> bool:
-        """Whether the file speaks of the run."""
-        return self.path.exists() and run_id in self.path.read_text()
-
-    def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> FileLogger:
-        """Write that it begins."""
-        if self.hangs:
-            threading.Event().wait()
-        self._write(f"begin {facts.id} {facts.status}")
-        self.log(points)
-        return self
-
-    def log(self, points: Sequence[CurvePoint]) -> None:
-        """Write values, those of training."""
-        for point in points:
-            if point.key.startswith("train"):
-                self._write(f"{point.key} {point.step} {point.value:g}")
-
-    def end(self, facts: RunFacts, results: Sequence[CurvePoint]) -> None:
-        """Write how it ended."""
-        self._write(f"end {facts.id} {facts.status}")
-
-    def leave(self) -> None:
-        """Nothing."""
-
-    def sweep(self, facts: SweepFacts) -> None:
-        """Write its name."""
-        self._write(f"sweep {facts.name}")
-
-    def _write(self, line: str) -> None:
-        with open(self.path, "a") as file:
-            file.write(line + "\n")
 
 
 def a_run(outputs: Path, name: str = "0" * 16, steps: int = 3, **config: object) -> Run:

@@ -188,9 +188,8 @@ def test_the_reference_has_every_key(reference: ModuleType):
     memories = [f"memory={path.stem}" for path in sorted((ROOT / "conf/memory").glob("*.yaml"))]
     for word in (*memories, "model=agrol_diffusion", "model=avatar_poser", "loss=manual", "rollout=streams"):
         config = OmegaConf.to_container(composed([word]), resolve=False)
-        keys = {
-            key for key, value in flatten(config).items() if f"## {key}\n" not in page or value is not None
-        }
+        values = flatten(config).items()
+        keys = {key for key, value in values if f"## {key}\n" not in page or value not in (None, {})}
         for key in keys:
             last = key.rsplit(".", 1)[-1]
             assert last in ("name", "_target_", "_partial_") or f"| `{key}` |" in page, f"{word}: {key}"

@@ -40,7 +40,7 @@ COMMANDS = {
     "results": Command("results", "results", "Keep runs' results with the code; make pages of them."),
     "report": Command("report", "report", "The page of some sweeps, tables and figures, in one file."),
     "runs": Command("runs", "runs", "List, show, compare, tag, clean up and move runs."),
-    "loggers": Command("loggers", "loggers", "Fill in what MLflow, TensorBoard or W&B lack of runs."),
+    "loggers": Command("loggers", "loggers", "Add runs to MLflow, TensorBoard or W&B."),
     "mlflow": Command("loggers", "mlflow", "MLflow's page on the runs it shows."),
     "ui": Command("ui", "ui", "Runs, sweeps and searches on a page of this machine, live."),
     "eval": Command("evaluate", "evaluate", "Metrics and predictions of a finished run."),

@@ -3,6 +3,7 @@
 import errno
 import importlib
 import unicodedata
+from importlib.util import find_spec
 from types import ModuleType
 
 BREAKING = ("Cc", "Cs", "Zl", "Zp")  # Unicode's controls, surrogates, separators of lines and of paragraphs
@@ -33,6 +34,12 @@ def why_unreadable(error: Exception) -> str:
     return " ".join(str(error).replace('"<unicode string>"', "it").split())
 
 
+def check_installed(package: str, extra: str, purpose: str) -> None:
+    """Raise InputError if an optional package is not installed; see `require`."""
+    if find_spec(package) is None:
+        raise InputError(f"{purpose}: needs {package}: pip install 'memmlp[{extra}]'")
+
+
 def require(module: str, extra: str, purpose: str) -> ModuleType:
     """Import and return a module of an optional package.
 
@@ -44,13 +51,8 @@ def require(module: str, extra: str, purpose: str) -> ModuleType:
     Raises:
         InputError: if the package is not installed.
     """
-    try:
-        return importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] != module.split(".")[0]:
-            raise
-        package = module.split(".")[0]
-        raise InputError(f"{purpose}: needs {package}: pip install 'memmlp[{extra}]'") from None
+    check_installed(module.split(".")[0], extra, purpose)
+    return importlib.import_module(module)
 
 
 class TrainingDiverged(RuntimeError):

@@ -28,7 +28,6 @@ from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import IK, LBFGS, Arms, NoIK
 from memmlp.evaluation.metrics import UserMetric
-from memmlp.experiment_tracking.follower_pipe import Loggers
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.network_coordinates import Coordinates, Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
@@ -43,6 +42,7 @@ from memmlp.networks.memory import Memory
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.vqvae import VQVAE
 from memmlp.runs.identity import VQVAE_SHAPE
+from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.lookup import check_trained
 from memmlp.runs.run import Run
 from memmlp.training.devices import device

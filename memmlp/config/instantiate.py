@@ -26,6 +26,8 @@ def built(node: DictConfig, **given: Any) -> Any:
     try:
         return instantiate(own, _convert_="all", **given)
     except InstantiationException as error:
+        if isinstance(error.__cause__, InputError):
+            raise error.__cause__ from None
         raise InputError(f"{own['_target_']}: cannot be built: {_reason(error)}") from error
 
 

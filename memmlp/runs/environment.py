@@ -23,9 +23,9 @@ PACKAGE = Path(memmlp.__file__).parent
 NOT_NUMBERS = (
     "cli",
     "config",
-    "experiment_tracking",
     "live",
     "report",
+    "runs/loggers",
     "sweep",
     "tables",
 )
@@ -225,8 +225,8 @@ def _distributions() -> Mapping[str, list[str]]:
 
 def _counts(path: Path) -> bool:
     """Return whether a run's numbers depend on the file at this path below the package."""
-    room = path.parts[0]
-    return path.as_posix() in WIRING or (not room.startswith("_") and room not in NOT_NUMBERS)
+    unused = path.parts[0].startswith("_") or any(map(path.is_relative_to, NOT_NUMBERS))
+    return path.as_posix() in WIRING or not unused
 
 
 def code_digest(text: str) -> str:

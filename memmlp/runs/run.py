@@ -89,7 +89,6 @@ class Run:
         "model.safetensors",
         "results.json",
         "metrics.jsonl",
-        "system.jsonl",
         "poses.png",
         "FAILED",
         "code.patch",

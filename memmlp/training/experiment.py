@@ -11,7 +11,7 @@ import torch
 
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.evaluation import Evaluation
-from memmlp.experiment_tracking.follower_pipe import Loggers
+from memmlp.runs.loggers.logger import Loggers
 from memmlp.motion.motion_source import Prepared
 from memmlp.networks.architectures import Architecture
 from memmlp.runs.run import Run

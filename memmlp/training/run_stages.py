@@ -22,7 +22,6 @@ from memmlp.common.files import write_json
 from memmlp.common.progress import remark, tell
 from memmlp.evaluation.evaluation import predict_first_clip
 from memmlp.evaluation.predictions import save_predictions
-from memmlp.experiment_tracking.follower_pipe import Loggers
 from memmlp.live.pose_latency import measure_pose
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.motion_source import Prepared
@@ -36,6 +35,7 @@ from memmlp.runs.identity import (
     evaluation_recipes,
     evaluation_settings,
 )
+from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.resumed_origin import UPSTREAM
 from memmlp.runs.run import Run
 from memmlp.runs.upstream_origin import upstream_origins

@@ -16,7 +16,6 @@ from memmlp.cli.runs.listing import shown_number
 from memmlp.cli.runs.printing import measured_numbers
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
-from memmlp.experiment_tracking.logged_values import facts_of
 from memmlp.report.ui.run_row import facts
 from memmlp.runs.deployment_folder import ONNX_FILES
 from memmlp.runs.evaluation_file import intact, write_report
@@ -27,6 +26,7 @@ from memmlp.runs.identity import (
     evaluation_id,
     evaluation_settings,
 )
+from memmlp.runs.loggers.facts import read_run
 from memmlp.runs.query import record
 from memmlp.runs.run import Run
 from memmlp.tables.measured_run import load
@@ -131,7 +131,8 @@ def test_times_of_another_file_have_its_name(tmp_path: Path, export: dict, name:
     assert "latency.median_ms" not in one
     assert facts(run.folder)["metrics"][f"latency-{name}.median_ms"] == time
     assert shown_number(one, "latency.median_ms") == f"{time:.2f} {name}"
-    assert facts_of(run).results[f"latency-{name}/median_ms"] == time
+    results = {point.key: point.value for point in read_run(run).results}
+    assert results[f"latency-{name}/median_ms"] == time
     assert measured_numbers(run)[f"latency-{name}.median_ms"] == time
     assert f"latency-{name}.settings" not in " ".join(measured_numbers(run))
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from fake_runs import fake_run, fake_sweep, table_of
 
 from memmlp.common.files import read_json
-from memmlp.experiment_tracking.logged_values import SweepFacts
+from memmlp.runs.loggers.facts import SweepFacts
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.sweep_file import load_sweep
 from memmlp.tables.sweep_summary import write_summary
@@ -36,7 +36,7 @@ def test_table_means_verdicts_labels_and_status(tmp_path: Path):
     facts = SweepFacts.read(folder)
     assert facts is not None
     assert (facts.name, facts.status) == ("mine", "done")
-    assert facts.arms == {entry.id: entry.label for entry in entries}
+    assert facts.variants == {entry.id: entry.label for entry in entries}
     cell = next(row for row in table.rows if row.label == "none").cells["stream"]["MPJPE"]
     assert cell.effect is not None
     assert facts.aggregates["none/stream/MPJPE"] == cell.mean

@@ -19,9 +19,9 @@ from memmlp.config.compose import composed
 from memmlp.config.schema import restored
 from memmlp.deploy.deployment import GRAPHS
 from memmlp.evaluation import modes as evaluation
-from memmlp.experiment_tracking.follower_pipe import Loggers
 from memmlp.motion.dataset import MotionDataset
 from memmlp.runs.identity import NEUTRAL, Identity, deployment_id, evaluation_id, flatten
+from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.run import Run
 from memmlp.training.experiment import Experiment
 from memmlp.training.run_stages import make_prerequisites

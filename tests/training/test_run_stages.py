@@ -24,11 +24,11 @@ from memmlp.common.progress import telling
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.config.package_data import packaged
-from memmlp.experiment_tracking.follower_pipe import Loggers
 from memmlp.live.stream import Stream
 from memmlp.motion.dataset import MotionDataset
 from memmlp.runs import environment
 from memmlp.runs.evaluation_file import write_report
+from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.recipe_versions import RECIPES
 from memmlp.runs.run import Run

@@ -226,20 +226,20 @@ class LoggerConfig:
 @dataclass
 class MLflowConfig(LoggerConfig):
     name: str = called("mlflow")
-    _target_: str = target("memmlp.experiment_tracking.mlflow_logger.MLflow")
+    _target_: str = target("memmlp.runs.loggers.mlflow.MLflow")
     uri: Optional[str] = key()
 
 
 @dataclass
 class TensorBoardConfig(LoggerConfig):
     name: str = called("tensorboard")
-    _target_: str = target("memmlp.experiment_tracking.tensorboard_logger.TensorBoard")
+    _target_: str = target("memmlp.runs.loggers.tensorboard.TensorBoard")
 
 
 @dataclass
 class WandBConfig(LoggerConfig):
     name: str = called("wandb")
-    _target_: str = target("memmlp.experiment_tracking.wandb_logger.WandB")
+    _target_: str = target("memmlp.runs.loggers.wandb.WandB")
     project: str = key(Text())
 
 

@@ -17,8 +17,8 @@ from command_line import run as command
 from fake_logger import a_run, losses
 from processes import until
 
-from memmlp.experiment_tracking.follower_pipe import Loggers, feed_of
-from memmlp.experiment_tracking.mlflow_logger import MLflow, quiet
+from memmlp.runs.loggers.logger import Loggers
+from memmlp.runs.loggers.mlflow import MLflow
 from memmlp.runs.run import Run
 
 pytestmark = pytest.mark.slow
@@ -88,25 +88,19 @@ class Server:
 
     def shown(self) -> dict[str, Any]:
         """The runs that it has, by our id; each must be there once."""
-        from mlflow import MlflowClient
-
-        with quiet():
-            client = MlflowClient(self.url)
-            experiment = client.get_experiment_by_name("memmlp")
-            runs = client.search_runs([experiment.experiment_id]) if experiment else []
+        with MLflow(self.url, self.folder).client() as (client, experiment):
+            runs = client.search_runs([experiment])
         found = {run.data.tags["memmlp.run_id"]: run for run in runs}
         assert len(found) == len(runs)
         return found
 
     def values(self, run: Run) -> list[tuple[str, int, float]]:
         """The losses that it has of a run."""
-        from mlflow import MlflowClient
-
         found = self.shown().get(run.id)
         if found is None:
             return []
-        with quiet():
-            history = MlflowClient(self.url).get_metric_history(found.info.run_id, "train/loss")
+        with MLflow(self.url, self.folder).client() as (client, _):
+            history = client.get_metric_history(found.info.run_id, "train/loss")
         return [("train/loss", one.step, one.value) for one in history]
 
 
@@ -130,16 +124,13 @@ def test_a_server_that_is_killed_and_restarted_has_everything_once(
         until(lambda: server.values(run) == losses(3), "the curve while it goes on")
         server.kill()
         run.log(4, {"loss": 1 / 4})
-        until(lambda: "is not shown by mlflow at present" in capfd.readouterr().err, "the warning")
+        until(lambda: "is not shown in mlflow" in capfd.readouterr().err, "the warning")
         server.start()
         until(lambda: server.values(run) == losses(4), "what was missed")
-        feed = feed_of(loggers)
-        assert feed.process is not None
-        feed.process.kill()  # who would show the rest
-        feed.process.wait()
+        server.kill()
         run.log(5, {"loss": 1 / 5})
         run.finish([])
-    feed.close()
+    server.start()
     other = a_run(outputs, "1" * 16)
     other.fail("loss is nan")
     assert server.values(run) == losses(4)

@@ -1,0 +1,206 @@
+"""Shows runs in MLflow: one MLflow run for each run folder, identified by a tag."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import os
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from memmlp.common.errors import check_installed
+from memmlp.runs.loggers.facts import CurvePoint, RunFacts, SweepFacts
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+
+ENVIRONMENT = {
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "DO_NOT_TRACK": "true",
+    "GIT_PYTHON_REFRESH": "quiet",
+    "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",  # a logger that fails is tried again anyway
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
+}
+EXPERIMENT = "memmlp"
+STATUS = {
+    "running": "RUNNING", "done": "FINISHED", "failed": "FAILED", "killed": "KILLED", "stopped": "KILLED",
+}  # fmt: skip
+PARAM_LENGTH, TAG_LENGTH, PARAMS, METRICS = 6000, 5000, 100, 1000  # MLflow's limits
+
+
+@dataclass(frozen=True)
+class MLflow:
+    """Shows runs in MLflow. Its packages print nothing, and only errors become lines.
+
+    Attributes:
+        uri: the tracking store; None for MLFLOW_TRACKING_URI, or else a sqlite file in the outputs folder.
+        outputs: the outputs folder.
+
+    Raises:
+        InputError: if MLflow is not installed.
+    """
+
+    uri: str | None
+    outputs: Path
+
+    name = "mlflow"
+
+    def __post_init__(self) -> None:
+        check_installed("mlflow", "mlflow", "loggers=mlflow")
+
+    @property
+    def place(self) -> str:
+        """The URI of the store in which MLflow keeps its runs."""
+        local = f"sqlite:///{self.outputs.absolute() / 'mlflow.db'}"
+        return self.uri or os.environ.get("MLFLOW_TRACKING_URI") or local
+
+    def fingerprint(self, run_id: str) -> str | None:
+        """Return the fingerprint of the facts with which a run ended in MLflow; None if it did not."""
+        with self.client() as (client, experiment):
+            runs = client.search_runs([experiment], f"tags.`memmlp.run_id` = '{run_id}'")
+        return runs[0].data.tags.get("memmlp.fingerprint") if len(runs) == 1 else None
+
+    def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> ShownInMLflow:
+        """Show a run; an MLflow run that exists is replaced, since MLflow can't remove values."""
+        from mlflow.entities import Dataset, DatasetInput, Param
+
+        with self.client() as (client, experiment):
+            tags = {"memmlp.run_id": facts.id} | _tags(facts)
+            run_id = _replace_run(client, experiment, "memmlp.run_id", facts.name, tags, facts.started)
+            params = [Param(key, value[:PARAM_LENGTH]) for key, value in facts.config.items()]
+            for batch in _batches(params, PARAMS):
+                client.log_batch(run_id, params=batch)
+            name, digest = facts.data  # MLflow has room for 36 characters of a digest; the whole one is a tag
+            client.log_inputs(run_id, [DatasetInput(Dataset(name, digest[:36], "local", "{}"), [])])
+        shown = ShownInMLflow(self, run_id)
+        shown.log(points)
+        return shown
+
+    def sweep(self, facts: SweepFacts) -> None:
+        """Make a sweep the parent of its runs, with its aggregates, verdicts and table.
+
+        A run that several sweeps share is a child of the last one shown; one tag per sweep holds the run's
+        label in that sweep.
+        """
+        with self.client() as (client, experiment):
+            verdicts = {f"verdict/{allowed_name(key)}": verdict for key, verdict in facts.verdicts.items()}
+            tags = {"memmlp.sweep": facts.name, **verdicts}
+            parent = _replace_run(client, experiment, "memmlp.sweep", facts.name, tags, None)
+            points = [CurvePoint(allowed_name(key), value, 0, 0.0) for key, value in facts.aggregates.items()]
+            _log(client, parent, points)
+            for run_id, label in facts.variants.items():
+                for child in client.search_runs([experiment], f"tags.`memmlp.run_id` = '{run_id}'"):
+                    client.set_tag(child.info.run_id, f"memmlp.variant.{facts.name}", label)
+                    client.set_tag(child.info.run_id, "mlflow.parentRunId", parent)
+            for path in facts.files:
+                client.log_artifact(parent, str(path))
+            client.set_terminated(parent, STATUS[facts.status])
+
+    @contextlib.contextmanager
+    def client(self) -> Iterator[tuple[MlflowClient, str]]:
+        """Yield a client and the experiment's id; a sqlite store is used by one process at a time."""
+        os.environ.update({name: os.environ.get(name, value) for name, value in ENVIRONMENT.items()})
+        warnings.filterwarnings("ignore", module=r"(mlflow|alembic|sqlalchemy|pydantic)\b")
+        from filelock import FileLock
+        from mlflow import MlflowClient
+        from mlflow.exceptions import MlflowException
+
+        for package in ("mlflow", "alembic", "urllib3"):
+            logging.getLogger(package).setLevel(logging.CRITICAL)
+        self.outputs.mkdir(parents=True, exist_ok=True)
+        local = self.place.startswith("sqlite:")
+        with FileLock(self.outputs / ".mlflow.lock") if local else contextlib.nullcontext():
+            client = MlflowClient(tracking_uri=self.place)
+            if client.get_experiment_by_name(EXPERIMENT) is None:
+                artifacts = (self.outputs.absolute() / "mlflow-artifacts").as_uri() if local else None
+                with contextlib.suppress(MlflowException):  # another process has created it meanwhile
+                    client.create_experiment(EXPERIMENT, artifact_location=artifacts)
+            experiment = client.get_experiment_by_name(EXPERIMENT)
+            assert experiment is not None
+            yield client, experiment.experiment_id
+
+
+@dataclass(frozen=True)
+class ShownInMLflow:
+    """A run as shown in MLflow.
+
+    Attributes:
+        logger: the logger.
+        mlflow_id: MLflow's own id of the run.
+    """
+
+    logger: MLflow
+    mlflow_id: str
+
+    def log(self, points: Sequence[CurvePoint]) -> None:
+        """Send values, in batches."""
+        with self.logger.client() as (client, _):
+            _log(client, self.mlflow_id, points)
+
+    def end(self, facts: RunFacts) -> None:
+        """Send results, tags and files, and end MLflow's run with the run's own status."""
+        from mlflow.entities import RunTag
+
+        with self.logger.client() as (client, _):
+            _log(client, self.mlflow_id, facts.results)
+            for path in facts.files:
+                client.log_artifact(self.mlflow_id, str(path))
+            tags = _tags(facts) | {"memmlp.fingerprint": facts.fingerprint}
+            for batch in _batches([RunTag(*pair) for pair in tags.items()], PARAMS):
+                client.log_batch(self.mlflow_id, tags=batch)
+            client.set_terminated(self.mlflow_id, STATUS[facts.status], int((facts.ended or 0) * 1000))
+
+    def close(self) -> None:
+        """Do nothing: MLflow keeps no run open."""
+
+
+def _replace_run(
+    client: MlflowClient, experiment: str, key: str, name: str, tags: Mapping[str, str], start: float | None
+) -> str:
+    """Create a run in the place of those with the same value of a tag, and return its id in MLflow."""
+    value = tags[key].replace("'", "\\'")
+    for old in client.search_runs([experiment], f"tags.`{key}` = '{value}'"):
+        client.delete_run(old.info.run_id)
+    start_ms = None if start is None else int(start * 1000)
+    return client.create_run(experiment, start_ms, dict(tags), run_name=name).info.run_id
+
+
+def _log(client: MlflowClient, mlflow_id: str, points: Sequence[CurvePoint]) -> None:
+    from mlflow.entities import Metric
+
+    for batch in _batches(points, METRICS):
+        metrics = [Metric(point.key, point.value, int(point.time * 1000), point.step) for point in batch]
+        client.log_batch(mlflow_id, metrics=metrics)
+
+
+def _batches(items: Sequence[Any], size: int) -> Iterator[list[Any]]:
+    return (list(items[start : start + size]) for start in range(0, len(items), size))
+
+
+def _tags(facts: RunFacts) -> dict[str, str]:
+    tags = {f"memmlp.{key.replace(' ', '_')}": value for key, value in facts.origin.items()}
+    tags |= {f"memmlp.label.{label}": "yes" for label in facts.tags}
+    given = {
+        "memmlp.folder": str(facts.folder),
+        "mlflow.source.name": "memmlp",
+        "mlflow.source.type": "LOCAL",
+        "mlflow.source.git.commit": facts.origin.get("commit"),
+        "mlflow.user": facts.origin.get("user"),
+        "mlflow.note.content": facts.note,
+        "memmlp.failure": facts.reason,
+        "memmlp.outdated_results": facts.outdated,
+    }
+    tags |= {key: value for key, value in given.items() if value}
+    return {key: value[:TAG_LENGTH] for key, value in tags.items()}
+
+
+def allowed_name(name: str) -> str:
+    """Return a name with the characters that MLflow allows; if any were replaced, a digest is appended."""
+    plain = re.sub(r"[^\w./ -]", "_", name)
+    return plain if plain == name else f"{plain} {hashlib.sha256(name.encode()).hexdigest()[:4]}"
