@@ -11,9 +11,9 @@ import torch
 
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.evaluation import Evaluation
-from memmlp.runs.loggers.logger import Loggers
 from memmlp.motion.motion_source import Prepared
 from memmlp.networks.architectures import Architecture
+from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.run import Run
 from memmlp.training.request import RunRequest
 from memmlp.training.train_network import NetworkTraining
