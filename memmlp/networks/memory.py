@@ -34,7 +34,7 @@ class Past(NamedTuple):
     codes: Tensor
 
 
-class Recurred(NamedTuple):
+class RecurrentPast(NamedTuple):
     """What a recurrent memory recalls.
 
     Attributes:
@@ -59,7 +59,7 @@ class MemoryBlock(nn.Module):
         self.feature = feature
         self.fusion = fusion
 
-    def forward(self, h: Tensor, past: Past | Recurred) -> Tensor:
+    def forward(self, h: Tensor, past: Past | RecurrentPast) -> Tensor:
         """Map the hidden state (B, T, d) to (B, T, d)."""
         return self.fusion.fuse(h, self.feature(past))
 
@@ -83,12 +83,12 @@ class Recall(nn.Module):
         self.memory.frames, self.memory.past_frames = 1, memory.past_frames - memory.frames + 1
         self.parts = nn.ModuleList(parts)
         if features:
-            self.gather(features)
+            self.join(features)
 
-    def gather(self, features: Sequence[Any]) -> None:
+    def join(self, features: Sequence[Any]) -> None:
         """Join the blocks' feature modules into one that computes a frame's features for all of them."""
 
-    def forward(self, past: Past | Recurred | None) -> tuple[Pieces, Pieces]:
+    def forward(self, past: Past | RecurrentPast | None) -> tuple[Pieces, Pieces]:
         """Return each block's contribution (1, d): of the entering frame, and of frames before the first."""
         if not self.parts:
             return (), ()
@@ -156,7 +156,7 @@ class Memory(nn.Module):
         """Return how many of the output's newest frames `remember` looks at."""
         return 0
 
-    def recall(self, sparse: Tensor, state: State, new: int) -> Past | Recurred | None:
+    def recall(self, sparse: Tensor, state: State, new: int) -> Past | RecurrentPast | None:
         """Return what the memory blocks see of the past.
 
         Args:
@@ -166,7 +166,7 @@ class Memory(nn.Module):
         """
         return None
 
-    def remember(self, motion: Tensor, past: Past | Recurred | None, state: State, new: int) -> State:
+    def remember(self, motion: Tensor, past: Past | RecurrentPast | None, state: State, new: int) -> State:
         """Return the state after an output.
 
         Args:

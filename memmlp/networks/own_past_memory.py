@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from memmlp.common import distributed
 from memmlp.motion.body import MOTION_DIM, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.memory import FeatureMemory, Past, Recall, Recurred
+from memmlp.networks.memory import FeatureMemory, Past, Recall, RecurrentPast
 from memmlp.networks.motion_model import State
 from memmlp.networks.vqvae import VQVAE, straight_through
 
@@ -62,54 +62,31 @@ class Blend(nn.Module):
         return self.value
 
 
-class ProjectedFeature(nn.Module):
-    """A memory feature made of projections; the base of the features with and without code-vectors."""
-
-
-class CodeFeature(ProjectedFeature):
+class PastFeature(nn.Module):
     """The paper's memory feature Z_l = Z_x + m * Z_theta + (1 - m) * Z_E (Sec. 3.2.1).
 
     Args:
         width: k, the width of the feature.
-        code_width: width of a code-vector.
+        code_width: width of a code-vector; None for the feature without Z_E and the VQ-VAE (Table 11).
         blend: the coefficient m.
     """
 
-    def __init__(self, width: int, code_width: int, blend: Blend):
+    def __init__(self, width: int, code_width: int | None, blend: Blend):
         super().__init__()
         self.sparse = Projection(SPARSE_DIM, width)
         self.motion = Projection(MOTION_DIM, width)
-        self.codes = Projection(code_width, width)
+        self.codes = Projection(code_width, width) if code_width else None
         self.blend = blend
 
     def forward(self, past: Past) -> Tensor:
         """Return the memory feature (B, T, k)."""
         motion = self.motion(past.motion)
         m = self.blend(motion)
-        return self.sparse(past.sparse) + m * motion + (1 - m) * self.codes(past.codes)
+        z = self.sparse(past.sparse) + m * motion
+        return z if self.codes is None else z + (1 - m) * self.codes(past.codes)
 
 
-class NoCodesFeature(ProjectedFeature):
-    """The memory feature without the VQ-VAE, Z_l = Z_x + m * Z_theta (Table 11).
-
-    Args:
-        width: k, the width of the feature.
-        blend: the coefficient m.
-    """
-
-    def __init__(self, width: int, blend: Blend):
-        super().__init__()
-        self.sparse = Projection(SPARSE_DIM, width)
-        self.motion = Projection(MOTION_DIM, width)
-        self.blend = blend
-
-    def forward(self, past: Past) -> Tensor:
-        """Return the memory feature (B, T, k)."""
-        motion = self.motion(past.motion)
-        return self.sparse(past.sparse) + self.blend(motion) * motion
-
-
-class ProjectionsAtOnce(nn.Module):
+class JointProjections(nn.Module):
     """The projections that several memory blocks make of the same input, computed at once.
 
     Args:
@@ -140,14 +117,14 @@ class CodeTable(nn.Module):
 
     def __init__(self, parts: Sequence[Projection], vectors: Tensor):
         super().__init__()
-        self.projected = nn.Parameter(ProjectionsAtOnce(parts)(vectors).detach())
+        self.projected = nn.Parameter(JointProjections(parts)(vectors).detach())
 
     def forward(self, index: Tensor) -> Tensor:
         """Map the index (1,) of a code-vector to its projections (1, blocks, k)."""
         return self.projected.index_select(0, index)
 
 
-class Indices(nn.Module):
+class CodeIndices(nn.Module):
     """A stand-in for a VQ-VAE that gives the index of a frame's code-vector instead of the vector."""
 
     def __init__(self, codes: VQVAE):
@@ -159,10 +136,10 @@ class Indices(nn.Module):
         return self.codebook.indices(self.encoder(torch.cat([sparse[0], motion[0]], -1)))[None]
 
 
-class OwnPast(Recall):
+class OwnPastRecall(Recall):
     """Recall for memories that project the inputs and the network's own motion."""
 
-    def gather(self, features: Sequence[ProjectedFeature]) -> None:
+    def join(self, features: Sequence[PastFeature]) -> None:
         """Make one feature module whose projections are those of all blocks."""
         self.whole = copy.deepcopy(features[0])
         for name, child in list(self.whole.named_children()):
@@ -171,23 +148,23 @@ class OwnPast(Recall):
 
     def projections(self, name: str, parts: Sequence[Projection]) -> nn.Module:
         """Join all blocks' projections of the input with the given name: "sparse", "motion" or "codes"."""
-        return ProjectionsAtOnce(parts)
+        return JointProjections(parts)
 
     def feature(self, past: Past) -> Tensor:
         """Return the features (1, blocks, k) of the frame that enters."""
         return self.whole(Past(*(part[0] for part in past)))
 
 
-class Coded(OwnPast):
+class CodeRecall(OwnPastRecall):
     """Recall for memories that have code-vectors as well, whose projections are looked up."""
 
-    def gather(self, features: Sequence[ProjectedFeature]) -> None:
+    def join(self, features: Sequence[PastFeature]) -> None:
         """Make one feature module whose projections are those of all blocks."""
         assert isinstance(self.memory, VQMemory)
         self.vectors = self.memory.codes.codebook.vectors
-        super().gather(features)
+        super().join(features)
         # In a new dict, since the shallow copy of the memory shares its own with the network's.
-        self.memory._modules = {**self.memory._modules, "codes": Indices(self.memory.codes)}
+        self.memory._modules = {**self.memory._modules, "codes": CodeIndices(self.memory.codes)}
 
     def projections(self, name: str, parts: Sequence[Projection]) -> nn.Module:
         """Join all blocks' projections of the input with the given name; code-vectors get a table."""
@@ -212,7 +189,7 @@ class OwnPastMemory(FeatureMemory):
         codes: the frozen VQ-VAE; not used here.
     """
 
-    streaming_recall = OwnPast
+    streaming_recall = OwnPastRecall
 
     def __init__(
         self,
@@ -267,7 +244,7 @@ class OwnPastMemory(FeatureMemory):
         """Return code-vectors (B, T, code width) of inputs (B, T, 54) and motion (B, T, 198)."""
         raise NotImplementedError
 
-    def remember(self, motion: Tensor, past: Past | Recurred | None, state: State, new: int) -> State:
+    def remember(self, motion: Tensor, past: Past | RecurrentPast | None, state: State, new: int) -> State:
         """Return the state after an output.
 
         Args:
@@ -287,7 +264,7 @@ class NoCodesMemory(OwnPastMemory):
 
     def feature(self) -> nn.Module:
         """Make the module that computes a block's memory feature."""
-        return NoCodesFeature(self.width, self.blend)
+        return PastFeature(self.width, None, self.blend)
 
     def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
         """Return code-vectors of width 0, (B, T, 0), since this memory has none."""
@@ -300,12 +277,12 @@ class VQMemory(OwnPastMemory):
     Each frame of the past window has one code-vector, shared by all memory blocks (reading 4).
     """
 
-    streaming_recall = Coded
+    streaming_recall = CodeRecall
     codes: VQVAE
 
     def feature(self) -> nn.Module:
         """Make the module that computes a block's memory feature."""
-        return CodeFeature(self.width, self.codes.width, self.blend)
+        return PastFeature(self.width, self.codes.width, self.blend)
 
     def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
         """Return code-vectors (B, T, code width) of inputs (B, T, 54) and motion (B, T, 198)."""

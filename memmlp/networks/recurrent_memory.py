@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from memmlp.common.float32_regions import in_float32
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.networks.memory import FeatureMemory, Past, Recall, Recurred
+from memmlp.networks.memory import FeatureMemory, Past, Recall, RecurrentPast
 from memmlp.networks.motion_model import State
 from memmlp.networks.streaming import FrameGRU
 from memmlp.networks.vqvae import VQVAE
@@ -79,22 +79,22 @@ class GRU(Recurrence):
         return output, [hidden]
 
 
-class RecurredFeature(nn.Module):
+class RecurrentFeature(nn.Module):
     """The output of a recurrent memory's layer of the given index."""
 
     def __init__(self, index: int):
         super().__init__()
         self.index = index
 
-    def forward(self, past: Recurred) -> Tensor:
+    def forward(self, past: RecurrentPast) -> Tensor:
         """Return the memory feature (B, T, k)."""
         return past.features[:, self.index]
 
 
-class FromRecurrence(Recall):
+class RecurrentRecall(Recall):
     """Recall for recurrent memories, whose features before the first frame are zeros."""
 
-    def gather(self, features: Sequence[Any]) -> None:
+    def join(self, features: Sequence[Any]) -> None:
         """Note the index of each block's recurrent layer, and replace GRUs by plain layers."""
         self.layers = [feature.index for feature in features]
         assert isinstance(self.memory, RecurrentMemory)
@@ -102,7 +102,7 @@ class FromRecurrence(Recall):
             if isinstance(recurrence.layer, nn.GRU):
                 recurrence.layer = FrameGRU(recurrence.layer)
 
-    def feature(self, past: Recurred) -> Tensor:
+    def feature(self, past: RecurrentPast) -> Tensor:
         """Return the features (1, blocks, k) of the frame that enters."""
         newest = past.features[:, :, -1]
         return newest.index_select(1, torch.tensor(self.layers, device=newest.device))
@@ -131,7 +131,7 @@ class RecurrentMemory(FeatureMemory):
         codes: the frozen VQ-VAE; not used here.
     """
 
-    streaming_recall = FromRecurrence
+    streaming_recall = RecurrentRecall
     recurrence: ClassVar[type[Recurrence]]
     settled = True
 
@@ -154,7 +154,7 @@ class RecurrentMemory(FeatureMemory):
     def feature(self) -> nn.Module:
         """Add one more recurrent layer and make the module that looks up its output."""
         self.recurrences.append(self.recurrence(self.width))
-        return RecurredFeature(len(self.recurrences) - 1)
+        return RecurrentFeature(len(self.recurrences) - 1)
 
     def initial_state(self, batch: int) -> State:
         """Return zeros: states (B, blocks, k), and the earlier frames' features (B, blocks, T - 1, k)."""
@@ -167,7 +167,7 @@ class RecurrentMemory(FeatureMemory):
         hidden = torch.stack([layer.begin(sparse[:, -1]) for layer in self._layers()], 1)
         return {"hidden": hidden.float()}
 
-    def recall(self, sparse: Tensor, state: State, new: int) -> Recurred:
+    def recall(self, sparse: Tensor, state: State, new: int) -> RecurrentPast:
         """Run the layers over the `new` last inputs of (B, past + new, 54), and recall the window."""
         features, states = [], []
         for index, layer in enumerate(self._layers()):
@@ -180,11 +180,11 @@ class RecurrentMemory(FeatureMemory):
         carried_on = {
             name: torch.stack(of, 1) for name, of in zip(names, zip(*states, strict=True), strict=True)
         }
-        return Recurred(window, carried_on)
+        return RecurrentPast(window, carried_on)
 
-    def remember(self, motion: Tensor, past: Past | Recurred | None, state: State, new: int) -> State:
+    def remember(self, motion: Tensor, past: Past | RecurrentPast | None, state: State, new: int) -> State:
         """Return the states after the newest frame, and the features of the last T - 1 frames."""
-        assert isinstance(past, Recurred)
+        assert isinstance(past, RecurrentPast)
         return past.carried | {"features": past.features[:, :, 1:]}
 
     def _layers(self) -> list[Recurrence]:
