@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from memmlp.tables.table import Table
 
 FOLDER = Path("docs/results")
-PROSE = Path("README.md")
 
 
 @click.group("results")
@@ -161,15 +160,12 @@ def docs(folder: Path, check: bool) -> None:
 
     No training is needed. Every file of data/ gives a table's page, which counts seeds beside those of the
     sweep's definition. The templates give pages whose sentences
-    take their numbers and verdicts from the tables. Prose that claims an effect by hand is refused, there and
-    in README.md.
+    take their numbers and verdicts from the tables.
     """
-    from memmlp.report.result_pages import check_claims, pages
+    from memmlp.report.result_pages import pages
 
     found = kept_tables(folder)
     made = pages(found, _templates(folder))
-    if PROSE.exists():
-        check_claims(str(PROSE), PROSE.read_text(encoding="utf-8"))
     differing = [name for name, text in made.items() if _text(folder / name) != text]
     stale = _stale(folder, made)
     if check:

@@ -25,15 +25,14 @@ if TYPE_CHECKING:
 @plugins_option
 @outputs_option
 def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path) -> None:
-    """Show runs, sweeps and searches on a page of this machine, which follows them while they go on.
+    """Show runs, sweeps and searches on a page of this machine, which follows them live.
 
-    The page only reads. Ctrl-C ends it. docs/guides/ui.md shows what is on it.
+    The page only reads. Ctrl-C ends it. docs/guides/ui.md describes the page.
     """
     import webbrowser
 
     from memmlp.common.request_access import check_token
-    from memmlp.report.ui.routes import Answers
-    from memmlp.report.ui.server import RunsServer
+    from memmlp.report.ui.server import Answers, RunsServer
 
     check_token(host, token)
     with (
@@ -50,7 +49,7 @@ def predict(run: Run, clip: str, mode: str) -> Mapping[str, np.ndarray]:
     """Return a run's prediction for a test clip (`prediction_arrays`), computed on one thread of the CPU.
 
     Raises:
-        InputError: if the run's data is no longer prepared here, or there is no such clip.
+        InputError: if the run's data is no longer prepared here, or does not have that clip.
     """
     import torch
 
@@ -58,10 +57,10 @@ def predict(run: Run, clip: str, mode: str) -> Mapping[str, np.ndarray]:
     from memmlp.config.open_run import OpenedRun, clip_of, data_of, experiment_of
     from memmlp.evaluation.predictions import predict_clip
 
-    torch.set_num_threads(1)  # trainings beside it need the others
+    torch.set_num_threads(1)  # trainings on this machine need the others
     experiment = experiment_of(run)
     if experiment.motion.digest() is None:
-        raise InputError(f"run {run.id}: its data is not prepared here; memmlp eval {run.id} prepares it")
+        raise InputError(f"run {run.id}: its data is not prepared here; prepare it with memmlp eval {run.id}")
     opened = OpenedRun(run, experiment, data_of(run, experiment))
     with torch.inference_mode():
         return predict_clip(opened.network(), clip_of(opened.test, clip, "clip"), mode)

@@ -10,7 +10,6 @@ from jinja2 import Environment, StrictUndefined, TemplateError
 
 from memmlp.common.errors import InputError
 from memmlp.report.kept_results import Kept
-from memmlp.report.unbacked_claims import claims
 from memmlp.tables.formats import escaped, markdown
 from memmlp.tables.measured_run import UNKNOWN, Measured
 from memmlp.tables.statistics import Verdict
@@ -60,7 +59,7 @@ def pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -> dic
         templates: the templates' texts by file name.
 
     Raises:
-        InputError: for a template that claims an effect by hand, or names what does not exist.
+        InputError: for a template that names what does not exist.
     """
     made = {f"{name}.md": _table_page(source) for name, source in sorted(sources.items())}
     twice = sorted(made.keys() & templates.keys())
@@ -72,18 +71,8 @@ def pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -> dic
     return made | {name: _filled(name, text, words) for name, text in sorted(templates.items())}
 
 
-def check_claims(name: str, text: str) -> None:
-    """Raise InputError for prose that claims effects by hand (see `memmlp.report.unbacked_claims`)."""
-    for claim in claims(text):
-        raise InputError(
-            f"{name}, line {claim.line}: {claim.reason} in '{claim.sentence[:80]}'; allowed for effects are "
-            "the placeholders of memmlp results docs"
-        )
-
-
 def _filled(name: str, text: str, words: Placeholders) -> str:
     """Return a page: its template, filled in. Raises InputError, which names the template."""
-    check_claims(name, text)
     environment = Environment(undefined=StrictUndefined, keep_trailing_newline=True, trim_blocks=True)
     environment.globals = words.functions()
     try:

@@ -192,12 +192,6 @@ def without_the_last_seed(sweep: Sweep, find: Find) -> dict[str, RunsBySeed]:
     return {label: {seed: run for seed, run in runs.items() if seed < 2} for label, runs in found.items()}
 
 
-def test_prose_with_a_claim_is_refused(memmlp: Memmlp, planned: None):
-    memmlp("results", "save", "14")
-    Path("README.md").write_text("# Title\n\nThe memory lowers Jitter.\n")
-    assert one_line(memmlp("results", "docs"), "README.md, line 3", "'lowers' beside 'Jitter'")
-
-
 def test_a_page_says_that_a_protocol_is_shown_on_other_data(memmlp: Memmlp, planned: None):
     memmlp("results", "save", "2", "data=mocap", "seed=0")
     memmlp("results", "docs")

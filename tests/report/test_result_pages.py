@@ -104,7 +104,6 @@ def test_each_commit_is_named_once(kept: Kept):
         ('{{ decided("t", "a") }}', "t: has no coarser groups"),
         ("{{ nothing }}", "'nothing' is undefined"),
         ("{{ effect(", "README.md"),
-        ('Memory lowers it: {{ effect("t", "2", "stream", "MPJPE") }}', "placeholders"),
     ],
 )
 def test_bad_templates_are_one_line(sweep: Sweep, kept: Kept, template: str, words: str):

@@ -10,7 +10,7 @@ from begun_runs import begun
 import memmlp.runs.recipe_versions
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
-from memmlp.report.ui.run_row import facts
+from memmlp.report.ui.run_index import read_facts
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.evaluations_as_configured import EvaluationsAsConfigured
 from memmlp.runs.identity import evaluation_id_of
@@ -54,7 +54,7 @@ def test_combined_is_of_one_inverse_kinematics_which_is_named(tmp_path: Path):
     own = {"MPJPE": 1.0, "of lbfgs": 1.0}
     named = {f"stream.combined-lbfgs-15.{key}": value for key, value in own.items()}
     assert found() == (own, own, {"stream": "lbfgs-15"}, named)
-    assert facts(run.folder)["metrics"] == {"stream.rotation.MPJPE": 9.0, **named}
+    assert read_facts(run.folder)["metrics"] == {"stream.rotation.MPJPE": 9.0, **named}
     solved(run, "lbfgs", 3.0, 2, made="3")  # others of the same kind
     assert found()[0] == own
 

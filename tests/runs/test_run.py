@@ -16,7 +16,7 @@ from memmlp.cli.runs.listing import shown_number
 from memmlp.cli.runs.printing import measured_numbers
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
-from memmlp.report.ui.run_row import facts
+from memmlp.report.ui.run_index import read_facts
 from memmlp.runs.deployment_folder import ONNX_FILES
 from memmlp.runs.evaluation_file import intact, write_report
 from memmlp.runs.identity import (
@@ -114,7 +114,7 @@ def test_times_shown_are_of_the_file_that_the_config_asks_for(tmp_path: Path, gr
     assert (one["latency.median_ms"], one["latency.onnx_bytes"]) == (1.0, 15)
     assert not [key for key in one if key.startswith("latency-")]
     assert load(run.folder).costs["ms"] == 1.0
-    assert facts(run.folder)["metrics"]["latency.median_ms"] == 1.0
+    assert read_facts(run.folder)["metrics"]["latency.median_ms"] == 1.0
     assert run.preferred_deployment.settings["graph"] == "auto"
 
 
@@ -129,7 +129,7 @@ def test_times_of_another_file_have_its_name(tmp_path: Path, export: dict, name:
     one = record(run)
     assert one[f"latency-{name}.median_ms"] == time
     assert "latency.median_ms" not in one
-    assert facts(run.folder)["metrics"][f"latency-{name}.median_ms"] == time
+    assert read_facts(run.folder)["metrics"][f"latency-{name}.median_ms"] == time
     assert shown_number(one, "latency.median_ms") == f"{time:.2f} {name}"
     results = {point.key: point.value for point in read_run(run).results}
     assert results[f"latency-{name}/median_ms"] == time
@@ -306,7 +306,7 @@ def test_a_run_that_was_killed_before_its_evaluation_is_trained_and_not_done(tmp
     run.evaluations.mkdir()
     for name, status in (("none", "trained"), ("stream-0", "trained"), ("window-0", "done")):
         run.evaluation(name).write_text("{}")
-        assert (run.status, facts(run.folder)["complete"]) == (status, status == "done")
+        assert (run.status, read_facts(run.folder)["complete"]) == (status, status == "done")
     run.want(["window-0", "stream-1"])
     with run.lock():
         assert run.status == "trained"  # somebody holds it, at none of its stages

@@ -39,6 +39,15 @@ export function section(title, ...children) {
   return h('section', {}, h('h2', {}, title), ...children);
 }
 
+// A table. A content is text, an element, or a whole cell; the first column has the rows' heads, and `n` aligns the others right.
+export function table(heads, rows, { n = true, kind = '', scroll = 'scroll short', caption = null } = {}) {
+  const cell = (content, i, head) => (content instanceof HTMLTableCellElement ? content
+    : h(head || !i ? 'th' : 'td', { scope: head ? 'col' : i ? null : 'row', class: i && n ? 'n' : null }, content));
+  const line = (contents, head) => h('tr', {}, contents.map((content, i) => cell(content, i, head)));
+  return h('div', { class: scroll }, h('table', { class: `grid ${kind}` }, caption && h('caption', {}, caption),
+    heads && h('thead', {}, line(heads, true)), h('tbody', {}, rows.map(row => line(row)))));
+}
+
 export function empty(title, ...children) {
   return h('div', { class: 'empty' }, h('p', { class: 'lead' }, title), ...children);
 }
@@ -47,7 +56,7 @@ export function code(text) {
   return h('code', {}, text);
 }
 
-// Tell those who don't see the page what changed on it.
+// Tell a screen reader what changed on the page.
 export function say(text) {
   document.getElementById('said').textContent = text;
 }

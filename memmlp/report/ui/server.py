@@ -1,7 +1,7 @@
 """The server of the page, made with the standard library alone: files, answers as JSON, and change events.
 
-It serves this machine alone, unless another address is asked for; in that case every request needs the token.
-It only reads: nothing that a page sends can change a run.
+It serves this machine alone, unless another address is asked for; then every request needs the token. It only
+reads: no request can change a run.
 """
 
 from __future__ import annotations
@@ -14,28 +14,116 @@ import time
 import urllib.parse
 from collections.abc import Callable, Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import plain
 from memmlp.common.request_access import LOCAL, Access
-from memmlp.report.ui import pages
-from memmlp.report.ui.routes import Answers
+from memmlp.report.ui import page_files, runs
+from memmlp.report.ui.replay import Predict, Replays, describe_body
+from memmlp.report.ui.run_index import RunIndex
+from memmlp.report.ui.searches import Searches
+from memmlp.report.ui.sweeps import Sweeps
 from memmlp.runs.identity import ID
+from memmlp.sweep.definition import MODES
 
-QUIET = 15.0  # seconds without news after which a comment shows that the connection lives
+MAX_CURVES = 60  # runs with curves in one answer
+HEARTBEAT = 15.0  # seconds without a change after which a comment shows that the connection lives
+
+
+class Answers:
+    """Answers the page's questions about an outputs folder.
+
+    Args:
+        outputs: the folder of runs and caches.
+        predict: computes a run's prediction for a test clip; None to show stored ones alone.
+    """
+
+    def __init__(self, outputs: Path, predict: Predict | None = None):
+        self.outputs = outputs
+        self.index = RunIndex(outputs)
+        self.sweeps, self.searches = Sweeps(self.index), Searches(outputs)
+        self.curves, self.replays = runs.Curves(outputs), Replays(outputs, predict)
+        self.refreshed = False
+
+    def refresh(self) -> str:
+        """Look at everything again, and return a text that changes whenever anything has changed."""
+        generation = self.index.refresh()
+        self.refreshed = True
+        return f"{generation} {hash((self.sweeps.refresh(), self.searches.stamp()))}"
+
+    def places(self) -> dict[str, list[dict[str, Any]]]:
+        """Return the sweeps and searches that use a run, by run id."""
+        found: dict[str, list[dict[str, Any]]] = {}
+        for name, known in self.sweeps.known.items():
+            for entry in known.plan.entries:
+                place = {"sweep": name, "variant": entry.label, "seed": entry.seed}
+                found.setdefault(entry.id, []).append(place)
+        for search, number, run_id in self.searches.runs():
+            found.setdefault(run_id, []).append({"search": search, "trial": number})
+        return found
+
+    def answer(self, path: str, query: Mapping[str, str]) -> Mapping[str, Any]:
+        """Return the answer to a question, such as "run/0123456789abcdef".
+
+        Raises:
+            KeyError: if there is nothing with that name.
+            ValueError: for a text that should be a number.
+        """
+        if not self.refreshed:
+            self.refresh()
+        kind, _, name = path.partition("/")
+        match kind, bool(name):
+            case "runs", False:
+                since = int(query.get("since", 0))
+                rows = runs.list_rows(self.index, self.places(), since, query.get("heads", ""))
+                return {**rows, "outputs": str(self.outputs.absolute())}
+            case "curves", False:
+                known = [one for one in ID.findall(query.get("runs", "")) if one in self.index.runs]
+                return {"curves": {run_id: self.curves.read(run_id) for run_id in known[:MAX_CURVES]}}
+            case "body", False:
+                return describe_body()
+            case "sweeps", _:
+                return self.sweeps.describe(name) if name else self.sweeps.list_rows()
+            case "searches", _:
+                return self.searches.describe(name) if name else self.searches.list_rows()
+            case (("run" | "replay"), True) if ID.fullmatch(name) and name in self.index.runs:
+                if kind == "replay":
+                    return self._replay(name, query)
+                return runs.describe_run(self.index, name, self.sweeps.control_of(name), self.places())
+        raise KeyError(path)
+
+    def missing(self, path: str) -> str:
+        """Return a message that there is nothing with that name, and where it would be."""
+        kind, _, name = path.partition("/")
+        folders = {"run": "runs", "replay": "runs", "sweeps": "sweeps", "searches": "tune"}
+        if kind not in folders or not name:
+            return f"{path}: there is no such page"
+        return f"{name}: not found in {self.outputs / folders[kind]}; is it in another outputs folder?"
+
+    def _replay(self, run_id: str, query: Mapping[str, str]) -> dict[str, Any]:
+        mode = query.get("mode", MODES[0])
+        if mode not in MODES or "clip" not in query:
+            raise ValueError(f"mode={mode}: must be {' or '.join(MODES)}, with a clip")
+        begin = float(query["from"]) if query.get("from") else None
+        return self.replays.get(run_id, query["clip"], mode, begin)
+
+    def close(self) -> None:
+        """Cancel the computations that are still waiting."""
+        self.replays.close()
 
 
 class Watch:
-    """Looks at the runs repeatedly while somebody watches, and reports when something has changed."""
+    """Looks at the runs repeatedly while a page is open, and reports changes."""
 
     def __init__(self, look: Callable[[], str], every: float = 1.0):
         self.look, self.every = look, every
         self.condition = threading.Condition()
-        self.watchers, self.closed = 0, False
+        self.pages, self.closed = 0, False
         self.state = ""
 
-    def wait(self, known: str, timeout: float = QUIET) -> str:
+    def wait(self, known: str, timeout: float = HEARTBEAT) -> str:
         """Wait, at most `timeout` seconds, until the state differs from a known one; return the state."""
         with self.condition:
             self.condition.wait_for(lambda: self.closed or self.state not in ("", known), timeout)
@@ -44,13 +132,13 @@ class Watch:
     def loop(self) -> None:
         """Look repeatedly until closed; looking takes at most a tenth of the time."""
         while not self.closed:
-            began = time.monotonic()
-            if self.watchers or not self.state:
+            started = time.monotonic()
+            if self.pages or not self.state:
                 state = self.look()
                 with self.condition:
                     self.state = state
                     self.condition.notify_all()
-            pause = max(self.every, 9 * (time.monotonic() - began))
+            pause = max(self.every, 9 * (time.monotonic() - started))
             with self.condition:
                 self.condition.wait_for(lambda: self.closed, pause)
 
@@ -75,85 +163,77 @@ class RunsHandler(BaseHTTPRequestHandler):
             query = dict(urllib.parse.parse_qsl(url.query))
             access, port = self.server.access, self.server.server_port
             if not access.allows(self.path, self.headers, port):
-                self._send(
-                    403,
-                    "text/plain; charset=utf-8",
-                    b"not allowed; open the address that memmlp ui printed\n",
-                )
+                refusal = b"not allowed; open the address that memmlp ui printed\n"
+                self._send(403, "text/plain; charset=utf-8", refusal)
             elif "token" in query:
                 self._send(303, "text/plain", b"", access.redirect_headers(query["token"], port))
             else:
                 self._route(urllib.parse.unquote(url.path).lstrip("/"), query)
 
-    def _route(self, name: str, query: Mapping[str, str]) -> None:
-        if name in ("", *pages.FILES):
-            file = name or "index.html"
-            self._send(200, pages.content_type(file), pages.read(file))
-        elif name == "events":
-            self._events()
-        elif name.startswith("api/"):
-            self._answer(name.removeprefix("api/"), query)
-        elif name.startswith("files/"):
-            self._file(*name.removeprefix("files/").partition("/")[::2])
+    def _route(self, path: str, query: Mapping[str, str]) -> None:
+        kind, _, name = path.partition("/")
+        if path in ("", *page_files.FILES):
+            file = path or "index.html"
+            self._send(200, page_files.content_type(file), page_files.read(file))
+        elif path == "events":
+            self._send_events()
+        elif kind == "api":
+            self._send_answer(name, query)
+        elif kind == "files":
+            self._send_run_file(*name.partition("/")[::2])
         else:
-            self._missing()
+            self._send_json(404, {"error": f"{path}: not found"})
 
-    def _answer(self, name: str, query: Mapping[str, str]) -> None:
+    def _send_answer(self, path: str, query: Mapping[str, str]) -> None:
         try:
-            found = self.server.answers.of(name, query)
+            found = self.server.answers.answer(path, query)
         except KeyError:
-            self._json(404, {"error": self.server.answers.missing(name)})
+            self._send_json(404, {"error": self.server.answers.missing(path)})
         except (InputError, ValueError, OverflowError) as error:
-            self._json(400, {"error": str(error)})
-        except Exception as error:  # one folder's damage must not look like the server's end
-            self._json(500, {"error": f"{type(error).__name__}: {error}"})
+            self._send_json(400, {"error": str(error)})
+        except Exception as error:  # one damaged folder must not look like the server's end
+            self._send_json(500, {"error": f"{type(error).__name__}: {error}"})
         else:
-            self._json(200, found)
+            self._send_json(200, found)
 
-    def _json(self, code: int, value: Mapping[str, Any]) -> None:
+    def _send_json(self, code: int, value: Mapping[str, Any]) -> None:
         try:
             text = json.dumps(value, separators=(",", ":"), allow_nan=False)
-        except ValueError:  # a number that JSON has no word for
+        except ValueError:  # NaN or infinity
             text = json.dumps(plain(value), separators=(",", ":"), allow_nan=False)
         self._send(code, "application/json", text.encode())
 
-    def _file(self, run_id: str, name: str) -> None:
-        """Send a file of a run, one of a short list of names."""
-        from memmlp.report.ui.runs import SHOWN_FILES
-
-        path = self.server.answers.index.outputs / "runs" / run_id / name
-        if not ID.fullmatch(run_id) or name not in SHOWN_FILES or not path.is_file():
-            self._missing()
+    def _send_run_file(self, run_id: str, name: str) -> None:
+        path = self.server.answers.outputs / "runs" / run_id / name
+        if not ID.fullmatch(run_id) or name not in runs.VIEWABLE or not path.is_file():
+            self._send_json(404, {"error": "not found"})
             return
         kind = "image/png" if name.endswith(".png") else "text/plain; charset=utf-8"
         self._send(200, kind, path.read_bytes(), {"Content-Security-Policy": "default-src 'none'; sandbox"})
 
-    def _missing(self) -> None:
-        self._json(404, {"error": "nothing is here"})
-
-    def _events(self) -> None:
+    def _send_events(self) -> None:
         """Send each change until the page or the server is closed."""
         watch = self.server.watch
-        self._head(200, {"Content-Type": "text/event-stream", "Connection": "close"})
+        self._send_head(200, {"Content-Type": "text/event-stream", "Connection": "close"})
         self.close_connection = True
-        watch.watchers += 1
+        watch.pages += 1
         try:
             known = "-"
             while not watch.closed:
                 state = watch.wait(known)
-                self.wfile.write(
-                    b": quiet\n\n" if state == known else f"data: {json.dumps(state)}\n\n".encode()
-                )
+                event = b": quiet\n\n" if state == known else f"data: {json.dumps(state)}\n\n".encode()
+                self.wfile.write(event)
                 self.wfile.flush()
                 known = state
         finally:
-            watch.watchers -= 1
+            watch.pages -= 1
 
     def _send(self, code: int, kind: str, content: bytes, headers: Mapping[str, str] | None = None) -> None:
-        self._head(code, {"Content-Type": kind, "Content-Length": str(len(content)), **(headers or {})})
+        length = {"Content-Type": kind, "Content-Length": str(len(content))}
+        self._send_head(code, {**length, **(headers or {})})
         self.wfile.write(content)
 
-    def _head(self, code: int, headers: Mapping[str, str]) -> None:
+    def _send_head(self, code: int, headers: Mapping[str, str]) -> None:
         self.send_response(code)
         safe = {
             "Cache-Control": "no-store",
@@ -170,11 +250,11 @@ class RunsHandler(BaseHTTPRequestHandler):
         return "memmlp"
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Log nothing, since requests are not worth a line."""
+        """Log nothing."""
 
 
 class RunsServer(ThreadingHTTPServer):
-    """Serves the page, from threads of its own, inside a `with` block.
+    """Serves the page, from its own threads, inside a `with` block.
 
     Args:
         answers: the answers about runs, sweeps and searches.
@@ -193,21 +273,18 @@ class RunsServer(ThreadingHTTPServer):
     def __init__(
         self, answers: Answers, port: int, host: str = LOCAL[0], token: str | None = None, every: float = 1.0
     ):
-        self.answers, self.policy = answers, pages.policy()
+        self.answers, self.policy = answers, page_files.security_policy()
         self.access = Access(host, token)
-        self.watch = Watch(answers.look, every)
+        self.watch = Watch(answers.refresh, every)
         try:
             super().__init__((host, port), RunsHandler)
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
-            allowed = "allowed are this machine's addresses and free ports (--port 0: any that is free)"
-            raise InputError(f"--host {host} --port {port}: {reason}; {allowed}") from None
+            expected = "expected an address of this machine and a free port (--port 0: any)"
+            raise InputError(f"--host {host} --port {port}: {reason}; {expected}") from None
 
     def server_bind(self) -> None:
-        """Bind to the address, without asking a name server for the host's name.
-
-        Connections of a page that was left open do not keep a server of before in the way.
-        """
+        """Bind to the address without a name lookup, even while a page of an earlier server is open."""
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.socket.bind(self.server_address)
         self.server_address = name, port, *_ = self.socket.getsockname()
@@ -219,16 +296,16 @@ class RunsServer(ThreadingHTTPServer):
         return self.access.url(self.server_name, self.server_port)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore the error, since a request that one page breaks off does not concern the others."""
+        """Ignore the error: a request that one page breaks off does not concern the others."""
 
     def __enter__(self) -> RunsServer:
-        self.threads = [threading.Thread(target=work, daemon=True) for work in (self._serve, self.watch.loop)]
+        self.threads = [
+            threading.Thread(target=work, daemon=True)
+            for work in (lambda: self.serve_forever(0.05), self.watch.loop)
+        ]
         for thread in self.threads:
             thread.start()
         return self
-
-    def _serve(self) -> None:
-        self.serve_forever(0.05)
 
     def __exit__(self, *_: object) -> None:
         self.watch.close()

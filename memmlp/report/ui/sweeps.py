@@ -1,149 +1,151 @@
-"""The content of the pages of sweeps: progress, remaining time, effects and verdicts."""
+"""The answers about sweeps: progress, remaining time, tables with effects and verdicts, and distributions."""
 
 from __future__ import annotations
 
 import json
+import math
 import statistics
 import threading
 import time
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, replace
-from math import isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from memmlp.common.errors import InputError
-from memmlp.common.files import file_digest, plain
+from memmlp.common.files import plain
 from memmlp.evaluation.metric_facts import UNITS
-from memmlp.report.ui.index import Index
+from memmlp.report.ui.run_index import RunIndex
 from memmlp.runs.identity import NETWORK, training_settings
 from memmlp.runs.run import STAGE_WORDS
 from memmlp.sweep.definition import Sweep, Variant
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.progress_table import name as task_name
-from memmlp.sweep.sweep_file import parse_sweep
 from memmlp.sweep.sweep_json import NAME as SWEEP_FILE
 from memmlp.sweep.sweep_json import kept_sweep
 from memmlp.tables.build_table import finished_runs, make_table
+from memmlp.tables.effects import RunsBySeed
+from memmlp.tables.error_distributions import distributions
 from memmlp.tables.formats import as_json
 from memmlp.tables.measured_run import Measured, load
 from memmlp.tables.seed_rounds import Rounds, standings, subject
 from memmlp.tables.seed_rounds_file import NAME as ROUNDS_FILE
 from memmlp.tables.seed_rounds_file import read as read_rounds
 from memmlp.tables.seed_rounds_file import same_runs
-from memmlp.tables.statistics import Verdict
+from memmlp.tables.statistics import Verdict, performance_profile
+from memmlp.tables.table import Table
 from memmlp.tables.table_text import better, caption, heading, legend
 
-ROUNDS = "seeds were spent in rounds; memmlp table has their verdicts, these do not keep the 5 %"
-OTHERS = "seeds were spent in rounds, but not of these runs: these verdicts do not keep the 5 %"
-NOT_KEPT = "this sweep's file was not kept with it, so its first arm is the control; memmlp table has its own"
+DAMAGED_ROUNDS = "seeds were spent in rounds that cannot be shown here: these verdicts do not keep the 5 %"
+OTHER_ROUNDS = "seeds were spent in rounds, but not of these runs: these verdicts do not keep the 5 %"
+PROFILE_POINTS = 61  # of a performance profile
 
 
-class TableAndRounds(NamedTuple):
-    """The results of a sweep's runs.
+class KnownSweep(NamedTuple):
+    """A sweep below an outputs folder.
 
     Attributes:
-        table: their table.
-        rounds: the rounds, if seeds were spent in rounds.
-        values: the shown metric by arm's label and seed, where it is a number.
+        plan: its plan, under the name of the sweep's folder.
+        sweep: its definition.
+        stamp: the times of its files, nanoseconds; it changes with them.
     """
 
-    table: dict[str, Any]
-    rounds: dict[str, Any] | None
-    values: dict[tuple[str, int], float]
+    plan: Plan
+    sweep: Sweep
+    stamp: tuple[int, ...]
 
 
 class Sweeps:
-    """The sweeps below an outputs folder."""
+    """The sweeps below an outputs folder.
 
-    def __init__(self, index: Index):
-        self.index = index
-        self.lock = threading.Lock()
-        self.plans: dict[Path, tuple[int, Plan]] = {}
-        self.tables: dict[str, tuple[Any, TableAndRounds]] = {}
-        self.bad: dict[str, str] = {}
+    Attributes:
+        damaged: why a sweep can't be read, by the name of its folder.
+    """
 
-    def known(self) -> list[Plan]:
-        """Return the plans of all sweeps, each under its folder's name, the most recently changed first."""
-        found: dict[Path, tuple[int, Plan]] = {}
-        self.bad = {}
+    def __init__(self, index: RunIndex):
+        self.index, self.lock = index, threading.Lock()
+        self.known: dict[str, KnownSweep] = {}
+        self.damaged: dict[str, str] = {}
+        self.results: dict[str, tuple[Any, dict[str, Any]]] = {}
+
+    def refresh(self) -> str:
+        """Look at all sweeps again, and return a text that changes when any of them changes."""
+        known, damaged = {}, {}
         for path in self.index.outputs.glob("sweeps/*/plan.json"):
+            folder, name = path.parent, path.parent.name
+            stamp = tuple(_changed(folder / file) for file in (path.name, SWEEP_FILE, ROUNDS_FILE))
+            before = self.known.get(name)
             try:
-                changed = path.stat().st_mtime_ns
-                before = self.plans.get(path)
-                plan = before[1] if before and before[0] == changed else Plan.load(path)
-                found[path] = (changed, replace(plan, name=path.parent.name, outputs=self.index.outputs))
+                if before and before.stamp == stamp:
+                    known[name] = before
+                elif (sweep := kept_sweep(folder)) is None:
+                    damaged[name] = f"{SWEEP_FILE} is missing; start the sweep again"
+                else:
+                    plan = replace(Plan.load(path), name=name, outputs=self.index.outputs)
+                    known[name] = KnownSweep(plan, sweep, stamp)
             except (InputError, OSError) as error:
-                self.bad[path.parent.name] = str(error)
-        self.plans = found
-        return [plan for _, plan in sorted(found.values(), key=lambda one: -one[0])]
+                damaged[name] = str(error)
+        newest = sorted(known.items(), key=lambda item: -item[1].stamp[0])
+        self.known, self.damaged = dict(newest), damaged
+        return repr([(name, one.stamp) for name, one in newest])
 
-    def stamp(self) -> str:
-        """Return a text that changes when a sweep appears, goes, changes, is planned anew, or has a look."""
-        found = [(path, seen) for path, (seen, _) in sorted(self.plans.items())]
-        beside = [[_changed(path.with_name(name)) for name in (SWEEP_FILE, ROUNDS_FILE)] for path, _ in found]
-        return repr([(str(path), seen, *others) for (path, seen), others in zip(found, beside, strict=True)])
+    def list_rows(self) -> dict[str, Any]:
+        """Return a row for each sweep, the most recently changed first."""
+        rows = [self.describe_progress(one, self.states(one.plan)) for one in self.known.values()]
+        return {"sweeps": rows, "damaged": self.damaged}
 
-    def rows(self) -> dict[str, Any]:
-        """Return a row for each sweep."""
-        return {"sweeps": [self.progress(plan) for plan in self.known()], "damaged": self.bad}
-
-    def progress(self, plan: Plan) -> dict[str, Any]:
-        """Return the progress of a sweep."""
-        states = self.states(plan)
-        counts = {kind: Counter(states[task.key] for task in tasks) for kind, tasks in _kinds(plan).items()}
-        sweep = self._kept(plan.name)
-        return {
-            "name": plan.name,
-            "title": caption_of(sweep) if sweep else plan.name,
-            "arms": len({entry.label for entry in plan.entries}),
-            "seeds": len({entry.seed for entry in plan.entries}),
-            "tasks": len(_kinds(plan)["networks"]),
-            "counts": dict(counts["networks"]),
-            "above": dict(counts["upstream"]),
-            "share": self._share(plan, states),
-            "left": self._time_left(plan, states),
-        }
-
-    def page(self, name: str) -> dict[str, Any]:
+    def describe(self, name: str) -> dict[str, Any]:
         """Return everything that a sweep's page shows. Raises KeyError for an unknown sweep."""
-        plan = next((plan for plan in self.known() if plan.name == name), None)
-        if plan is None:
-            raise KeyError(name)
-        states = self.states(plan)
-        sweep = self._kept(name) or sweep_of_plan(plan)
-        made = self.made(plan)
-        cells = [self._cell(entry, states, made) for entry in plan.entries]
-        upstream = [self._upstream(plan, task, states) for task in plan.tasks if task.kind != NETWORK]
-        branches = {arm.branch for arm in sweep.variants}
-        found = {
-            "metric": _shown_metric(sweep),
-            "branch": branches.pop() if len(branches) == 1 else "",
-            "cells": cells,
-            "upstream": upstream,
-            "table": made.table,
-            "rounds": made.rounds,
+        known = self.known[name]
+        plan, states = known.plan, self.states(known.plan)
+        results = self._results(known)
+        values = results["values"]
+        return {
+            **self.describe_progress(known, states),
+            **{key: value for key, value in results.items() if key != "values"},
+            "cells": [
+                self._describe_cell(e, states[e.key], values.get((e.label, e.seed))) for e in plan.entries
+            ],
+            "prerequisites": [
+                {"name": task_name(plan, task), "id": task.id, "state": states[task.key]}
+                for task in plan.tasks
+                if task.kind != NETWORK
+            ],
         }
-        return self.progress(plan) | found
+
+    def describe_progress(self, known: KnownSweep, states: Mapping[str, str]) -> dict[str, Any]:
+        """Return a sweep's progress, given its tasks' states."""
+        plan = known.plan
+        counts = {True: Counter[str](), False: Counter[str]()}
+        for task in plan.tasks:
+            counts[task.kind == NETWORK][states[task.key]] += 1
+        return {
+            **name_sweep(plan.name, known.sweep),
+            "variants": len({entry.label for entry in plan.entries}),
+            "seeds": len({entry.seed for entry in plan.entries}),
+            "tasks": counts[True].total(),
+            "counts": dict(counts[True]),
+            "prerequisite_counts": dict(counts[False]),
+            "share": self._share(plan, states),
+            "remaining": self._remaining_seconds(plan, states),
+        }
 
     def control_of(self, run_id: str) -> str | None:
-        """Return the run of the same seed with which a run's arm is compared; None for none.
+        """Return the run of the same seed with which a run's variant is compared; None for none.
 
-        If several sweeps use the run, the first one in which its arm has a control decides.
+        If several sweeps use the run, the first one in which its variant has a control decides.
         """
-        for plan in self.known():
+        for plan, sweep, _ in self.known.values():
             ids = {(entry.label, entry.seed): entry.id for entry in plan.entries}
+            controls = {variant.label: sweep.control_of(variant) for variant in sweep.variants}
             for label, seed in [place for place, used in ids.items() if used == run_id]:
-                control = ids.get((self._control(plan, label), seed), run_id)
+                control = ids.get((controls.get(label) or "", seed), run_id)
                 if control != run_id and control in self.index.runs:
                     return control
         return None
-
-    def _control(self, plan: Plan, label: str) -> str:
-        """Return the label of an arm's control; empty for none."""
-        sweep = self._kept(plan.name) or sweep_of_plan(plan)
-        return next((sweep.control_of(arm) or "" for arm in sweep.variants if arm.label == label), "")
 
     def states(self, plan: Plan) -> dict[str, str]:
         """Return every task's state by its key, as `Plan.states` does, from the facts in the index."""
@@ -158,20 +160,15 @@ class Sweeps:
         run = plan.run_of(task)
         return "done" if all(map(run.has, task.stages)) else run.doing or run.state(False)
 
-    def _cell(self, entry: Entry, states: Mapping[str, str], made: TableAndRounds) -> dict[str, Any]:
+    def _describe_cell(self, entry: Entry, state: str, value: float | None) -> dict[str, Any]:
         facts = self.index.runs.get(entry.id, {})
         recent = facts.get("recent") or [[0, 0, None]]
         return {
-            "arm": entry.label, "seed": entry.seed, "id": entry.id, "state": states[entry.key],
+            "variant": entry.label, "seed": entry.seed, "id": entry.id, "state": state, "value": value,
             "step": recent[-1][0], "steps": facts.get("steps"), "failure": facts.get("failure", ""),
-            "value": made.values.get((entry.label, entry.seed)),
         }  # fmt: skip
 
-    def _upstream(self, plan: Plan, task: RunTask, states: Mapping[str, str]) -> dict[str, Any]:
-        return {"name": task_name(plan, task), "id": task.id, "state": states[task.key]}
-
-    def _left(self, task: RunTask, state: str) -> int:
-        """Return the number of remaining steps of a task's training."""
+    def _remaining_steps(self, task: RunTask, state: str) -> int:
         total = int(training_settings(task.kind, task.config)["steps"] or 0)
         facts = self.index.runs.get(task.id)
         if state == "done" or facts is None or not facts["recent"]:
@@ -179,180 +176,161 @@ class Sweeps:
         return max(total - int(facts["recent"][-1][0]), 0)
 
     def _share(self, plan: Plan, states: Mapping[str, str]) -> float:
-        """Return the share of all steps that is done; a run that is not done has at least one step left."""
-        total = sum(
-            self._left(task, "new")
-            if task.id not in self.index.runs
-            else int(self.index.runs[task.id]["steps"] or 0)
-            for task in plan.tasks
-        )
+        """Return the share of all steps that is done; an unfinished run has at least one step left."""
+        total = sum(self._total_steps(task) for task in plan.tasks)
         each = [(task, states[task.key]) for task in plan.tasks]
-        left = sum(max(self._left(task, state), state != "done") for task, state in each)
-        return 1 - left / total if total else 0.0
+        remaining = sum(max(self._remaining_steps(task, state), state != "done") for task, state in each)
+        return 1 - remaining / total if total else 0.0
 
-    def _time_left(self, plan: Plan, states: Mapping[str, str]) -> float | None:
+    def _total_steps(self, task: RunTask) -> int:
+        facts = self.index.runs.get(task.id)
+        return self._remaining_steps(task, "new") if facts is None else int(facts["steps"] or 0)
+
+    def _remaining_seconds(self, plan: Plan, states: Mapping[str, str]) -> float | None:
         """Return the estimated seconds of training left for the workers that train at present.
 
-        It is None if nobody trains, or if everything is trained.
+        It is None if no worker trains, or if everything is trained.
         """
         running = [task for task in plan.tasks if states[task.key] in STAGE_WORDS.values()]
         paces = [pace for task in plan.tasks if (pace := _pace(self.index.runs.get(task.id))) is not None]
         if not running or not paces:
             return None
-        left = sum(
-            self._left(task, states[task.key])
+        remaining = sum(
+            self._remaining_steps(task, states[task.key])
             for task in plan.tasks
             if states[task.key] not in ("failed", "blocked")
         )
-        return left * statistics.median(paces) / len(running) if left else None
+        return remaining * statistics.median(paces) / len(running) if remaining else None
 
-    def made(self, plan: Plan) -> TableAndRounds:
-        """Return the results of a sweep's runs.
-
-        They are computed again if a run, the sweep, its plan or its rounds changed.
-        """
+    def _results(self, known: KnownSweep) -> dict[str, Any]:
+        """Return the results of a sweep's runs, computed again after a change of the sweep or of a run."""
         with self.lock:
-            runs = [self.index.signatures.get(entry.id) for entry in plan.entries]
-            folder = self.index.outputs / "sweeps" / plan.name
-            stamp = (plan, runs, _digest(folder / SWEEP_FILE), _digest(folder / ROUNDS_FILE))
-            known = self.tables.get(plan.name)
-            if known and known[0] == stamp:
-                return known[1]
-            made = self._make(plan)
-            self.tables[plan.name] = (stamp, made)
-            return made
+            plan = known.plan
+            stamp = (known.stamp, [self.index.signatures.get(entry.id) for entry in plan.entries])
+            before = self.results.get(plan.name)
+            if before is None or before[0] != stamp:
+                before = self.results[plan.name] = (stamp, self._compute(known))
+            return before[1]
 
-    def _make(self, plan: Plan) -> TableAndRounds:
-        flags: list[str] = []
-        sweep = self._kept(plan.name)
-        if sweep is None:
-            sweep, flags = sweep_of_plan(plan), [NOT_KEPT]
-        rounds, doubts = rounds_of(sweep, plan, self._rounds_path(plan)) if not flags else (None, [])
-        sweep = rounds.spent(sweep) if rounds else sweep
-        flags += doubts
+    def _compute(self, known: KnownSweep) -> dict[str, Any]:
+        plan, flags = known.plan, list[str]()
+        rounds, flag = find_rounds(known.sweep, plan)
+        sweep = rounds.spent(known.sweep) if rounds else known.sweep
         entries = {(entry.label, entry.seed): entry for entry in plan.entries}
-        metric = _shown_metric(sweep)
+        metric = _cell_metric(sweep)
         values: dict[tuple[str, int], float] = {}
 
-        def find(arm: Variant, seed: int) -> Measured | None:
-            entry = entries.get((arm.label, seed))
+        def find(variant: Variant, seed: int) -> Measured | None:
+            entry = entries.get((variant.label, seed))
             if entry is None or not plan.complete(entry):
                 return None
             try:
                 run = load(plan.run_of(entry).folder, entry.stages)
-                # Of this arm's own evaluation: arms that share a training may use its network in other ways.
-                value = run.value("stream", arm.branch, metric)
-                values.update({(arm.label, seed): value} if value is not None and isfinite(value) else {})
-                return run
+                # Variants that share a training may evaluate its network differently.
+                value = run.value("stream", variant.branch, metric)
             except InputError as error:
                 flags.append(str(error))
                 return None
+            if value is not None and math.isfinite(value):
+                values[variant.label, seed] = value
+            return run
 
-        made = make_table(sweep, finished_runs(sweep, find), rounds=rounds)
-        table = table_words(replace(made, flags=(*made.flags, *flags)))
-        return TableAndRounds(table, rounds_words(rounds, sweep) if rounds else None, values)
-
-    def _rounds_path(self, plan: Plan) -> Path:
-        return self.index.outputs / "sweeps" / plan.name / ROUNDS_FILE
-
-    def _kept(self, name: str) -> Sweep | None:
-        try:
-            return kept_sweep(self.index.outputs / "sweeps" / name)
-        except InputError:
-            return None
+        runs = finished_runs(sweep, find)
+        table = make_table(sweep, runs, rounds=rounds)
+        table = replace(table, flags=(*table.flags, *flag, *flags))
+        progress = describe_rounds(rounds, sweep) if rounds else None
+        return describe_results(sweep, runs, table) | {"rounds": progress, "values": values}
 
 
-def _shown_metric(sweep: Sweep) -> str:
-    """Return the metric that the cells of a sweep's page show."""
-    return next((metric for metric in sweep.metrics if metric in UNITS), "MPJPE")
+def name_sweep(name: str, sweep: Sweep) -> dict[str, Any]:
+    """Return a sweep's name and title, with its table's number in the paper."""
+    return {"name": name, "title": f"Table {sweep.table}: {sweep.title}" if sweep.table else sweep.title}
 
 
-def rounds_of(sweep: Sweep, plan: Plan, path: Path) -> tuple[Rounds | None, list[str]]:
-    """Return the rounds that decided the verdicts, None for none, and otherwise what a reader has to know."""
+def describe_results(sweep: Sweep, runs: Mapping[str, RunsBySeed], table: Table) -> dict[str, Any]:
+    """Return a sweep's results for a page: the table, the distributions, and the metric of its cells."""
+    branches = {variant.branch for variant in sweep.variants}
+    return {
+        "metric": _cell_metric(sweep),
+        "branch": branches.pop() if len(branches) == 1 else "",
+        "table": {
+            **json.loads(as_json(table)),
+            "caption": caption(table),
+            "headings": {metric: heading(metric) for metric in table.metrics},
+            "better": {metric: better(metric) for metric in table.metrics},
+            "legend": legend(table),
+        },
+        "distributions": describe_distributions(sweep, runs, table.modes[0]),
+    }
+
+
+def describe_distributions(sweep: Sweep, runs: Mapping[str, RunsBySeed], mode: str) -> dict[str, Any]:
+    """Return performance profiles, interquartile means and probabilities of improvement by metric.
+
+    A profile is the fraction of all runs' test clips with at most each of some `thresholds`.
+    """
+    found = {}
+    for metric, variants in distributions(sweep, runs, mode).items():
+        every = np.concatenate([variant.errors.ravel() for variant in variants])
+        every = every[np.isfinite(every)]
+        if not every.size:
+            continue
+        thresholds = np.linspace(every.min(), every.max(), PROFILE_POINTS)
+        rows = [
+            {
+                "variant": one.label,
+                "fractions": list(performance_profile(one.errors, thresholds)) if one.errors.size else [],
+                "middle": one.middle if one.middle is None or math.isfinite(one.middle) else None,
+                "improvement": one.improvement,
+            }
+            for one in variants
+        ]
+        found[metric] = {"mode": mode, "thresholds": thresholds.tolist(), "rows": rows}
+    return found
+
+
+def find_rounds(sweep: Sweep, plan: Plan) -> tuple[Rounds | None, list[str]]:
+    """Return the rounds that decided a sweep's verdicts, or None with a flag if other rounds were taken."""
+    path = plan.outputs / "sweeps" / plan.name / ROUNDS_FILE
     try:
         rounds = read_rounds(path)
         if rounds is None or not rounds.taken:
             return None, []
         if rounds.subject != plain(subject(sweep)):
-            return None, [OTHERS]
+            return None, [OTHER_ROUNDS]
         same_runs(rounds, sweep, plan, path)
     except InputError:
-        return None, [ROUNDS]
+        return None, [DAMAGED_ROUNDS]
     return rounds, []
 
 
-def rounds_words(rounds: Rounds, sweep: Sweep) -> dict[str, Any]:
-    """Return the looks of a sweep's rounds, what each look decided, and each arm's progress."""
-    looks = []
+def describe_rounds(rounds: Rounds, sweep: Sweep) -> dict[str, Any]:
+    """Return the interim analyses of a sweep's rounds with what each decided, and each variant's progress."""
+    analyses = []
     for seeds, level in zip(rounds.looks, rounds.levels, strict=True):
         found = [finding for look in rounds.taken if look.seeds == seeds for finding in look.found]
         decided = sum(finding.verdict is not Verdict.INCONCLUSIVE for finding in found)
-        looks.append({"seeds": seeds, "level": level, "compared": len(found), "decided": decided})
-    return {
-        "comparisons": len(rounds.family(sweep)),
-        "looks": looks,
-        "arms": [asdict(arm) for arm in standings(rounds, sweep)],
-    }
+        analyses.append({"seeds": seeds, "level": level, "compared": len(found), "decided": decided})
+    variants = [asdict(variant) for variant in standings(rounds, sweep)]
+    return {"comparisons": len(rounds.family(sweep)), "analyses": analyses, "variants": variants}
 
 
-def table_words(table: Any) -> dict[str, Any]:
-    """Return a table's content, with its columns' heads, their better directions, and the legend."""
-    words = json.loads(as_json(table))
-    return {
-        **words,
-        "caption": caption(table),
-        "headings": {m: heading(m) for m in table.metrics},
-        "better": {m: better(m) for m in table.metrics},
-        "legend": legend(table),
-    }
-
-
-def _kinds(plan: Plan) -> dict[str, list[RunTask]]:
-    """Return a plan's tasks in two groups: networks, which are arms and seeds, and their upstream runs."""
-    found: dict[str, list[RunTask]] = {"networks": [], "upstream": []}
-    for task in plan.tasks:
-        found["networks" if task.kind == NETWORK else "upstream"].append(task)
-    return found
-
-
-def caption_of(sweep: Sweep) -> str:
-    """Return a sweep's title, with its table's number in the paper."""
-    return f"Table {sweep.table}: {sweep.title}" if sweep.table else sweep.title
-
-
-def sweep_of_plan(plan: Plan) -> Sweep:
-    """Return a sweep with a plan's arms and seeds, of which the first arm is the control."""
-    seeds = list(dict.fromkeys(entry.seed for entry in plan.entries)) or [0]
-    arms: dict[str, list[str]] = {
-        label: [] for label in dict.fromkeys(entry.label for entry in plan.entries)
-    } or {"-": []}
-    return parse_sweep(plan.name, {"title": plan.name, "seeds": seeds, "variants": arms})
+def _cell_metric(sweep: Sweep) -> str:
+    return next((metric for metric in sweep.metrics if metric in UNITS), "MPJPE")
 
 
 def _changed(path: Path) -> int:
-    """Return when a file was last changed, in nanoseconds; 0 if there is none."""
     try:
         return path.stat().st_mtime_ns
     except OSError:
         return 0
 
 
-def _digest(path: Path) -> str:
-    """Return the digest of a file's content; "" if there is no file."""
-    try:
-        return file_digest(path)
-    except OSError:
-        return ""
-
-
 def _pace(facts: Mapping[str, Any] | None) -> float | None:
-    """Return a run's seconds per step over its last entries; None if they are not enough to tell."""
+    """Return a run's seconds per step over its last entries; None if there are too few of them."""
     recent = (facts or {}).get("recent") or []
     if len(recent) < 2 or recent[-1][0] <= recent[0][0]:
         return None
     seconds = recent[-1][1] - recent[0][1]
-    return (
-        seconds / (recent[-1][0] - recent[0][0])
-        if 0 < seconds < 86400 and recent[-1][1] < time.time() + 60
-        else None
-    )
+    plausible = 0 < seconds < 86400 and recent[-1][1] < time.time() + 60
+    return seconds / (recent[-1][0] - recent[0][0]) if plausible else None

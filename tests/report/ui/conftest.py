@@ -1,4 +1,4 @@
-"""Run folders of made-up numbers, a sweep of them, and servers on them."""
+"""Run folders of invented numbers, a sweep of them, and servers on them."""
 
 from __future__ import annotations
 
@@ -14,32 +14,33 @@ from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.sweep_file import parse_sweep
 from memmlp.sweep.sweep_json import keep_sweep
 
-ARMS = {"none": 1.0, "gru": 0.8}
+VARIANTS = {"none": 1.0, "gru": 0.8}
 SEEDS = (0, 1, 2)
 
 
 @pytest.fixture
 def outputs(tmp_path: Path) -> Path:
-    """An outputs folder with a finished sweep of two arms and three seeds."""
-    made(tmp_path / "outputs")
+    """An outputs folder with a finished sweep of two variants and three seeds."""
+    make_outputs(tmp_path / "outputs")
     return tmp_path / "outputs"
 
 
-def made(outputs: Path) -> Sweep:
-    """Make a finished sweep called "mine" of made-up runs."""
-    arms = {
-        arm: {"overrides": [f"memory={arm}"], "paper": {"MPJPE": 6 * factor}} for arm, factor in ARMS.items()
+def make_outputs(outputs: Path) -> Sweep:
+    """Make a finished sweep called "mine" of invented runs."""
+    variants = {
+        variant: {"overrides": [f"memory={variant}"], "paper": {"MPJPE": 6 * factor}}
+        for variant, factor in VARIANTS.items()
     }
     sweep = parse_sweep(
-        "mine", {"title": "Mine", "seeds": list(SEEDS), "variants": arms, "metrics": ["MPJPE"]}
+        "mine", {"title": "Mine", "seeds": list(SEEDS), "variants": variants, "metrics": ["MPJPE"]}
     )
     entries, tasks = [], []
-    for arm, factor in ARMS.items():
+    for variant, factor in VARIANTS.items():
         for seed in SEEDS:
             optim = {"steps": 2000, "batch": 1, "lr": 1e-3}  # which is little motion
-            config = {"memory": {"name": arm}, "seed": seed, "optim": optim, "model": {"frames": 11}}
-            run = fake_run(outputs, arm, seed, factor, config=config, log=True)
-            entries.append(Entry(arm, seed, run.id))
+            config = {"memory": {"name": variant}, "seed": seed, "optim": optim, "model": {"frames": 11}}
+            run = fake_run(outputs, variant, seed, factor, config=config, log=True)
+            entries.append(Entry(variant, seed, run.id))
             tasks.append(RunTask(run.id, "memmlp", config))
     folder = outputs / "sweeps" / "mine"
     Plan("mine", outputs, tuple(entries), tuple(tasks)).save(folder / "plan.json")
@@ -47,15 +48,15 @@ def made(outputs: Path) -> Sweep:
     return sweep
 
 
-def run_of(outputs: Path, arm: str = "gru", seed: int = 0) -> Run:
+def run_of(outputs: Path, variant: str = "gru", seed: int = 0) -> Run:
     """Return a run of that sweep."""
     plan = Plan.load(outputs / "sweeps" / "mine" / "plan.json")
-    found = plan.run(arm, seed)
+    found = plan.run(variant, seed)
     assert found is not None
     return found
 
 
-def begun(outputs: Path, name: str = "abcdef0123456789", step: int = 500) -> Run:
+def started_run(outputs: Path, name: str = "abcdef0123456789", step: int = 500) -> Run:
     """Make a run that trains: no marker, a log as far as a step."""
     run = Run.of(outputs, name)
     run.folder.mkdir(parents=True)

@@ -5,19 +5,19 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
 
 import pytest
 from chromium import Browser
-from report.ui.conftest import SEEDS, begun, made, run_of
+from report.ui.conftest import SEEDS, make_outputs, run_of, started_run
 from report.ui.test_replay import motion
 
 from memmlp.cli.seed_rounds import look
 from memmlp.evaluation.metric_facts import UNITS
-from memmlp.report.ui.one_file import ReportedSweep, page_text, query, rounded
-from memmlp.report.ui.routes import Answers
-from memmlp.report.ui.server import RunsServer
+from memmlp.report.ui.report_file import ReportedSweep, write_page
+from memmlp.report.ui.server import Answers, RunsServer
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan
 from memmlp.sweep.sweep_json import kept_sweep
@@ -27,7 +27,7 @@ from memmlp.tables.runs_of_plan import run_finder
 from memmlp.tables.seed_rounds import new_rounds
 
 EVIL = "<img src=x onerror=owned=1>"
-READY = "document.documentElement.dataset.ready"
+READY = "document.documentElement.dataset.ready !== undefined"
 NAMES = "[...document.querySelectorAll('.runs tbody th a')].map(a => a.textContent)"
 
 
@@ -40,10 +40,10 @@ def predict(run: Run, clip: str, mode: str) -> dict:
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sweep, a run that trains, one that is damaged, and one whose every word looks like markup."""
     outputs = tmp_path_factory.mktemp("home") / "outputs"
-    made(outputs)
-    begun(outputs)
+    make_outputs(outputs)
+    started_run(outputs)
     (outputs / "runs" / ("0" * 16)).mkdir()
-    evil = begun(outputs, "e" * 16)
+    evil = started_run(outputs, "e" * 16)
     evil.config_path.write_text(
         json.dumps({"memory": {"name": EVIL}, "seed": 9, EVIL: EVIL, "optim": {"steps": 900}})
     )
@@ -161,11 +161,11 @@ def test_units_and_directions_of_metrics_of_ones_own(
     """Those of a package in use; of another metric nobody knows what is better."""
     monkeypatch.setitem(UNITS, "Score", "points")
     monkeypatch.setattr("memmlp.tables.table_text.HIGHER", {"Score"})
-    made(tmp_path)
+    make_outputs(tmp_path)
     none, gru = (run_of(tmp_path, arm, 0) for arm in ("none", "gru"))
     scored(none, Score=5.0, Odd=1.0)
     scored(gru, Score=7.0, Odd=2.0)
-    with RunsServer(Answers(tmp_path, kept=False), 0, every=0.05) as running:
+    with RunsServer(Answers(tmp_path), 0, every=0.05) as running:
         go(browser, running.url, f"run/{gru.id}", "document.querySelectorAll('.grid').length >= 2")
         rows = browser.value("[...document.querySelectorAll('.grid tbody tr')].map(r => r.textContent)")
         (row,) = (row for row in rows if row.startswith("Score"))
@@ -189,28 +189,28 @@ def test_units_and_directions_of_metrics_of_ones_own(
 
 def test_no_difference_is_shown_from_a_control_on_other_data(browser: Browser, tmp_path: Path):
     """Its means are over other test clips."""
-    made(tmp_path)
+    make_outputs(tmp_path)
     gru, none = (run_of(tmp_path, arm, 0) for arm in ("gru", "none"))
     small = "[...document.querySelectorAll('.grid td.n > small')].length"
     told = "document.body.textContent.includes('The control has other data')"
-    with RunsServer(Answers(tmp_path, kept=False), 0, every=0.05) as running:
+    with RunsServer(Answers(tmp_path), 0, every=0.05) as running:
         go(browser, running.url, f"run/{gru.id}", "document.querySelectorAll('.grid').length >= 2")
         assert browser.value(small) > 0
         assert not browser.value(told)
     none.manifest_path.write_text(json.dumps({**none.manifest, "data": "e" * 64}))
-    with RunsServer(Answers(tmp_path, kept=False), 0, every=0.05) as running:
+    with RunsServer(Answers(tmp_path), 0, every=0.05) as running:
         go(browser, running.url, f"run/{gru.id}", "document.querySelectorAll('.grid').length >= 2")
         assert browser.value(told)
         assert browser.value(small) == 0
         go(browser, running.url, f"compare?runs={none.id},{gru.id}", "document.querySelectorAll('.lines')[1]")
-        assert browser.value("document.body.textContent.includes('whose errors do not compare')")
+        assert browser.value("document.body.textContent.includes('their errors are not comparable')")
         assert browser.value("document.querySelectorAll('.least').length") == 0
 
 
 def test_rounds_of_a_sweep(browser: Browser, tmp_path: Path):
-    sweep, folder = made(tmp_path), tmp_path / "sweeps" / "mine"
+    sweep, folder = make_outputs(tmp_path), tmp_path / "sweeps" / "mine"
     look(sweep, tmp_path, new_rounds(sweep), Plan.load(folder / "plan.json"))
-    with RunsServer(Answers(tmp_path, kept=False), 0, every=0.05) as running:
+    with RunsServer(Answers(tmp_path), 0, every=0.05) as running:
         go(browser, running.url, "sweep/mine", "document.body.textContent.includes('Rounds')")
         words = browser.value("document.body.textContent")
         assert "2 of 2 comparisons are decided" in words
@@ -270,7 +270,7 @@ def test_a_replay_says_that_the_other_run_s_is_being_computed(browser: Browser, 
             seen.wait()
         return predict(run, clip, mode)
 
-    with RunsServer(Answers(home, slow, kept=False), 0, every=0.05) as server:
+    with RunsServer(Answers(home, slow), 0, every=0.05) as server:
         go(browser, server.url, f"run/{run_of(home, 'gru', 1).id}", "document.querySelector('.view .wait')")
         assert browser.value("document.querySelector('.view .wait').textContent") == "computing …"
         seen.set()
@@ -278,34 +278,33 @@ def test_a_replay_says_that_the_other_run_s_is_being_computed(browser: Browser, 
         assert browser.value("document.querySelector('.view .wait')") is None
 
 
-EXTRA = "<h1>Extra</h1><a href='#low'>Low</a><p style='height: 5000px'></p><h2 id='low'>Low</h2>"
-
-
 def test_a_file_without_a_server(browser: Browser, home: Path, tmp_path: Path):
     folder = home / "sweeps" / "mine"
     sweep, plan = kept_sweep(folder), Plan.load(folder / "plan.json")
     assert sweep is not None
-    table = make_table(sweep, finished_runs(sweep, run_finder(plan, load)))
-    text = page_text(Answers(home, predict, kept=False), [ReportedSweep("mine", table)], EXTRA)
+    runs = finished_runs(sweep, run_finder(plan, load))
+    other = replace(sweep, name="other", title="Other")
+    nothing = {variant.label: {} for variant in other.runnable()}
+    sweeps = [
+        ReportedSweep("other", other, nothing, make_table(other, nothing)),
+        ReportedSweep("mine", sweep, runs, make_table(sweep, runs)),
+    ]
+    text = write_page(Answers(home, predict), sweeps, "Generated today")
     assert EVIL not in text
+    assert not re.search(r"<link[^>]*href=\"(?!data:)|<(script|img)[^>]*src=", text)
     file = tmp_path / "report.html"
     file.write_text(text)
-    go(browser, file.as_uri(), "", "document.querySelector('main h1').textContent == 'Extra'")
-    browser.click("a[href='#low']")  # a part of the page, and no room of the file
-    browser.wait("document.querySelector('main a[href]').getBoundingClientRect().top < -1000")
-    assert browser.value("document.querySelector('main h1').textContent") == "Extra"
+    go(browser, file.as_uri(), "", "document.querySelectorAll('main h2').length >= 2")
+    heads = "[...document.querySelectorAll('main h2')].map(one => one.textContent)"
+    assert browser.value(heads) == ["Mine", "Other", "Accuracy and latency"]  # one without runs comes last
+    assert browser.value("document.body.textContent.includes('Generated today')")
+    assert browser.value("document.querySelectorAll('.verdict').length") == 2
     go(browser, file.as_uri(), "runs", f"{NAMES}.length == 6")
     best = min(
         (run_of(home, "gru", seed) for seed in range(3)),
         key=lambda run: run.results["stream"]["rotation"]["MPJPE"],
     )
     go(browser, file.as_uri(), f"run/{best.id}", "document.documentElement.dataset.replayed?.endsWith(' 3')")
-    go(browser, file.as_uri(), "sweep/mine", "document.querySelectorAll('.plot svg').length >= 2")
-    go(browser, file.as_uri(), "extra", "document.querySelector('main h1').textContent == 'Extra'")
-
-
-def test_words_of_an_address_and_numbers_of_a_file():
-    assert query(clip="a b/c~d*e", mode="stream") == "clip=a+b%2Fc%7Ed*e&mode=stream"
-    assert rounded({"a": [1.23456789, float("nan"), (float("inf"), 3, "x", None, True)]}) == {
-        "a": [1.23457, None, [None, 3, "x", None, True]]
-    }
+    go(browser, file.as_uri(), "sweep/mine", "document.querySelectorAll('.plot svg').length >= 3")
+    assert browser.value("document.body.textContent.includes('Beyond the mean')")
+    go(browser, file.as_uri(), "sweep/other", "document.querySelector('.effects')")

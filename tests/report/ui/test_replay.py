@@ -11,7 +11,7 @@ from processes import until
 from report.ui.conftest import run_of
 
 from memmlp.common.errors import InputError
-from memmlp.report.ui.replay import Replays, piece, worst_seconds
+from memmlp.report.ui.replay import Replays, cut_piece, find_worst_seconds
 from memmlp.runs.recipe_versions import RECIPES
 from memmlp.runs.run import Run
 
@@ -43,20 +43,20 @@ def ready(replays: Replays, *words: str) -> dict:
 
 def test_a_piece_is_around_the_worst_second_in_the_page_s_axes():
     made = motion()
-    found = piece(made["true_positions"], made["predicted_positions"])
+    found = cut_piece(made["true_positions"], made["predicted_positions"])
     assert found["worst"][0] == {"first": 300, "mean": 20.0}
     assert (found["frames"], found["from"], len(found["truth"])) == (FRAMES, 30, 600)
     assert found["truth"][0][:3] == [0, 1000, 0]  # up is y there
     assert found["joints"][270][:3] == [200, 1000, 0]
     assert found["errors"][300] == 20.0
-    assert piece(made["true_positions"], made["predicted_positions"], 12.0)["from"] == 300
+    assert cut_piece(made["true_positions"], made["predicted_positions"], 12.0)["from"] == 300
 
 
 def test_motion_that_is_no_number_is_said():
     made = motion()
     made["predicted_positions"][120:] = np.nan
-    found = piece(made["true_positions"], made["predicted_positions"])
-    said = f"{FRAMES - 120} of {FRAMES} frames are no numbers, first at 2.0 s"
+    found = cut_piece(made["true_positions"], made["predicted_positions"])
+    said = f"{FRAMES - 120} of {FRAMES} frames are NaN or infinite, first at 2.0 s"
     assert found == {"state": "failed", "reason": said}
 
 
@@ -64,7 +64,7 @@ def test_worst_seconds_do_not_overlap():
     errors = np.ones(400)
     errors[100:160], errors[130:190] = 5.0, 6.0
     errors[300:360] = 3.0
-    found = worst_seconds(errors)
+    found = find_worst_seconds(errors)
     firsts = sorted(one["first"] for one in found)
     assert found[0] == {"first": 130, "mean": 6.0}
     assert all(later - earlier >= 60 for earlier, later in itertools.pairwise(firsts))
@@ -74,7 +74,7 @@ def test_worst_seconds_do_not_overlap():
 @pytest.mark.parametrize("frames", [1, 30, 60, 61])
 def test_short_clips(frames: int):
     truth = np.zeros((frames, 22, 3))
-    found = piece(truth, truth + 0.1)
+    found = cut_piece(truth, truth + 0.1)
     assert (len(found["truth"]), found["worst"][0]["first"]) == (frames, 0)
 
 

@@ -1,4 +1,4 @@
-"""What the pages of runs are told."""
+"""Rows of runs, units, curves."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from typing import Any
 
 import pytest
 from own_package import registers_kept
+from report.ui.conftest import started_run
 
 from memmlp.evaluation.metric_facts import HIGHER, UNITS
-from memmlp.report.ui.runs import by_earlier_recipes, differing, partners, sets, shared, units
+from memmlp.report.ui.runs import Curves, describe_units, differing_keys, outdated_modes, thin_out
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.identity import evaluation_id_of, evaluation_recipes, evaluation_settings
 from memmlp.runs.recipe_versions import RECIPES
@@ -22,9 +23,9 @@ def of(data: str, **config: Any) -> dict[str, Any]:
 
 def test_one_folder_of_data_has_many_spellings():
     here, there = {"data.root": "data/mine", "seed": 0}, {"data.root": "/x/data/mine", "seed": 1}
-    assert differing([of("d", **here), of("d", **there)]) == ["seed"]
-    assert differing([of("d", **here), of("e", **there)]) == ["data.root", "seed"]
-    assert differing([of("d", **here), of("d", seed=0)]) == []
+    assert differing_keys([of("d", **here), of("d", **there)]) == ["seed"]
+    assert differing_keys([of("d", **here), of("e", **there)]) == ["data.root", "seed"]
+    assert differing_keys([of("d", **here), of("d", seed=0)]) == []
 
 
 def test_units_and_what_is_better_where_somebody_knows():
@@ -33,58 +34,61 @@ def test_units_and_what_is_better_where_somebody_knows():
     with registers_kept():
         UNITS["Score"] = "points"
         HIGHER.add("Score")
-        assert units(metrics) == {
+        assert describe_units(metrics) == {
             "MPJPE": {"unit": "cm", "better": "lower"},
             "Jitter": {"unit": "10² m/s³", "better": "lower"},
             "GT Jitter": {"unit": "10² m/s³", "better": ""},
             "Score": {"unit": "points", "better": "higher"},
             "median_ms": {"unit": "ms", "better": "lower"},
         }
-    assert "Score" not in units(metrics)
-
-
-def network(run_id: str, data: str = "d", status: str = "done", **config: Any) -> dict[str, Any]:
-    config = {"memory.name": "vq", "memory.codes": 8, "optim.lr": 1e-3, "seed": 0, **config}
-    return {"id": run_id, "kind": "memmlp", "status": status, "data": data, "config": config}
-
-
-def test_the_run_to_see_beside_one_is_of_its_data_and_differs_little():
-    every = [
-        network("own"),
-        network("a_seed", seed=1),
-        network("b_both", **{"memory.name": "none", "memory.codes": None, "optim.lr": 1e-2}),
-        network("c_memory", **{"memory.name": "none", "memory.codes": None, "data.root": "/elsewhere"}),
-        network("d_other_data", data="e"),
-        network("e_trains", status="training"),
-        network("f_rate", **{"optim.lr": 1e-2}),
-    ]
-    known = {run["id"]: run for run in every}
-    assert partners(known, "own") == ["f_rate", "c_memory", "b_both", "a_seed"]
-    assert partners(known, "own", control="b_both")[0] == "b_both"
-    assert partners(known, "own", control="d_other_data")[0] == "f_rate"
-    assert partners(known, "d_other_data") == []
-
-
-def test_runs_of_different_data_that_share_a_name_are_told_apart():
-    first, second = "78bb7c86", "877ca548"
-    runs = [
-        {"name": "tiny", "data": first, "data_name": "mocap"},
-        {"name": "tiny", "data": second, "data_name": "synth"},
-        {"name": "memory=none", "data": second, "data_name": "synth"},
-        {"name": "VQ-VAE", "data": first, "data_name": ""},
-        {"name": "damaged", "data": "", "data_name": ""},
-    ]
-    assert shared(runs) == ["tiny"]
-    assert sets(runs) == {first: "mocap 78bb7c86", second: "synth 877ca548"}
+    assert "Score" not in describe_units(metrics)
 
 
 def test_what_an_earlier_recipe_measured_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     run, settings = Run(tmp_path / ("a" * 16)), evaluation_settings({}, "window")
     report = {"mode": "window", "settings": settings, "recipes": evaluation_recipes(settings)}
     write_report(run.evaluation(evaluation_id_of(settings)), {**report, "mean": {}, "clips": []})
-    assert by_earlier_recipes(run) == []
+    assert outdated_modes(run) == []
     now = RECIPES["mode.window"]
     monkeypatch.setitem(RECIPES, "mode.window", now + 1)
-    assert by_earlier_recipes(run) == [f"window (mode.window {now} -> {now + 1})"]
+    assert outdated_modes(run) == [f"window (mode.window {now} -> {now + 1})"]
     run.config_path.write_text("[")
-    assert by_earlier_recipes(run) == []
+    assert outdated_modes(run) == []
+
+
+def test_what_was_appended_is_added(tmp_path: Path):
+    run = started_run(tmp_path, step=200)
+    curves = Curves(tmp_path)
+    assert curves.read(run.id)["train loss"] == [[0, 100, 200], [5.0, 4.9, 4.8]]
+    with open(run.metrics_path, "ab") as file:
+        file.write(b'{"step": 300, "phase": "train", "time": 1, "values": {"loss": 1}}\n{"step": 400, "ph')
+    position = curves.logs[run.id].position
+    assert curves.read(run.id)["train loss"][0] == [0, 100, 200, 300]
+    assert position < curves.logs[run.id].position < run.metrics_path.stat().st_size
+
+
+def test_a_log_that_was_made_anew_is_read_anew(tmp_path: Path):
+    run = started_run(tmp_path, step=200)
+    curves = Curves(tmp_path)
+    curves.read(run.id)
+    line = b'{"step": %d, "phase": "train", "time": 1, "values": {"loss": 2}}\n'
+    run.metrics_path.write_bytes(b"".join(line % step for step in range(900)))
+    assert curves.read(run.id)["train loss"][0][-1] == 899
+    assert curves.read(run.id)["train loss"][1] == [2.0] * len(curves.read(run.id)["train loss"][0])
+
+
+def test_a_step_done_twice_counts_once(tmp_path: Path):
+    run = started_run(tmp_path, step=100)
+    run.log(100, {"loss": 9.0, "other": float("nan")})
+    curves = Curves(tmp_path)
+    assert curves.read(run.id)["train loss"] == [[0, 100], [5.0, 9.0]]
+    assert curves.read(run.id)["train other"] == [[100], [None]]
+    assert curves.read("0" * 16) == {}
+
+
+def test_thinning_keeps_ends_and_peaks():
+    points = {step: 1.0 for step in range(10_000)} | {5_003: 9.0, 7_771: -3.0}
+    steps, values = thin_out(points, 100)
+    assert (steps[0], steps[-1], max(values), min(values)) == (0, 9_999, 9.0, -3.0)
+    assert len(steps) <= 110
+    assert steps == sorted(steps)

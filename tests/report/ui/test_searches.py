@@ -24,7 +24,7 @@ def test_a_pruned_trial_has_no_value(folder: Path):
     """That of its last step stood among those of trained networks."""
     study = with_a_pruned_trial(folder)
     write_json(folder / "search.json", asdict(study.search))
-    first, second, *_ = Searches(folder.parents[1]).page("mine")["trials"]
+    first, second, *_ = Searches(folder.parents[1]).describe("mine")["trials"]
     assert (first["state"], first["values"]) == ("complete", [5.0])
     assert (second["state"], second["values"], second["reason"]) == ("pruned", [], "9 at step 10")
 
@@ -36,11 +36,11 @@ def test_a_search_in_a_storage_of_ones_own_is_read_again(folder: Path, tmp_path:
     one, searches = director(study, folder), Searches(tmp_path / "outputs")
     plan = folder / "controllers/a.json"
     one.look(1).save(plan)
-    assert searches.page("mine")["counts"] == {"running": 1}
+    assert searches.describe("mine")["counts"] == {"running": 1}
     before = searches.stamp()
     finish(one.look(1))
     one.look(1).save(plan)
-    assert searches.page("mine")["counts"] == {"complete": 1, "running": 1}
+    assert searches.describe("mine")["counts"] == {"complete": 1, "running": 1}
     assert searches.stamp() != before
 
 
@@ -48,7 +48,7 @@ def test_of_few_trials_it_says_why_there_is_no_importance(folder: Path):
     study = open_study(folder, n_trials=2)
     write_json(folder / "search.json", asdict(study.search))
     to_the_end(study, folder)
-    page = Searches(folder.parents[1]).page("mine")
+    page = Searches(folder.parents[1]).describe("mine")
     assert (page["importance"], page["too_few"]) == (
         [],
         "told from 25 complete trials on; of 2 it would be chance",

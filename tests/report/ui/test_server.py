@@ -10,12 +10,11 @@ from typing import NamedTuple
 from urllib.parse import quote
 
 import pytest
-from report.ui.conftest import begun, run_of
+from report.ui.conftest import run_of, started_run
 
 from memmlp.common.errors import InputError
-from memmlp.report.ui import pages
-from memmlp.report.ui.routes import Answers
-from memmlp.report.ui.server import RunsServer
+from memmlp.report.ui import page_files
+from memmlp.report.ui.server import Answers, RunsServer
 
 TOKEN = "a token of many letters"
 
@@ -58,11 +57,11 @@ def test_runs_and_only_what_changed_since(server: RunsServer, outputs: Path):
     since = f"/api/runs?since={first['generation']}&heads={first['heads']}"
     assert get(server, since).json["rows"] == []
     (run_of(outputs).folder / "notes.json").write_text('{"tags": ["good"]}')
-    server.answers.look()
+    server.answers.refresh()
     changed = get(server, since).json
     assert ([row["tags"] for row in changed["rows"]], changed["whole"]) == ([["good"]], False)
-    begun(outputs)
-    server.answers.look()
+    started_run(outputs)
+    server.answers.refresh()
     assert get(server, since).json["whole"]  # its config has values that no other run has
 
 
@@ -75,7 +74,7 @@ def test_pages_of_a_run_a_sweep_and_curves(server: RunsServer, outputs: Path):
     assert "config.yaml" in [file["name"] for file in page["files"]]
     assert get(server, "/api/sweeps").json["sweeps"][0]["title"] == "Mine"
     assert get(server, "/api/sweeps/mine").json["table"]["caption"] == "Mine"
-    curves = get(server, f"/api/curves?runs={run.id},{control.id},zzz&names=train%20loss").json["curves"]
+    curves = get(server, f"/api/curves?runs={run.id},{control.id},zzz").json["curves"]
     assert {len(found["train loss"][0]) for found in curves.values()} == {21}
     assert get(server, "/api/searches").json == {"searches": []}
 
@@ -102,11 +101,8 @@ def test_the_page_says_what_it_reads_before_it_has_read_it(server: RunsServer):
 
 
 def test_what_is_missing_is_named(server: RunsServer, outputs: Path):
-    assert (
-        get(server, "/api/run/nope").json["error"].startswith(f"run nope: it is not in {outputs / 'runs'};")
-    )
-    assert get(server, "/api/sweeps/none").json["error"].startswith("sweep none: it is not in ")
-    assert get(server, "/api/none").json["error"] == "none: there is no such page"
+    assert f"nope: not found in {outputs / 'runs'};" in get(server, "/api/run/nope").json["error"]
+    assert f"none: not found in {outputs / 'sweeps'};" in get(server, "/api/sweeps/none").json["error"]
 
 
 @pytest.mark.parametrize(
@@ -118,7 +114,7 @@ def test_a_bad_question_is_one_line(server: RunsServer, outputs: Path, path: str
 
 
 def test_the_page_s_files_and_their_policy(server: RunsServer):
-    for name in pages.FILES:
+    for name in page_files.FILES:
         answer = get(server, f"/{name}")
         assert (answer.code, len(answer.body) > 100) == (200, True)
     policy = answer.headers["Content-Security-Policy"]
@@ -188,13 +184,13 @@ def test_news_come_when_something_changed(server: RunsServer, outputs: Path):
     first = news.readline()
     assert first.startswith(b'data: "1 ')
     assert news.readline() == b"\n"
-    begun(outputs)
+    started_run(outputs)
     assert news.readline().startswith(b'data: "2 ')
     connection.close()
 
 
 def test_a_port_that_is_taken_is_one_line(server: RunsServer, outputs: Path):
-    with pytest.raises(InputError, match=f"--port {server.server_port}: .*; allowed are"):
+    with pytest.raises(InputError, match=f"--port {server.server_port}: .*; expected"):
         RunsServer(Answers(outputs), server.server_port)
     with pytest.raises(InputError, match=r"--host nowhere\.invalid"):
         RunsServer(Answers(outputs), 0, "nowhere.invalid")
@@ -204,6 +200,6 @@ def test_a_bug_in_an_answer_is_an_answer(server: RunsServer, monkeypatch: pytest
     def broken(*_: object) -> dict:
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr(server.answers, "of", broken)
+    monkeypatch.setattr(server.answers, "answer", broken)
     answer = get(server, "/api/runs")
     assert (answer.code, answer.json) == (500, {"error": "ZeroDivisionError: a bug"})

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 from fake_runs import fake_run
-from report.ui.conftest import begun, run_of
+from report.ui.conftest import run_of, started_run
 
 from memmlp.cli.seed_rounds import look
-from memmlp.report.ui.index import Index
-from memmlp.report.ui.routes import Answers
-from memmlp.report.ui.sweeps import NOT_KEPT, OTHERS, ROUNDS, Sweeps
+from memmlp.report.ui.run_index import RunIndex
+from memmlp.report.ui.server import Answers
+from memmlp.report.ui.sweeps import DAMAGED_ROUNDS, OTHER_ROUNDS, Sweeps
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan, RunTask
 from memmlp.sweep.sweep_json import keep_sweep, kept_sweep
@@ -25,9 +25,17 @@ from memmlp.tables.seed_rounds import Rounds, new_rounds
 
 
 def sweeps_of(outputs: Path) -> Sweeps:
-    index = Index(outputs)
+    index = RunIndex(outputs)
     index.refresh()
-    return Sweeps(index)
+    sweeps = Sweeps(index)
+    sweeps.refresh()
+    return sweeps
+
+
+def describe(sweeps: Sweeps) -> dict:
+    """Return the sweep's page as it is now."""
+    sweeps.refresh()
+    return sweeps.describe("mine")
 
 
 def test_the_table_is_that_of_the_command(outputs: Path):
@@ -35,7 +43,7 @@ def test_the_table_is_that_of_the_command(outputs: Path):
     sweep, plan = kept_sweep(folder), Plan.load(folder / "plan.json")
     assert sweep is not None
     table = json.loads(as_json(make_table(sweep, finished_runs(sweep, run_finder(plan, load)))))
-    shown = sweeps_of(outputs).page("mine")["table"]
+    shown = describe(sweeps_of(outputs))["table"]
     assert shown["rows"] == table["rows"]
     (row,) = [row for row in shown["rows"] if row["label"] == "gru"]
     effect = row["cells"]["stream"]["MPJPE"]["effect"]
@@ -46,8 +54,8 @@ def test_the_table_is_that_of_the_command(outputs: Path):
 
 
 def test_progress_and_time_left(outputs: Path, monkeypatch: pytest.MonkeyPatch):
-    before = sweeps_of(outputs).progress(sweeps_of(outputs).known()[0])
-    assert (before["counts"], before["share"], before["left"]) == ({"done": 6}, 1.0, None)
+    before = describe(sweeps_of(outputs))
+    assert (before["counts"], before["share"], before["remaining"]) == ({"done": 6}, 1.0, None)
     run = run_of(outputs, "gru", 2)
     run.marker.unlink()
     lines = [
@@ -56,12 +64,12 @@ def test_progress_and_time_left(outputs: Path, monkeypatch: pytest.MonkeyPatch):
     run.metrics_path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     monkeypatch.setattr(Run, "doing", property(lambda self: None if self.done else "training"))
     sweeps = sweeps_of(outputs)
-    found = sweeps.progress(sweeps.known()[0])
+    found = describe(sweeps)
     assert found["counts"] == {"done": 5, "training": 1}
     assert found["share"] == pytest.approx(11 / 12)
-    assert found["left"] is not None
-    (cell,) = [cell for cell in sweeps.page("mine")["cells"] if cell["state"] == "training"]
-    assert (cell["arm"], cell["seed"], cell["step"], cell["steps"]) == ("gru", 2, 1000, 2000)
+    assert found["remaining"] is not None
+    (cell,) = [cell for cell in describe(sweeps)["cells"] if cell["state"] == "training"]
+    assert (cell["variant"], cell["seed"], cell["step"], cell["steps"]) == ("gru", 2, 1000, 2000)
 
 
 def test_a_run_that_lacks_an_evaluation_is_trained_and_a_vqvae_is_no_arm(outputs: Path):
@@ -76,8 +84,12 @@ def test_a_run_that_lacks_an_evaluation_is_trained_and_a_vqvae_is_no_arm(outputs
     entries = (replace(first, stages=("stream-absent",)), *plan.entries[1:])
     replace(plan, entries=entries, tasks=(vqvae, *tasks)).save(path)
     sweeps = sweeps_of(outputs)
-    found = sweeps.progress(sweeps.known()[0])
-    assert (found["counts"], found["above"], found["tasks"]) == ({"trained": 1, "done": 5}, {"done": 1}, 6)
+    found = describe(sweeps)
+    assert (found["counts"], found["prerequisite_counts"], found["tasks"]) == (
+        {"trained": 1, "done": 5},
+        {"done": 1},
+        6,
+    )
     say = state_finder(Plan.load(path))
     arm = next(arm for arm in kept_sweep(path.parent).runnable() if arm.label == first.label)
     assert say(arm, first.seed) == "trained, an evaluation or export is missing"
@@ -86,7 +98,7 @@ def test_a_run_that_lacks_an_evaluation_is_trained_and_a_vqvae_is_no_arm(outputs
 def test_a_run_that_lacks_only_what_the_sweep_does_not_want_is_done(outputs: Path):
     run_of(outputs, "gru", 2).want(["stream-0", "stream-absent"])
     sweeps = sweeps_of(outputs)
-    assert sweeps.progress(sweeps.known()[0])["counts"] == {"done": 6}
+    assert describe(sweeps)["counts"] == {"done": 6}
     assert sweeps.index.runs[run_of(outputs, "gru", 2).id]["status"] == "trained"
 
 
@@ -95,8 +107,8 @@ def test_no_time_is_left_where_only_the_evaluation_is(outputs: Path):
     with run.lock():
         run.attempt("evaluation")
         sweeps = sweeps_of(outputs)
-        found = sweeps.progress(sweeps.known()[0])
-    assert (found["counts"], found["left"]) == ({"done": 5, "evaluating": 1}, None)
+        found = describe(sweeps)
+    assert (found["counts"], found["remaining"]) == ({"done": 5, "evaluating": 1}, None)
     assert 0.999 < found["share"] < 1
 
 
@@ -105,7 +117,7 @@ def test_the_board_shows_the_sweep_s_first_metric_and_its_branch(outputs: Path):
     sweep = kept_sweep(folder)
     assert sweep is not None
     keep_sweep(replace(sweep, metrics=("FLOPs", "MPJRE", "MPJPE")).with_branch("combined"), folder)
-    page = sweeps_of(outputs).page("mine")
+    page = describe(sweeps_of(outputs))
     assert (page["metric"], page["branch"]) == ("MPJRE", "combined")
     (cell,) = [cell for cell in page["cells"] if cell["id"] == run.id]
     assert cell["value"] == pytest.approx(run.results["stream"]["combined"]["MPJRE"])
@@ -125,7 +137,7 @@ def test_arms_of_one_training_have_each_the_value_of_their_own_evaluation(output
         if planned["id"] == run.id:
             planned["stages"] = ["stream-1"]
     path.write_text(json.dumps(plan))
-    page = sweeps_of(outputs).page("mine")
+    page = describe(sweeps_of(outputs))
     (cell,) = [cell for cell in page["cells"] if cell["id"] == run.id]
     assert cell["value"] == pytest.approx(own + 7.0)
 
@@ -134,16 +146,16 @@ def test_a_failed_run_and_its_reason(outputs: Path):
     run = run_of(outputs, "none", 1)
     run.marker.unlink()
     run.fail("the loss was no number")
-    page = sweeps_of(outputs).page("mine")
+    page = describe(sweeps_of(outputs))
     (cell,) = [cell for cell in page["cells"] if cell["state"] == "failed"]
-    assert (cell["arm"], cell["seed"], cell["failure"]) == ("none", 1, "the loss was no number")
+    assert (cell["variant"], cell["seed"], cell["failure"]) == ("none", 1, "the loss was no number")
 
 
-def test_a_sweep_from_before_has_its_first_arm_as_control_and_says_so(outputs: Path):
+def test_a_sweep_without_its_file_or_plan_is_named(outputs: Path):
     (outputs / "sweeps" / "mine" / "sweep.json").unlink()
-    page = sweeps_of(outputs).page("mine")
-    assert NOT_KEPT in page["table"]["flags"]
-    assert page["table"]["control"] == "none"
+    assert "sweep.json is missing" in sweeps_of(outputs).damaged["mine"]
+    (outputs / "sweeps" / "mine" / "plan.json").write_text("{")
+    assert sweeps_of(outputs).list_rows()["damaged"].keys() == {"mine"}
 
 
 def test_a_sweep_with_another_control_has_another_table(outputs: Path):
@@ -151,22 +163,23 @@ def test_a_sweep_with_another_control_has_another_table(outputs: Path):
     folder = outputs / "sweeps" / "mine"
     sweeps, sweep = sweeps_of(outputs), kept_sweep(folder)
     assert sweep is not None
-    assert sweeps.page("mine")["table"]["control"] == "none"
-    before = sweeps.stamp()
+    assert describe(sweeps)["table"]["control"] == "none"
+    before = sweeps.refresh()
     keep_sweep(replace(sweep, control="gru", metrics=("MPJRE",)), folder)
-    table = sweeps.page("mine")["table"]
+    table = describe(sweeps)["table"]
     assert (table["control"], table["metrics"]) == ("gru", ["MPJRE"])
-    assert sweeps.stamp() != before
+    assert sweeps.refresh() != before
 
 
 def test_a_run_s_control_is_that_of_its_arm_and_not_the_first_arm(outputs: Path):
     """Most of the paper's tables have a control that does not stand first."""
-    folder, answers = outputs / "sweeps" / "mine", Answers(outputs, kept=False)
+    folder, answers = outputs / "sweeps" / "mine", Answers(outputs)
     sweep = kept_sweep(folder)
     assert sweep is not None
 
     def control(arm: str) -> dict | None:
-        return answers.of(f"run/{run_of(outputs, arm, 1).id}", {})["control"]
+        answers.refresh()
+        return answers.answer(f"run/{run_of(outputs, arm, 1).id}", {})["control"]
 
     assert control("none") is None
     assert control("gru")["id"] == run_of(outputs, "none", 1).id
@@ -181,7 +194,7 @@ def test_a_sweep_that_is_planned_anew_has_another_table(outputs: Path):
     plan, other = Plan.load(path), {"none": "gru", "gru": "none"}
 
     def effect() -> float:
-        return sweeps.page("mine")["table"]["rows"][1]["cells"]["stream"]["MPJPE"]["effect"]["mean"]
+        return describe(sweeps)["table"]["rows"][1]["cells"]["stream"]["MPJPE"]["effect"]["mean"]
 
     before = effect()
     entries = [replace(one, label=other[one.label]) for one in plan.entries]
@@ -199,34 +212,34 @@ def looked(outputs: Path) -> Rounds:
 
 def test_verdicts_of_rounds_and_their_looks_are_shown(outputs: Path):
     sweeps = sweeps_of(outputs)
-    assert sweeps.page("mine")["rounds"] is None
-    before = sweeps.stamp()
+    assert describe(sweeps)["rounds"] is None
+    before = sweeps.refresh()
     rounds = looked(outputs)
-    assert sweeps.stamp() != before
-    page = sweeps.page("mine")
+    assert sweeps.refresh() != before
+    page = describe(sweeps)
     effect = page["table"]["rows"][1]["cells"]["stream"]["MPJPE"]["effect"]
     assert (effect["verdict"], effect["decided"], effect["level"]) == ("holds", 3, rounds.levels[0])
-    assert not {ROUNDS, OTHERS} & set(page["table"]["flags"])
-    first, second = page["rounds"]["looks"][:2]
+    assert not {DAMAGED_ROUNDS, OTHER_ROUNDS} & set(page["table"]["flags"])
+    first, second = page["rounds"]["analyses"][:2]
     assert first == {"seeds": 3, "level": rounds.levels[0], "compared": 2, "decided": 2}
     assert (second["compared"], page["rounds"]["comparisons"]) == (0, 2)
-    arms = {arm["label"]: arm for arm in page["rounds"]["arms"]}
-    assert arms["gru"] == {"label": "gru", "decided": 2, "inconclusive": 0, "seeds": 3, "next": None}
+    variants = {one["label"]: one for one in page["rounds"]["variants"]}
+    assert variants["gru"] == {"label": "gru", "decided": 2, "inconclusive": 0, "seeds": 3, "next": None}
 
 
 @pytest.mark.parametrize(
     ("change", "flag"),
     [
-        ({"subject": {}}, OTHERS),
-        ({"taken": 3}, ROUNDS),
-        ({"taken": [{"seeds": 3, "level": 0.01, "runs": {"gru": "0" * 16}, "found": []}]}, ROUNDS),
+        ({"subject": {}}, OTHER_ROUNDS),
+        ({"taken": 3}, DAMAGED_ROUNDS),
+        ({"taken": [{"seeds": 3, "level": 0.01, "runs": {"gru": "0" * 16}, "found": []}]}, DAMAGED_ROUNDS),
     ],
 )
 def test_rounds_of_something_else_are_flagged(outputs: Path, change: dict, flag: str):
     looked(outputs)
     path = outputs / "sweeps" / "mine" / "rounds.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-    page = sweeps_of(outputs).page("mine")
+    page = describe(sweeps_of(outputs))
     assert page["rounds"] is None
     assert flag in page["table"]["flags"]
     assert page["table"]["rows"][1]["cells"]["stream"]["MPJPE"]["effect"]["decided"] is None
@@ -234,7 +247,7 @@ def test_rounds_of_something_else_are_flagged(outputs: Path, change: dict, flag:
 
 def test_damaged_rounds_are_flagged(outputs: Path):
     (outputs / "sweeps" / "mine" / "rounds.json").write_text("{}")
-    assert ROUNDS in sweeps_of(outputs).page("mine")["table"]["flags"]
+    assert DAMAGED_ROUNDS in describe(sweeps_of(outputs))["table"]["flags"]
 
 
 def test_damage_is_told(outputs: Path):
@@ -243,17 +256,17 @@ def test_damage_is_told(outputs: Path):
     (bad / "plan.json").write_text("{")
     (run_of(outputs, "gru", 0).folder / "evaluations" / "stream-0.json").write_text("{")
     sweeps = sweeps_of(outputs)
-    assert list(sweeps.rows()["damaged"]) == ["bad"]
-    assert any("cannot be read" in flag for flag in sweeps.page("mine")["table"]["flags"])
+    assert list(sweeps.list_rows()["damaged"]) == ["bad"]
+    assert any("cannot be read" in flag for flag in describe(sweeps)["table"]["flags"])
     with pytest.raises(KeyError):
-        sweeps.page("bad")
+        sweeps.describe("bad")
 
 
 def test_a_table_is_made_again_when_a_run_changed(outputs: Path):
-    begun(outputs)
+    started_run(outputs)
     sweeps = sweeps_of(outputs)
-    first = sweeps.page("mine")["table"]
-    assert sweeps.page("mine")["table"] is first
+    first = describe(sweeps)["table"]
+    assert describe(sweeps)["table"] is first
     run_of(outputs, "gru", 0).marker.unlink()
     sweeps.index.refresh()
-    assert [row["found"] for row in sweeps.page("mine")["table"]["rows"]] == [[0, 1, 2], [1, 2]]
+    assert [row["found"] for row in describe(sweeps)["table"]["rows"]] == [[0, 1, 2], [1, 2]]

@@ -1,18 +1,21 @@
-// Charts by Observable Plot, in the page's colours, each with a sentence and a table for those who don't see it.
+// Charts by Observable Plot, in the page's colours, each with a sentence and a table for screen readers.
 
-import { h, replace } from './dom.js';
+import { h, replace, table } from './dom.js';
 import { number } from './format.js';
 
 const Plot = window.Plot;
 export const COLOURS = Array.from({ length: 10 }, (_, i) => `var(--series${i})`);
 
-let latest = 0; // the last chart's width: most are as wide, so that one that is drawn anew does not jump
+let latest = 0; // the last chart's width: most have the same, so that a redrawn one does not jump
 
-// A figure that is drawn again when its place changes its width. draw(width) returns an element.
+// A figure that is drawn again when its width changes. draw(width) returns an element.
 export function figure(label, draw, rows) {
   const frame = h('div', { class: 'plot' });
   const details = rows && h('details', { class: 'data' }, h('summary', {}, 'Data'), h('div'));
-  details?.addEventListener('toggle', () => details.open && replace(details.lastChild, dataTable(rows())));
+  details?.addEventListener('toggle', () => {
+    const [heads, ...data] = rows();
+    if (details.open) replace(details.lastChild, table(heads, data.slice(0, 400).map(row => row.map(cell => number(cell)))));
+  });
   const element = h('figure', { class: 'chart' }, frame, details);
   let width = latest;
   const render = () => {
@@ -31,21 +34,19 @@ export function figure(label, draw, rows) {
   return element;
 }
 
-function dataTable([heads, ...rows]) {
-  return h('div', { class: 'scroll short' }, h('table', { class: 'grid' },
-    h('thead', {}, h('tr', {}, heads.map(head => h('th', { scope: 'col' }, head)))),
-    h('tbody', {}, rows.slice(0, 400).map(row => h('tr', {}, row.map(cell => h('td', { class: typeof cell === 'number' ? 'n' : '' }, number(cell))))))));
-}
-
 const base = (width, height, more) => ({
   width, height, marginLeft: 56, marginRight: 16, marginTop: 22, marginBottom: 34,
   style: { background: 'none', fontFamily: 'inherit', fontSize: '11.5px', overflow: 'visible' },
   ...more,
 });
 
+const nameWidth = names => Math.max(...names.map(name => name.length)) * 6.6 + 18;
+
 export function colourOf(groups) {
   return new Map([...groups].map((group, i) => [group, COLOURS[i % COLOURS.length]]));
 }
+
+const tip = (data, options) => Plot.tip(data, Plot.pointer({ fill: 'var(--card)', stroke: 'var(--line)', textPadding: 8, ...options }));
 
 // Curves by group with the band of each group's runs.
 // series: [{ run, group, steps, values }]
@@ -67,11 +68,8 @@ export function curves(series, { label, log = false, smooth = 0, each = false, c
       Plot.line(lines, { x: 'step', y: 'value', z: 'run', stroke: point => colours.get(point.group), strokeWidth: each && lines.length > wide.length ? 1.3 : 1.8, strokeOpacity: each ? 0.75 : 1 }),
       Plot.line(wide, { x: 'step', y: 'mean', z: 'group', stroke: point => colours.get(point.group), strokeWidth: 2 }),
       Plot.ruleX(tips, Plot.pointerX({ x: 'step', stroke: 'var(--faint)', strokeOpacity: 0.5 })),
-      Plot.tip(tips, Plot.pointer({
-        x: 'step', y: 'mean', fill: 'var(--card)', stroke: 'var(--line)', textPadding: 8,
-        title: point => [point.run && !point.low ? point.runName ?? point.group : point.group, `step ${point.step}`,
-          point.low === undefined ? number(point.mean) : `${number(point.mean)}  (${number(point.low)} to ${number(point.high)}, ${point.count} runs)`].join('\n'),
-      })),
+      tip(tips, { x: 'step', y: 'mean', title: point => [point.group, `step ${point.step}`,
+        point.low === undefined ? number(point.mean) : `${number(point.mean)}  (${number(point.low)} to ${number(point.high)}, ${point.count} runs)`].join('\n') }),
     ],
   }));
   const last = groups.map(group => {
@@ -80,13 +78,6 @@ export function curves(series, { label, log = false, smooth = 0, each = false, c
   });
   const rows = () => [['group', 'step', label], ...thin(points, 200).map(point => [point.group, point.step, point.value])];
   return figure(`${label} by step. ${last.filter(Boolean).join('; ')}.`, draw, rows);
-}
-
-// A chart at least so wide; on a narrower page it scrolls.
-function wide(width, least, options) {
-  const plot = Plot.plot(options(Math.max(width, least)));
-  if (width < least) (plot.tagName === 'svg' ? plot : plot.querySelector('svg')).setAttribute('data-wide', '');
-  return plot;
 }
 
 const thin = (points, most) => points.filter((_, i) => i % Math.ceil(points.length / most) === 0);
@@ -128,35 +119,34 @@ function at({ steps, values }, step) {
   return a + Math.min(Math.max(part, 0), 1) * (b - a);
 }
 
-// Differences from the control with their intervals, and the paper's beside them.
+// Differences from the control with their intervals, and the paper's below them.
 export function forest(rows, { label, smallest }) {
   const known = rows.filter(row => row.mean !== null);
-  const domain = rows.map(row => row.arm);
+  const domain = rows.map(row => row.variant);
   const colour = row => ({ holds: 'var(--good)', opposite: 'var(--bad)' })[row.verdict] ?? 'var(--accent)';
-  const named = Math.min(Math.max(...domain.map(arm => arm.length)) * 6.6 + 18, 230);
+  const shorten = name => (name.length > 34 ? `${name.slice(0, 33)}…` : name);
   const draw = width => Plot.plot(base(width, 64 + 34 * domain.length, {
-    marginLeft: Math.min(named, width * 0.38), marginBottom: 38,
+    marginLeft: Math.min(nameWidth(domain), 230, width * 0.38), marginBottom: 38,
     x: { label: `${label}, difference`, grid: true, zero: true, ticks: Math.min(width / 80, 9), labelAnchor: 'center', labelArrow: 'none' },
-    y: { domain, label: null, tickSize: 0, tickFormat: arm => (arm.length > 34 ? `${arm.slice(0, 33)}…` : arm) },
+    y: { domain, label: null, tickSize: 0, tickFormat: shorten },
     marks: [
       smallest ? Plot.rect([0], { x1: -smallest, x2: smallest, fill: 'var(--faint)', fillOpacity: 0.1 }) : null,
       Plot.ruleX([0], { stroke: 'var(--faint)' }),
-      Plot.link(known.filter(row => row.low !== null), { x1: 'low', x2: 'high', y1: 'arm', y2: 'arm', stroke: colour, strokeWidth: 2.5, strokeLinecap: 'round' }),
-      Plot.dot(known, { x: 'mean', y: 'arm', r: 5.5, stroke: colour, strokeWidth: 2, fill: row => (row.significant ? colour(row) : 'var(--card)') }),
-      Plot.dot(rows.filter(row => row.paper !== null), { x: 'paper', y: 'arm', symbol: 'diamond', r: 6, fill: 'none', stroke: 'var(--ink)', strokeWidth: 1.5, dy: 11 }),
-      Plot.tip(known, Plot.pointerY({ x: 'mean', y: 'arm', fill: 'var(--card)', stroke: 'var(--line)', textPadding: 8,
-        title: row => `${row.arm}\n${row.words}` })),
-    ].filter(Boolean),
+      Plot.link(known.filter(row => row.low !== null), { x1: 'low', x2: 'high', y1: 'variant', y2: 'variant', stroke: colour, strokeWidth: 2.5, strokeLinecap: 'round' }),
+      Plot.dot(known, { x: 'mean', y: 'variant', r: 5.5, stroke: colour, strokeWidth: 2, fill: row => (row.significant ? colour(row) : 'var(--card)') }),
+      Plot.dot(rows.filter(row => row.paper !== null), { x: 'paper', y: 'variant', symbol: 'diamond', r: 6, fill: 'none', stroke: 'var(--ink)', strokeWidth: 1.5, dy: 11 }),
+      tip(known, { x: 'mean', y: 'variant', title: row => `${row.variant}\n${row.words}` }),
+    ],
   }));
-  const sentence = known.map(row => `${row.arm}: ${row.words}`).join('; ');
+  const sentence = known.map(row => `${row.variant}: ${row.words}`).join('; ');
   return figure(`${label}, differences from the control. ${sentence}`, draw,
-    () => [['arm', 'difference', 'low', 'high', 'paper', 'verdict'], ...rows.map(row => [row.arm, row.mean, row.low, row.high, row.paper, row.verdict ?? ''])]);
+    () => [['variant', 'difference', 'low', 'high', 'paper', 'verdict'], ...rows.map(row => [row.variant, row.mean, row.low, row.high, row.paper, row.verdict ?? ''])]);
 }
 
 export function bars(rows, { label, digits = 2 }) {
   const domain = rows.map(row => row.name);
   const draw = width => Plot.plot(base(width, 46 + 26 * rows.length, {
-    marginLeft: Math.min(Math.max(...domain.map(name => name.length)) * 6.6 + 16, width * 0.45), marginRight: 46, marginTop: 8,
+    marginLeft: Math.min(nameWidth(domain), width * 0.45), marginRight: 46, marginTop: 8,
     x: { label, grid: true, ticks: Math.min(width / 80, 6) }, y: { domain, label: null, tickSize: 0 },
     marks: [
       Plot.barX(rows, { x: 'value', y: 'name', fill: 'var(--series0)', rx: 2, insetTop: 3, insetBottom: 3 }),
@@ -167,7 +157,7 @@ export function bars(rows, { label, digits = 2 }) {
 }
 
 // Trials' values by number, and the best so far.
-export function history(trials, { label, choose }) {
+export function history(trials, { label, open }) {
   let best = Infinity;
   const line = trials.map(trial => ({ number: trial.number, best: (best = Math.min(best, trial.value)) }));
   const draw = width => {
@@ -176,29 +166,43 @@ export function history(trials, { label, choose }) {
       marks: [
         Plot.line(line, { x: 'number', y: 'best', curve: 'step-after', stroke: 'var(--series1)', strokeWidth: 1.8 }),
         Plot.dot(trials, { x: 'number', y: 'value', fill: 'var(--series0)', r: 4, fillOpacity: 0.85 }),
-        Plot.tip(trials, Plot.pointer({ x: 'number', y: 'value', fill: 'var(--card)', stroke: 'var(--line)', title: trial => `trial ${trial.number}\n${number(trial.value)}` })),
+        tip(trials, { x: 'number', y: 'value', title: trial => `trial ${trial.number}\n${number(trial.value)}` }),
       ],
     }));
-    plot.addEventListener('click', () => plot.value && choose?.(plot.value));
+    plot.addEventListener('click', () => plot.value && open(plot.value));
     return plot;
   };
   return figure(`${label} by trial; the best is ${number(best)}.`, draw, () => [['trial', label], ...trials.map(t => [t.number, t.value])]);
 }
 
-// Points in two measures, and the line of those that no other beats in both.
-export function scatter(points, { x, y, front, title }) {
+// Points { id, x, y, text } in two measures; those on the front have the second colour, and a line.
+export function scatter(points, { x, y, front, log = false, line = true }) {
   const best = points.filter(point => front.has(point.id)).sort((a, b) => a.x - b.x);
   const draw = width => Plot.plot(base(width, 300, {
-    x: { label: x, grid: true, nice: true, ticks: Math.min(width / 90, 8), labelAnchor: 'center', labelArrow: 'none' },
+    x: { label: x, type: log ? 'log' : 'linear', grid: true, nice: true, ticks: Math.min(width / 90, 8), tickFormat: '~r', labelAnchor: 'center', labelArrow: 'none' },
     y: { label: y, grid: true, nice: true, ticks: 6 },
     marks: [
-      Plot.line(best, { x: 'x', y: 'y', stroke: 'var(--series1)', strokeWidth: 1.5, curve: 'step-after', strokeDasharray: '4 3' }),
+      line ? Plot.line(best, { x: 'x', y: 'y', stroke: 'var(--series1)', strokeWidth: 1.5, curve: 'step-after', strokeDasharray: '4 3' }) : null,
       Plot.dot(points, { x: 'x', y: 'y', r: 5, fill: point => (front.has(point.id) ? 'var(--series1)' : 'var(--series0)'), fillOpacity: 0.85 }),
-      Plot.tip(points, Plot.pointer({ x: 'x', y: 'y', fill: 'var(--card)', stroke: 'var(--line)', title })),
+      tip(points, { x: 'x', y: 'y', title: 'text' }),
     ],
   }));
-  return figure(`${y} against ${x}; ${best.length} of ${points.length} are on the front.`, draw,
-    () => [['', x, y], ...points.map(point => [point.id, point.x, point.y])]);
+  return figure(`${y} against ${x}; ${best.length} of ${points.length} are in the second colour.`, draw, () => [['', x, y], ...points.map(point => [point.id, point.x, point.y])]);
+}
+
+// Performance profiles: the fraction of values that are at most a threshold, a line for each variant.
+export function profiles({ thresholds, rows }, { label }) {
+  const colours = colourOf(rows.map(row => row.variant));
+  const points = rows.flatMap(row => row.fractions.map((fraction, i) => ({ x: thresholds[i], y: fraction, variant: row.variant })));
+  const draw = width => Plot.plot(base(width, Math.min(Math.max(width * 0.42, 220), 320), {
+    x: { label, ticks: Math.min(width / 90, 8), labelAnchor: 'center', labelArrow: 'none' }, y: { label: 'fraction of clips', domain: [0, 1], grid: true, ticks: 5 },
+    marks: [
+      Plot.line(points, { x: 'x', y: 'y', z: 'variant', stroke: point => colours.get(point.variant), strokeWidth: 1.8 }),
+      tip(points, { x: 'x', y: 'y', title: point => `${point.variant}\n${number(point.y, 2)} at ${number(point.x)}` }),
+    ],
+  }));
+  const legend = h('div', { class: 'keys' }, rows.map(row => h('span', { class: 'key still' }, h('i', { style: `background:${colours.get(row.variant)}` }), row.variant)));
+  return h('div', {}, legend, figure(`Performance profiles of ${label}.`, draw));
 }
 
 // A line for each trial across an axis for each key; the better the darker.
@@ -219,7 +223,9 @@ export function parallel(trials, axes, { label }) {
   const lines = order.flatMap((trial, rank) => scales.filter(scale => trial.cells[scale.key] !== undefined && trial.cells[scale.key] !== null)
     .map(scale => ({ id: trial.id, axis: scale.name, y: scale.at(trial.cells[scale.key]), rank: (rank + 1) / order.length, best: rank === order.length - 1, text: trial.text })));
   const names = scales.map(scale => scale.name);
-  const draw = width => wide(width, 124 * axes.length, across => base(across, 300, {
+  const draw = width => {
+    const across = Math.max(width, 124 * axes.length);
+    const plot = Plot.plot(base(across, 300, {
     marginLeft: 60, marginRight: 60, marginTop: 40, marginBottom: 30,
     x: { domain: names, type: 'point', axis: null }, y: { axis: null, domain: [0, 1] },
     marks: [
@@ -229,15 +235,18 @@ export function parallel(trials, axes, { label }) {
       Plot.text(names, { x: name => name, y: 1, dy: -26, text: name => name, fontWeight: 600, fill: 'var(--ink)' }),
       Plot.text(scales, { x: 'name', y: 1, dy: -10, text: scale => scale.ends[1], fill: 'var(--faint)' }),
       Plot.text(scales, { x: 'name', y: 0, dy: 14, text: scale => scale.ends[0], fill: 'var(--faint)' }),
-      Plot.tip(lines, Plot.pointer({ x: 'axis', y: 'y', fill: 'var(--card)', stroke: 'var(--line)', title: 'text' })),
+      tip(lines, { x: 'axis', y: 'y', title: 'text' }),
     ],
-  }));
+    }));
+    if (width < across) plot.setAttribute('data-wide', ''); // it scrolls
+    return plot;
+  };
   return figure(`${label}: ${trials.length} trials across ${names.join(', ')}.`, draw,
     () => [['trial', ...names], ...trials.map(trial => [trial.id, ...scales.map(scale => trial.cells[scale.key])])]);
 }
 
-// A course over time in which one can go to a moment.
-export function course(values, { fps, label, at: when, go, marks, colours }) {
+// Errors over time; a click goes to a moment.
+export function timeline(values, { fps, label, at: when, go, marks, colours }) {
   const points = values.flatMap((one, i) => one.errors.map((error, frame) => ({ time: frame / fps, error, name: one.name, i })));
   const draw = width => {
     const plot = Plot.plot(base(width, 120, {

@@ -3,35 +3,30 @@
 import { about } from './store.js';
 
 const CONDITION = /^([\w.\- ]*?[\w.\-])(<=|>=|!=|=|<|>)(.*)$/;
-const PLACES = ['sweep', 'arm', 'search', 'trial'];
-const OWN = ['id', 'name', 'status', 'kind', 'device', 'note', 'started', 'code', 'data'];
+const PLACES = ['sweep', 'variant', 'search', 'trial'];
+const FACTS = ['id', 'name', 'status', 'kind', 'device', 'note', 'started', 'code', 'data'];
 
+// The tests of a filter's text, each a function of a run.
 export function parse(text) {
-  const words = text.match(/(?:[^\s"]|"[^"]*")+/g) ?? [];
-  const kept = words.map(word => word.replaceAll('"', '')).filter(word => word && !/^(and|AND|&&)$/.test(word));
-  return kept.map(test);
+  const words = (text.match(/(?:[^\s"]|"[^"]*")+/g) ?? []).map(word => word.replaceAll('"', ''));
+  return words.filter(word => word && !/^(and|&&)$/i.test(word)).map(test);
 }
 
-export function matches(tests, run) {
-  return tests.every(one => one(run));
-}
+export const matches = (tests, run) => tests.every(one => one(run));
 
 function test(word) {
   const found = word.match(CONDITION);
-  if (!found) {
-    const wanted = word.toLowerCase();
-    return run => run.text.includes(wanted);
-  }
+  if (!found) return run => run.text.includes(word.toLowerCase());
   const [, key, sign, wanted] = found;
   const values = reader(key);
   return run => values(run).some(value => compare(value, sign, wanted)) !== (sign === '!=');
 }
 
-// What gives a run's values under a name, which may be the end of a dotted key.
+// A function that gives a run's values under a name, which may be the end of a dotted key.
 function reader(key) {
   if (key === 'tag' || key === 'tags') return run => run.tags;
   if (PLACES.includes(key)) return run => run.places.map(place => place[key]).filter(value => value !== undefined);
-  if (OWN.includes(key)) return run => [run[key]];
+  if (FACTS.includes(key)) return run => [run[key]];
   const near = name => name === key || name === `${key}.name`;
   const far = name => name.endsWith(`.${key}`) || name.replace('.rotation.', '.') === key;
   for (const fits of [near, far]) {
@@ -44,13 +39,12 @@ function reader(key) {
 }
 
 function compare(value, sign, wanted) {
-  const same = same_(value, wanted);
-  if (sign === '=' || sign === '!=') return same;
+  if (sign === '=' || sign === '!=') return equals(value, wanted);
   const [a, b] = [typeof value === 'number' ? value : NaN, Number(wanted)];
   return { '<': a < b, '>': a > b, '<=': a <= b, '>=': a >= b }[sign];
 }
 
-function same_(value, wanted) {
+function equals(value, wanted) {
   if (typeof value === 'number' && wanted.trim() !== '') return value === Number(wanted);
   const text = value === null || value === undefined ? 'null' : Array.isArray(value) ? `[${value}]` : String(value);
   const pattern = wanted.toLowerCase().split('*').map(part => part.replace(/[.*+?^${}()|[\]\\]/g, '\\$&')).join('.*');

@@ -3,12 +3,11 @@
 import { about } from './store.js';
 
 const COSTS = {
-  median_ms: 'latency', p95_ms: 'latency p95', pose_median_ms: 'pose latency', ratio_to_yardstick: '× yardstick', parameters: 'parameters', macs: 'MACs',
-  onnx_bytes: 'ONNX bytes',
+  median_ms: 'latency', p95_ms: 'latency p95', pose_median_ms: 'pose latency', ratio_to_yardstick: '× yardstick', macs: 'MACs', onnx_bytes: 'ONNX bytes',
 };
-
 export const MINUS = '\u2212';
 export const DASH = '\u2013';
+export const ARROWS = { lower: '↓', higher: '↑' };
 
 export function number(value, digits) {
   if (value === null || value === undefined || value === '') return DASH;
@@ -28,7 +27,7 @@ export function signed(value, digits = Math.abs(value) >= 1000 ? 0 : 2) {
 // The decimals of an error: two, or as many as show two digits of one below 0.1.
 export const decimals = value => (value && Number.isFinite(value) ? Math.max(1 - Math.floor(Math.log10(Math.abs(value))), 2) : 2);
 
-// The decimals of a difference and its interval: those of the arm's value, or as many as a significant one needs for a digit.
+// The decimals of a difference and its interval: those of the variant's value, or as many as a significant one needs for a digit.
 export function effectDigits({ mean, holm, level, value }) {
   const size = Math.abs(mean);
   if (size >= 1000) return 0;
@@ -36,7 +35,7 @@ export function effectDigits({ mean, holm, level, value }) {
   return size > 0 && holm !== null && holm < level ? Math.max(least, -Math.floor(Math.log10(size))) : least;
 }
 
-// An order from the largest error to the smallest: what is no number comes first, what is not there last.
+// An order from the largest error to the smallest: NaN comes first, a missing error last.
 export function largestFirst(one, other) {
   const rank = value => (value === undefined ? -1 : typeof value === 'number' ? value : Infinity);
   const [first, second] = [rank(one), rank(other)];
@@ -60,8 +59,7 @@ export function duration(seconds) {
 
 export function ago(text) {
   const time = Date.parse(text);
-  if (Number.isNaN(time)) return DASH;
-  return `${duration(Math.max((Date.now() - time) / 1000, 0))} ago`;
+  return Number.isNaN(time) ? DASH : `${duration(Math.max((Date.now() - time) / 1000, 0))} ago`;
 }
 
 export function date(text) {
@@ -78,21 +76,19 @@ export function bytes(count) {
 
 const known = name => about.units[name.split('.').at(-1)] ?? { unit: '', better: '' };
 
-// "stream.rotation.MPJPE" -> its parts in words.
+// The parts of a name such as "stream.rotation.MPJPE" in words.
 export function metricWords(name) {
   const parts = name.split('.');
   const metric = parts.at(-1);
   const unit = known(name).unit.replace(/^deg$/, '°');
   if (parts[0] === 'latency') return { metric: COSTS[metric] ?? metric, where: '', unit };
-  const where = parts.slice(0, -1).filter(part => part !== 'rotation').join(' ');
-  return { metric, where, unit };
+  return { metric, where: parts.slice(0, -1).filter(part => part !== 'rotation').join(' '), unit };
 }
 
-// What is better of a metric: 'lower', 'higher', or '' where nobody knows.
+// 'lower', 'higher', or '' for a metric without a known direction.
 export const better = name => known(name).better;
-export const ARROWS = { lower: '↓', higher: '↑' };
 
-// The best of these numbers of a metric; null where nobody knows which that is.
+// The best of these numbers of a metric; null for a metric without a known direction.
 export function bestOf(name, values) {
   const choose = { lower: Math.min, higher: Math.max }[better(name)];
   return choose && values.length ? choose(...values) : null;
@@ -103,23 +99,17 @@ export function metricText(name) {
   return `${where} ${metric}${unit ? ` [${unit}]` : ''}`.trim();
 }
 
-// The digits behind the point with which a metric is shown.
-export function digitsOf(name) {
-  const metric = name.split('.').at(-1);
-  if (metric === 'parameters' || metric === 'macs' || metric === 'onnx_bytes') return 0;
-  return metric === 'Jitter' || metric === 'MPJVE' || metric === 'GT Jitter' ? 1 : 2;
-}
-
 export function metricNumber(name, value) {
-  if (typeof value !== 'number') return number(value); // none, or a word such as nan
+  if (typeof value !== 'number') return number(value); // missing, or a word such as nan
   if (value && Math.abs(value) < 0.1) return Math.abs(value) < 1e-3 ? number(value) : number(value, decimals(value));
-  const digits = Math.abs(value) >= 1000 ? 0 : digitsOf(name);
-  return digits === 0 ? number(Math.round(value)) : number(value, digits);
+  const metric = name.split('.').at(-1);
+  if (Math.abs(value) >= 1000 || ['parameters', 'macs', 'onnx_bytes'].includes(metric)) return number(Math.round(value));
+  return number(value, ['Jitter', 'MPJVE', 'GT Jitter'].includes(metric) ? 1 : 2);
 }
 
-// Short heads for dotted keys: the last word where no other key has it.
+// Short heads for dotted keys: the last word, unless another key has it too.
 export function shortKeys(keys) {
-  const last = key => (key.endsWith('.name') ? key.slice(0, -5) : key).split('.').at(-1);
+  const last = key => key.replace(/\.name$/, '').split('.').at(-1);
   const counts = new Map();
   for (const key of keys) counts.set(last(key), (counts.get(last(key)) ?? 0) + 1);
   return new Map(keys.map(key => [key, counts.get(last(key)) > 1 ? key.replace(/\.name$/, '') : last(key)]));

@@ -1,12 +1,12 @@
-// A replay: truth, a run and another run side by side in 3D, at one time, seen from one side.
+// A replay: truth, a run and another run side by side in 3D, at one time, from one view.
 
 import { Stage } from './stage.js';
 import { h, replace } from './dom.js';
-import { ask, alone, nameOf } from './store.js';
-import { course } from './charts.js';
+import { ask, inFile, nameOf } from './store.js';
+import { timeline } from './charts.js';
 import { number } from './format.js';
 
-const WAIT = 700; // milliseconds between two questions whether a prediction is ready
+const WAIT = 700; // milliseconds between two requests for a prediction
 
 let body = null;
 
@@ -32,7 +32,7 @@ export class Replay {
   async show(run, clip, mode, other) {
     const asked = ++this.asked;
     this.stop();
-    replace(this.place, h('p', { class: 'wait' }, 'Computing what the network makes of this clip; the first time takes some seconds.'));
+    replace(this.place, h('p', { class: 'wait' }, 'Computing the network’s prediction for this clip; the first time takes some seconds.'));
     try {
       body ??= await ask('body');
       const mine = await this.piece(asked, run.id, clip, mode);
@@ -46,7 +46,7 @@ export class Replay {
       if (same) this.begin(asked, run, mine, other, theirs, { clip, mode });
       else {
         this.begin(asked, run, mine, null, null, { clip, mode });
-        this.remark(`${nameOf(other)}: ${theirs.reason ?? 'its clip is another motion'}`);
+        this.remark(`${nameOf(other)}: ${theirs.reason ?? 'its clip has another motion'}`);
       }
     } catch (error) {
       if (asked === this.asked) replace(this.place, h('div', { class: 'empty' }, h('p', { class: 'lead' }, 'This clip cannot be replayed.'), h('p', {}, error.message)));
@@ -57,7 +57,7 @@ export class Replay {
   async piece(asked, id, clip, mode, begin) {
     for (;;) {
       const path = `replay/${id}?${new URLSearchParams({ clip, mode })}`;
-      const found = await ask(begin === undefined || alone ? path : `${path}&from=${begin}`);
+      const found = await ask(begin === undefined || inFile ? path : `${path}&from=${begin}`);
       if (found.state === 'failed') throw new Error(found.reason);
       if (found.state === 'ready' || asked !== this.asked) return found;
       await new Promise(done => setTimeout(done, WAIT));
@@ -73,10 +73,10 @@ export class Replay {
     this.stop();
     const same = this.data?.about.clip === about.clip && this.run === run;
     Object.assign(this, { run, other, data: { mine, theirs, about }, top: Math.max(mine.top, theirs?.top ?? 0) });
-    const calm = matchMedia('(prefers-reduced-motion: reduce)').matches;
+    const still = matchMedia('(prefers-reduced-motion: reduce)').matches;
     this.speed ??= 0.5;
     this.time = same && before.time !== undefined ? before.time : mine.worst[0].first / mine.fps;
-    this.playing = same && before.playing !== undefined ? before.playing : !calm;
+    this.playing = same && before.playing !== undefined ? before.playing : !still;
     this.layout();
     let last = performance.now();
     const tick = now => {
@@ -89,7 +89,7 @@ export class Replay {
     this.tick = requestAnimationFrame(tick);
   }
 
-  // Play on; at the end of the worst second once more.
+  // Advance the time; the worst second repeats.
   forward(seconds) {
     const { mine } = this.data;
     const [start, end] = this.span;
@@ -124,7 +124,7 @@ export class Replay {
     const whole = h('button', { type: 'button', class: 'small', 'aria-pressed': 'false', onclick: () => { this.loop = null; this.mark(); } }, mine.joints.length < mine.frames ? `${Math.round(mine.joints.length / mine.fps)} s around it` : 'Whole clip');
     this.pieces = [...worst, whole];
     const speeds = h('select', { 'aria-label': 'Speed', onchange: event => { this.speed = Number(event.target.value); } }, [0.1, 0.25, 0.5, 1].map(speed => h('option', { value: speed, selected: speed === this.speed }, `${speed}×`)));
-    const chart = course([mine, ...(theirs ? [theirs] : [])].map((one, i) => ({ errors: one.errors, name: i ? nameOf(this.other) : nameOf(this.run) })), {
+    const chart = timeline([mine, ...(theirs ? [theirs] : [])].map((one, i) => ({ errors: one.errors, name: i ? nameOf(this.other) : nameOf(this.run) })), {
       fps: mine.fps, label: 'error [cm] by second', at: () => this.time, go: time => this.go(time), marks: mine.worst, colours: ['var(--series0)', 'var(--series1)'],
     });
     this.chart = chart;
@@ -190,7 +190,7 @@ export class Replay {
     this.needle(mine);
   }
 
-  // All cameras stand where that of the stage stands which was touched last.
+  // All cameras follow that of the stage that was touched last.
   together() {
     if (!this.leader) return;
     const { camera, controls } = this.leader.stage;

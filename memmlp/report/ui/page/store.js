@@ -1,21 +1,22 @@
-// What the page knows: the runs, kept up to date by the server's news; other answers by their addresses.
+// What the page knows: the runs, kept up to date by the server's events; other answers by their addresses.
 
 const embedded = document.getElementById('answers');
 const answers = embedded ? JSON.parse(embedded.textContent) : null;
-export const alone = answers !== null; // the page is a file without a server
+export const inFile = answers !== null; // the page is a file without a server
+export const generated = answers?.about ?? '';
 
 export const runs = new Map();
-export const about = { keys: [], minor: [], paths: [], metrics: [], units: {}, sets: {}, shared: [], outputs: '', generation: 0, heads: '' };
+export const about = { keys: [], minor: [], paths: [], metrics: [], units: {}, outputs: '', generation: 0, heads: '' };
 const listeners = new Set();
-let state = alone ? 'file' : 'connecting';
+let dataNames = new Map();
+let ambiguous = new Set(); // names of runs on several data sets
+let state = inFile ? 'file' : 'connecting';
 
-// The answer to a question such as 'run/0123...'. Throws an Error with the server's words.
+// The answer to a question such as 'run/0123...'. Throws an Error with the server's message.
 export async function ask(path) {
-  if (alone) {
+  if (inFile) {
     if (path in answers) return answers[path];
-    const error = new Error('This is not in the file; memmlp ui has it.');
-    error.missing = true;
-    throw error;
+    throw Object.assign(new Error('This is not in the file; memmlp ui has it.'), { missing: true });
   }
   const response = await fetch(`api/${path}`);
   const found = await response.json();
@@ -23,97 +24,80 @@ export async function ask(path) {
   return found;
 }
 
-export async function curvesOf(ids, names) {
+export async function curvesOf(ids) {
   const wanted = ids.slice(0, 60);
-  if (alone) {
-    const found = answers.curves ?? {};
-    return Object.fromEntries(wanted.filter(id => id in found).map(id => [id, found[id]]));
-  }
-  const query = new URLSearchParams({ runs: wanted.join(',') });
-  if (names) query.set('names', names.join('|'));
-  return (await ask(`curves?${query}`)).curves;
+  if (!inFile) return (await ask(`curves?${new URLSearchParams({ runs: wanted.join(',') })}`)).curves;
+  return Object.fromEntries(wanted.filter(id => id in answers.curves).map(id => [id, answers.curves[id]]));
 }
 
 export async function load() {
-  const query = alone || !about.generation ? '' : `?since=${about.generation}&heads=${about.heads}`;
-  const found = await ask(`runs${query}`);
-  const { rows, removed, whole, ...rest } = found;
+  const query = inFile || !about.generation ? '' : `?since=${about.generation}&heads=${about.heads}`;
+  const { rows, removed, whole, ...rest } = await ask(`runs${query}`);
   Object.assign(about, rest);
   if (whole) runs.clear();
-  for (const id of removed ?? []) runs.delete(id);
+  for (const id of removed) runs.delete(id);
   for (const row of rows) runs.set(row.id, readable(row));
+  // A VQ-VAE's config does not name its data; that of a network on the same data does.
+  dataNames = new Map([...runs.values()].filter(run => run.data && run.data_name).map(run => [run.data, `${run.data_name} ${run.data}`]));
+  const seen = new Map();
+  for (const run of runs.values()) seen.set(run.name, (seen.get(run.name) ?? new Set()).add(run.data));
+  ambiguous = new Set([...seen].filter(([, data]) => data.size > 1).map(([name]) => name));
 }
 
-// A run's data by name and short digest; its digest alone where no config names it.
-export const dataName = data => about.sets[data] ?? data;
-
-// A run's name, with its data where runs of other data have the same name.
-export const nameOf = run => (about.shared.includes(run.name) ? `${run.name} · ${dataName(run.data) || 'unknown data'}` : run.name);
+export const dataName = data => dataNames.get(data) ?? data;
+export const nameOf = run => (ambiguous.has(run.name) ? `${run.name} · ${dataName(run.data) || 'unknown data'}` : run.name);
 
 // A row with its config and metrics by name, and the text in which words are looked for.
 function readable(row) {
   const config = Object.fromEntries(about.keys.map((key, i) => [key, row.config[i]]));
   const metrics = Object.fromEntries(about.metrics.map((key, i) => [key, row.metrics[i]]));
   const words = [
-    row.id, row.name, row.status, row.kind, row.device, row.note, row.failure, dataName(row.data), ...row.tags,
+    row.id, row.name, row.status, row.kind, row.device, row.note, row.failure, row.data_name, row.data, ...row.tags,
     ...row.places.flatMap(place => Object.values(place).map(String)), ...about.keys.map((key, i) => `${key}=${row.config[i]}`),
   ];
-  // What runs are compared by: of paths of data the data's digest, as one folder has many spellings.
+  // Runs are compared by these; a path of data counts as the data's digest, since one folder has many spellings.
   const cells = Object.fromEntries(about.keys.map((key, i) => [key, about.paths.includes(key) ? row.data : JSON.stringify(row.config[i] ?? null)]));
   return { ...row, config, cells, metrics, text: words.join('\n').toLowerCase() };
 }
 
 export const connection = () => state;
+export const listen = listener => listeners.add(listener);
 
-export function listen(listener) {
-  listeners.add(listener);
-  return () => listeners.delete(listener);
-}
-
-const tell = what => { for (const listener of listeners) listener(what); };
-
-// Follow the server's news; what comes while the last ones are being fetched is fetched after them.
+// Follow the server's events; events during a fetch lead to one more fetch.
 export function follow() {
-  if (alone) return;
+  if (inFile) return;
+  const notify = what => { for (const listener of listeners) listener(what); };
+  const change = next => { state = next; notify('state'); };
   const events = new EventSource('events');
   let busy = false;
-  let more = false;
+  let again = false;
   const refresh = async () => {
-    if (busy) { more = true; return; }
+    again = busy;
+    if (busy) return;
     busy = true;
-    try {
-      await load();
-      tell('news');
-    } catch (error) {
-      console.warn(error);
-    }
+    await load().then(() => notify('news'), console.warn);
     busy = false;
-    if (more) { more = false; refresh(); }
+    if (again) refresh();
   };
-  events.onopen = () => { state = 'live'; tell('state'); };
-  events.onerror = () => { state = 'gone'; tell('state'); };
+  events.onopen = () => change('live');
+  events.onerror = () => change('gone');
   events.onmessage = refresh;
 }
 
-// The page that is shown where the address names none: of a report its tables and figures.
-const first = document.getElementById('extra')?.innerHTML.trim() ? 'extra' : 'runs';
-
-// The address: #/room/name?key=value
+// The address: #/page/name?key=value
 export function place() {
   const [path, query = ''] = location.hash.replace(/^#\/?/, '').split('?');
-  const [room = '', ...rest] = path.split('/').map(part => decodeURIComponent(part));
-  return { room: room || first, name: rest.join('/'), query: new URLSearchParams(query) };
+  const [page, ...rest] = path.split('/').map(decodeURIComponent);
+  return { page: page || (inFile ? 'tables' : 'runs'), name: rest.join('/'), query: new URLSearchParams(query) };
 }
 
-export function address(room, name = '', query = {}) {
+export function address(page, name = '', query = {}) {
   const words = new URLSearchParams(Object.entries(query).filter(([, value]) => value !== '' && value !== null && value !== undefined));
-  const path = [room, name].filter(Boolean).map(encodeURIComponent).join('/');
-  return `#/${path}${words.size ? `?${words}` : ''}`;
+  return `#/${[page, name].filter(Boolean).map(encodeURIComponent).join('/')}${words.size ? `?${words}` : ''}`;
 }
 
-// Change what the address says of the page, without a new entry in the history.
+// Change the query of the address, without a new entry in the history.
 export function remember(changes) {
-  const { room, name, query } = place();
-  const next = { ...Object.fromEntries(query), ...changes };
-  history.replaceState(null, '', address(room, name, next));
+  const { page, name, query } = place();
+  history.replaceState(null, '', address(page, name, { ...Object.fromEntries(query), ...changes }));
 }

@@ -1,58 +1,54 @@
-// Sweeps: how far they are, what they found, and curves by arm.
+// Sweeps: how far they are, their effects and tables beside the paper's, distributions, and curves by variant.
 
-import { h, replace, link, section, empty, choice, select } from './dom.js';
-import { address, alone, ask, nameOf, place, remember, runs } from './store.js';
+import { h, replace, link, section, empty, choice, table } from './dom.js';
+import { address, ask, generated, inFile, nameOf, place, remember, runs } from './store.js';
 import { curvePanel } from './compare.js';
-import { forest } from './charts.js';
-import { AT_WORK, look, state, STATE_WORDS } from './runs.js';
+import { forest, profiles, scatter } from './charts.js';
+import { ACTIVE, look, state, STATE_WORDS } from './runs.js';
 import { DASH, decimals, duration, effectDigits, metricNumber, metricText, number, signed } from './format.js';
 
-const ORDER = ['done', ...AT_WORK, 'trained', 'lost', 'stopped', 'new', 'failed', 'blocked'];
+const ORDER = ['done', ...ACTIVE, 'trained', 'lost', 'stopped', 'new', 'failed', 'blocked'];
 
 export async function page() {
   const element = h('div', { class: 'page' });
   async function update() {
-    const found = await ask('sweeps');
-    const damaged = Object.entries(found.damaged ?? {}).map(([name, why]) => h('p', { class: 'warning' }, h('b', {}, `${name}: `), why));
-    const list = found.sweeps.map(sweep => h('li', {}, h('a', { class: 'card', href: address('sweep', sweep.name) },
-      h('span', { class: 'card-title' }, sweep.title), h('span', { class: 'faint' }, `${sweep.name} · ${sweep.arms} arms × ${sweep.seeds} seeds`), progress(sweep))));
-    replace(element, h('div', { class: 'bar' }, h('h1', {}, 'Sweeps'), h('p', { class: 'count' }, number(found.sweeps.length))), damaged,
-      list.length ? h('ul', { class: 'cards' }, list) : empty('There are no sweeps yet.', h('p', {}, 'A sweep of the paper, or of your own:'), h('pre', {}, 'memmlp sweep 14 data=mocap data.root=FOLDER\nmemmlp sweep mine.yaml --workers 2')));
+    const { sweeps, damaged } = await ask('sweeps');
+    const warnings = Object.entries(damaged).map(([name, why]) => h('p', { class: 'warning' }, h('b', {}, `${name}: `), why));
+    const list = sweeps.map(sweep => h('li', {}, h('a', { class: 'card', href: address('sweep', sweep.name) },
+      h('span', { class: 'card-title' }, sweep.title), h('span', { class: 'faint' }, `${sweep.name} · ${sweep.variants} variants × ${sweep.seeds} seeds`), progress(sweep))));
+    replace(element, h('div', { class: 'bar' }, h('h1', {}, 'Sweeps'), h('p', { class: 'count' }, number(sweeps.length))), warnings,
+      list.length ? h('ul', { class: 'cards' }, list) : noSweeps());
   }
   await update();
   return { title: 'Sweeps', element, update };
 }
 
+const noSweeps = () => empty('There are no sweeps yet.', h('p', {}, 'Start a sweep of the paper, or a custom one:'), h('pre', {}, 'memmlp sweep 14 data=mocap data.root=FOLDER\nmemmlp sweep mine.yaml --workers 2'));
+
 function progress(sweep) {
-  const parts = ORDER.filter(name => sweep.counts[name]).map(name => h('i', { class: look(name), style: `flex-grow:${sweep.counts[name]}` }));
-  const told = counts => ORDER.filter(name => counts[name]).map(name => `${counts[name]} ${STATE_WORDS[name] ?? name}`).join(', ');
-  const above = told(sweep.above);
+  const words = counts => ORDER.filter(name => counts[name]).map(name => `${counts[name]} ${STATE_WORDS[name] ?? name}`).join(', ');
   const missing = sweep.counts.trained ? ' (trained: an evaluation or export is missing)' : '';
-  const words = `${told(sweep.counts)}${missing}${above ? `; what they build upon: ${above}` : ''}`;
-  const left = sweep.left === null ? '' : ` · about ${duration(sweep.left)} of training left`;
-  return h('span', { class: 'sweep-progress' }, h('span', { class: 'segments', role: 'img', 'aria-label': words }, parts), h('span', { class: 'n' }, `${Math.floor(100 * sweep.share)} %`), h('small', { class: 'faint' }, `${words}${left}`));
+  const before = words(sweep.prerequisite_counts);
+  const text = `${words(sweep.counts)}${missing}${before ? `; prerequisites: ${before}` : ''}`;
+  const remaining = sweep.remaining === null ? '' : ` · about ${duration(sweep.remaining)} of training remaining`;
+  const parts = ORDER.filter(name => sweep.counts[name]).map(name => h('i', { class: look(name), style: `flex-grow:${sweep.counts[name]}` }));
+  return h('span', { class: 'sweep-progress' }, h('span', { class: 'segments', role: 'img', 'aria-label': text }, parts), h('span', { class: 'n' }, `${Math.floor(100 * sweep.share)} %`), h('small', { class: 'faint' }, `${text}${remaining}`));
 }
 
 export async function single(name) {
   let sweep = await ask(`sweeps/${name}`);
   const ids = [...new Set(sweep.cells.map(cell => cell.id))].filter(id => runs.has(id));
-  const arm = new Map(sweep.cells.map(cell => [cell.id, cell.arm]));
-  const panel = curvePanel(ids, [['arm', 'arm', id => arm.get(id)], ['run', 'run', id => runs.has(id) ? nameOf(runs.get(id)) : id]], { most: 2 });
+  const variants = new Map(sweep.cells.map(cell => [cell.id, cell.variant]));
+  const panel = curvePanel(ids, [['variant', 'variant', id => variants.get(id)], ['run', 'run', id => (runs.has(id) ? nameOf(runs.get(id)) : id)]]);
   const top = h('div');
-  const found = h('div');
-  const element = h('div', { class: 'page' }, top, found, section('Curves by arm', panel.element), notes());
-  function notes() {
-    const lines = [...sweep.table.flags, ...sweep.table.legend, ...sweep.table.notes];
-    return section('How to read it', h('ul', { class: 'remarks' }, lines.map(line => h('li', {}, line))));
-  }
+  const element = h('div', { class: 'page' }, top, ids.length ? section('Curves by variant', panel.element) : null, notes(sweep.table));
   function draw() {
-    const running = sweep.counts.done === sweep.tasks ? null : progress(sweep);
     replace(top, h('p', { class: 'trail' }, link('#/sweeps', 'Sweeps')), h('div', { class: 'bar title' }, h('h1', {}, sweep.table.caption)),
-      sweep.name === sweep.table.caption ? null : h('p', { class: 'faint sub' }, sweep.name), running, board(sweep));
-    replace(found, effects(sweep.table, draw), section('Table', results(sweep.table)), sweep.rounds ? rounds(sweep.rounds) : null);
+      sweep.name === sweep.table.caption ? null : h('p', { class: 'faint sub' }, sweep.name), sweep.counts.done === sweep.tasks ? null : progress(sweep), sweep.cells.length ? board(sweep) : null,
+      effects(sweep.table, draw), section('Table', results(sweep.table)), beyondTheMean(sweep), sweep.rounds ? rounds(sweep.rounds) : null);
   }
   async function update() {
-    if (!alone) sweep = await ask(`sweeps/${name}`);
+    if (!inFile) sweep = await ask(`sweeps/${name}`);
     draw();
     await panel.update();
   }
@@ -61,69 +57,125 @@ export async function single(name) {
   return { title: sweep.title, element, update };
 }
 
+// The tables of all sweeps below each other, and errors against speed.
+export async function tables() {
+  const { sweeps } = await ask('sweeps');
+  const pages = await Promise.all(sweeps.map(sweep => ask(`sweeps/${sweep.name}`)));
+  const contents = h('ol', {}, pages.map(one => h('li', {}, h('a', { href: address('sweep', one.name), onclick: event => { event.preventDefault(); document.getElementById(`table-${one.name}`).scrollIntoView(); } }, one.table.caption))));
+  const part = one => {
+    const own = h('section', { id: `table-${one.name}` });
+    const draw = () => replace(own, h('h2', {}, link(address('sweep', one.name), one.table.caption)), results(one.table), effects(one.table, draw, 'h3'), notes(one.table, 'h3'));
+    draw();
+    return own;
+  };
+  const element = h('div', { class: 'page' }, h('h1', {}, 'Tables'), generated ? h('p', { class: 'faint sub' }, generated) : null,
+    pages.length ? [h('details', { open: pages.length < 6 }, h('summary', {}, 'Contents'), contents), pages.map(part), speeds(pages)] : noSweeps());
+  return { title: 'Tables', element };
+}
+
+function notes(found, head = 'h2') {
+  const lines = [...found.flags, ...found.legend, ...found.notes];
+  return lines.length ? h('section', {}, h(head, {}, 'How to read it'), h('ul', { class: 'remarks' }, lines.map(line => h('li', {}, line)))) : null;
+}
+
+// The paper's Fig. 1 with a point for each measured variant, and the paper's systems with both numbers.
+function speeds(pages) {
+  const measured = pages.flatMap(one => [...new Set(one.cells.map(cell => cell.variant))].map(variant => {
+    const found = one.cells.filter(cell => cell.variant === variant).map(cell => runs.get(cell.id)?.metrics ?? {}).filter(metrics => metrics['latency.median_ms'] && typeof metrics['stream.rotation.MPJRE'] === 'number');
+    const mean = name => found.reduce((sum, metrics) => sum + metrics[name], 0) / found.length;
+    return found.length ? { id: `${one.name} ${variant}`, x: 1000 / mean('latency.median_ms'), y: mean('stream.rotation.MPJRE'), text: `${one.table.caption}\n${variant}` } : null;
+  })).filter(Boolean);
+  if (!measured.length) return null;
+  const printed = metric => pages.flatMap(one => one.table.rows.map(row => [row.label, Object.values(row.cells)[0]?.[metric]?.paper])).filter(([, value]) => typeof value === 'number');
+  const systems = printed('FPS').map(([label, fps]) => [label, fps, printed('MPJRE').find(([other]) => other.toLowerCase().startsWith(label.toLowerCase()))?.[1]]).filter(([, , value]) => value !== undefined)
+    .map(([label, x, y]) => ({ id: `paper ${label}`, x, y, text: `${label}, paper` }));
+  const front = new Set(systems.map(point => point.id));
+  return section('Accuracy and latency', scatter([...measured, ...systems], { x: 'frames a second', y: 'MPJRE [°], stream mode', front, log: true, line: false }),
+    h('p', { class: 'faint' }, 'A point for each variant: its mean over seeds, against frames a second of one CPU core here. In the second colour: the paper’s systems, which ran on a Meta Quest 3 with other data.'));
+}
+
 function board(sweep) {
-  const arms = [...new Set(sweep.cells.map(cell => cell.arm))];
+  const variants = [...new Set(sweep.cells.map(cell => cell.variant))];
   const seeds = [...new Set(sweep.cells.map(cell => cell.seed))].sort((a, b) => a - b);
-  const at = (arm, seed) => sweep.cells.find(cell => cell.arm === arm && cell.seed === seed);
-  const words = cell => {
-    if (!cell) return h('td', { class: 'n faint' }, DASH);
+  const draw = cell => {
+    if (!cell) return DASH;
     const share = cell.state === 'training' && cell.steps ? Math.min(cell.step / cell.steps, 1) : null;
-    const text = cell.state === 'done' ? (typeof cell.value === 'number' ? h('b', {}, metricNumber(sweep.metric, cell.value)) : 'done') : share === null ? state(cell.state, cell.failure || undefined) : [h('progress', { value: share, max: 1, 'aria-label': 'trained' }), ` ${Math.floor(100 * share)} %`];
+    let text = state(cell.state, cell.failure || undefined);
+    if (cell.state === 'done') text = typeof cell.value === 'number' ? h('b', {}, metricNumber(sweep.metric, cell.value)) : 'done';
+    else if (share !== null) text = [h('progress', { value: share, max: 1, 'aria-label': 'trained' }), ` ${Math.floor(100 * share)} %`];
     return h('td', { class: `n cell ${look(cell.state)}` }, runs.has(cell.id) ? link(address('run', cell.id), text) : text);
   };
-  const failed = sweep.cells.filter(cell => cell.failure).map(cell => h('p', { class: 'warning' }, h('b', {}, `${cell.arm}, seed ${cell.seed}: `), cell.failure));
-  const above = sweep.upstream.map(task => h('li', {}, runs.has(task.id) ? link(address('run', task.id), task.name) : task.name, ' ', state(task.state)));
-  return section('Runs', h('p', { class: 'faint' }, `${metricText(sweep.metric)}, stream mode${sweep.branch ? `, ${sweep.branch} branch` : ''}.`), h('div', { class: 'scroll short' }, h('table', { class: 'grid' },
-    h('thead', {}, h('tr', {}, h('th', { scope: 'col' }, 'arm'), seeds.map(seed => h('th', { scope: 'col', class: 'n' }, `seed ${seed}`)))),
-    h('tbody', {}, arms.map(arm => h('tr', {}, h('th', { scope: 'row' }, arm), seeds.map(seed => words(at(arm, seed)))))))),
-    above.length ? h('details', {}, h('summary', {}, `${above.length} runs that they build upon`), h('ul', { class: 'remarks' }, above)) : null, failed);
+  const at = (variant, seed) => sweep.cells.find(cell => cell.variant === variant && cell.seed === seed);
+  const failures = sweep.cells.filter(cell => cell.failure).map(cell => h('p', { class: 'warning' }, h('b', {}, `${cell.variant}, seed ${cell.seed}: `), cell.failure));
+  const before = sweep.prerequisites.map(task => h('li', {}, runs.has(task.id) ? link(address('run', task.id), task.name) : task.name, ' ', state(task.state)));
+  return section('Runs', h('p', { class: 'faint' }, `${metricText(sweep.metric)}, stream mode${sweep.branch ? `, ${sweep.branch} branch` : ''}.`),
+    table(['variant', ...seeds.map(seed => `seed ${seed}`)], variants.map(variant => [variant, ...seeds.map(seed => draw(at(variant, seed)))])),
+    before.length ? h('details', {}, h('summary', {}, `${before.length} prerequisite runs`), h('ul', { class: 'remarks' }, before)) : null, failures);
 }
 
-function effects(table, draw) {
+// A difference with its interval, verdict and the paper's difference, in words.
+function effectWords(cell) {
+  const effect = cell.effect;
+  const paper = (cell.paper_effect ?? null) === null ? '' : `; the paper: ${signed(cell.paper_effect)}`;
+  if (!effect) return `not measured${paper}`;
+  const digits = effectDigits({ ...effect, value: cell.mean });
+  const interval = effect.low === null ? '' : ` [${signed(effect.low, digits)}, ${signed(effect.high, digits)}]`;
+  return `${signed(effect.mean, digits)}${interval}${effect.verdict ? `, ${effect.verdict}` : ''}${effect.decided ? ` at ${effect.decided} seeds` : ''}${paper}`;
+}
+
+function effects(found, draw, head = 'h2') {
   const { query } = place();
-  const mode = table.modes.includes(query.get('mode')) ? query.get('mode') : table.modes[0];
-  const tested = table.metrics.filter(metric => table.rows.some(row => row.cells[mode]?.[metric]?.effect));
-  if (!tested.length) return section('Effects', h('p', { class: 'faint' }, 'They appear when an arm and its control have a finished run of the same seed.'));
+  const mode = found.modes.includes(query.get('mode')) ? query.get('mode') : found.modes[0];
+  const tested = found.metrics.filter(metric => found.rows.some(row => row.cells[mode]?.[metric]?.effect));
+  if (!tested.length) return h('section', {}, h(head, {}, 'Effects'), h('p', { class: 'faint' }, 'They appear when a variant and its control have a finished run of the same seed.'));
   const metric = tested.includes(query.get('metric')) ? query.get('metric') : tested[0];
-  const rows = table.rows.filter(row => row.cells[mode]?.[metric]?.effect || (row.cells[mode]?.[metric]?.paper_effect ?? null) !== null).map(row => {
-    const cell = row.cells[mode][metric];
-    const effect = cell.effect ?? {}, digits = effectDigits({ ...effect, value: cell.mean });
-    const text = effect.mean === undefined ? 'not measured' : `${signed(effect.mean, digits)}${effect.low === null ? '' : ` [${signed(effect.low, digits)}, ${signed(effect.high, digits)}]`}${effect.verdict ? `, ${effect.verdict}` : ''}${effect.decided ? ` at ${effect.decided} seeds` : ''}`;
-    const paper = cell.paper_effect === null ? '' : `; the paper: ${signed(cell.paper_effect)}`;
-    return { arm: row.label, mean: effect.mean ?? null, low: effect.low ?? null, high: effect.high ?? null, paper: cell.paper_effect, verdict: effect.verdict, significant: effect.holm !== null && effect.holm < effect.level, words: text + paper };
-  });
-  const choose = changes => { remember(changes); draw(); };
-  return section('Effects', h('div', { class: 'tools' }, choice('Metric', tested.map(one => [one, one]), metric, value => choose({ metric: value })), table.modes.length > 1 ? choice('Mode', table.modes.map(one => [one, one]), mode, value => choose({ mode: value })) : null),
-    h('p', { class: 'faint' }, `Difference from ‘${table.control}’, or from the arm’s own control, with its 95 % interval over seeds and clips; filled where it is significant after Holm’s correction. `, rows.some(row => row.paper !== null) ? [h('span', { class: 'diamond' }, '◇'), ' the paper’s difference.'] : null, { lower: ' Left is better.', higher: ' Right is better.' }[table.better[metric]], ' The band is the smallest effect of interest.'),
-    forest(rows, { label: table.headings[metric].replace(/ ↓| ↑/, ''), smallest: table.smallest[metric] }));
-}
-
-// Looks at a growing number of seeds: what each decided, and how far each arm is.
-function rounds(about) {
-  const percent = level => `${number(Number((100 * level).toPrecision(2)))} %`;
-  const table = (heads, lines) => h('div', { class: 'scroll' }, h('table', { class: 'grid' },
-    h('thead', {}, h('tr', {}, heads.map((head, i) => h('th', { scope: 'col', class: i ? 'n' : null }, head)))),
-    h('tbody', {}, lines.map(([head, ...cells]) => h('tr', {}, h('th', { scope: 'row' }, head), cells.map(cell => h('td', { class: 'n' }, cell)))))));
-  const decided = about.arms.reduce((sum, arm) => sum + arm.decided, 0);
-  return section('Rounds', h('p', { class: 'faint' }, `Seeds were added where verdicts were inconclusive: ${decided} of ${about.comparisons} comparisons are decided. What a look decides is final; all looks together spend 5 %.`),
-    h('div', { class: 'pair' },
-      table(['look at', 'spends', 'compared', 'decided'], about.looks.map(look => [`${look.seeds} seeds`, percent(look.level), ...(look.compared ? [number(look.compared), number(look.decided)] : [DASH, DASH])])),
-      table(['arm', 'decided', 'inconclusive', 'seeds', 'next'], about.arms.map(arm => [arm.label, number(arm.decided), number(arm.inconclusive), number(arm.seeds), arm.next ? `look at ${arm.next}` : DASH]))));
-}
-
-function results(table) {
-  return h('div', { class: 'stack' }, table.modes.map(mode => {
-    const head = h('thead', {}, h('tr', {}, h('th', { scope: 'col' }, 'arm'), h('th', { scope: 'col', class: 'n' }, 'seeds'), table.metrics.map(metric => h('th', { scope: 'col', class: 'n' }, table.headings[metric]))));
-    const line = row => h('tr', {}, h('th', { scope: 'row' }, row.label), h('td', { class: 'n faint' }, row.wanted.length ? `${row.found.length}/${row.wanted.length}` : 'paper'), table.metrics.map(metric => cell(row.cells[mode][metric], metric)));
-    return h('div', { class: 'scroll' }, h('table', { class: 'grid effects' }, table.modes.length > 1 ? h('caption', {}, `${mode} mode`) : null, head, h('tbody', {}, table.rows.map(line))));
+  const rows = found.rows.map(row => [row.label, row.cells[mode]?.[metric]]).filter(([, cell]) => cell?.effect || (cell?.paper_effect ?? null) !== null).map(([variant, cell]) => ({
+    variant, mean: null, low: null, high: null, ...cell.effect, paper: cell.paper_effect ?? null, significant: significant(cell.effect), words: effectWords(cell),
   }));
+  const choose = changes => { remember(changes); draw(); };
+  const note = [`Difference from ‘${found.control}’, or from the variant’s own control, with its 95 % interval over seeds and clips; filled where it is significant after Holm’s correction.`,
+    rows.some(row => row.paper !== null) && [' ', h('span', { class: 'diamond' }, '◇'), ' the paper’s difference.'], { lower: ' Left is better.', higher: ' Right is better.' }[found.better[metric]], ' The band is the smallest effect of interest.'];
+  return h('section', {}, h(head, {}, 'Effects'),
+    h('div', { class: 'tools' }, choice('Metric', tested.map(one => [one, one]), metric, value => choose({ metric: value })), found.modes.length > 1 ? choice('Mode', found.modes.map(one => [one, one]), mode, value => choose({ mode: value })) : null),
+    h('p', { class: 'faint' }, note), forest(rows, { label: found.headings[metric].replace(/ ↓| ↑/, ''), smallest: found.smallest[metric] }));
 }
 
-function cell(one, metric) {
-  const effect = one.effect, digits = effectDigits({ ...effect, value: one.mean });
-  const lines = [h('span', { class: 'strong' }, one.mean === null ? DASH : metricNumber(metric, one.mean), one.sd === null ? null : h('small', { class: 'faint' }, ` ± ${number(one.sd, one.mean >= 1000 ? 0 : decimals(one.mean))}`))];
-  if (effect) lines.push(h('span', { class: effect.holm !== null && effect.holm < effect.level ? 'strong' : '' }, signed(effect.mean, digits), effect.low === null ? null : h('small', { class: 'faint' }, ` [${signed(effect.low, digits)}, ${signed(effect.high, digits)}]`)));
-  if (effect?.verdict) lines.push(h('span', { class: `verdict ${effect.verdict}` }, effect.verdict), effect.decided ? h('small', { class: 'faint' }, `at ${effect.decided} seeds`) : null);
-  if (one.paper !== null) lines.push(h('small', { class: 'faint' }, `paper ${number(one.paper)}`, one.paper_effect === null ? null : ` (${signed(one.paper_effect)})`));
-  return h('td', { class: 'n' }, lines);
+const significant = effect => Boolean(effect) && effect.holm !== null && effect.holm < effect.level;
+
+function beyondTheMean(sweep) {
+  const metrics = Object.keys(sweep.distributions);
+  if (!metrics.length) return null;
+  const rows = sweep.distributions[metrics[0]].rows.map((row, i) => [row.variant, ...metrics.flatMap(metric => {
+    const { middle, improvement } = sweep.distributions[metric].rows[i];
+    return [middle === null ? DASH : metricNumber(metric, middle), improvement === null ? DASH : number(improvement, 2)];
+  })]);
+  return section('Beyond the mean', h('p', { class: 'faint' }, 'The fraction of all runs’ test clips with at most a value, the mean of the middle half of all seeds and clips (IQM), and how often a run of the variant has a better value than its control’s on the same clip. They are not tests.'),
+    h('div', { class: 'charts' }, metrics.map(metric => h('div', { class: 'panel-chart' }, profiles(sweep.distributions[metric], { label: sweep.table.headings[metric] })))),
+    table(['variant', ...metrics.flatMap(metric => [`${metric}: IQM`, 'P(better)'])], rows));
+}
+
+// Seeds spent in rounds: what each interim analysis decided, and the progress of each variant.
+function rounds(found) {
+  const decided = found.variants.reduce((sum, one) => sum + one.decided, 0);
+  const percent = level => `${number(Number((100 * level).toPrecision(2)))} %`;
+  return section('Rounds', h('p', { class: 'faint' }, `Seeds were added where verdicts were inconclusive: ${decided} of ${found.comparisons} comparisons are decided. What an interim analysis decides is final; together they spend 5 %.`),
+    h('div', { class: 'pair' },
+      table(['analysis at', 'spends', 'compared', 'decided'], found.analyses.map(one => [`${one.seeds} seeds`, percent(one.level), ...(one.compared ? [number(one.compared), number(one.decided)] : [DASH, DASH])])),
+      table(['variant', 'decided', 'inconclusive', 'seeds', 'next'], found.variants.map(one => [one.label, number(one.decided), number(one.inconclusive), number(one.seeds), one.next ? `analysis at ${one.next}` : DASH]))));
+}
+
+function results(found) {
+  const row = (one, mode) => [one.label, one.wanted.length ? `${one.found.length}/${one.wanted.length}` : 'paper', ...found.metrics.map(metric => h('td', { class: 'n' }, cell(one.cells[mode][metric], metric)))];
+  const heads = ['variant', 'seeds', ...found.metrics.map(metric => found.headings[metric])];
+  return h('div', { class: 'stack' }, found.modes.map(mode => table(heads, found.rows.map(one => row(one, mode)), { kind: 'effects', scroll: 'scroll', caption: found.modes.length > 1 ? `${mode} mode` : null })));
+}
+
+function cell({ mean, sd, effect, paper, paper_effect: paperEffect }, metric) {
+  const digits = effectDigits({ ...effect, value: mean });
+  return [
+    h('span', { class: 'strong' }, mean === null ? DASH : metricNumber(metric, mean), sd === null ? null : h('small', { class: 'faint' }, ` ± ${number(sd, mean >= 1000 ? 0 : decimals(mean))}`)),
+    effect && h('span', { class: significant(effect) ? 'strong' : '' }, signed(effect.mean, digits), effect.low === null ? null : h('small', { class: 'faint' }, ` [${signed(effect.low, digits)}, ${signed(effect.high, digits)}]`)),
+    effect?.verdict && [h('span', { class: `verdict ${effect.verdict}` }, effect.verdict), effect.decided ? h('small', { class: 'faint' }, `at ${effect.decided} seeds`) : null],
+    paper !== null && h('small', { class: 'faint' }, `paper ${number(paper)}`, paperEffect === null ? null : ` (${signed(paperEffect)})`),
+  ];
 }

@@ -1,10 +1,10 @@
-"""What the page's one file keeps of a run."""
+"""What `memmlp report` puts into the page's file."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from memmlp.report.ui.one_file import _run
+from memmlp.report.ui.report_file import _shorten, encode_query, round_numbers
 
 
 def clip(name: str, error: Any) -> dict[str, Any]:
@@ -14,5 +14,12 @@ def clip(name: str, error: Any) -> dict[str, Any]:
 
 def test_clips_without_a_number_are_the_worst():
     clips = [clip("good", 3.0), clip("nan", "nan"), clip("bad", 9.0), {"name": "none"}, clip("inf", "inf")]
-    kept = _run({"clips": clips, "manifest": {}})["clips"]
+    kept = _shorten({"clips": clips, "manifest": {}})["clips"]
     assert [one["name"] for one in kept] == ["nan", "inf", "bad", "good", "none"]
+
+
+def test_addresses_and_numbers_of_the_file():
+    assert encode_query(clip="a b/c~d*e", mode="stream") == "clip=a+b%2Fc%7Ed*e&mode=stream"
+    assert round_numbers({"a": [1.23456789, float("nan"), (float("inf"), 3, "x", None, True)]}) == {
+        "a": [1.23457, None, [None, 3, "x", None, True]]
+    }

@@ -1,23 +1,21 @@
-"""The index follows run folders, keeps what it parsed, and shows damage as damage."""
+"""The index follows run folders, and shows damage as damage."""
 
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import pytest
-from report.ui.conftest import begun, run_of
+from report.ui.conftest import run_of, started_run
 
-from memmlp.report.ui import run_row
-from memmlp.report.ui.index import Index
-from memmlp.report.ui.run_row import facts, last_entries, read_config
+from memmlp.report.ui import run_index
+from memmlp.report.ui.run_index import RunIndex, read_config, read_facts, read_recent
 
 
 def test_facts_of_a_finished_run(outputs: Path):
     run = run_of(outputs, "gru", 1)
     (run.folder / "notes.json").write_text(json.dumps({"tags": ["good", 7], "note": "<b>look</b>"}))
-    found = facts(run.folder)
+    found = read_facts(run.folder)
     assert (found["id"], found["done"], found["steps"], found["damage"]) == (run.id, True, 2000, [])
     assert found["metrics"]["stream.rotation.MPJPE"] == pytest.approx(
         run.results["stream"]["rotation"]["MPJPE"]
@@ -25,13 +23,6 @@ def test_facts_of_a_finished_run(outputs: Path):
     assert found["metrics"]["latency.median_ms"] == pytest.approx(0.64)
     assert (found["tags"], found["note"]) == (["good", "7"], "<b>look</b>")
     assert found["recent"][-1][0] == 2000
-    assert found["remark"].startswith("hardly trained (its steps saw 6.1 minutes of motion")
-
-
-def test_who_saw_enough_motion_has_no_remark(outputs: Path):
-    run = run_of(outputs)
-    run.config_path.write_text(json.dumps(run.config | {"model": {"frames": 1100}}))
-    assert facts(run.folder)["remark"] == ""
 
 
 def test_times_of_a_run_are_those_of_the_file_that_was_asked_for(outputs: Path):
@@ -41,7 +32,7 @@ def test_times_of_a_run_are_those_of_the_file_that_was_asked_for(outputs: Path):
     changes = {"settings": {"precision": "int8"}, "int8": {"median_ms": 0.32, "onnx_bytes": 7}}
     path.write_text(json.dumps(record | changes))
     run.config_path.write_text(json.dumps(run.config | {"export": {"precision": "int8"}}))
-    found = facts(run.folder)["metrics"]
+    found = read_facts(run.folder)["metrics"]
     assert (found["latency.median_ms"], found["latency.onnx_bytes"]) == (0.32, 7)
     assert found["latency.parameters"] == record["parameters"]
 
@@ -53,7 +44,7 @@ def test_times_of_a_run_are_those_of_the_file_that_was_asked_for(outputs: Path):
         ("config.yaml", b"a: [", "config.yaml"),
         ("config.yaml", b"\xff\xfe", "config.yaml"),
         ("config.yaml", b"- a list", "config.yaml"),
-        ("evaluations/stream-0.json", b'{"mean": 3}', "evaluations/stream-0.json"),
+        ("evaluations/stream-0.json", b'{"mean": 3}', "evaluations"),
         ("notes.json", b"[1]", None),
         ("metrics.jsonl", b"\x00\x00 no line\n{}\n", None),
         ("deployments/fp32-0/latency.json", b"[", None),
@@ -64,7 +55,7 @@ def test_times_of_a_run_are_those_of_the_file_that_was_asked_for(outputs: Path):
 def test_damage_is_told_and_raises_nothing(outputs: Path, name: str, content: bytes, damaged: str | None):
     run = run_of(outputs)
     (run.folder / name).write_bytes(content)
-    index = Index(outputs)
+    index = RunIndex(outputs)
     index.refresh()
     assert len(index.runs) == 6
     assert index.runs[run.id]["damage"] == ([damaged] if damaged else [])
@@ -73,7 +64,7 @@ def test_damage_is_told_and_raises_nothing(outputs: Path, name: str, content: by
 def test_a_folder_without_anything_is_a_run_that_is_damaged(outputs: Path):
     (outputs / "runs" / ("0" * 16)).mkdir()
     (outputs / "runs" / "no run").mkdir()
-    index = Index(outputs)
+    index = RunIndex(outputs)
     index.refresh()
     assert index.runs["0" * 16]["damage"] == ["manifest.json", "config.yaml"]
     assert "no run" not in index.runs
@@ -81,13 +72,15 @@ def test_a_folder_without_anything_is_a_run_that_is_damaged(outputs: Path):
 
 def test_only_what_changed_is_parsed_again(outputs: Path, monkeypatch: pytest.MonkeyPatch):
     parsed = []
-    monkeypatch.setattr(run_row, "facts", lambda folder: parsed.append(folder.name) or facts(folder))
-    index = Index(outputs)
+    monkeypatch.setattr(
+        run_index, "read_facts", lambda folder: parsed.append(folder.name) or read_facts(folder)
+    )
+    index = RunIndex(outputs)
     first = index.refresh()
     assert len(parsed) == 6
     assert index.refresh() == first
     assert len(parsed) == 6
-    run = begun(outputs)
+    run = started_run(outputs)
     second = index.refresh()
     assert (second, parsed[6:]) == (first + 1, [run.id])
     assert index.runs[run.id]["status"] == "stopped"
@@ -97,7 +90,7 @@ def test_only_what_changed_is_parsed_again(outputs: Path, monkeypatch: pytest.Mo
 
 
 def test_a_run_is_not_done_while_it_is_evaluated(outputs: Path):
-    index = Index(outputs)
+    index = RunIndex(outputs)
     index.refresh()
     run = run_of(outputs)
     with run.lock():
@@ -109,7 +102,7 @@ def test_a_run_is_not_done_while_it_is_evaluated(outputs: Path):
 
 
 def test_a_trained_run_whose_deployment_failed_is_not_done(outputs: Path):
-    index = Index(outputs)
+    index = RunIndex(outputs)
     index.refresh()
     run = run_of(outputs)
     run.fail("RuntimeError: ONNX Runtime differs from torch")
@@ -121,7 +114,7 @@ def test_a_trained_run_whose_deployment_failed_is_not_done(outputs: Path):
 
 
 def test_a_trained_run_without_its_evaluation_is_not_done(outputs: Path):
-    run, index = run_of(outputs), Index(outputs)
+    run, index = run_of(outputs), RunIndex(outputs)
     for path in run.evaluations.iterdir():
         path.unlink()
     index.refresh()
@@ -129,42 +122,15 @@ def test_a_trained_run_without_its_evaluation_is_not_done(outputs: Path):
 
 
 def test_a_run_that_is_gone_is_told(outputs: Path):
-    index = Index(outputs)
+    index = RunIndex(outputs)
     index.refresh()
-    run = begun(outputs)
+    run = started_run(outputs)
     index.refresh()
     for path in run.folder.iterdir():
         path.unlink()
     run.folder.rmdir()
     assert index.refresh() == index.removed[run.id] == 3
     assert run.id not in index.runs
-
-
-def test_facts_are_kept_between_starts(outputs: Path, monkeypatch: pytest.MonkeyPatch):
-    store = outputs / "cache" / "ui" / "runs.sqlite"
-    first = Index(outputs, store)
-    first.refresh()
-    first.keep()
-    parsed = []
-    monkeypatch.setattr(run_row, "facts", lambda folder: parsed.append(folder.name) or facts(folder))
-    changed = run_of(outputs)
-    os.utime(changed.manifest_path, ns=(1, 1))
-    second = Index(outputs, store)
-    second.refresh()
-    assert parsed == [changed.id]
-    status = {run_id: run["status"] for run_id, run in second.runs.items()}
-    assert status == {run_id: run["status"] for run_id, run in first.runs.items()}
-
-
-@pytest.mark.parametrize("content", [b"no database", b""])
-def test_a_damaged_store_is_made_anew(outputs: Path, content: bytes):
-    store = outputs / "cache" / "ui" / "runs.sqlite"
-    store.parent.mkdir(parents=True)
-    store.write_bytes(content)
-    index = Index(outputs, store)
-    index.refresh()
-    index.keep()
-    assert len(Index(outputs, store).runs) == 6
 
 
 def test_a_config_in_parts_is_the_config_as_a_whole(tmp_path: Path):
@@ -179,12 +145,12 @@ def test_a_config_in_parts_is_the_config_as_a_whole(tmp_path: Path):
     }
     path = tmp_path / "config.yaml"
     path.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
-    assert read_config(path) == content
+    assert read_config(path)[0] == content
 
 
 def test_last_entries_of_a_log_that_is_being_written(tmp_path: Path):
     path = tmp_path / "metrics.jsonl"
     lines = [{"step": step, "phase": "train", "time": step, "values": {"loss": 1}} for step in range(9)]
     path.write_text("\n".join(map(json.dumps, lines)) + '\n{"step": 9, "pha')
-    assert [entry[0] for entry in last_entries(path)] == [4, 5, 6, 7, 8]
-    assert last_entries(tmp_path / "none") == []
+    assert [entry[0] for entry in read_recent(path)] == [4, 5, 6, 7, 8]
+    assert read_recent(tmp_path / "none") == []

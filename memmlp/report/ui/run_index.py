@@ -1,0 +1,269 @@
+"""The runs below an outputs folder, as the page lists them; a run is read again when its files change."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import re
+import threading
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from memmlp.common.errors import InputError
+from memmlp.common.files import plain, read_json
+from memmlp.runs.deployment_folder import as_deployed
+from memmlp.runs.evaluation_file import with_solvers
+from memmlp.runs.evaluations_as_configured import EvaluationsAsConfigured
+from memmlp.runs.former_keys import with_present_names
+from memmlp.runs.identity import DEPLOYMENT, EVALUATION, ID, INFERENCE, flatten, training_settings
+from memmlp.runs.run import LOADER, Run, latency_name
+from memmlp.runs.shown_name import run_name
+
+HIDDEN = ("paths", "loggers", "force", "hydra", "save_predictions")
+"""Config groups that are not listed."""
+
+USE = {*EVALUATION, *DEPLOYMENT, *(key.split(".")[0] for key in INFERENCE)}
+"""Config groups that say how a trained network is evaluated and deployed."""
+
+COSTS = {
+    "median_ms": "ms", "p95_ms": "ms", "pose_median_ms": "ms", "ratio_to_yardstick": "", "parameters": "",
+    "macs": "", "onnx_bytes": "",
+}  # fmt: skip
+"""The listed costs of a deployment, with units; lower is better."""
+
+FILES = ("config.yaml", "manifest.json", "metrics.jsonl", "DONE", "FAILED", "results.json", "notes.json")
+TAIL = 1 << 14  # bytes at the end of a metrics log in which the last entries are looked for
+RECENT = 5  # number of training entries from which the speed of a run is estimated
+
+
+class RunIndex:
+    """The facts of all runs.
+
+    Attributes:
+        outputs: the folder of runs and caches.
+        generation: a number that grows with every change.
+        runs: the facts by run id (`read_facts`), with the run's `status` and the `generation` of its last
+            change.
+        removed: the ids of deleted runs, with the generation in which they disappeared.
+        signatures: by run id, a text that changes with the run's files.
+    """
+
+    def __init__(self, outputs: Path):
+        self.outputs, self.generation = outputs, 0
+        self.runs: dict[str, dict[str, Any]] = {}
+        self.removed: dict[str, int] = {}
+        self.signatures: dict[str, str] = {}
+        self.lock = threading.RLock()
+
+    def refresh(self) -> int:
+        """Look at all run folders again, and return the generation."""
+        with self.lock:
+            present = {folder.name: folder for folder in self._folders()}
+            following = self.generation + 1
+            changed = [one for one, folder in present.items() if self._update(one, folder, following)]
+            deleted = [run_id for run_id in self.runs if run_id not in present]
+            for run_id in deleted:
+                del self.runs[run_id], self.signatures[run_id]
+                self.removed[run_id] = following
+            if changed or deleted:
+                self.generation = following
+            return self.generation
+
+    def _folders(self) -> Iterator[Path]:
+        with (
+            contextlib.suppress(FileNotFoundError, NotADirectoryError),
+            os.scandir(self.outputs / "runs") as entries,
+        ):
+            for entry in entries:
+                if ID.fullmatch(entry.name) and entry.is_dir():
+                    yield Path(entry.path)
+
+    def _update(self, run_id: str, folder: Path, generation: int) -> bool:
+        """Update a run's facts, and return whether they changed."""
+        signature = _signature(folder)
+        facts = self.runs.get(run_id)
+        if facts is None or self.signatures[run_id] != signature:
+            facts = read_facts(folder) | {"status": None}
+            self.signatures[run_id] = signature
+        if facts["complete"] and not facts["failure"] and not _is_claimed(folder):
+            status = "done"
+        else:
+            status = _read_status(folder)
+        if facts["status"] == status:
+            return False
+        self.removed.pop(run_id, None)
+        self.runs[run_id] = {**facts, "status": status, "generation": generation}
+        return True
+
+
+def read_facts(folder: Path) -> dict[str, Any]:
+    """Return what is listed of a run; `damage` names the files that cannot be read."""
+    run, damage = Run(folder), list[str]()
+    if not (manifest := run.manifest):
+        damage.append("manifest.json")
+    config: dict[str, Any] = {}
+    listed: dict[str, Any] = {}
+    try:
+        config, listed = read_config(run.config_path)
+    except ValueError:
+        damage.append("config.yaml")
+    git, seconds = (
+        found if isinstance(found := manifest.get(key), dict) else {} for key in ("git", "seconds")
+    )
+    numbers = [value for value in seconds.values() if isinstance(value, int | float)]
+    notes = read_json(folder / "notes.json")
+    return {
+        "id": run.id,
+        "name": run_name(manifest, listed),
+        "kind": _text(manifest.get("kind")),
+        "done": run.done,
+        "complete": run.complete,
+        "started": _text(manifest.get("started")),
+        "finished": _text(manifest.get("finished")),
+        "seconds": sum(numbers) if numbers else None,
+        "code": _text(git.get("commit") or manifest.get("version"))[:7],
+        "data": _text(manifest.get("data"))[:8],
+        "data_name": _text(listed.get("data.name")),
+        "device": _text(manifest.get("gpu")) or _text(manifest.get("device")),
+        "upstream": _text(manifest.get("upstream")),
+        "steps": _total_steps(manifest.get("kind"), config),
+        "recent": read_recent(run.metrics_path),
+        "config": listed,
+        "metrics": _read_metrics(run, {key: config[key] for key in USE if key in config}, damage),
+        "failure": _text(read_json(folder / "FAILED").get("reason")),
+        "tags": [str(tag) for tag in notes["tags"]] if isinstance(notes.get("tags"), list) else [],
+        "note": _text(notes.get("note")),
+        "damage": damage,
+    }  # fmt: skip
+
+
+def read_config(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return a resolved config, and its listed values by dotted key.
+
+    The runs of a sweep share most groups of their configs, so each group's text is parsed only once.
+
+    Raises:
+        ValueError: if the file does not hold a config.
+    """
+    try:
+        groups = [_parse_group(text) for text in re.split(r"\n(?=[^\s#-])", path.read_text(encoding="utf-8"))]
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, TypeError) as error:
+        raise ValueError(str(error)) from None
+    config: dict[str, Any] = {}
+    listed: dict[str, Any] = {}
+    for tree, flat in groups:
+        config |= tree
+        listed |= flat
+    return config, listed
+
+
+@lru_cache(4096)
+def _parse_group(text: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    found = yaml.load(text, LOADER)  # a safe loader
+    if not isinstance(found, dict):
+        raise TypeError("not a config")
+    found = with_present_names(found)
+    flat = plain(flatten(found))
+    hidden = {key for key in flat if key.split(".")[0] in HIDDEN or key.endswith(("._target_", "._partial_"))}
+    return found, {key: value for key, value in flat.items() if key not in hidden}
+
+
+def read_recent(path: Path) -> list[list[Any]]:
+    """Return step, time and loss of a metrics log's last training entries, the newest last."""
+    try:
+        with open(path, "rb") as file:
+            file.seek(max(file.seek(0, 2) - TAIL, 0))
+            lines = file.read().split(b"\n")[:-1]
+    except OSError:
+        return []
+    found: list[list[Any]] = []
+    for line in reversed(lines):
+        entry = parse_line(line)
+        if entry and entry["phase"] == "train":
+            loss = entry["values"].get("loss", math.nan)
+            found.append([entry["step"], entry["time"], loss if math.isfinite(loss) else None])
+        if len(found) == RECENT:
+            break
+    return found[::-1]
+
+
+def parse_line(line: bytes) -> dict[str, Any] | None:
+    """Return the entry in a line of a metrics log, its values as numbers; None if it does not hold one."""
+    try:
+        entry = json.loads(line)
+        values = {str(key): float(value) for key, value in entry["values"].items()}
+        step, phase, time = int(entry["step"]), str(entry["phase"]), float(entry["time"])
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return None
+    return {"step": step, "phase": phase, "time": time, "values": values}
+
+
+def _total_steps(kind: object, config: Mapping[str, Any]) -> int | None:
+    try:
+        steps = training_settings(str(kind), config)["steps"]
+    except (KeyError, TypeError):
+        return None
+    return steps if isinstance(steps, int) else None
+
+
+def _read_metrics(run: Run, config: Mapping[str, Any], damage: list[str]) -> dict[str, float]:
+    """Return the measured numbers by dotted name, such as "stream.rotation.MPJPE"."""
+    found: dict[str, Any] = {}
+    try:
+        evaluations = EvaluationsAsConfigured(run.evaluations, config)
+        found |= flatten(with_solvers(evaluations.results, evaluations.combined_by))
+    except (InputError, KeyError, TypeError, AttributeError):
+        damage.append("evaluations")
+    deployed = run.deployment_shown(config)
+    name, record = latency_name(deployed, config), as_deployed(deployed.record)
+    found |= {f"{name}.{key}": record[key] for key in COSTS if key in record}
+    if run.results_path.exists():
+        found |= flatten(read_json(run.results_path), "vqvae.")
+    return {
+        key: value for key, value in found.items() if isinstance(value, int | float) and math.isfinite(value)
+    }
+
+
+def _read_status(folder: Path) -> str:
+    try:
+        return Run(folder).status
+    except (KeyError, ValueError, TypeError, AttributeError):  # a damaged claim
+        return "stopped"
+
+
+def _is_claimed(folder: Path) -> bool:
+    """Return whether a process may be working on a run, as its folder has a claim that is not free."""
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        return any(re.fullmatch(r"\.lease-\d+", entry.name) for entry in entries)
+    return False
+
+
+def _signature(folder: Path) -> str:
+    """Return a text that changes when any file changes from which a run's facts come."""
+    stats = _stat_files(folder, FILES) + _stat_files(folder / "evaluations")
+    with contextlib.suppress(OSError):
+        for name in os.listdir(folder / "deployments"):
+            stats += _stat_files(folder / "deployments" / name, ("latency.json",))
+    return hashlib.sha256(repr(sorted(stats)).encode()).hexdigest()[:20]
+
+
+def _stat_files(folder: Path, names: tuple[str, ...] | None = None) -> list[tuple[str, str, int, int]]:
+    """Return name, time and size of a folder's files, either of certain names or all."""
+    found = []
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            if (names is None or entry.name in names) and not entry.name.startswith("."):
+                stat = entry.stat()
+                found.append((folder.name, entry.name, stat.st_mtime_ns, stat.st_size))
+    return found
+
+
+def _text(value: object) -> str:
+    return "" if value is None or isinstance(value, dict | list) else str(value)
