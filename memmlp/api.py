@@ -350,7 +350,7 @@ class Prediction:
             InputError: for another kind of file, or if the file can't be written.
         """
         from memmlp.evaluation.predictions import motion_clip
-        from memmlp.motion.exporting.write import format_of, write_motion
+        from memmlp.motion.exporting import format_of, write_motion
 
         file = Path(path)
         chosen = format_of(file)

@@ -26,9 +26,8 @@ from memmlp.evaluation import modes as evaluation
 from memmlp.evaluation.ik import IK, LBFGS, Arms
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.clip import Clip
-from memmlp.motion.dataset import WindowSampler
+from memmlp.motion.dataset import MirroredDataset, WindowSampler
 from memmlp.motion.formats.npz import read_clip
-from memmlp.motion.mirror import MirroredDataset
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.motion.synthetic import ACTIVITIES, synthesize, synthesize_clip

@@ -11,7 +11,7 @@ import torch
 
 from memmlp.motion.body import FRAME_DIM, builtin_rest_joints
 from memmlp.motion.dataset import MotionDataset
-from memmlp.motion.features import motion_frames
+from memmlp.motion.geometry import motion_frames
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.agrol import AGRoLDiffusion, AGRoLMLP

@@ -11,8 +11,7 @@ import torch
 
 from memmlp.live.stream import Pose, Stream
 from memmlp.motion.body import TRACKED
-from memmlp.motion.features import motion_frames
-from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics
+from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics, motion_frames
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import MotionModel
 

@@ -399,7 +399,7 @@ def write_avatar(given: InputOptions, path: Path) -> None:
     """Write this project's own avatar with the network's body."""
     from memmlp.common.errors import InputError
     from memmlp.live.exported import ExportedNetwork
-    from memmlp.motion.formats.vrm_writer import write_vrm
+    from memmlp.motion.formats.vrm import write_vrm
 
     if path.suffix.lower() != ".vrm":
         raise InputError(f"--save-avatar {path}: no such kind of file; allowed: .vrm")

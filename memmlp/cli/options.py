@@ -164,6 +164,9 @@ format_option = click.option(
     type=click.Choice(["bvh", "npz", "gltf"]),
     help="Of the files.  [default: by the suffix .bvh, .npz or .glb of --out]",
 )
+body_option = click.option(
+    "--body", default="builtin", show_default=True, help="builtin, or an SMPL-H model.npz."
+)
 strict_option = click.option(
     "--strict", is_flag=True, help="Stop at the first bad file instead of skipping it."
 )

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
     from memmlp.evaluation.evaluation import Evaluation
     from memmlp.evaluation.predictions import ClipPredictor
-    from memmlp.motion.exporting.export_folder import ExportReport
+    from memmlp.motion.exporting import ExportReport
 
 
 @click.command("predict")
@@ -66,7 +66,7 @@ def predict(
     from memmlp.cli.data.printing import show_exported
     from memmlp.config.open_run import OpenedRun, data_of, experiment_of, trained_network
     from memmlp.evaluation.predictions import ClipPredictor
-    from memmlp.motion.exporting.export_folder import plan_export
+    from memmlp.motion.exporting import plan_export
     from memmlp.motion.preparing.imported_body import check_imported_body
     from memmlp.runs.lookup import find_run
 
@@ -116,8 +116,7 @@ def predict_test_clip(
     """
     from memmlp.common.errors import InputError
     from memmlp.motion.body import FPS
-    from memmlp.motion.exporting.export_folder import ExportReport, choose_format
-    from memmlp.motion.exporting.write import write_motion
+    from memmlp.motion.exporting import ExportReport, choose_format, write_motion
 
     chosen, test = choose_format(out, format_, folder=False), run.test
     if name not in test.names:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from memmlp.common.progress import progress_bar
 from memmlp.deploy.onnx_stream import NEXT, Arrays, OnnxStream
 from memmlp.motion.body import ROTATION, SPARSE_DIM
-from memmlp.motion.torch_threads import one_thread
+from memmlp.motion.geometry import one_thread
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.own_past_memory import Blend
 

@@ -19,8 +19,7 @@ from memmlp.evaluation.ik import IK, NoIK
 from memmlp.motion.body import FPS, SPARSE_DIM
 from memmlp.motion.clip import SPLINES, Clip, resample
 from memmlp.motion.dataset import MotionDataset
-from memmlp.motion.exporting.export_folder import ExportPlan, ExportReport, Target, read_motion, read_targets
-from memmlp.motion.exporting.write import write_motion
+from memmlp.motion.exporting import ExportPlan, ExportReport, Target, read_motion, read_targets, write_motion
 from memmlp.motion.normalizer import Normalizer
 from memmlp.motion.preparing.cache import frame_blocks
 from memmlp.networks.motion_model import MotionModel

@@ -257,7 +257,7 @@ class TrackerFrames:
 
 
 class Features:
-    """Computes the network's 54 inputs frame by frame, as `memmlp.motion.features.sparse_features` does."""
+    """Computes the network's 54 inputs frame by frame, as `memmlp.motion.geometry.sparse_features` does."""
 
     def __init__(self) -> None:
         self.last: TrackerSample | None = None

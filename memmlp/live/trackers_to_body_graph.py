@@ -43,8 +43,7 @@ from memmlp.motion.body import (
     SPARSE_ROTATION,
     SPARSE_VELOCITY,
 )
-from memmlp.motion.features import sparse_features
-from memmlp.motion.geometry import sixd_to_matrix
+from memmlp.motion.geometry import sixd_to_matrix, sparse_features
 from memmlp.networks.motion_model import MotionModel, StreamingGraph
 
 INPUTS = ("tracker_positions", "tracker_rotations")

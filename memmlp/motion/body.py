@@ -92,23 +92,23 @@ def load_rest_joints(body: str | Path) -> np.ndarray:
         body: "builtin", or the path of an SMPL-H `model.npz`.
 
     Raises:
-        InputError: if the file is no such model.
+        InputError: if the file is not such a model.
     """
     if str(body) == "builtin":
         return builtin_rest_joints()
     path = Path(body)
     if not path.is_file():
-        raise InputError(f"data.body: {path} is not a file; allowed: builtin, or an SMPL-H model.npz")
+        raise InputError(f"data.body={path}: no such file; must be builtin, or an SMPL-H model.npz")
     try:
         with np.load(path, allow_pickle=False) as model:
             joints = np.asarray(model["J_regressor"] @ model["v_template"], dtype=np.float64)
             parents = np.asarray(model["kintree_table"])[0, :N_JOINTS].astype(np.int64)
     except (OSError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"data.body: {path} is no SMPL-H model.npz ({error})") from error
+        raise InputError(f"data.body={path}: not an SMPL-H model.npz ({error})") from error
     if joints.ndim != 2 or joints.shape[0] < N_JOINTS or joints.shape[1] != 3:
-        raise InputError(f"data.body: {path} gives joints of shape {joints.shape}, not (>= 22, 3)")
+        raise InputError(f"data.body={path}: joints of shape {joints.shape}, not (>= 22, 3)")
     if not np.isfinite(joints).all() or tuple(parents[1:]) != PARENTS[1:]:
-        raise InputError(f"data.body: {path} has not SMPL's tree of 22 body joints")
+        raise InputError(f"data.body={path}: lacks SMPL's tree of 22 body joints")
     return joints[:N_JOINTS]
 
 

@@ -1,4 +1,4 @@
-"""Motion clips in memory, and their resampling to 60 Hz."""
+"""Motion clips in memory: their resampling to 60 Hz, their frame rates, and their form in Y-up worlds."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SPLINES, LINES = "splines", "lines"
 INTERPOLATIONS = (SPLINES, LINES)
 """How motion is interpolated at times that lie between two recorded frames.
 
-Splines are smooth, as motion is. Lines have a kink at each recorded frame, and so a jerk that no body has:
+Splines are smooth, like motion. Lines have a kink at each recorded frame, and so a jerk that no body has:
 four times as much as there is in Bandai-Namco's motion at 30 Hz (docs/guides/motion.md).
 """
 RATE_TOLERANCE = 1e-4  # relative: 59.94 is not 60, and 120.0005 (a BVH's frame time of .0083333) is 120
@@ -64,14 +64,14 @@ class Clip:
 
 
 def resample(clip: Clip, fps: float = FPS, interpolation: str = SPLINES) -> tuple[Clip, str]:
-    """Resample a clip to exactly `fps`, and say how: `kept`, `every k. frame`, or `interpolated`.
+    """Resample a clip to exactly `fps`; also return the way: `kept`, `every k. frame`, or `interpolated`.
 
     If the clip's rate is a multiple of `fps`, every k-th frame is taken; otherwise poses and translation are
     interpolated at the times k / fps that lie inside the clip.
 
     Args:
         clip: the clip.
-        fps: the wanted rate, Hz.
+        fps: the new rate, Hz.
         interpolation: SPLINES, with continuous accelerations of joints' rotations and of the translation, or
             LINES, slerp and straight lines.
 
@@ -86,21 +86,44 @@ def resample(clip: Clip, fps: float = FPS, interpolation: str = SPLINES) -> tupl
     if len(clip) < 2:
         raise InputError(f"{clip.name}: one frame at {clip.fps:g} Hz cannot be brought to {fps:g} Hz")
     times = np.arange(len(clip)) / clip.fps
-    wanted = np.arange(int(np.floor(times[-1] * fps + 1e-9)) + 1) / fps
-    wanted = np.minimum(wanted, times[-1])
-    turning, move = (RotationSpline, _spline) if interpolation == SPLINES else (Slerp, _lines)
+    new = np.arange(int(np.floor(times[-1] * fps + 1e-9)) + 1) / fps
+    new = np.minimum(new, times[-1])
+    turning = RotationSpline if interpolation == SPLINES else Slerp
     joints = [turning(times, Rotation.from_rotvec(clip.poses[:, j])) for j in range(N_JOINTS)]
-    poses = np.stack([joint(wanted).as_rotvec() for joint in joints], 1)
-    return replace(clip, poses=poses, trans=move(times, clip.trans, wanted), fps=float(fps)), INTERPOLATED
+    poses = np.stack([joint(new).as_rotvec() for joint in joints], 1)
+    if interpolation == SPLINES:
+        from scipy.interpolate import CubicSpline  # slow to import, and most clips do not need it
+
+        trans = CubicSpline(times, clip.trans)(new)
+    else:
+        trans = np.stack([np.interp(new, times, axis) for axis in clip.trans.T], 1)
+    return replace(clip, poses=poses, trans=trans, fps=float(fps)), INTERPOLATED
 
 
-def _spline(times: np.ndarray, points: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Return where a cubic spline through points (N, 3) at times (N,) is at the wanted times (M,): (M, 3)."""
-    from scipy.interpolate import CubicSpline  # slow to import, and most clips need none
-
-    return CubicSpline(times, points)(wanted)
+USUAL_RATES = (15, 24, 25, 30, 48, 50, 60, 72, 75, 90, 100, 120, 144, 150, 180, 200, 240, 300)  # Hz
+RARE_RATES = (20, 40, 80, 250, 360, 400, 480, 500)  # Hz; a rounded frame time is not taken for these
+CLOSE = 2e-3  # relative: 29.97, 59.94 and 119.88 Hz are rates of video
 
 
-def _lines(times: np.ndarray, points: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Return where lines through points (N, 3) at times (N,) are at the wanted times (M,): (M, 3)."""
-    return np.stack([np.interp(wanted, times, axis) for axis in points.T], 1)
+def nearest_rate(rate: float) -> float:
+    """Return the usual or rare rate that is nearest to a rate, relatively, Hz."""
+    return float(min(USUAL_RATES + RARE_RATES, key=lambda known: max(known / rate, rate / known)))
+
+
+def is_known_rate(rate: float) -> bool:
+    """Return whether motion is usually recorded and kept at a rate, Hz; others may be mistakes."""
+    return abs(nearest_rate(rate) - rate) <= CLOSE * rate
+
+
+Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # from AMASS' world: (x, y, z) becomes (x, z, -y)
+
+
+def y_up_motion(clip: Clip, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return local rotations (N, 22, 3, 3), the root's global, and the root's positions (N, 3), metres.
+
+    The world is right-handed with Y up, as SMPL's body frame is: where all rotations are the identity the
+    person stands in T-pose, upright, and faces +Z. A rest pose (22, 3), metres, needs no conversion.
+    """
+    rotations = Rotation.from_rotvec(clip.poses.reshape(-1, 3)).as_matrix().reshape(-1, N_JOINTS, 3, 3)
+    rotations[:, 0] = Y_UP @ rotations[:, 0]
+    return rotations, (rest[0] + clip.trans) @ Y_UP.T

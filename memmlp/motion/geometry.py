@@ -1,18 +1,25 @@
-"""Rotations and forward kinematics, on torch tensors of any leading shape and floating type.
+"""Rotations, forward kinematics, and the frames [X | Theta] of motion, on torch tensors.
 
-A rotation matrix acts on column vectors. "6D" is its first two columns, one after the other (Zhou et al.
-2019, in the order that every code base of the field uses). Angles are radians.
+Rotations may have any leading shape and floating type. A rotation matrix acts on column vectors. "6D" is its
+first two columns, one after the other (Zhou et al. 2019, in the order that every code base of the field
+uses). Angles are radians.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from memmlp.motion.body import HEAD, N_JOINTS, PARENTS
+from memmlp.motion.body import HEAD, N_JOINTS, PARENTS, TRACKED
+
+if TYPE_CHECKING:
+    from memmlp.motion.clip import Clip
 
 
 def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
@@ -103,8 +110,8 @@ def forward_kinematics(local: Tensor, root: Tensor, rest: Tensor) -> tuple[Tenso
     offsets = (rest - rest[list(PARENTS)])[..., None]  # the root's is not used
     rotations, positions = [local[..., :1, :, :]], [root[..., None, :, None]]
     for joints, parents in LEVELS:
-        above = _taken(rotations[-1], parents)
-        positions.append(_taken(positions[-1], parents) + above @ offsets[joints])
+        above = _take_rows(rotations[-1], parents)
+        positions.append(_take_rows(positions[-1], parents) + above @ offsets[joints])
         rotations.append(above @ local[..., joints, :, :])
     return torch.cat(rotations, -3), torch.cat(positions, -3)[..., 0]
 
@@ -142,7 +149,7 @@ def _levels() -> Iterator[tuple[slice, list[slice]]]:
         yield slice(start, stop), runs
 
 
-def _taken(values: Tensor, runs: list[slice]) -> Tensor:
+def _take_rows(values: Tensor, runs: list[slice]) -> Tensor:
     """Return the rows of values (..., n, a, b) that lie in runs, one run after the other."""
     if runs == [slice(0, values.shape[-3])]:
         return values
@@ -151,3 +158,63 @@ def _taken(values: Tensor, runs: list[slice]) -> Tensor:
 
 
 LEVELS = tuple(_levels())
+
+
+def clip_kinematics(clip: Clip, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return global rotations (N, 22, 3, 3) and positions (N, 22, 3), metres, world, of a clip on a body.
+
+    Args:
+        clip: the motion.
+        rest: the body's rest joints (22, 3), metres.
+    """
+    local = axis_angle_to_matrix(torch.from_numpy(clip.poses))
+    joints = torch.from_numpy(rest)
+    rotations, positions = forward_kinematics(local, joints[0] + torch.from_numpy(clip.trans), joints)
+    return rotations.numpy(), positions.numpy()
+
+
+def sparse_features(rotations: Tensor, positions: Tensor) -> Tensor:
+    """Compute the inputs X of three trackers (AvatarPoser's features, Sec. 3.1 of the paper).
+
+    Args:
+        rotations: global rotations of head, left and right wrist (N, 3, 3, 3).
+        positions: their global positions (N, 3, 3), metres.
+
+    Returns:
+        (N - 1, 54), feature-major as `memmlp.motion.body.SPARSE_*`. Frame 0 has no velocity and is dropped.
+    """
+    angular = rotations[:-1].transpose(-1, -2) @ rotations[1:]
+    parts = [
+        matrix_to_sixd(rotations[1:]),
+        matrix_to_sixd(angular),
+        positions[1:],
+        positions[1:] - positions[:-1],
+    ]
+    return torch.cat([part.flatten(1) for part in parts], 1)
+
+
+def motion_frames(poses: Tensor, trans: Tensor, rest: Tensor) -> Tensor:
+    """Compute the frames [X | Theta] (N - 1, 252) of a clip, world.
+
+    Args:
+        poses: axis-angle (N, 22, 3), the root's global.
+        trans: translation (N, 3), metres; the root joint is at rest[0] + trans.
+        rest: rest positions (22, 3), metres.
+    """
+    local = axis_angle_to_matrix(poses)
+    rotations, positions = forward_kinematics(local, trans + rest[0], rest)
+    tracked = list(TRACKED)
+    sparse = sparse_features(rotations[:, tracked], positions[:, tracked])
+    theta = torch.cat([matrix_to_sixd(local).flatten(1), positions.flatten(1)], 1)
+    return torch.cat([sparse, theta[1:]], 1)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Limit torch to one thread: on short clips, more threads would only wait for one another."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

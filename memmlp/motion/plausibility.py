@@ -1,7 +1,7 @@
-"""Whether a clip can be a person's motion in radians, metres and with Z up, as files don't say their units.
+"""Whether a clip can be a person's motion in radians, metres and with Z up, as files don't state their units.
 
-The limits leave room for what people do (jump, lie, crawl, climb, dance far from the origin, on a floor of
-any height): wrong units are off by factors of 39 to 1000, and a wrong axis by 90 degrees.
+The limits leave room for human motion (jumping, lying, crawling, climbing, dancing far from the origin, on a
+floor of any height): wrong units are off by factors of 39 to 1000, and a wrong axis by 90 degrees.
 """
 
 from __future__ import annotations
@@ -14,23 +14,22 @@ from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
-from memmlp.motion.clip import Clip
-from memmlp.motion.frame_rates import is_known_rate, nearest_rate
+from memmlp.motion.clip import Clip, is_known_rate, nearest_rate
 
 HEAD, ANKLES = JOINTS.index("head"), [JOINTS.index("left_ankle"), JOINTS.index("right_ankle")]
 KNEES = [JOINTS.index("left_knee"), JOINTS.index("right_knee")]
 ELBOWS = [JOINTS.index("left_elbow"), JOINTS.index("right_elbow")]
-MOST_TURN = 4 * math.pi  # a rotation vector has no reason to be longer than pi; fits wind up to 2 pi and more
+MOST_TURN = 4 * math.pi  # rotation vectors need no more than pi; fits wind up to 2 pi and more
 MOST_SPEED = 30.0  # m/s; the fastest runner reached 12.4
-MOST_HEIGHT = 10.0  # metres of the pelvis over z = 0 beyond which the feet have to prove that they stand
-LOWEST = 0.3  # metres of the lowest joint over or below z = 0, beyond which feet that slide are told
-RATES = (20.0, 500.0)  # Hz between which motion is recorded and kept; others may be slips, as 12 for 120
-COARSE = 1e-3  # metres between the places of half precision from which on speeds show them: 0.06 m/s at 60 Hz
-STIFF = 0.01  # radians by which a joint turns in a clip at most, if it does not turn
-ALONG = math.radians(20)  # between trunk and legs, up to which a body is straight
-LEANS = (30.0, 65.0)  # degrees from Z of a straight body; who runs came to 22, who lies is near 90
+MOST_HEIGHT = 10.0  # metres of the pelvis over z = 0, beyond which feet must stand still at times
+LOWEST = 0.3  # metres of the lowest joint over or below z = 0, beyond which sliding feet are unusual
+RATES = (20.0, 500.0)  # Hz between which motion is recorded; others may be mistakes, as 12 for 120
+COARSE = 1e-3  # metres between the values of half precision that show in speeds: 0.06 m/s at 60 Hz
+STIFF = 0.01  # radians by which a joint that does not turn may turn in a clip
+ALONG = math.radians(20)  # largest angle between trunk and legs of a straight body
+LEANS = (30.0, 65.0)  # degrees from Z of a straight body; runners came to 22, people who lie are near 90
 BACKWARDS = 0.3  # radians of knees and elbows that bend the wrong way; stretched ones came to 0.08
-SAMPLES = 50  # frames looked at for posture
+SAMPLES = 50  # frames that are tested for posture
 
 
 def check_plausible(path: Path, clip: Clip) -> None:
@@ -42,78 +41,61 @@ def check_plausible(path: Path, clip: Clip) -> None:
 
 def implausible(clip: Clip) -> str | None:
     """Return why a clip cannot be a person's motion in radians, metres and with Z up, or None."""
-    return _degrees(clip) or _too_fast(clip) or _too_high(clip) or _y_up(clip)
+    share = (np.linalg.norm(clip.poses, axis=-1).max(1) > MOST_TURN).mean()
+    if share > 0.5:
+        return f"rotations beyond two turns in {share:.0%} of the frames, so poses is in degrees, not radians"
+    speeds = np.linalg.norm(np.diff(clip.trans, axis=0), axis=-1) * clip.fps
+    if len(speeds) and (speed := np.quantile(speeds, 0.75)) > MOST_SPEED:  # fewer frames may be glitches
+        fast = f"the pelvis moves at {speed:.0f} m/s in a quarter of the frames"
+        return f"{fast}, so trans is not in metres, or the frame rate is wrong"
+    height = float(np.median(clip.trans[:, 2]))
+    if abs(height) > MOST_HEIGHT and not _feet_hold(clip):
+        where = f"the pelvis is at z = {height:.0f} m and no joint is at rest while it moves"
+        return f"{where}, so trans is not in metres"
+    return "the person stands along Y and never along Z, so Y is up, not Z" if _is_y_up(clip) else None
 
 
 def unusual(clip: Clip) -> str | None:
-    """Return what the user should know of a clip that is odd but may be sound, or None."""
+    """Return a warning about a clip that is odd but may be sound, or None."""
     joints = _joints(clip, _spread(clip))
-    if _never_upright(joints):
-        return "the head is never above the pelvis, so it lies throughout, or Z is not up"
-    if abs(height := _height(clip)) > MOST_HEIGHT:
+    if (joints[:, HEAD, 2] - joints[:, 0, 2] > 0.2).mean() < 0.02:
+        return "the head is never above the pelvis, so the person lies throughout, or Z is not up"
+    if abs(height := float(np.median(clip.trans[:, 2]))) > MOST_HEIGHT:
         return f"the pelvis is at z = {height:.0f} m"
-    of_poses = _stiff(clip) or _backwards(clip) or _leaning(joints)
-    return _odd_rate(clip) or _coarse(clip) or of_poses or _off_the_floor(clip, joints)
+    file_remark = _odd_rate(clip.fps) or _coarse(clip)
+    return file_remark or _stiff(clip) or _backwards(clip) or _leaning(joints) or _off_the_floor(clip, joints)
 
 
-def _degrees(clip: Clip) -> str | None:
-    share = (np.linalg.norm(clip.poses, axis=-1).max(1) > MOST_TURN).mean()
-    if share <= 0.5:
-        return None
-    return (
-        f"rotations beyond two turns in {share:.0%} of the frames, so poses is in degrees; allowed: radians"
-    )
+def _is_y_up(clip: Clip) -> bool:
+    """Return whether a person stands along Y and never along Z, on a floor.
 
-
-def _too_fast(clip: Clip) -> str | None:
-    """Return why the pelvis is too fast in a quarter of the frames, or None; fewer may be glitches."""
-    speeds = np.linalg.norm(np.diff(clip.trans, axis=0), axis=-1) * clip.fps
-    if len(speeds) == 0 or np.quantile(speeds, 0.75) <= MOST_SPEED:
-        return None
-    fast = f"the pelvis moves at {np.quantile(speeds, 0.75):.0f} m/s in a quarter of the frames"
-    return f"{fast}, so trans is not in metres, or the frame rate is wrong; allowed: {MOST_SPEED:g} m/s"
-
-
-def _too_high(clip: Clip) -> str | None:
-    """Return why the pelvis is too high, or None.
-
-    A great height is accepted if the feet hold: on a high floor, a foot stands still while the pelvis moves
-    on.
-    """
-    height = _height(clip)
-    if abs(height) <= MOST_HEIGHT or _feet_hold(clip):
-        return None
-    where = f"the pelvis is at z = {height:.0f} m and no joint is at rest while it moves"
-    return f"{where}, so trans is not in metres; allowed: a floor within {MOST_HEIGHT:g} m"
-
-
-def _y_up(clip: Clip) -> str | None:
-    """Return why the clip seems to have Y up, or None: a person stands along Y and never along Z, on a floor.
-
-    Someone who lies throughout with the head towards +Y hardly has the feet at y = 0, and does not rise by a
+    People who lie throughout with the head towards +Y hardly have the feet at y = 0, and do not rise by a
     metre while the feet stay in one plane.
     """
     joints = _joints(clip, _spread(clip))
-    if _standing(joints, axis=2) > 0.02 or _standing(joints, axis=1) < 0.6:
-        return None
+
+    def standing(axis: int) -> float:
+        """Return the share of frames with the head well above the pelvis, and the pelvis above an ankle."""
+        heights = joints[:, :, axis] - joints[:, :1, axis]
+        return float(((heights[:, HEAD] > 0.4) & (heights[:, ANKLES].min(1) < -0.5)).mean())
+
+    if standing(axis=2) > 0.02 or standing(axis=1) < 0.6:
+        return False
     low, middle, high = np.quantile(joints[:, :, 1].min(1), [0.05, 0.5, 0.95])
-    if abs(middle) > 0.2 and (high - low > 0.35 or np.ptp(joints[:, 0, 2]) < 1.0):
-        return None
-    return "the person stands along Y and never along Z, so Y is up; allowed: Z up"
+    return not (abs(middle) > 0.2 and (high - low > 0.35 or np.ptp(joints[:, 0, 2]) < 1.0))
 
 
-def _odd_rate(clip: Clip) -> str | None:
+def _odd_rate(fps: float) -> str | None:
     low, high = RATES
-    if not low <= clip.fps <= high:
-        return f"a frame rate of {clip.fps:g} Hz, which may be wrong; usual are {low:g} to {high:g} Hz"
-    if is_known_rate(clip.fps):
+    if low <= fps <= high and is_known_rate(fps):
         return None
-    usual = f"the nearest usual one is {nearest_rate(clip.fps):g} Hz"
-    return f"a frame rate of {clip.fps:g} Hz, which may be wrong; {usual}"
+    usual = f"the nearest usual one is {nearest_rate(fps):g} Hz"
+    if not low <= fps <= high:
+        usual = f"usual are {low:g} to {high:g} Hz"
+    return f"a frame rate of {fps:g} Hz, which may be wrong; {usual}"
 
 
 def _coarse(clip: Clip) -> str | None:
-    """Return what is odd about a translation that was saved in half precision, or None."""
     half = clip.trans.astype(np.float16)
     step = float(np.spacing(np.abs(half).max()))
     if step < COARSE or (half != clip.trans).any() or not np.ptp(half, axis=0).any():
@@ -141,26 +123,26 @@ def _backwards(clip: Clip) -> str | None:
 
 
 def _leaning(joints: np.ndarray) -> str | None:
-    """Return what is odd about how far the body leans where it is straight, or None."""
+    """Return a warning if the body leans too far where it is straight, or None."""
+
+    def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        lengths = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
+        return np.arccos(np.clip((a * b).sum(-1) / np.maximum(lengths, 1e-9), -1, 1))
+
     ankles, pelvis, head = joints[:, ANKLES].mean(1), joints[:, 0], joints[:, HEAD]
-    straight = _angles(head - pelvis, pelvis - ankles) < ALONG
+    straight = angles(head - pelvis, pelvis - ankles) < ALONG
     if straight.mean() < 0.5:
         return None
-    lean = math.degrees(np.median(_angles(head - ankles, np.array([0.0, 0.0, 1.0]))[straight]))
-    if not LEANS[0] < lean < LEANS[1]:
-        return None
-    return f"the straight body leans by {lean:.0f} degrees, so Z may not be up"
-
-
-def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the angles (n,), radians, between vectors (n, 3)."""
-    lengths = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
-    cosines = (a * b).sum(-1) / np.maximum(lengths, 1e-9)
-    return np.arccos(np.clip(cosines, -1, 1))
+    lean = math.degrees(np.median(angles(head - ankles, np.array([0.0, 0.0, 1.0]))[straight]))
+    return (
+        f"the straight body leans by {lean:.0f} degrees, so Z may not be up"
+        if LEANS[0] < lean < LEANS[1]
+        else None
+    )
 
 
 def _off_the_floor(clip: Clip, joints: np.ndarray) -> str | None:
-    """Return what is odd about a clip off the floor whose feet slide, or None.
+    """Return a warning for a clip off the floor whose feet slide, or None.
 
     A trans of other axes or units than the poses', or of zeros, lifts or sinks the body and does not fit the
     steps. On a floor at another height than zero the feet stand still.
@@ -170,25 +152,6 @@ def _off_the_floor(clip: Clip, joints: np.ndarray) -> str | None:
         return None
     where = f"the lowest joint is at z = {low:.1f} m and none stands still while the pelvis moves"
     return f"{where}, so trans may have other units or axes than metres with Z up, or lack the heights"
-
-
-def _height(clip: Clip) -> float:
-    return float(np.median(clip.trans[:, 2]))
-
-
-def _standing(joints: np.ndarray, axis: int) -> float:
-    """Return the share of frames with the head well above the pelvis, and the pelvis above an ankle.
-
-    Args:
-        joints: positions (n, 22, 3), metres.
-        axis: the axis along which heights are measured.
-    """
-    heights = joints[:, :, axis] - joints[:, :1, axis]
-    return float(((heights[:, HEAD] > 0.4) & (heights[:, ANKLES].min(1) < -0.5)).mean())
-
-
-def _never_upright(joints: np.ndarray) -> bool:
-    return bool((joints[:, HEAD, 2] - joints[:, 0, 2] > 0.2).mean() < 0.02)
 
 
 def _feet_hold(clip: Clip) -> bool:

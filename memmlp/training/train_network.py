@@ -13,8 +13,7 @@ from memmlp.common import distributed
 from memmlp.evaluation import modes
 from memmlp.evaluation.metrics import UserMetrics
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.motion.dataset import MotionDataset, WindowSampler
-from memmlp.motion.mirror import MirroredDataset
+from memmlp.motion.dataset import MirroredDataset, MotionDataset, WindowSampler
 from memmlp.motion.motion_source import Prepared
 from memmlp.networks import checkpoint
 from memmlp.networks.architectures import Architecture

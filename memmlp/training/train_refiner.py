@@ -13,8 +13,7 @@ from torch import Tensor, nn
 from memmlp.evaluation import modes
 from memmlp.evaluation.metrics import UserMetrics
 from memmlp.motion.body import HANDS, HEAD, ROOT, ROTATION, SPARSE_DIM
-from memmlp.motion.dataset import MotionDataset, WindowSampler
-from memmlp.motion.mirror import MirroredDataset
+from memmlp.motion.dataset import MirroredDataset, MotionDataset, WindowSampler
 from memmlp.motion.motion_source import Prepared
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import checkpoint

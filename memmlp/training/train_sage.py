@@ -21,8 +21,7 @@ from torch import Tensor, nn
 from memmlp.common import distributed
 from memmlp.common.float32_regions import in_float32
 from memmlp.motion.body import HANDS, HEAD, N_JOINTS, ROOT, ROTATION, SPARSE_DIM, SPARSE_POSITION
-from memmlp.motion.dataset import MotionDataset, WindowSampler
-from memmlp.motion.mirror import MirroredDataset
+from memmlp.motion.dataset import MirroredDataset, MotionDataset, WindowSampler
 from memmlp.motion.motion_source import Prepared
 from memmlp.networks import checkpoint
 from memmlp.networks.architectures import Architecture, PartedArchitecture

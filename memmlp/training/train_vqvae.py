@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from memmlp.common import distributed
-from memmlp.motion.dataset import MotionDataset, WindowSampler
-from memmlp.motion.mirror import MirroredDataset
+from memmlp.motion.dataset import MirroredDataset, MotionDataset, WindowSampler
 from memmlp.motion.motion_source import Prepared
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import checkpoint

@@ -25,10 +25,9 @@ from memmlp.evaluation.predictions import (
 )
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.clip import Clip
-from memmlp.motion.exporting.export_folder import plan_export
-from memmlp.motion.features import motion_frames
+from memmlp.motion.exporting import plan_export
 from memmlp.motion.formats.npz import read_clip, write_clip
-from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics
+from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics, motion_frames
 
 NETWORK = model()
 BODY = REST.numpy()

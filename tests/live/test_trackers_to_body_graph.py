@@ -29,8 +29,7 @@ from memmlp.live.trackers_to_body_graph import (
     trackers_of,
 )
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.motion.features import sparse_features
-from memmlp.motion.geometry import axis_angle_to_matrix
+from memmlp.motion.geometry import axis_angle_to_matrix, sparse_features
 from memmlp.networks.streaming import streaming
 
 pytestmark = pytest.mark.slow

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import random
 from dataclasses import replace
 
 from bvh_samples import TREES, ZXY, Sample, own_tree, performed, random_turns, tree
 
 from memmlp.motion.formats.bvh import Bvh
+from memmlp.motion.formats.recording import END
 from memmlp.motion.importing.skeleton_map import load_skeleton
 from memmlp.motion.synthetic import synthesize_clip
 
@@ -92,12 +92,10 @@ def walking(name: str, turned: bool = False, seconds: float = 2.0) -> Sample:
 
 def renamed(bvh: Bvh, names: dict[str, str]) -> Bvh:
     """Return a file with other names, given for its joints."""
-    ends = tuple(replace(end, name=names[bvh.names[end.parent]] + ".end") for end in bvh.ends)
-    return replace(bvh, names=tuple(names[name] for name in bvh.names), ends=ends)
+    new = [names[name.removesuffix(END)] + (END if name.endswith(END) else "") for name in bvh.nodes]
+    return replace(bvh, nodes=tuple(new))
 
 
-def anonymous(bvh: Bvh) -> dict[str, str]:
-    """Return names for a file's joints that say nothing, in no order."""
-    numbers = list(range(len(bvh.names)))
-    random.Random(3).shuffle(numbers)
-    return {name: f"joint_{number}" for name, number in zip(bvh.names, numbers, strict=True)}
+def joints(bvh: Bvh) -> tuple[str, ...]:
+    """Return the names of a file's joints, without its end sites."""
+    return bvh.nodes[: len(bvh.channels)]

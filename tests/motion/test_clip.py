@@ -1,10 +1,20 @@
 """Clips: exact resampling."""
 
+from __future__ import annotations
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from memmlp.motion.clip import INTERPOLATIONS, Clip, resample
+from memmlp.motion.clip import (
+    INTERPOLATIONS,
+    RARE_RATES,
+    USUAL_RATES,
+    Clip,
+    is_known_rate,
+    nearest_rate,
+    resample,
+)
 
 
 def analytic(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -90,3 +100,17 @@ def test_pieces_are_the_clip(frames: int, lengths: list[int]):
     assert [len(piece) for piece in pieces] == lengths
     np.testing.assert_array_equal(np.concatenate([piece.poses for piece in pieces]), poses)
     np.testing.assert_array_equal(np.concatenate([piece.trans for piece in pieces]), trans)
+
+
+# Rates of recordings: which are known, and which known one is nearest
+
+
+@pytest.mark.parametrize("rate", [*USUAL_RATES, *RARE_RATES, 23.976, 29.97, 59.94, 119.88, 1 / 0.0083333])
+def test_rates_of_cameras_and_of_video_are_known(rate: float):
+    assert is_known_rate(rate)
+
+
+@pytest.mark.parametrize(("time", "usual"), [(0.016, 60), (0.017, 60), (0.008, 120), (0.03, 30), (0.011, 90)])
+def test_the_rate_of_a_frame_time_that_was_cut_off_is_none(time: float, usual: float):
+    assert not is_known_rate(1 / time)
+    assert nearest_rate(1 / time) == usual

@@ -1,9 +1,14 @@
 """Datasets: stretches of windows, and which windows the sampler draws."""
 
+import numpy as np
 import pytest
+import tiny
 import torch
+from plain_body import posed
 
-from memmlp.motion.dataset import MotionDataset, WindowSampler
+from memmlp.motion.body import FRAME_DIM, JOINTS, ROTATION, SPARSE_DIM, SWAPPED
+from memmlp.motion.dataset import MirroredDataset, MotionDataset, WindowSampler, mirror_frames
+from memmlp.motion.geometry import motion_frames
 
 
 @pytest.fixture
@@ -33,3 +38,70 @@ def test_the_sampler_draws_every_window_alike_and_the_step_is_its_position(frame
     assert not torch.equal(sampler.draw(7)[1], WindowSampler(frames, 200, 6, seed=1).draw(7)[1])
     clips = WindowSampler(frames, batch=3000, window=6, seed=0, drawn_by="clips").draw(0)[0]
     assert torch.bincount(clips).min() > 800
+
+
+# The mirror: by the motion's own joints and rotations, not by features
+
+
+CLIP = tiny.clip(20)
+
+
+def test_left_and_right_change_places():
+    pairs = {(JOINTS[i], JOINTS[j]) for i, j in enumerate(SWAPPED)}
+    assert ("left_knee", "right_knee") in pairs
+    assert ("right_wrist", "left_wrist") in pairs
+    assert ("spine2", "spine2") in pairs
+    assert sum(a != b for a, b in pairs) == 16
+
+
+def test_twice_is_nothing_and_once_is_not():
+    assert torch.equal(mirror_frames(mirror_frames(CLIP)), CLIP)
+    assert not torch.allclose(mirror_frames(CLIP), CLIP)
+
+
+def test_joints_of_the_mirrored_rotations_are_the_mirrored_joints():
+    """By forward kinematics joint by joint, in NumPy."""
+    for frame, other in zip(CLIP[::6], mirror_frames(CLIP)[::6], strict=True):
+        body, seen = (posed(one[SPARSE_DIM:][ROTATION].numpy()) for one in (frame, other))
+        for joint, name in enumerate(JOINTS):
+            twin = name.replace("left", "LEFT").replace("right", "left").replace("LEFT", "right")
+            expected = body[JOINTS.index(twin)] * np.array([-1, 1, 1])
+            np.testing.assert_allclose(seen[joint], expected, atol=1e-5)
+
+
+def test_it_is_what_a_person_of_mirrored_angles_gives():
+    """Axis-angle (x, y, z) is (x, -y, -z) in the mirror; all 252 features of that person are compared."""
+    random = np.random.default_rng(3)
+    poses, trans = random.normal(size=(6, 22, 3)), random.normal(size=(6, 3))
+    other = np.zeros_like(poses)
+    for joint, name in enumerate(JOINTS):
+        twin = name.replace("left", "LEFT").replace("right", "left").replace("LEFT", "right")
+        other[:, joint] = poses[:, JOINTS.index(twin)] * [1, -1, -1]
+    pairs = ((poses, trans), (other, trans * [-1, 1, 1]))
+    plain, expected = (
+        motion_frames(torch.tensor(turns), torch.tensor(moved), tiny.REST.double()) for turns, moved in pairs
+    )
+    assert plain.shape[-1] == FRAME_DIM
+    torch.testing.assert_close(mirror_frames(plain), expected, atol=1e-9, rtol=0)
+
+
+def test_a_mirrored_dataset_has_each_clip_twice_and_its_frames_once():
+    plain = tiny.frames((30, 20))
+    both = MirroredDataset(plain)
+    assert both.frames is plain.frames
+    assert both.names == ["clip0", "clip1", "clip0 (mirrored)", "clip1 (mirrored)"]
+    assert both.groups == [*plain.groups, *plain.groups]
+    for index, clip in enumerate(both.clips()):
+        expected = plain.clip(index % 2)
+        assert torch.equal(clip, mirror_frames(expected) if index > 1 else expected)
+    drawn = both.stretches(torch.arange(4), torch.full((4,), 9), 5)
+    for index, segment in enumerate(drawn):
+        expected = plain.clip(index % 2)[5:10]
+        assert torch.equal(segment, mirror_frames(expected) if index > 1 else expected)
+
+
+@pytest.mark.parametrize("drawn_by", ["frames", "clips"])
+def test_half_of_the_windows_are_mirrored(drawn_by):
+    both = MirroredDataset(tiny.frames((30, 20)))
+    clips, _ = WindowSampler(both, 4000, 7, 0, drawn_by).draw(0)
+    assert float((clips >= 2).float().mean()) == pytest.approx(0.5, abs=0.03)

@@ -1,14 +1,25 @@
 """Rotations against SciPy, gradients at awkward angles, forward kinematics against a plain recursion."""
 
+from __future__ import annotations
+
 import math
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from bvh_samples import performed, write
 from scipy.spatial.transform import Rotation
 
 from memmlp.motion import geometry
 from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
+from memmlp.motion.clip import Clip
+from memmlp.motion.geometry import clip_kinematics, one_thread
+from memmlp.motion.importing import convert as module
+from memmlp.motion.importing.import_folder import import_folder, verify_folder
+from memmlp.motion.importing.skeleton_map import load_skeleton
+from memmlp.motion.synthetic import synthesize_clip
 
 ANGLES = (0.0, 1e-9, 1e-7, 1e-3, 1.0, 3.0, math.pi - 1e-4, math.pi - 1e-7, 10.0)
 
@@ -92,3 +103,56 @@ def test_the_built_in_body_is_a_person():
             assert rest[name][0] > 0
             np.testing.assert_allclose(rest[name] * [-1, 1, 1], rest["right_" + name[5:]])
     assert 1.5 < rest["head"][1] - rest["left_foot"][1] < 1.7
+
+
+# The joints of a body that moves as a clip does
+
+
+def test_a_body_that_is_turned_about_its_pelvis():
+    """By a right angle about X in its second frame; the pelvis alone keeps its offset unturned."""
+    rest = builtin_rest_joints() + np.array([0.1, 0.2, 0.3])
+    poses = np.zeros((2, 22, 3))
+    poses[1, 0, 0] = np.pi / 2
+    trans = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
+    rotations, positions = clip_kinematics(Clip("turned", poses, trans, 60.0), rest)
+    turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    np.testing.assert_allclose(
+        rotations, np.stack([np.tile(each, (22, 1, 1)) for each in (np.eye(3), turn)]), atol=1e-7
+    )
+    np.testing.assert_allclose(positions[0], rest, atol=1e-7)
+    np.testing.assert_allclose(positions[1], rest[0] + trans[1] + (rest - rest[0]) @ turn.T, atol=1e-7)
+
+
+# Torch's threads while clips are imported
+
+
+@pytest.fixture(autouse=True)
+def _two_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_one_thread_and_then_as_many_as_before() -> None:
+    with one_thread():
+        assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == 2
+
+
+def test_imports_keep_torch_to_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With more, short clips wait for one another, and busily at that."""
+    seen, posed = [], module.clip_kinematics
+
+    def counted(*arguments: object) -> object:
+        seen.append(torch.get_num_threads())
+        return posed(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(module, "clip_kinematics", counted)
+    torch.set_num_threads(2)
+    path = write(
+        tmp_path, performed(load_skeleton("cmu_daz"), synthesize_clip("walking", 1, seconds=1.0)).text()
+    )
+    import_folder(path, tmp_path / "out")
+    list(verify_folder(path))
+    assert seen == [1, 1]

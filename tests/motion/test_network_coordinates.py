@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from memmlp.motion.body import FRAME_DIM, ROTATION, SPARSE_DIM, builtin_rest_joints
-from memmlp.motion.features import motion_frames
-from memmlp.motion.geometry import axis_angle_to_matrix, matrix_to_axis_angle
+from memmlp.motion.geometry import axis_angle_to_matrix, matrix_to_axis_angle, motion_frames
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 

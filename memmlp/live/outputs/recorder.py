@@ -22,7 +22,7 @@ from memmlp.live.outputs.output import BodyFrame
 from memmlp.live.rotations import slerp
 from memmlp.motion.body import N_JOINTS, ROOT
 from memmlp.motion.clip import Clip
-from memmlp.motion.exporting.write import format_of, write_motion
+from memmlp.motion.exporting import format_of, write_motion
 
 ROW = 3 * N_JOINTS + 3  # numbers of a kept frame: rotation vectors, and the root's position
 LONGEST = 1.0  # seconds without a frame that are filled

@@ -17,7 +17,7 @@ from memmlp.live.outputs.output import BodyFrame
 from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.spaces import SPACES
 from memmlp.motion.body import N_JOINTS, PARENTS, ROOT
-from memmlp.motion.formats.humanoid_bones import UNITY
+from memmlp.motion.formats.vrm import UNITY_BONES as UNITY
 
 PORT = 39539
 SPACE = SPACES["unity"]

@@ -17,7 +17,7 @@ import numpy as np
 from memmlp.common import npm
 from memmlp.common.errors import InputError, why_unreadable
 from memmlp.live.session.page_server import FILES, HTML, SCRIPT, File, read_page
-from memmlp.motion.formats.vrm_writer import write_vrm
+from memmlp.motion.formats.vrm import write_vrm
 
 THREE = ("build/three.module.js", "build/three.core.js", "examples/jsm/loaders/GLTFLoader.js",
          "examples/jsm/utils/BufferGeometryUtils.js", "examples/jsm/utils/SkeletonUtils.js")  # fmt: skip

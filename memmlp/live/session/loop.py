@@ -18,7 +18,7 @@ from memmlp.live.session.wearer_fitting import Fitting
 from memmlp.live.spaces import SPACES, Space
 from memmlp.live.stream import Pose, Stream
 from memmlp.motion.body import FPS, JOINTS, PARENTS, ROOT
-from memmlp.motion.formats.humanoid_bones import VRM
+from memmlp.motion.formats.vrm import VRM_BONES as VRM
 from memmlp.motion.limb_shapes import HEAT, LIMBS
 
 PAGE_SPACE = SPACES["openxr"]  # the page's axes: those of three.js

@@ -131,8 +131,8 @@ def npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
     import torch
 
     from memmlp.motion.clip import resample
-    from memmlp.motion.features import motion_frames
     from memmlp.motion.formats.npz import read_clip
+    from memmlp.motion.geometry import motion_frames
     from memmlp.motion.plausibility import check_plausible, unusual
     from memmlp.motion.preparing.imported_body import check_imported_body
 

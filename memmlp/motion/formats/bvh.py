@@ -1,8 +1,9 @@
-"""Reads BVH files, and computes their joints' global rotations and positions by forward kinematics.
+"""Reads and writes BVH files, and computes their joints' global rotations and positions.
 
-Everything here is in the file's own units and axes. A joint's rotation is the product of its rotation
-channels in the file's order (Z X Y means Rz Rx Ry, on column vectors, degrees in the file); its position
-channels, if it has any, replace the numbers of its OFFSET.
+A joint's rotation is the product of its rotation channels in the file's order (Z X Y means Rz Rx Ry, on
+column vectors, degrees in the file); its position channels, if it has any, replace the numbers of its OFFSET.
+
+Written files have 22 joints and their end sites, centimetres, Y up, and the body's T-pose as zero pose.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import re
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
 from typing import NoReturn
@@ -18,12 +19,13 @@ from typing import NoReturn
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.motion.clip import FRAME_RATE_RANGE
-from memmlp.motion.frame_rates import USUAL_RATES
+from memmlp.common.files import atomic_file
+from memmlp.motion.body import JOINTS, PARENTS
+from memmlp.motion.clip import FRAME_RATE_RANGE, USUAL_RATES, Clip, y_up_motion
+from memmlp.motion.formats.recording import END, Recording
 
 AXES = "XYZ"
 CHANNELS = tuple(axis + kind for kind in ("position", "rotation") for axis in AXES)
-END = ".end"  # an end site's name is that of its joint with this suffix
 LIMIT = 1e6  # the largest size of any number in the file, in its units or degrees
 MAX_JOINTS = 1000
 MAX_BYTES = 2**29
@@ -31,144 +33,71 @@ MAX_HEAD = 2**22  # bytes before MOTION
 MAX_LINE = 200_000  # bytes
 MAX_VALUES = 2**24  # in all frames: 25 minutes of 93 channels at 120 Hz
 RATE_DIGITS = 1e-4  # relative: 1 / 0.00833333 s is 120 Hz, as the header has no more digits
-COARSEST = 0.05  # relative rounding of a frame time that still means one of them: two digits
+COARSEST = 0.05  # relative: a frame time that is rounded more coarsely does not identify a usual rate
+
+CENTIMETRES = 100.0  # in a metre
+NUMBER = "%.6f"  # 1e-8 m and 1e-6 degrees: more precise than a clip's float32
+TIPS = {
+    "left_foot": (0.0, 0.0, 0.06), "right_foot": (0.0, 0.0, 0.06), "head": (0.0, 0.18, 0.0),
+    "left_wrist": (0.17, 0.0, 0.0), "right_wrist": (-0.17, 0.0, 0.0),
+}  # fmt: skip
+"""From the last joints to the tips of toes, head and fingers, metres, body frame: bones are drawn to them."""
 
 
 @dataclass(frozen=True)
-class EndSite:
-    """The tip of a chain of joints.
+class Bvh(Recording):
+    """A BVH file. Its nodes are its joints and then its end sites.
 
     Attributes:
-        name: `<joint>.end`.
-        parent: index of the joint to which the end site belongs.
-        offset: offset (3,) from that joint.
+        channels: each joint's channels in the file's order, of `CHANNELS`; end sites are not included.
     """
 
-    name: str
-    parent: int
-    offset: np.ndarray
-
-
-@dataclass(frozen=True)
-class Bvh:
-    """A BVH file. Its nodes are its J joints, each after its parent, and then its E end sites.
-
-    Attributes:
-        path: the file's path, for messages.
-        names: the J joints' names, all different.
-        parents: index of each joint's parent; the root's is -1.
-        offsets: joint minus parent in the zero pose (J, 3).
-        channels: each joint's channels in the file's order, of `CHANNELS`.
-        ends: the E end sites.
-        frame_time: seconds between frames.
-        values: channel values (N, C), degrees and the file's unit.
-        rounding: half a unit of the last digit of the frame time in the header, seconds.
-    """
-
-    path: Path
-    names: tuple[str, ...]
-    parents: tuple[int, ...]
-    offsets: np.ndarray
     channels: tuple[tuple[str, ...], ...]
-    ends: tuple[EndSite, ...]
-    frame_time: float
-    values: np.ndarray
-    rounding: float = 0.0
-
-    def __len__(self) -> int:
-        return len(self.values)
-
-    @property
-    def nodes(self) -> tuple[str, ...]:
-        """Names of the J joints and E end sites."""
-        return self.names + tuple(end.name for end in self.ends)
-
-    @property
-    def node_parents(self) -> tuple[int, ...]:
-        """Parents' indices of the J joints and E end sites."""
-        return self.parents + tuple(end.parent for end in self.ends)
-
-    @property
-    def fps(self) -> float:
-        """Frames per second, rounded to a whole number or a usual rate where the header's digits allow it.
-
-        The header's time may be rounded to its last digit, or cut off after it: 0.0167 and 0.0166 are 60 Hz.
-        """
-        rate, coarsest = 1 / self.frame_time, COARSEST * self.frame_time
-        if abs(rate - round(rate)) <= RATE_DIGITS * rate:
-            return float(round(rate))
-        usual = min(USUAL_RATES, key=lambda usual: abs(1 / usual - self.frame_time))
-        lacking, digit = 1 / usual - self.frame_time, 2 * self.rounding
-        rounded = abs(lacking) <= self.rounding <= coarsest
-        cut_off = 0 < lacking < digit <= coarsest
-        return float(usual) if rounded or cut_off else rate
-
-    def zero_pose(self) -> np.ndarray:
-        """Return positions (J+E, 3) of the nodes with all rotations zero and the root at the origin."""
-        offsets = np.concatenate([self.offsets, *(end.offset[None] for end in self.ends)])
-        positions = np.zeros_like(offsets)
-        for node, parent in enumerate(self.node_parents[1:], start=1):
-            positions[node] = positions[parent] + offsets[node]
-        return positions
 
     def kinematics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nodes' global rotations (N, J+E, 3, 3) and positions (N, J+E, 3).
+        """Return global rotations (N, nodes, 3, 3) and positions (N, nodes, 3) of all frames.
 
         An end site has its joint's rotation.
         """
         rotations = np.empty((len(self.nodes), len(self), 3, 3))
         positions = np.empty((len(self.nodes), len(self), 3))
-        for joint, parent in enumerate(self.parents):
+        first = 0
+        for joint, channels in enumerate(self.channels):
+            parent, values = self.node_parents[joint], self.values[:, first : first + len(channels)]
+            first += len(channels)
+            shift = np.tile(self.offsets[joint], (len(self), 1))
+            for name, column in zip(channels, values.T, strict=True):
+                if name.endswith("position"):
+                    shift[:, AXES.index(name[0])] = column
             above = rotations[parent] if joint else np.eye(3)
-            values = self._joint_values(joint)
-            positions[joint] = np.einsum("...ij,...j->...i", above, self._shift(joint, values))
+            positions[joint] = np.einsum("...ij,...j->...i", above, shift)
             positions[joint] += positions[parent] if joint else 0.0
             rotations[joint] = above
-            for name, angles in zip(self.channels[joint], np.radians(values).T, strict=True):
+            for name, angles in zip(channels, np.radians(values).T, strict=True):
                 if name.endswith("rotation"):
                     _turn(rotations[joint], AXES.index(name[0]), angles)
-        for node, end in enumerate(self.ends, start=len(self.names)):
-            rotations[node] = rotations[end.parent]
-            positions[node] = positions[end.parent] + rotations[end.parent] @ end.offset
+        for node in range(len(self.channels), len(self.nodes)):
+            parent = self.node_parents[node]
+            rotations[node] = rotations[parent]
+            positions[node] = positions[parent] + rotations[parent] @ self.offsets[node]
         return rotations.swapaxes(0, 1), positions.swapaxes(0, 1)
 
-    def posed(self, angles: Mapping[str, Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nodes' global rotations (J+E, 3, 3) and positions (J+E, 3) in a pose.
-
-        Args:
-            angles: joint -> the values of its rotation channels, degrees, in the file's order; other joints
-                have zeros, and so do the root's position channels.
-
-        Raises:
-            InputError: if there is no such joint, or it has another number of channels.
-        """
-        values = []
-        for joint, name in enumerate(self.names):
-            turns = [channel for channel in self.channels[joint] if channel.endswith("rotation")]
-            told = iter(angles.get(name, [0.0] * len(turns)))
-            if len(angles.get(name, turns)) != len(turns):
-                wrong = f"{len(angles[name])} rotations for {name}"
+    def pose(self, turns: Mapping[str, Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
+        """Return global rotations (nodes, 3, 3) and positions (nodes, 3) of one pose (`Recording.pose`)."""
+        values: list[float] = []
+        for joint, channels in enumerate(self.channels):
+            count = sum(channel.endswith("rotation") for channel in channels)
+            given = list(turns.get(self.nodes[joint], [0.0] * count))
+            if len(given) != count:
                 raise InputError(
-                    f"{self.path}: {wrong}; allowed: {len(turns)}, one for each rotation channel"
+                    f"{self.path}: rest.{self.nodes[joint]} has {len(given)} values; "
+                    f"must have {count}, one for each rotation channel"
                 )
-            for channel in self.channels[joint]:
+            for channel in channels:
                 shift = 0.0 if joint == 0 else self.offsets[joint][AXES.index(channel[0])]
-                values.append(next(told) if channel.endswith("rotation") else shift)
+                values.append(given.pop(0) if channel.endswith("rotation") else shift)
         rotations, positions = replace(self, values=np.array([values])).kinematics()
         return rotations[0], positions[0]
-
-    def _joint_values(self, joint: int) -> np.ndarray:
-        """Return the values (N, c) of a joint's channels."""
-        first = sum(map(len, self.channels[:joint]))
-        return self.values[:, first : first + len(self.channels[joint])]
-
-    def _shift(self, joint: int, values: np.ndarray) -> np.ndarray:
-        """Return a joint's position (N, 3) in its parent's frame."""
-        shift = np.tile(self.offsets[joint], (len(values), 1))
-        for name, column in zip(self.channels[joint], values.T, strict=True):
-            if name.endswith("position"):
-                shift[:, AXES.index(name[0])] = column
-        return shift
 
 
 def _turn(rotations: np.ndarray, axis: int, angles: np.ndarray) -> None:
@@ -180,41 +109,39 @@ def _turn(rotations: np.ndarray, axis: int, angles: np.ndarray) -> None:
     rotations[:, :, third] = cosine * b - sine * a
 
 
+# Reading
+
+
 def read_bvh(path: Path) -> Bvh:
     """Read a BVH file; line ends, blanks and letter case of keywords may vary, nothing else.
 
     Raises:
         InputError: for anything damaged (braces, numbers, counts, names, channels, an absurd frame time, more
-            than 1000 joints, bytes that are no text); the message names the file and where possible the line.
+            than 1000 joints, bytes that are not text); the message names the file and where possible the
+            line.
     """
     lines = _lines(path)
-    hierarchy = _Hierarchy(_Words(path, _head(path, lines)))
-    frame_time, rounding, values = _motion(path, lines, sum(map(len, hierarchy.channels)))
-    return Bvh(
-        path=path,
-        names=tuple(hierarchy.names),
-        parents=tuple(hierarchy.parents),
-        offsets=np.array(hierarchy.offsets),
-        channels=tuple(hierarchy.channels),
-        ends=tuple(hierarchy.ends),
-        frame_time=frame_time,
-        values=values,
-        rounding=rounding,
-    )
+    names, parents, offsets, channels = _hierarchy(_Words(path, _head(path, lines)))
+    fps, values = _motion(path, lines, sum(map(len, channels)))
+    return Bvh(path, tuple(names), tuple(parents), np.array(offsets), fps, values, tuple(channels))
+
+
+def _fail(path: Path, line: int, wrong: str, expected: str) -> NoReturn:
+    raise InputError(f"{path}: line {line}: {wrong}; expected {expected}")
 
 
 def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
     """Yield the file's lines with their numbers, whatever the line ends (LF, CRLF or CR)."""
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: too large; allowed: a BVH of at most {MAX_BYTES >> 20} MiB")
-        with open(path, encoding="latin-1") as file:  # Latin-1 gives every byte back
+            raise InputError(f"{path}: too large; expected at most {MAX_BYTES >> 20} MiB")
+        with open(path, encoding="latin-1") as file:  # Latin-1 keeps every byte
             for number, line in enumerate(iter(lambda: file.readline(MAX_LINE), ""), start=1):
                 if len(line) == MAX_LINE:
-                    _fail(path, number, "too long", f"{MAX_LINE} bytes")
+                    _fail(path, number, "too long", f"at most {MAX_LINE} bytes")
                 yield number, line.encode("latin-1")
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); allowed: a BVH file") from error
+        raise InputError(f"{path}: cannot be read ({error.strerror}); expected a BVH file") from error
 
 
 def _head(path: Path, lines: Iterator[tuple[int, bytes]]) -> list[bytes]:
@@ -227,35 +154,15 @@ def _head(path: Path, lines: Iterator[tuple[int, bytes]]) -> list[bytes]:
         head.append(line)
         size += len(line)
         if size > MAX_HEAD:
-            raise InputError(
-                f"{path}: no MOTION line in its first {MAX_HEAD >> 20} MiB; allowed: HIERARCHY, then MOTION"
-            )
-    raise InputError(f"{path}: no MOTION line, so truncated or no BVH; allowed: HIERARCHY, then MOTION")
-
-
-def _fail(path: Path, line: int, wrong: str, allowed: str) -> NoReturn:
-    raise InputError(f"{path}: line {line}: {wrong}; allowed: {allowed}")
-
-
-def _number(word: str) -> float:
-    """Parse a number as BVH writes it; NaN for anything else, also for `1_0` or `Infinity`."""
-    try:
-        return float(word) if re.fullmatch(r"[-+.0-9eE]+", word) else float("nan")
-    except ValueError:
-        return float("nan")
-
-
-def _show(word: str) -> str:
-    """Quote a word of the file for a message, shortened to 40 characters."""
-    return repr(word)[:40]
+            break
+    raise InputError(f"{path}: no MOTION line; expected HIERARCHY, then MOTION")
 
 
 class _Words:
     """The words of the hierarchy, one after the other; `line` is the line of the last one."""
 
     def __init__(self, path: Path, lines: list[bytes]) -> None:
-        self.path = path
-        self.line = 1
+        self.path, self.line = path, 1
         self._words = self._split(lines)
 
     def _split(self, lines: list[bytes]) -> Iterator[str]:
@@ -263,125 +170,129 @@ class _Words:
             try:
                 text = line.decode("utf-8-sig" if self.line == 1 else "utf-8")
             except UnicodeDecodeError as error:
-                self.fail(f"byte {line[error.start]:#04x} is no text", "UTF-8")
+                self.fail(f"byte {line[error.start]:#04x}", "UTF-8 text")
             yield from text.replace("{", " { ").replace("}", " } ").split()
 
-    def fail(self, wrong: str, allowed: str) -> NoReturn:
-        _fail(self.path, self.line, wrong, allowed)
+    def fail(self, wrong: str, expected: str) -> NoReturn:
+        _fail(self.path, self.line, wrong, expected)
 
-    def next(self, allowed: str) -> str:
-        """Return the next word; `allowed` says what it may be, for the message."""
+    def next(self, expected: str) -> str:
         word = next(self._words, None)
-        return word if word is not None else self.fail("the hierarchy ends before its time", allowed)
+        return word if word is not None else self.fail("the hierarchy ends too early", expected)
 
-    def expect(self, *keywords: str) -> str:
+    def keyword(self, *keywords: str) -> str:
         """Return the next word in capitals, which must be one of the keywords."""
         word = self.next(" or ".join(keywords))
-        return word.upper() if word.upper() in keywords else self.fail(_show(word), " or ".join(keywords))
+        return word.upper() if word.upper() in keywords else self.fail(_quote(word), " or ".join(keywords))
 
-    def offset(self) -> np.ndarray:
-        """Read three numbers."""
-        return np.array([self._coordinate() for _ in range(3)])
-
-    def _coordinate(self) -> float:
-        allowed = f"three numbers up to {LIMIT:g} in size after OFFSET"
-        word = self.next(allowed)
-        return _number(word) if abs(_number(word)) <= LIMIT else self.fail(_show(word), allowed)
+    def offset(self) -> list[float]:
+        self.keyword("OFFSET")
+        expected, numbers = f"three numbers up to {LIMIT:g} in size after OFFSET", []
+        for _ in range(3):
+            word = self.next(expected)
+            numbers.append(
+                _number(word) if abs(_number(word)) <= LIMIT else self.fail(_quote(word), expected)
+            )
+        return numbers
 
     def channels(self) -> tuple[str, ...]:
-        """Read a count, and that many different channels."""
-        allowed = f"0 to {len(CHANNELS)} and as many different ones of {', '.join(CHANNELS)} after CHANNELS"
-        count = self.next(allowed)
+        self.keyword("CHANNELS")
+        expected = f"0 to {len(CHANNELS)} and as many different ones of {', '.join(CHANNELS)} after CHANNELS"
+        count = self.next(expected)
         if count not in map(str, range(len(CHANNELS) + 1)):
-            self.fail(_show(count), allowed)
-        names = tuple(self.next(allowed).capitalize() for _ in range(int(count)))
+            self.fail(_quote(count), expected)
+        names = tuple(self.next(expected).capitalize() for _ in range(int(count)))
         wrong = next((name for name in names if name not in CHANNELS or names.count(name) > 1), None)
-        return names if wrong is None else self.fail(_show(wrong), allowed)
+        return names if wrong is None else self.fail(_quote(wrong), expected)
 
     def finish(self) -> None:
-        """Check that no further word follows."""
         word = next(self._words, None)
         if word is not None:
-            self.fail(_show(word), "MOTION after the root's last }")
+            self.fail(_quote(word), "MOTION after the root's last }")
 
 
-@dataclass
-class _Hierarchy:
-    """The joints as they are read, without recursion; `open` holds those whose closing } is still to come."""
+def _hierarchy(words: _Words) -> tuple[list[str], list[int], list[list[float]], list[tuple[str, ...]]]:
+    """Read names, parents and offsets of joints and end sites, and the joints' channels."""
+    names: list[str] = []
+    parents: list[int] = []
+    offsets: list[list[float]] = []
+    channels: list[tuple[str, ...]] = []
+    ends: list[tuple[str, int, list[float]]] = []
+    open_joints: list[int] = []  # whose closing } is still to come
 
-    words: _Words
-    names: list[str] = field(default_factory=list)
-    parents: list[int] = field(default_factory=list)
-    offsets: list[np.ndarray] = field(default_factory=list)
-    channels: list[tuple[str, ...]] = field(default_factory=list)
-    ends: list[EndSite] = field(default_factory=list)
-    open: list[int] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.words.expect("HIERARCHY")
-        self.words.expect("ROOT")
-        self._joint()
-        while self.open:
-            keyword = self.words.expect("JOINT", "END", "}")
-            if keyword == "JOINT":
-                self._joint()
-            elif keyword == "END":
-                self._end()
-            else:
-                self.open.pop()
-        self.words.finish()
-
-    def _joint(self) -> None:
-        """Read `name { OFFSET x y z CHANNELS n ...`; the joint's children follow later."""
-        if len(self.names) == MAX_JOINTS:
-            self.words.fail("one joint more", f"up to {MAX_JOINTS} joints")
-        self.names.append(self._new_name(self.words.next("a joint's name")))
-        self.parents.append(self.open[-1] if self.open else -1)
-        self.open.append(len(self.names) - 1)
-        self.words.expect("{")
-        self.words.expect("OFFSET")
-        self.offsets.append(self.words.offset())
-        self.words.expect("CHANNELS")
-        self.channels.append(self.words.channels())
-
-    def _end(self) -> None:
-        """Read `Site { OFFSET x y z }`, which follows `End`."""
-        joint = self.open[-1]
-        name = self._new_name(self.names[joint] + END)
-        for keyword in ("SITE", "{", "OFFSET"):
-            self.words.expect(keyword)
-        self.ends.append(EndSite(name, joint, self.words.offset()))
-        self.words.expect("}")
-
-    def _new_name(self, name: str) -> str:
-        if name in ("{", "}") or name in self.names or any(name == end.name for end in self.ends):
-            self.words.fail(f"name {_show(name)}", "a name for each joint, and no name (or end site) twice")
+    def check(name: str) -> str:
+        if name in ("{", "}") or name in names or any(name == end for end, _, _ in ends):
+            words.fail(f"name {_quote(name)}", "a name for each joint, and no name (or end site) twice")
         return name
 
+    words.keyword("HIERARCHY")
+    keyword = words.keyword("ROOT")
+    while True:
+        if keyword == "}":
+            open_joints.pop()
+            if not open_joints:
+                break
+        elif keyword == "END":
+            name = check(names[open_joints[-1]] + END)
+            words.keyword("SITE")
+            words.keyword("{")
+            ends.append((name, open_joints[-1], words.offset()))
+            words.keyword("}")
+        else:
+            if len(names) == MAX_JOINTS:
+                words.fail("one joint more", f"up to {MAX_JOINTS} joints")
+            names.append(check(words.next("a joint's name")))
+            parents.append(open_joints[-1] if open_joints else -1)
+            open_joints.append(len(names) - 1)
+            words.keyword("{")
+            offsets.append(words.offset())
+            channels.append(words.channels())
+        keyword = words.keyword("JOINT", "END", "}")
+    words.finish()
+    names += [name for name, _, _ in ends]
+    parents += [joint for _, joint, _ in ends]
+    offsets += [offset for _, _, offset in ends]
+    return names, parents, offsets, channels
 
-def _motion(path: Path, lines: Iterator[tuple[int, bytes]], width: int) -> tuple[float, float, np.ndarray]:
-    """Read frame time, its rounding and values (N, width) from the lines after MOTION, without blank ones."""
+
+def _motion(path: Path, lines: Iterator[tuple[int, bytes]], width: int) -> tuple[float, np.ndarray]:
+    """Read the frame rate and values (N, width) from the lines after MOTION, without blank ones."""
     rows = ((number, line) for number, line in lines if line.strip())
     first, second = next(rows, None), next(rows, None)
     if first is None or second is None or width == 0:
-        raise InputError(f"{path}: no motion; allowed: channels, Frames:, Frame Time: and the frames")
+        raise InputError(f"{path}: no motion; expected channels, Frames:, Frame Time: and the frames")
     frames = _header(path, *first, "Frames:")
     if not re.fullmatch(r"0*[1-9]\d{0,8}", frames, re.ASCII):
-        _fail(path, first[0], f"Frames: {_show(frames)}", "a whole number from 1")
+        _fail(path, first[0], f"Frames: {_quote(frames)}", "a whole number from 1")
     low, high = FRAME_RATE_RANGE
     seconds = _number(word := _header(path, *second, "Frame Time:"))
     if not 1 / high <= seconds <= 1 / low:
-        _fail(path, second[0], f"Frame Time: {_show(word)}", f"{1 / high:g} to {1 / low:g} s")
+        _fail(path, second[0], f"Frame Time: {_quote(word)}", f"{1 / high:g} to {1 / low:g} s")
     values = array("d")  # a list of rows would be much larger than its numbers
     for number, line in rows:
-        values.extend(_values(path, number, line, width))
+        values.extend(_frame(path, number, line, width))
         if len(values) > MAX_VALUES:
-            _fail(path, number, "too many frames", f"{MAX_VALUES} values")
+            _fail(path, number, "too many frames", f"at most {MAX_VALUES} values")
     if len(values) != int(frames) * width:
         wrong = f"Frames: {int(frames)}, but {len(values) // width} lines of values follow"
         _fail(path, first[0], wrong, "one line for each frame")
-    rounding = 0.5 * 10.0 ** int(Decimal(word).as_tuple().exponent)
-    return seconds, rounding, np.array(values).reshape(-1, width)
+    return _frame_rate(word), np.array(values).reshape(-1, width)
+
+
+def _frame_rate(frame_time: str) -> float:
+    """Return a rate, rounded to a whole number or a usual rate where the frame time's digits allow it.
+
+    The time may be rounded to its last digit, or cut off after it: 0.0167 and 0.0166 are 60 Hz.
+    """
+    seconds = _number(frame_time)
+    if abs(1 / seconds - round(1 / seconds)) <= RATE_DIGITS / seconds:
+        return float(round(1 / seconds))
+    digit = 10.0 ** int(Decimal(frame_time).as_tuple().exponent)
+    usual = min(USUAL_RATES, key=lambda usual: abs(1 / usual - seconds))
+    lacking, coarsest = 1 / usual - seconds, COARSEST * seconds
+    rounded = abs(lacking) <= 0.5 * digit <= coarsest
+    cut_off = 0 < lacking < digit <= coarsest
+    return float(usual) if rounded or cut_off else 1 / seconds
 
 
 def _header(path: Path, number: int, line: bytes, key: str) -> str:
@@ -389,10 +300,10 @@ def _header(path: Path, number: int, line: bytes, key: str) -> str:
     text = line.decode("latin-1").strip()
     pattern = key.replace(" ", r"\s*").replace(":", r"\s*:\s*(\S+)")
     match = re.fullmatch(pattern, text, re.IGNORECASE)
-    return match[1] if match else _fail(path, number, _show(text), f"{key} and one number")
+    return match[1] if match else _fail(path, number, _quote(text), f"{key} and one number")
 
 
-def _values(path: Path, number: int, line: bytes, width: int) -> np.ndarray:
+def _frame(path: Path, number: int, line: bytes, width: int) -> np.ndarray:
     """Parse the numbers (width,) of a frame's line."""
     words = line.split()
     if len(words) != width:
@@ -404,5 +315,111 @@ def _values(path: Path, number: int, line: bytes, width: int) -> np.ndarray:
     if not (np.abs(values) <= LIMIT).all():
         texts = line.decode("latin-1").split()
         wrong = next((text for text in texts if not abs(_number(text)) <= LIMIT), texts[0])
-        _fail(path, number, _show(wrong), f"numbers up to {LIMIT:g} in size")
+        _fail(path, number, _quote(wrong), f"numbers up to {LIMIT:g} in size")
     return values
+
+
+def _number(word: str) -> float:
+    """Parse a number as BVH writes it; NaN for anything else, also for `1_0` or `Infinity`."""
+    try:
+        return float(word) if re.fullmatch(r"[-+.0-9eE]+", word) else float("nan")
+    except ValueError:
+        return float("nan")
+
+
+def _quote(word: str) -> str:
+    return repr(word)[:40]
+
+
+# Writing
+
+
+def write_bvh(path: Path, clip: Clip, rest: np.ndarray) -> None:
+    """Write a clip on a body with these rest joints (22, 3), metres, atomically.
+
+    `memmlp data import` knows the joints (`importing/skeletons/smpl_words.yaml`); `memmlp.yaml` there also
+    gives the axes, for clips in which nobody stands up.
+    """
+    with atomic_file(path) as file:
+        for line in ("HIERARCHY", *_joint_lines(0, rest, ""), *_motion_lines(clip, rest)):
+            file.write(f"{line}\n".encode())
+
+
+def _joint_lines(joint: int, rest: np.ndarray, indent: str) -> Iterator[str]:
+    """Yield the lines of a joint and of all joints below it.
+
+    The root's offset is zero, since some programs add it to the position channels and others do not.
+    """
+    offset = rest[joint] - rest[max(PARENTS[joint], 0)]
+    position = "" if joint else "Xposition Yposition Zposition "
+    yield f"{indent}{'JOINT' if joint else 'ROOT'} {JOINTS[joint]}"
+    yield f"{indent}{{"
+    yield f"{indent}\tOFFSET {_centimetres(offset)}"
+    yield f"{indent}\tCHANNELS {3 if joint else 6} {position}Zrotation Xrotation Yrotation"
+    for child in _children(joint):
+        yield from _joint_lines(child, rest, indent + "\t")
+    if JOINTS[joint] in TIPS:
+        tip = _centimetres(np.array(TIPS[JOINTS[joint]]))
+        yield from (f"{indent}\t{line}" for line in ("End Site", "{", f"\tOFFSET {tip}", "}"))
+    yield f"{indent}}}"
+
+
+def _children(joint: int) -> list[int]:
+    return [child for child, parent in enumerate(PARENTS) if parent == joint]
+
+
+def _centimetres(metres: np.ndarray) -> str:
+    return " ".join(NUMBER % value for value in CENTIMETRES * metres)
+
+
+def _motion_lines(clip: Clip, rest: np.ndarray) -> Iterator[str]:
+    yield from ("MOTION", f"Frames: {len(clip)}", f"Frame Time: {1 / clip.fps:.12f}")
+
+    def below(joint: int) -> Iterator[int]:  # in the hierarchy's order
+        yield joint
+        for child in _children(joint):
+            yield from below(child)
+
+    order, before = list(below(0)), None
+    for piece in clip.pieces():
+        rotations, root = y_up_motion(piece, rest)
+        angles = euler_zxy(rotations, before)
+        before = angles[-1]
+        values = np.concatenate([CENTIMETRES * root, angles[:, order].reshape(len(piece), -1)], 1)
+        form = " ".join([NUMBER] * values.shape[1])
+        yield from (form % tuple(row) for row in values.tolist())
+
+
+def euler_zxy(rotations: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
+    """Return angles (N, ..., 3), degrees, with Rz Rx Ry = rotations (N, ..., 3, 3).
+
+    Several triples of angles give the same rotation (two, and full turns). Each frame has the triple nearest
+    to the frame before, so that a program may interpolate between frames. In gimbal lock, where only the sum
+    of the outer angles counts, the product is still the rotation. The first frame's triple is near the angles
+    (..., 3) `before` it, if they are given.
+    """
+    z = np.arctan2(-rotations[..., 0, 1], rotations[..., 1, 1])
+    cosine, sine = np.cos(z)[..., None], np.sin(z)[..., None]
+    first = cosine * rotations[..., 0, :] + sine * rotations[..., 1, :]  # rows of Rz^T R = Rx Ry
+    second = cosine * rotations[..., 1, :] - sine * rotations[..., 0, :]
+    x = np.arctan2(rotations[..., 2, 1], second[..., 1])
+    y = np.arctan2(first[..., 2], first[..., 0])
+    angles = np.stack([z, x, y], -1)
+    if before is None:
+        return np.degrees(_continuous(angles))
+    return np.degrees(_continuous(np.concatenate([np.radians(before)[None], angles]))[1:])
+
+
+def _continuous(angles: np.ndarray) -> np.ndarray:
+    """Return the same rotations by angles Z X Y (N, ..., 3), radians, without jumps between frames."""
+
+    def without_turns(angles: np.ndarray) -> np.ndarray:
+        return np.remainder(angles + np.pi, 2 * np.pi) - np.pi
+
+    others = np.array([np.pi, np.pi, np.pi]) + np.array([1, -1, 1]) * angles  # of the same rotations
+    steps = without_turns(angles[1:] - angles[:-1])
+    changed = without_turns(others[1:] - angles[:-1])
+    changes = np.abs(changed).sum(-1) < np.abs(steps).sum(-1)
+    second = np.zeros(angles.shape[:-1], bool)
+    second[1:] = np.cumsum(changes, axis=0) % 2  # a change from the second triple leads back to the first
+    return np.unwrap(np.where(second[..., None], others, angles), axis=0)

@@ -10,24 +10,21 @@ vectors from the left.
 
 No file states its frame rate. The published files are at 120 Hz, although the papers treat them as 25 Hz and
 one author as 30: only at 120 Hz do walkers move at 1.2 m/s with steps of 0.56 s, and jumpers fall at 10
-m/s^2.
-
-Human3.6M's files of 99 numbers have another tree, and a root that is given relative to the frame before; they
-are refused.
+m/s^2. Human3.6M's files of 99 numbers have another tree, and are refused.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn, TextIO
+from typing import NoReturn
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
-from memmlp.motion.clip import FRAME_RATE_RANGE
+from memmlp.motion.formats.recording import Recording
 
 PUBLISHED_FPS = 120.0
 LIMIT = 1e4  # the largest size of any number, in the file's unit or radians
@@ -82,107 +79,65 @@ WIDTH = 3 + 3 * len(NODES)
 
 
 @dataclass(frozen=True)
-class Expmap:
-    """A file of exponential maps on the CMU skeleton of 38 nodes; end sites are nodes, too.
+class Expmap(Recording):
+    """A file of exponential maps on the CMU skeleton of 38 nodes; end sites are nodes, too."""
 
-    Attributes:
-        path: the file's path, for messages.
-        fps: frames per second, as given by the caller.
-        values: (N, 117), the file's unit and radians.
-    """
+    def kinematics(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return global rotations (N, 38, 3, 3) and positions (N, 38, 3) of all frames."""
+        return _forward(self.values[:, 3:].reshape(-1, len(NODES), 3), self.values[:, :3])
 
-    path: Path
-    fps: float
-    values: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.values)
-
-    @property
-    def nodes(self) -> tuple[str, ...]:
-        """Names of the 38 nodes, each after its parent; an end site's is its joint's with `.end`."""
-        return NODES
-
-    @property
-    def node_parents(self) -> tuple[int, ...]:
-        """Index of each node's parent; the root's is -1."""
-        return PARENTS
-
-    def zero_pose(self) -> np.ndarray:
-        """Return positions (38, 3) of the nodes with all rotations zero and the root at the origin."""
-        return self.posed({})[1]
-
-    def posed(self, angles: Mapping[str, Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
-        """Return global rotations (38, 3, 3) and positions (38, 3), the root at the origin, of one pose.
-
-        Args:
-            angles: node -> its rotation vector as in the file, radians; the others are zero.
-
-        Raises:
-            InputError: for an unknown node, or a wrong number of values.
-        """
+    def pose(self, turns: Mapping[str, Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
+        """Return global rotations (38, 3, 3) and positions (38, 3) of one pose (`Recording.pose`)."""
         vectors = np.zeros((len(NODES), 3))
-        for node, vector in angles.items():
+        for node, vector in turns.items():
             if node not in NODES or len(vector) != 3:
-                wrong = f"rest: {node} has {len(vector)} values"
-                raise InputError(f"{self.path}: {wrong}; allowed: three for a node of the CMU skeleton")
+                raise InputError(
+                    f"{self.path}: rest.{node} has {len(vector)} values; "
+                    "must be three values for a node of the CMU skeleton"
+                )
             vectors[NODES.index(node)] = vector
         rotations, positions = _forward(vectors[None], np.zeros((1, 3)))
         return rotations[0], positions[0]
 
-    def kinematics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nodes' global rotations (N, 38, 3, 3) and positions (N, 38, 3) in the file's unit."""
-        return _forward(self.values[:, 3:].reshape(-1, len(NODES), 3), self.values[:, :3])
 
-
-def read_expmap(path: Path, fps: float) -> Expmap:
-    """Read a file of 117 numbers a line.
-
-    Args:
-        path: the file.
-        fps: the file's frame rate, Hz, which the file does not state (`PUBLISHED_FPS` for the published
-            files).
+def read_expmap(path: Path) -> Expmap:
+    """Read a file of 117 numbers a line; it gets the frame rate of the published files, `PUBLISHED_FPS`.
 
     Raises:
         InputError: for anything else than lines of 117 finite numbers, or a file of more than 64 MiB; the
             message names the file and where possible the line.
     """
-    low, high = FRAME_RATE_RANGE
-    if not low <= fps <= high:
-        raise InputError(f"{path}: a frame rate of {fps:g} Hz; allowed: {low:g} to {high:g}")
+    values = []
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: too large; allowed: a file of at most {MAX_BYTES >> 20} MiB")
+            raise InputError(f"{path}: too large; expected at most {MAX_BYTES >> 20} MiB")
         with open(path, encoding="latin-1") as file:
-            values = [_row(path, number, line) for number, line in _numbered(file) if line.strip()]
+            for number, line in enumerate(iter(lambda: file.readline(MAX_LINE), ""), start=1):
+                if line.strip():
+                    values.append(_row(path, number, line))
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); allowed: a text file") from error
+        raise InputError(f"{path}: cannot be read ({error.strerror}); expected a text file") from error
     if not values:
-        raise InputError(f"{path}: no frames; allowed: lines of {WIDTH} numbers")
-    return Expmap(path, float(fps), np.array(values))
-
-
-def _numbered(file: TextIO) -> Iterator[tuple[int, str]]:
-    """Yield a file's lines with their numbers; a line that is too long is cut."""
-    return enumerate(iter(lambda: file.readline(MAX_LINE), ""), start=1)
+        raise InputError(f"{path}: no frames; expected lines of {WIDTH} numbers")
+    return Expmap(path, NODES, PARENTS, OFFSETS, PUBLISHED_FPS, np.array(values))
 
 
 def _row(path: Path, number: int, line: str) -> np.ndarray:
     """Parse the numbers (117,) of a line."""
+
+    def fail(wrong: str) -> NoReturn:
+        raise InputError(f"{path}: line {number}: {wrong}; expected {WIDTH} numbers with commas between them")
+
     words = line.split(",")
     if len(words) != WIDTH:
-        _fail(path, number, f"{len(words)} values")
+        fail(f"{len(words)} values")
     try:
         values = np.array([float("nan") if "_" in word else float(word) for word in words])
     except ValueError:
-        _fail(path, number, "a value that is no number")
+        fail("a value that is not a number")
     if not (np.abs(values) <= LIMIT).all():
-        _fail(path, number, f"a value that is no number up to {LIMIT:g} in size")
+        fail(f"a value that is not a number up to {LIMIT:g} in size")
     return values
-
-
-def _fail(path: Path, line: int, wrong: str) -> NoReturn:
-    raise InputError(f"{path}: line {line}: {wrong}; allowed: {WIDTH} numbers with commas between them")
 
 
 def _forward(vectors: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

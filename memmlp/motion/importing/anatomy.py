@@ -1,6 +1,7 @@
-"""A body's anatomy: its segments, the stance from which a skeleton is read, and its joints in that stance.
+"""Anatomy: the body's segments, tests of whether a pose is a stance, and the joints' rotations in a stance.
 
-All positions (..., 22, 3) here are in Y-up axes and metres. `mapped` (22,) says which joints a file has.
+A stance is the pose of a person who stands upright. All positions (..., 22, 3) here are in Y-up axes and
+metres. `mapped` (22,) says which joints a file has.
 """
 
 from __future__ import annotations
@@ -19,33 +20,27 @@ HIPS, SHOULDERS = (1, 2), (16, 17)  # left, right
 LIMBS = {1: 4, 2: 5, 4: 7, 5: 8, 16: 18, 17: 19, 18: 20, 19: 21}  # joint -> the other end of its bone
 LEGS = {joint: end for joint, end in LIMBS.items() if joint < 6}
 FEET = {7: 10, 8: 11}
-SPINE, ANKLES = (3, 6, 9, 12), (7, 8)
+SPINE = (3, 6, 9, 12)
 HINGES = {1: (1.0, 0.0, 0.0), 2: (1.0, 0.0, 0.0), 16: (0.0, -1.0, 0.0), 17: (0.0, 1.0, 0.0)}
 """Thighs and upper arms -> the axis about which the joint at their end bends, in the body's rest pose."""
 
-LEFT, UP, DOWN = np.eye(3)[0], np.eye(3)[1], -np.eye(3)[1]
+LEFT, UP = np.eye(3)[:2]
+LEG_LENGTH = (0.55, 1.15)  # metres from hip to ankle of adults
 TRUNK, THIGHS, SHINS = 45.0, 60.0, 75.0  # degrees: largest angles from the vertical in a stance, a runner's
 LEVEL = 30.0  # degrees: largest angle of the line of the hips from the horizontal in a stance
-ARMS = 100.0  # degrees: largest angle of an upper arm or forearm from a T-pose's in a stance
+ARMS = 100.0  # degrees: largest angle of an upper arm or forearm from a T-pose's in a zero pose
 SHORTEST = 1e-3  # metres
 BENT = 15.0  # degrees by which a knee or elbow must bend in a stance to show its axis
-HINGE_BEND, HINGE_AGREEMENT = 0.1, 0.8  # mean sine of the bend and agreement of its axes, to be known
+HINGE_BEND, HINGE_AGREEMENT = 0.1, 0.8  # least mean sine of the bend, and agreement of its axes, in motion
 
 
 class Segment(NamedTuple):
-    """The straight line from a joint to the next joint of its chain that the file has.
-
-    Attributes:
-        start: the joint whose rotation turns the segment.
-        end: the joint at the segment's end.
-    """
+    """The straight line from a joint, whose rotation turns it, to the next joint of its chain in the file."""
 
     start: int
     end: int
 
-    @property
-    def name(self) -> str:
-        """The segment in words."""
+    def __str__(self) -> str:
         return f"{JOINTS[self.start]} to {JOINTS[self.end]}"
 
 
@@ -69,76 +64,70 @@ def least_rotation(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return the smallest rotations (..., 3, 3) that turn directions (..., 3) onto others.
 
     For a direction without length, the identity is returned. Opposite directions are carried onto each other
-    by a half turn about one of the axes across them.
+    by a half turn about one of the axes perpendicular to them.
     """
     axis, along = np.cross(source, target), (source * target).sum(-1, keepdims=True)
     norm = np.linalg.norm(axis, axis=-1, keepdims=True)
     opposite = (norm == 0) & (along < 0)
-    axis, norm = np.where(opposite, _across(source), axis), np.where(opposite, 1.0, norm)
+    across = np.cross(source, np.eye(3)[np.abs(source).argmin(-1)])
+    length = np.linalg.norm(across, axis=-1, keepdims=True)
+    across = np.divide(across, length, out=np.zeros_like(across), where=length > 0)
+    axis, norm = np.where(opposite, across, axis), np.where(opposite, 1.0, norm)
     angle = np.where(opposite, np.pi, np.arctan2(norm, along))
     turn = axis * np.divide(angle, norm, out=np.zeros_like(norm), where=norm > 0)
     return Rotation.from_rotvec(turn.reshape(-1, 3)).as_matrix().reshape(*turn.shape, 3)
 
 
-def _across(vectors: np.ndarray) -> np.ndarray:
-    """Return vectors of length 1 that are perpendicular to vectors (..., 3) with a length."""
-    axes = np.eye(3)[np.abs(vectors).argmin(-1)]
-    across = np.cross(vectors, axes)
-    length = np.linalg.norm(across, axis=-1, keepdims=True)
-    return np.divide(across, length, out=np.zeros_like(across), where=length > 0)
-
-
-def aligned(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the rotation (3, 3) that aligns one direction exactly, and another as far as possible then.
+def align(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Return the rotation (3, 3) that aligns one direction exactly, and then another as far as possible.
 
     Each argument is a pair: a direction, and the direction onto which it is turned.
     """
     (a, to_a), (b, to_b) = first, second
     once = least_rotation(a, to_a)
     axis = unit(to_a)
-    turned, wanted = (v - (v @ axis) * axis for v in (once @ b, to_b))
-    angle = np.arctan2(np.cross(turned, wanted) @ axis, turned @ wanted)
+    turned, goal = (v - (v @ axis) * axis for v in (once @ b, to_b))
+    angle = np.arctan2(np.cross(turned, goal) @ axis, turned @ goal)
     return Rotation.from_rotvec(angle * axis).as_matrix() @ once
 
 
-# A stance
+# Whether a pose is a stance
 
 
 def why_no_stance(pose: np.ndarray) -> str | None:
-    """Say why a pose (22, 3) isn't that of a person who stands upright; None if it is.
+    """Return why a pose (22, 3) isn't that of a person who stands upright; None if it is.
 
-    Which way the person faces, and what is left and right, does not matter here.
+    The direction that the person faces, and left and right, do not matter here.
     """
     for start, end in ((0, HEAD), *LIMBS.items()):
         if np.linalg.norm(pose[end] - pose[start]) < SHORTEST:
             return f"{JOINTS[start]} and {JOINTS[end]} are at the same place"
-    if np.linalg.norm(pose[HIPS[0]] - pose[HIPS[1]]) < SHORTEST:
+    across = pose[HIPS[0]] - pose[HIPS[1]]
+    if np.linalg.norm(across) < SHORTEST:
         return "the hips are at the same place"
     for start, end, along, most in _verticals():
         angle = angles(pose[end] - pose[start], along)
-        word = "up" if along is UP else "down"
         if angle > most:
-            return f"{JOINTS[start]} to {JOINTS[end]} is {angle:.0f} degrees from {word}"
-    tilt = abs(90 - angles(pose[HIPS[0]] - pose[HIPS[1]], UP))
+            direction = "up" if along is UP else "down"
+            return f"{JOINTS[start]} to {JOINTS[end]} is {angle:.0f} degrees from {direction}"
+    tilt = abs(90 - angles(across, UP))
     if tilt > LEVEL:
         return f"the line of the hips is {tilt:.0f} degrees from level"
     for hip in HIPS:
         axis = bend(pose, hip)
-        if axis is not None and axis @ (pose[HIPS[0]] - pose[HIPS[1]]) < 0:
-            return (
-                f"{JOINTS[LIMBS[hip]]} bends forward: left and right, or the joints of the leg, may be wrong"
-            )
+        if axis is not None and axis @ across < 0:
+            knee = JOINTS[LIMBS[hip]]
+            return f"{knee} bends forward: left and right, or the joints of the leg, may be wrong"
     return None
 
 
 def wrong_sides(pose: np.ndarray, mapped: np.ndarray) -> str | None:
-    """Say what contradicts the hips about left and forward in a stance (22, 3); None if nothing does."""
+    """Return a contradiction about left and forward in a stance (22, 3); None if there is none."""
     left = pose[HIPS[0]] - pose[HIPS[1]]
-    forward = np.cross(left, UP)
     if (pose[SHOULDERS[0]] - pose[SHOULDERS[1]]) @ left < 0:
         return "the left shoulder is on the side of the right hip"
     feet = [pose[toes] - pose[ankle] for ankle, toes in FEET.items() if mapped[ankle] and mapped[toes]]
-    if feet and unit(np.mean(feet, axis=0)) @ unit(forward) < 0:
+    if feet and unit(np.mean(feet, axis=0)) @ unit(np.cross(left, UP)) < 0:
         return "the feet point backward, so left and right may be swapped"
     return None
 
@@ -153,7 +142,8 @@ def unevenness(poses: np.ndarray) -> np.ndarray:
     """Return how far poses (N, 22, 3) are from standing straight, as sums of angles (N,), degrees."""
     total = sum(angles(poses[:, end] - poses[:, start], along) for start, end, along, _ in _verticals())
     left, across = (poses[:, a] - poses[:, b] for a, b in (HIPS, SHOULDERS))
-    bends = [angles(poses[:, e] - poses[:, m], poses[:, m] - poses[:, s]) for s, m, e in _joints_of_arms()]
+    arms = ((16, 18, 20), (17, 19, 21))
+    bends = [angles(poses[:, e] - poses[:, m], poses[:, m] - poses[:, s]) for s, m, e in arms]
     return total + np.abs(90 - angles(left, UP)) + angles(left, across) + 0.5 * sum(bends)
 
 
@@ -167,14 +157,10 @@ def _verticals() -> Iterator[tuple[int, int, np.ndarray, float]]:
     """Yield the segments that are vertical in a stance, their direction, and the tolerance in degrees."""
     yield 0, HEAD, UP, TRUNK
     for start, end in LEGS.items():
-        yield start, end, DOWN, THIGHS if start in HIPS else SHINS
+        yield start, end, -UP, THIGHS if start in HIPS else SHINS
 
 
-def _joints_of_arms() -> tuple[tuple[int, int, int], ...]:
-    return ((16, 18, 20), (17, 19, 21))
-
-
-# Joints in a stance
+# The joints' rotations in a stance
 
 
 def orientations(stance: np.ndarray, mapped: np.ndarray, rest: np.ndarray) -> np.ndarray:
@@ -182,18 +168,22 @@ def orientations(stance: np.ndarray, mapped: np.ndarray, rest: np.ndarray) -> np
 
     Every segment points as in the stance. About its own axis, the pelvis follows the hips, the chest the
     shoulders, and the spine both. Upper limbs take the smallest rotation from the body's rest pose (22, 3),
-    lower limbs the smallest rotation from the upper ones. The head is upright and looks where the chest
-    faces. Wrists and toes continue straight.
+    lower limbs the smallest rotation from the upper ones. The head is upright and faces in the direction of
+    the chest. Wrists and toes continue straight.
     """
+
+    def is_long(start: int, end: int) -> bool:
+        return bool(np.linalg.norm(stance[end] - stance[start]) > SHORTEST)
+
     result = np.tile(np.eye(3), (len(JOINTS), 1, 1))
     ends = {segment.start: segment.end for segment in segments(mapped)}
     hips, shoulders = (unit(stance[left] - stance[right]) for left, right in (HIPS, SHOULDERS))
-    chest = aligned((UP, UP), (LEFT, shoulders))
-    trunk = next(end for end in (*SPINE, HEAD) if _long(stance, 0, end) and mapped[end])
-    result[0] = aligned((rest[1] - rest[2], hips), (rest[trunk] - rest[0], stance[trunk] - stance[0]))
+    chest = align((UP, UP), (LEFT, shoulders))
+    trunk = next(end for end in (*SPINE, HEAD) if is_long(0, end) and mapped[end])
+    result[0] = align((rest[1] - rest[2], hips), (rest[trunk] - rest[0], stance[trunk] - stance[0]))
     for step, joint in enumerate(SPINE, start=1):
         left = unit(hips + min(step / 3, 1.0) * (shoulders - hips))
-        result[joint] = aligned((UP, UP), (LEFT, left))
+        result[joint] = align((UP, UP), (LEFT, left))
     result[HEAD] = chest
     for joint in range(1, len(JOINTS)):
         parent = PARENTS[joint]
@@ -204,14 +194,10 @@ def orientations(stance: np.ndarray, mapped: np.ndarray, rest: np.ndarray) -> np
         end = ends.get(joint)
         if end is None:
             result[joint] = result[joint] if joint == HEAD else result[parent]
-        elif _long(stance, joint, end):
+        elif is_long(joint, end):
             bone = result[joint] @ (rest[end] - rest[joint])
             result[joint] = least_rotation(bone, stance[end] - stance[joint]) @ result[joint]
     return result
-
-
-def _long(pose: np.ndarray, start: int, end: int) -> bool:
-    return bool(np.linalg.norm(pose[end] - pose[start]) > SHORTEST)
 
 
 def bend(stance: np.ndarray, joint: int) -> np.ndarray | None:
@@ -231,7 +217,7 @@ def hinge(upper: np.ndarray, positions: np.ndarray, joint: int) -> np.ndarray | 
 
     Returns:
         The axis (3,) in the thigh's or upper arm's own frame; None if it bends too little, or about too many
-        axes, to tell.
+        axes.
     """
     middle, end = LIMBS[joint], LIMBS[LIMBS[joint]]
     bones = unit(positions[:, middle] - positions[:, joint]), unit(positions[:, end] - positions[:, middle])
@@ -239,9 +225,3 @@ def hinge(upper: np.ndarray, positions: np.ndarray, joint: int) -> np.ndarray | 
     total, sizes = bends.sum(0), np.linalg.norm(bends, axis=-1)
     known = sizes.mean() > HINGE_BEND and np.linalg.norm(total) > HINGE_AGREEMENT * sizes.sum()
     return unit(total) if known else None
-
-
-def turned_to_hinge(orientation: np.ndarray, joint: int, bone: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Return an orientation (3, 3) of a limb, turned about its bone (3,) to bend about an axis (3,)."""
-    along = orientation @ bone
-    return aligned((along, along), (orientation @ np.array(HINGES[joint]), axis)) @ orientation

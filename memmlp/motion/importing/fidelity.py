@@ -15,11 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from memmlp.motion.body import HEAD, JOINTS, PARENTS
 from memmlp.motion.clip import Clip
-from memmlp.motion.clip_kinematics import clip_kinematics
+from memmlp.motion.geometry import clip_kinematics
 from memmlp.motion.importing.anatomy import (
     FEET,
     HINGES,
     HIPS,
+    LEG_LENGTH,
     LIMBS,
     SHOULDERS,
     angles,
@@ -27,13 +28,11 @@ from memmlp.motion.importing.anatomy import (
     segments,
     unit,
 )
-from memmlp.motion.importing.axes import LEG
-from memmlp.motion.importing.mapped_motion import MappedMotion
-from memmlp.motion.importing.skeleton_map import Z_UP
+from memmlp.motion.importing.skeleton_map import Z_UP, MappedMotion
 from memmlp.motion.plausibility import implausible
 
 MOST_MM, MOST_DEGREES = 1.0, 3.0  # the largest errors that an import may have
-SHORTEST = 1e-2  # metres: a shorter segment has no direction to speak of
+SHORTEST = 1e-2  # metres: the direction of a shorter segment does not count
 TRUNK = 25.0  # degrees between pelvis to head on the body and in the file
 UPRIGHT_SHARE = 0.5  # of the frames, in which the head must be above the pelvis
 BENT, FORWARD_SHARE = 0.35, 0.3  # sine of a knee's bend that counts; share of it that may be the wrong way
@@ -43,7 +42,7 @@ TORSO, TURN = (3, 6, 9, 12, 13, 14, 15), 60.0  # spine, neck, collars, head; deg
 TWIST = 45.0  # degrees by which a knee's or elbow's axis may be off the body's
 SIDES = 1.1  # left over right
 FLOOR = 0.3  # metres: how far from the floor feet may stay through a whole clip
-FEET_STAY = "the feet stay"  # how the fault begins that says so
+FEET_STAY = "the feet stay"  # the beginning of that fault
 STRETCH = 0.02  # metres by which a segment may change its length
 
 
@@ -66,7 +65,7 @@ class Worst(NamedTuple):
 
 @dataclass(frozen=True)
 class Fidelity:
-    """How far an import is from its file, in the worst frame.
+    """The deviation of an import from its file, in the worst frame.
 
     Attributes:
         name: the file's path below the folder.
@@ -75,7 +74,7 @@ class Fidelity:
         mm: largest distance, millimetres, between a joint in the file and in the import posed on the file's
             own bones; a bone has its length in the file at that frame.
         degrees: largest angle, degrees, between the directions of a segment on the body and in the file.
-        faults: what is wrong with the clip, one sentence each, as `data verify` and `data import` report it.
+        faults: the clip's faults, one sentence each, as `data verify` and `data import` report them.
     """
 
     name: str
@@ -86,25 +85,24 @@ class Fidelity:
     faults: tuple[str, ...]
 
 
-def compare(clip: Clip, mapped_motion: MappedMotion, rest: np.ndarray, skeleton: str) -> Fidelity:
+def compare(clip: Clip, motion: MappedMotion, rest: np.ndarray, skeleton: str) -> Fidelity:
     """Compare a clip on a body, rest joints (22, 3) in metres, with the mapped motion that it came from."""
     rotations, positions = clip_kinematics(clip, rest)
-    expected = mapped_motion.positions @ Z_UP.T
-    mm = _on_own_bones(rotations, expected, mapped_motion.mapped)
-    degrees = _segments(positions, expected, mapped_motion.mapped)
-    found = Fidelity(clip.name, skeleton, len(clip), mm, degrees, ())
-    faults = (
-        *_unlike_the_file(found, positions, expected, mapped_motion.mapped),
-        *_unlike_people(rotations, positions, mapped_motion.mapped),
-        *_odd_turns(rotations),
-        *_twisted_limbs(rotations, positions),
-        *_odd_lengths(expected, rest),
-        *_implausible(clip),
-    )
-    return replace(found, faults=faults)
+    expected, mapped = motion.positions @ Z_UP.T, motion.mapped
+    mm, degrees = _distance(rotations, expected, mapped), _deviation(positions, expected, mapped)
+    result = Fidelity(clip.name, skeleton, len(clip), mm, degrees, ())
+    faults = [
+        *_file_faults(result, positions, expected, mapped),
+        *_posture_faults(rotations, positions, mapped),
+        *floor_faults(positions),
+        *_turn_faults(rotations, positions),
+        *_length_faults(expected, rest),
+        *filter(None, [implausible(clip)]),
+    ]
+    return replace(result, faults=tuple(faults))
 
 
-def _on_own_bones(rotations: np.ndarray, expected: np.ndarray, mapped: np.ndarray) -> Worst:
+def _distance(rotations: np.ndarray, expected: np.ndarray, mapped: np.ndarray) -> Worst:
     """Return the worst distance, mm, of joints posed by a clip's rotations on the bones of the file.
 
     A bone's direction in its joint's frame is its mean over the frames, so rotations that do not turn with
@@ -115,18 +113,18 @@ def _on_own_bones(rotations: np.ndarray, expected: np.ndarray, mapped: np.ndarra
         parent = PARENTS[joint]
         while not mapped[parent]:
             parent = PARENTS[parent]
-        there = expected[:, joint] - expected[:, parent]
-        length = np.linalg.norm(there, axis=-1, keepdims=True)
-        own = np.einsum("nij,ni->nj", rotations[:, parent], there).mean(0)
+        bone = expected[:, joint] - expected[:, parent]
+        length = np.linalg.norm(bone, axis=-1, keepdims=True)
+        own = np.einsum("nij,ni->nj", rotations[:, parent], bone).mean(0)
         size = np.linalg.norm(own)
-        way = rotations[:, parent] @ (own / size) * length if size > 1e-9 else there
-        posed[:, joint] = posed[:, parent] + way
+        posed_bone = rotations[:, parent] @ (own / size) * length if size > 1e-9 else bone
+        posed[:, joint] = posed[:, parent] + posed_bone
     return _worst(1000 * np.linalg.norm(posed - expected, axis=-1), JOINTS)
 
 
-def _segments(positions: np.ndarray, expected: np.ndarray, mapped: np.ndarray) -> Worst:
+def _deviation(positions: np.ndarray, expected: np.ndarray, mapped: np.ndarray) -> Worst:
     """Return the worst angle, degrees, between segments on the body and in the file."""
-    named = {segment.name: (segment.start, segment.end) for segment in segments(mapped)}
+    named = {str(segment): (segment.start, segment.end) for segment in segments(mapped)}
     named |= {"right_hip to left_hip": HIPS[::-1]}
     off = np.zeros((len(positions), len(named)))
     for column, (start, end) in enumerate(named.values()):
@@ -142,61 +140,35 @@ def _worst(errors: np.ndarray, names: list[str] | tuple[str, ...]) -> Worst:
     return Worst(float(errors[frame, column]), names[column], int(frame))
 
 
-# What is wrong
+# Faults, one sentence each
 
 
-def _unlike_the_file(
+def _file_faults(
     found: Fidelity, positions: np.ndarray, expected: np.ndarray, mapped: np.ndarray
 ) -> Iterator[str]:
-    """Yield descriptions of the differences from the file."""
+    """Yield the differences from the file."""
     if found.mm.value > MOST_MM:
         where, frame = found.mm.where, found.mm.frame
         yield f"{where} is {found.mm.value:.1f} mm off on the file's own bones in frame {frame}"
     if found.degrees.value > MOST_DEGREES:
         where, frame = found.degrees.where, found.degrees.frame
         yield f"{where} points {found.degrees.value:.1f} degrees off the file's in frame {frame}"
-    trunk = [array[:, HEAD] - array[:, 0] for array in (positions, expected)]
-    off = angles(*trunk)
-    if np.median(off) > TRUNK:
-        yield f"pelvis to head points {np.median(off):.0f} degrees off the file's in half of the frames"
+    off = np.median(angles(*(array[:, HEAD] - array[:, 0] for array in (positions, expected))))
+    if off > TRUNK:
+        yield f"pelvis to head points {off:.0f} degrees off the file's in half of the frames"
     for segment in segments(mapped):
         lengths = np.linalg.norm(expected[:, segment.end] - expected[:, segment.start], axis=-1)
         if np.ptp(lengths) > STRETCH:
             frame = int(np.abs(lengths - np.median(lengths)).argmax())
-            size = f"{1000 * np.ptp(lengths):.0f} mm in the file (most in frame {frame})"
-            change = f"{segment.name} changes its length by {size}"
-            yield f"{change}, which no body's does: a joint between them turns, or the map is wrong"
+            change = f"{segment} changes its length by {1000 * np.ptp(lengths):.0f} mm in the file"
+            yield f"{change} (most in frame {frame}): a joint between them turns, or the map is wrong"
 
 
-def _unlike_people(rotations: np.ndarray, positions: np.ndarray, mapped: np.ndarray) -> Iterator[str]:
-    """Yield descriptions of what no person's body does."""
+def _posture_faults(rotations: np.ndarray, positions: np.ndarray, mapped: np.ndarray) -> Iterator[str]:
+    """Yield impossible postures of head, knees and feet."""
     upright = (positions[:, HEAD, 2] > positions[:, 0, 2]).mean()
     if upright < UPRIGHT_SHARE:
         yield f"the head is below the pelvis in {1 - upright:.0%} of the frames"
-    wrong = _forward_bends(rotations, positions)
-    if wrong > FORWARD_SHARE:
-        yield f"the knees bend forward in {wrong:.0%} of their bends"
-    yield from _backward_feet(rotations, positions, mapped)
-    yield from off_the_floor(positions)
-
-
-def off_the_floor(positions: np.ndarray) -> Iterator[str]:
-    """Yield how far the feet stay from the floor, if that is far, in a clip of joints (N, 22, 3), metres."""
-    lowest = float(np.quantile(positions[:, [7, 8, 10, 11], 2].min(1), 0.05))
-    if abs(lowest) > FLOOR:
-        side = "above" if lowest > 0 else "below"
-        yield f"{FEET_STAY} {abs(lowest):.2f} m {side} the floor"
-
-
-def _implausible(clip: Clip) -> Iterator[str]:
-    """Yield the reason why preparing would skip the clip, if any."""
-    reason = implausible(clip)
-    if reason is not None:
-        yield reason.partition("; allowed: ")[0]
-
-
-def _forward_bends(rotations: np.ndarray, positions: np.ndarray) -> float:
-    """Return the share of all knee bending that is forward, with respect to the pelvis."""
     bends = []
     for hip in HIPS:
         knee, ankle = LIMBS[hip], LIMBS[LIMBS[hip]]
@@ -204,18 +176,25 @@ def _forward_bends(rotations: np.ndarray, positions: np.ndarray) -> float:
         bends.append((np.cross(unit(thigh), unit(shin)) * rotations[:, 0, :, 0]).sum(-1))
     strong = np.concatenate(bends)
     strong = strong[np.abs(strong) > BENT]
-    return float((strong < 0).mean()) if len(strong) else 0.0
-
-
-def _backward_feet(rotations: np.ndarray, positions: np.ndarray, mapped: np.ndarray) -> Iterator[str]:
+    forward = float((strong < 0).mean()) if len(strong) else 0.0
+    if forward > FORWARD_SHARE:
+        yield f"the knees bend forward in {forward:.0%} of their bends"
     feet = [positions[:, toes] - positions[:, ankle] for ankle, toes in FEET.items() if mapped[toes]]
     backward = [(foot * rotations[:, 0, :, 2]).sum(-1) < 0 for foot in feet]
     if backward and np.mean(backward) > 0.5:
         yield f"the feet point backward in {np.mean(backward):.0%} of the frames"
 
 
-def _odd_turns(rotations: np.ndarray) -> Iterator[str]:
-    """Yield the joints of the torso that are turned further than any person's."""
+def floor_faults(positions: np.ndarray) -> Iterator[str]:
+    """Yield the distance of the feet from the floor, if it is large, given joints (N, 22, 3), metres."""
+    lowest = float(np.quantile(positions[:, [7, 8, 10, 11], 2].min(1), 0.05))
+    if abs(lowest) > FLOOR:
+        side = "above" if lowest > 0 else "below"
+        yield f"{FEET_STAY} {abs(lowest):.2f} m {side} the floor"
+
+
+def _turn_faults(rotations: np.ndarray, positions: np.ndarray) -> Iterator[str]:
+    """Yield the joints that are turned further than any person's, and limbs that are twisted."""
     turns = [angles(rotations[:, HEAD, :, axis], rotations[:, CHEST, :, axis]) for axis in (1, 2)]
     odd = np.max(turns, axis=0) > HEAD_TURN
     if odd.mean() > HEAD_SHARE:
@@ -227,20 +206,16 @@ def _odd_turns(rotations: np.ndarray) -> Iterator[str]:
         if turn > TURN:
             against = f"{turn:.0f} degrees against {JOINTS[PARENTS[joint]]} in half of the frames"
             yield f"{JOINTS[joint]} is turned by {against}: rest, the zero pose or the map is wrong"
-
-
-def _twisted_limbs(rotations: np.ndarray, positions: np.ndarray) -> Iterator[str]:
-    """Yield the thighs and upper arms that are twisted, as the axes of knees and elbows show."""
-    for joint, axis in HINGES.items():
-        own = hinge(rotations[:, joint], positions, joint)
-        off = 0.0 if own is None else angles(own, np.array(axis))
+    for joint, body_axis in HINGES.items():
+        axis = hinge(rotations[:, joint], positions, joint)
+        off = 0.0 if axis is None else angles(axis, np.array(body_axis))
         if off > TWIST:
             turned = f"bends about an axis {off:.0f} degrees off the body's"
-            yield f"{JOINTS[LIMBS[joint]]} {turned}: the limb is turned about itself in rest or the zero pose"
+            yield f"{JOINTS[LIMBS[joint]]} {turned}: the limb is twisted in rest or the zero pose"
 
 
-def _odd_lengths(expected: np.ndarray, rest: np.ndarray) -> Iterator[str]:
-    """Yield the limbs whose lengths in the file are no person's."""
+def _length_faults(expected: np.ndarray, rest: np.ndarray) -> Iterator[str]:
+    """Yield the limbs whose lengths in the file are impossible for a person."""
 
     def length(at: np.ndarray, start: int, end: int) -> float:
         return float(np.median(np.linalg.norm(at[..., end, :] - at[..., start, :], axis=-1)))
@@ -248,7 +223,7 @@ def _odd_lengths(expected: np.ndarray, rest: np.ndarray) -> Iterator[str]:
     def legs(at: np.ndarray) -> float:
         return sum(length(at, start, LIMBS[start]) for start in (1, 2, 4, 5)) / 2
 
-    if not LEG[0] <= legs(expected) <= LEG[1]:
+    if not LEG_LENGTH[0] <= legs(expected) <= LEG_LENGTH[1]:
         yield f"the legs are {legs(expected):.2f} m long, so the unit may be wrong"
     for left, right in ((1, 2), (4, 5), (16, 17), (18, 19)):
         both = [length(expected, start, LIMBS[start]) for start in (left, right)]

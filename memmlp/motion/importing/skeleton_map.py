@@ -1,20 +1,21 @@
-"""Skeleton maps: which node of a motion file stands for which of the 22 body joints, as YAML."""
+"""Skeleton maps, as YAML: they map the 22 body joints to nodes of a motion file, and pick their motion."""
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
 import yaml
 
 from memmlp.common.errors import InputError, why_unreadable
-from memmlp.motion.body import JOINTS
-from memmlp.motion.importing.motion_file import MotionFile
-from memmlp.motion.importing.node_names import find_nodes
+from memmlp.motion.body import JOINTS, PARENTS
+from memmlp.motion.formats.recording import END, Recording
 
 SKELETONS = Path(__file__).parent / "skeletons"
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # Y-up axes to the world's: y becomes z
@@ -23,14 +24,13 @@ REQUIRED = (
     "pelvis", "head", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle",
     "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
 )  # fmt: skip
-FOUND = "auto"  # a unit or up axis that is found in each file
+AUTO = "auto"  # a unit or up axis that is found in each file
+SEPARATORS = re.compile(r"[\W_]+")
 
 
 @dataclass(frozen=True)
 class SkeletonMap:
-    """Which node of a file's skeleton stands for which of our 22 joints.
-
-    A map has the file's unit, axes and stance, too.
+    """A map from the body's 22 joints to the nodes of a file's skeleton.
 
     Attributes:
         name: the map's name.
@@ -41,7 +41,7 @@ class SkeletonMap:
         rest: the pose in which the person stands, from which the skeleton is read: `auto` (the zero pose if
             the person stands in it, else the straightest frame), a frame's number, or the rotation values,
             degrees, of joints as in a frame of the file.
-        note: what users who import such files should know.
+        note: advice for users who import such files.
     """
 
     name: str
@@ -49,7 +49,7 @@ class SkeletonMap:
     unit: float | None = None
     up: str | None = None
     calibration_frame: bool = False
-    rest: str | int | dict[str, list[float]] = FOUND
+    rest: str | int | dict[str, list[float]] = AUTO
     note: str = ""
 
     def with_up(self, up: str | None) -> SkeletonMap:
@@ -71,45 +71,47 @@ def load_skeleton(which: str) -> SkeletonMap:
     """Load a shipped map by its name, or a user's by its path.
 
     Raises:
-        InputError: if there is no such file or it is no map.
+        InputError: if there is no such file or it is not a valid map.
     """
     path = SKELETONS / f"{which}.yaml" if which in shipped_skeletons() else Path(which)
     if not path.is_file():
         known = ", ".join(shipped_skeletons())
-        raise InputError(f"skeleton: {which!r} is no file; allowed: {known}, or the path of a YAML map")
+        raise InputError(f"skeleton={which}: must be one of {known}, or the path of a YAML map")
     try:
         content = yaml.load(path.read_text("utf-8"), _StrictLoader)
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        raise InputError(f"{path}: {why_unreadable(error)[:120]}; allowed: a readable YAML map") from error
-    return _parsed(path, content)
+        raise InputError(f"{path}: {why_unreadable(error)[:120]}; expected a readable YAML map") from error
+    return _parse(path, content)
 
 
-def find_skeleton(recording: MotionFile, chosen: SkeletonMap | None = None) -> SkeletonMap:
+def find_skeleton(recording: Recording, chosen: SkeletonMap | None = None) -> SkeletonMap:
     """Find the shipped map all of whose nodes the file has; of several maps, the one with the most nodes.
 
-    Of maps with equally many nodes, the one that finds unit and up axis in the file is preferred.
-
-    Spellings and namespaces may differ (`names.find_nodes`); the returned map has the file's spellings. A map
-    that the user chose is returned with the file's spellings, too, or unchanged if the file lacks some of its
-    nodes.
+    Of maps with equally many nodes, the one that finds unit and up axis in the file is preferred. Spellings
+    and namespaces may differ (`find_nodes`); the returned map has the file's spellings. A map that the user
+    chose is returned with the file's spellings, too, or unchanged if the file lacks some of its nodes.
 
     Raises:
         InputError: if no map fits, or several fit equally well.
     """
     if chosen is not None:
-        return spelt_as_in(chosen, recording) or chosen
+        return _respell(chosen, recording) or chosen
     maps = _shipped_maps(SKELETONS)
-    fitting = [fitted for skeleton in maps if (fitted := spelt_as_in(skeleton, recording)) is not None]
-    best = max(map(_rank, fitting), default=(0, 0))
-    fitting = [skeleton for skeleton in fitting if _rank(skeleton) == best]
+    fitting = [fitted for skeleton in maps if (fitted := _respell(skeleton, recording)) is not None]
+
+    def rank(skeleton: SkeletonMap) -> tuple[int, int]:
+        return len(skeleton.joints), (skeleton.unit, skeleton.up).count(None)
+
+    best = max(map(rank, fitting), default=(0, 0))
+    fitting = [skeleton for skeleton in fitting if rank(skeleton) == best]
     if len(fitting) == 1:
         return fitting[0]
-    state = "fits more than one skeleton" if fitting else "has an unknown skeleton"
+    problem = "fits more than one skeleton" if fitting else "has an unknown skeleton"
     known = ", ".join(skeleton.name for skeleton in fitting or maps)
-    names = [name for name in recording.nodes if not name.endswith(".end")]
+    names = [name for name in recording.nodes if not name.endswith(END)]
     listed = ", ".join(names[:60]) + (", ..." if len(names) > 60 else "")
     raise InputError(
-        f"{recording.path}: {state} with the joints {listed}; allowed: {known}, or a map by skeleton="
+        f"{recording.path}: {problem} with the joints {listed}; expected {known}, or a map by skeleton="
     )
 
 
@@ -119,23 +121,58 @@ def _shipped_maps(folder: Path) -> tuple[SkeletonMap, ...]:
     return tuple(load_skeleton(name) for name in shipped_skeletons())
 
 
-def _rank(skeleton: SkeletonMap) -> tuple[int, int]:
-    """Return the rank of a map among those that fit a file; the highest rank wins."""
-    return len(skeleton.joints), (skeleton.unit, skeleton.up).count(None)
-
-
-def spelt_as_in(skeleton: SkeletonMap, recording: MotionFile) -> SkeletonMap | None:
-    """Return a map with its nodes spelt as in the file, including the file's namespace.
-
-    Returns None if the file lacks one of the nodes.
-    """
-    told = skeleton.rest if isinstance(skeleton.rest, dict) else {}
-    nodes = find_nodes(recording.nodes, sorted({*skeleton.joints.values(), *told}))
+def _respell(skeleton: SkeletonMap, recording: Recording) -> SkeletonMap | None:
+    """Return a map with its nodes spelt as in the file; None if the file lacks one of them."""
+    rest = skeleton.rest if isinstance(skeleton.rest, dict) else {}
+    nodes = find_nodes(recording.nodes, sorted({*skeleton.joints.values(), *rest}))
     if nodes is None:
         return None
     joints = {joint: nodes[node] for joint, node in skeleton.joints.items()}
-    rest = {nodes[node]: turns for node, turns in told.items()} or skeleton.rest
-    return replace(skeleton, joints=joints, rest=rest)
+    return replace(
+        skeleton, joints=joints, rest={nodes[n]: turns for n, turns in rest.items()} or skeleton.rest
+    )
+
+
+# Names of nodes
+
+
+def without_namespace(nodes: Sequence[str]) -> list[str]:
+    """Return the names without their common beginning, such as `mixamorig:`, `Character1_` or `m_avg_`.
+
+    Anything that ends in a colon is a namespace, common or not. The names are left whole if two would become
+    the same.
+    """
+    plain = [re.sub(r".*[:|]", "", node) for node in nodes]
+    letters = zip(*(name.removesuffix(END) for name in plain), strict=False)
+    shared = [each[0] for each in takewhile(lambda each: len(set(each)) == 1, letters)]
+    for length in range(len(shared), 0, -1):  # up to a separator or before a capital letter
+        capital = shared[length - 1].islower() and all(name[length : length + 1].isupper() for name in plain)
+        if SEPARATORS.fullmatch(shared[length - 1]) or capital:
+            plain = [name[length:] for name in plain]
+            break
+    return plain if len(set(plain)) == len(plain) and all(plain) else list(nodes)
+
+
+def find_nodes(nodes: Sequence[str], names: Sequence[str]) -> dict[str, str] | None:
+    """Find the file's node for each name: the exact name, else the only node with an equivalent spelling.
+
+    `Left_hip`, `left_hip` and `x:LeftHip` are equivalent. Returns None if a name has no node.
+    """
+    keys = [_key(name) for name in without_namespace(nodes)]
+    count = Counter(keys)
+    unique = {key: node for key, node in zip(keys, nodes, strict=True) if count[key] == 1}
+    found = {name: name if name in nodes else unique.get(_key(name)) for name in names}
+    if None in found.values() or len(set(found.values())) < len(found):
+        return None
+    return {name: str(node) for name, node in found.items()}
+
+
+def _key(name: str) -> str:
+    stem = name.removesuffix(END)
+    return SEPARATORS.sub("", stem).lower() + (END if stem != name else "")
+
+
+# The YAML file
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -143,53 +180,47 @@ class _StrictLoader(yaml.SafeLoader):
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
-        twice = [key for key, count in keys.items() if count > 1]
-        if twice:
-            raise ValueError(f"the key {twice[0]!r} stands twice")
+        if twice := [key for key, count in keys.items() if count > 1]:
+            raise ValueError(f"the key {twice[0]!r} occurs twice")
         return super().construct_mapping(node, deep)
 
 
-def _parsed(path: Path, content: object) -> SkeletonMap:
-    """Return the map in a YAML file. Raises InputError unless it has what a SkeletonMap needs."""
+def _parse(path: Path, content: object) -> SkeletonMap:
+    """Return the map in a YAML file. Raises InputError unless all of its values are valid."""
 
-    def require(good: bool, key: str, allowed: str) -> None:
+    def require(good: bool, key: str, expected: str) -> None:
         if not good:
-            raise InputError(f"{path}: {key} is wrong or missing; allowed: {allowed}")
+            raise InputError(f"{path}: {key}: must be {expected}")
 
-    needed, more = ("name", "joints"), ("unit", "up", "calibration_frame", "rest", "note")
-    if not isinstance(content, dict) or not set(needed) <= set(content) <= {*needed, *more}:
-        raise InputError(
-            f"{path}: not the keys of a map; allowed: {', '.join(needed)}, and {', '.join(more)}"
-        )
-    told = {"unit": FOUND, "up": FOUND, "calibration_frame": False, "rest": FOUND, "note": "", **content}
-    require(_is_text(told["name"]), "name", "text")
-    numbers = "a number of metres from 1e-6 to 1000, or auto"
-    require(told["unit"] == FOUND or is_number(told["unit"], 1e-6, 1e3), "unit", numbers)
-    require(told["up"] in ("y", "z", FOUND), "up", "y, z or auto")
-    require(isinstance(told["calibration_frame"], bool), "calibration_frame", "true or false")
-    require(_is_rest(told["rest"]), "rest", "auto, a frame's number, or JOINT: [degrees, degrees, degrees]")
-    require(told["note"] == "" or _is_text(told["note"]), "note", "text")
-    _check_joints(require, told["joints"])
-    unit, up = (None if told[key] == FOUND else told[key] for key in ("unit", "up"))
-    return SkeletonMap(**{**told, "unit": unit, "up": up})
-
-
-def _check_joints(require: Callable[[bool, str, str], None], joints: object) -> None:
-    """Check that a map's joints are joints of the body, include the needed ones, and have different nodes."""
-    require(isinstance(joints, dict), "joints", f"{', '.join(JOINTS)}, each with the file's joint")
-    assert isinstance(joints, dict)
+    required, optional = ("name", "joints"), ("unit", "up", "calibration_frame", "rest", "note")
+    if not isinstance(content, dict) or not set(required) <= set(content) <= {*required, *optional}:
+        raise InputError(f"{path}: the keys must be {', '.join(required)}, and any of {', '.join(optional)}")
+    values = {"unit": AUTO, "up": AUTO, "calibration_frame": False, "rest": AUTO, "note": "", **content}
+    require(_is_text(values["name"]), "name", "text")
+    good_unit = values["unit"] == AUTO or is_number(values["unit"], 1e-6, 1e3)
+    require(good_unit, "unit", "a number of metres from 1e-6 to 1000, or auto")
+    require(values["up"] in ("y", "z", AUTO), "up", "y, z or auto")
+    require(isinstance(values["calibration_frame"], bool), "calibration_frame", "true or false")
+    rest = "auto, a frame's number, or JOINT: [degrees, degrees, degrees]"
+    require(_is_rest(values["rest"]), "rest", rest)
+    require(values["note"] == "" or _is_text(values["note"]), "note", "text")
+    joints = values["joints"]
+    if not isinstance(joints, dict):
+        raise InputError(f"{path}: joints: must map {', '.join(JOINTS)} to the file's joints")
     for joint, node in joints.items():
-        allowed = f"a joint of the file for each of {', '.join(JOINTS)}"
-        require(joint in JOINTS and _is_text(node), f"joints.{joint}", allowed)
+        known = joint in JOINTS and _is_text(node)
+        require(known, f"joints.{joint}", f"a joint of the file for one of {', '.join(JOINTS)}")
     for joint in REQUIRED:
-        require(joint in joints, f"joints.{joint}", f"a joint's name; {', '.join(REQUIRED)} are needed")
+        require(joint in joints, f"joints.{joint}", "the name of a joint; it is required")
     node, count = Counter(joints.values()).most_common(1)[0]
-    require(count == 1, f"joints: {node}", "each of the file's joints once")
+    require(count == 1, f"joints: {node}", "named once")
+    unit, up = (None if values[key] == AUTO else values[key] for key in ("unit", "up"))
+    return SkeletonMap(**{**values, "unit": unit, "up": up})
 
 
 def _is_rest(value: object) -> bool:
     if not isinstance(value, dict):
-        return value == FOUND or (isinstance(value, int) and not isinstance(value, bool) and value >= 0)
+        return value == AUTO or (isinstance(value, int) and not isinstance(value, bool) and value >= 0)
     return bool(value) and all(
         _is_text(node) and isinstance(turns, list) and all(is_number(turn, -360, 360) for turn in turns)
         for node, turns in value.items()
@@ -201,4 +232,69 @@ def _is_text(value: object) -> bool:
 
 
 def is_number(value: object, low: float, high: float) -> bool:
+    """Return whether a value of a YAML file is a number between two bounds."""
     return isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high
+
+
+# The joints' motion
+
+
+@dataclass(frozen=True)
+class MappedMotion:
+    """A recording's motion of the mapped joints, in Y-up axes and metres.
+
+    Attributes:
+        path: the file, for messages.
+        mapped: whether (22,) each body joint has a node in the file.
+        nodes: index (22,) of that node; without one, that of the parent joint's node.
+        rotations: global rotations (N, 22, 3, 3) of these nodes.
+        positions: their positions (N, 22, 3).
+        zero: their positions (22, 3) in the file's zero pose, where all rotations are the identity.
+    """
+
+    path: Path
+    mapped: np.ndarray
+    nodes: np.ndarray
+    rotations: np.ndarray
+    positions: np.ndarray
+    zero: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.rotations)
+
+
+def pick_joints(recording: Recording, skeleton: SkeletonMap) -> MappedMotion:
+    """Pick the mapped joints' motion from a recording, without its calibration frame.
+
+    Raises:
+        InputError: if nodes that the map names are missing or have another order than the body's, or no frame
+            is left.
+    """
+    if missing := sorted(set(skeleton.joints.values()) - set(recording.nodes)):
+        raise InputError(f"{recording.path}: lacks {', '.join(missing)} of skeleton {skeleton.name}")
+    nodes = np.zeros(len(JOINTS), int)
+    for joint, parent in enumerate(PARENTS):
+        node = skeleton.joints.get(JOINTS[joint])
+        nodes[joint] = nodes[parent] if node is None else recording.nodes.index(node)
+        above = int(nodes[joint])
+        while above not in (nodes[parent], -1):
+            above = recording.node_parents[above]
+        if above < 0:
+            raise InputError(
+                f"{recording.path}: {node} must be below {recording.nodes[nodes[parent]]} for skeleton "
+                f"{skeleton.name}; check the map"
+            )
+    rotations, positions = (
+        array[int(skeleton.calibration_frame) :, nodes] for array in recording.kinematics()
+    )
+    if len(rotations) == 0:
+        raise InputError(f"{recording.path}: only the calibration frame; expected two frames or more")
+    upright, unit = skeleton.upright, skeleton.unit
+    return MappedMotion(
+        path=recording.path,
+        mapped=np.array([joint in skeleton.joints for joint in JOINTS]),
+        nodes=nodes,
+        rotations=upright @ rotations @ upright.T,
+        positions=unit * positions @ upright.T,
+        zero=unit * recording.zero_pose()[nodes] @ upright.T,
+    )

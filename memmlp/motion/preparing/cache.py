@@ -32,7 +32,6 @@ from memmlp.motion.preparing.imported_body import body_name, check_imported_body
 from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manifest
 from memmlp.motion.preparing.splits import PARTS, Split
 from memmlp.motion.preparing.survey import survey
-from memmlp.motion.torch_threads import one_thread
 from memmlp.runs.recipe_versions import RECIPES
 
 FRAMES_VERSION = 1  # number of a frame's content; a new one changes every digest, and so repeats every run
@@ -183,6 +182,8 @@ def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) 
 def _write_frames(
     source: ClipFolder, rest: np.ndarray, manifest: Manifest, paths: Mapping[str, Path]
 ) -> None:
+    from memmlp.motion.geometry import one_thread  # imports torch, like `frame_blocks`
+
     with ExitStack() as stack:
         stack.enter_context(one_thread())
         files = {part: stack.enter_context(open(path, "wb")) for part, path in paths.items()}
@@ -203,7 +204,7 @@ def frame_blocks(clip: Clip, rest: np.ndarray) -> Iterator[np.ndarray]:
     """Yield the frames of a 60 Hz clip in blocks (<= CHUNK, 252), float32, computed in float64."""
     import torch  # takes seconds to import, and finding a finished cache does not need it
 
-    from memmlp.motion.features import motion_frames
+    from memmlp.motion.geometry import motion_frames
 
     poses, trans, joints = (torch.from_numpy(np.ascontiguousarray(x)) for x in (clip.poses, clip.trans, rest))
     for start in range(0, len(clip) - 1, CHUNK):

@@ -10,8 +10,8 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.motion.body import load_rest_joints
 from memmlp.motion.clip import Skipped
-from memmlp.motion.clip_kinematics import clip_kinematics
 from memmlp.motion.formats.npz import read_clip
+from memmlp.motion.geometry import clip_kinematics
 from memmlp.motion.preparing.find_clips import clip_name, find_clips
 from memmlp.report.pictures.canvas import Sheet, shorten
 from memmlp.report.pictures.raster import Camera, draw

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from memmlp.common.files import atomic_write
-from memmlp.motion.importing.node_names import without_namespace
-from memmlp.motion.importing.skeleton_map import Z_UP
-from memmlp.motion.importing.stance_with_all_nodes import StanceWithAllNodes
+from memmlp.motion.importing.convert import StanceView
+from memmlp.motion.importing.skeleton_map import Z_UP, without_namespace
 from memmlp.motion.limb_shapes import RADII
 from memmlp.report.pictures.canvas import FAINT, INK, Sheet, png, shorten
 from memmlp.report.pictures.raster import Camera, draw
@@ -24,7 +23,7 @@ SPACING = 21  # pixels from a name to the next
 LEFT, RIGHT, MIDDLE, BARE = "#1f6fd0", "#d0561f", "#2a8c4a", "#b4bac1"
 
 
-def skeleton_png(path: Path, stance: StanceWithAllNodes, title: str) -> None:
+def skeleton_png(path: Path, stance: StanceView, title: str) -> None:
     """Write a PNG of a stance from the front and from the right: the file's nodes, and the body.
 
     All nodes are grey; those mapped to a body joint are coloured, and named `body joint = node`.
@@ -65,7 +64,7 @@ def _colour(joint: str) -> str:
     return {"left": LEFT, "right": RIGHT}.get(joint.split("_")[0], MIDDLE)
 
 
-def _bones(sheet: Sheet, stance: StanceWithAllNodes, places: np.ndarray, near: np.ndarray) -> None:
+def _bones(sheet: Sheet, stance: StanceView, places: np.ndarray, near: np.ndarray) -> None:
     """Draw all nodes grey, with lines to their parents, and the mapped ones in their colours.
 
     Nodes that are not `near` (nodes,) are left out: a root at the origin may be far from the person.
@@ -78,9 +77,7 @@ def _bones(sheet: Sheet, stance: StanceWithAllNodes, places: np.ndarray, near: n
         _line(sheet, places[[node]], color=_colour(joint), lw=0, marker="o", ms=7)
 
 
-def _names(
-    sheet: Sheet, stance: StanceWithAllNodes, places: np.ndarray, side: str, x: float, align: str
-) -> None:
+def _names(sheet: Sheet, stance: StanceView, places: np.ndarray, side: str, x: float, align: str) -> None:
     """Write the names of one side's joints below each other, each joined to its node by a line."""
     joints = [joint for joint in stance.mapped if _colour(joint) == _colour(side or "pelvis")]
     joints.sort(key=lambda joint: places[stance.mapped[joint], 1])
@@ -108,7 +105,7 @@ def spread(wanted: Sequence[float], least: float, low: float, high: float) -> li
     return places
 
 
-def _body(sheet: Sheet, stance: StanceWithAllNodes) -> None:
+def _body(sheet: Sheet, stance: StanceView) -> None:
     """Draw the built-in body in the same stance, from the front and from the right."""
     joints = stance.body @ Z_UP.T
     joints = joints - [0, 0, joints[:, 2].min() - min(RADII)]

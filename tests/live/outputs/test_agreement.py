@@ -22,8 +22,8 @@ from memmlp.live.outputs.vmc import VMC
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream
 from memmlp.motion.body import JOINTS, N_JOINTS
-from memmlp.motion.formats.humanoid_bones import UNITY
 from memmlp.motion.formats.npz import read_clip
+from memmlp.motion.formats.vrm import UNITY_BONES as UNITY
 from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics
 
 pytestmark = pytest.mark.slow

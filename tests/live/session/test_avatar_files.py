@@ -30,7 +30,7 @@ from memmlp.live.session.sources import ClipSource, TrackedClip
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Pose
 from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
-from memmlp.motion.formats.humanoid_bones import VRM
+from memmlp.motion.formats.vrm import VRM_BONES as VRM
 
 REST = builtin_rest_joints()
 RANDOM = np.random.default_rng(2)

@@ -29,7 +29,7 @@ FORMATS: dict[str, tuple[Callable[[], bytes], Callable[[Path], np.ndarray]]] = {
         lambda: person("cmu_motionbuilder", frames=5, seed=0).text().encode(),
         lambda path: read_bvh(path).kinematics()[1],
     ),
-    "a.txt": (sound_expmap, lambda path: read_expmap(path, 120.0).kinematics()[1]),
+    "a.txt": (sound_expmap, lambda path: read_expmap(path).kinematics()[1]),
 }
 
 

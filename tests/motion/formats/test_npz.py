@@ -11,7 +11,7 @@ import pytest
 
 from memmlp.common.errors import InputError
 from memmlp.motion.clip import Clip
-from memmlp.motion.formats import bounded_npz
+from memmlp.motion.formats import npz as bounded_npz
 from memmlp.motion.formats.npz import NoMotion, read_clip, write_clip
 
 
@@ -247,7 +247,7 @@ def peak_of_refusal(path: Path, match: str) -> int:
 
 
 @pytest.mark.parametrize(
-    ("shape", "allowed"), [((5000, 156), "allowed: up to 500 frames"), ((100, 8000), "not floats")]
+    ("shape", "allowed"), [((5000, 156), "1 to 500 frames"), ((100, 8000), "expected floats")]
 )
 def test_a_small_file_that_unpacks_to_much_is_refused_before_it_does(shape, allowed, tmp_path, monkeypatch):
     """It says so itself; the bound is lowered, so that the test need not pack gigabytes."""
@@ -262,14 +262,14 @@ def test_a_small_file_that_unpacks_to_much_is_refused_before_it_does(shape, allo
 def test_rotations_in_another_form_are_refused(width, tmp_path):
     """Quaternions, 6D, and matrices of 22 joints would be read as rotation vectors of another motion."""
     np.savez(tmp_path / "a.npz", **(arrays() | {"poses": np.zeros((50, width))}))
-    with pytest.raises(InputError, match=rf"a\.npz: poses is .*{width}.* not floats \(N, 66\) or \(N, 72\)"):
+    with pytest.raises(InputError, match=rf"a\.npz: poses is .*{width}.*\(N, 66\) or \(N, 72\)"):
         read_clip(tmp_path / "a.npz", "a")
 
 
 def test_two_frame_rates_must_be_one(tmp_path):
     given = arrays() | {"mocap_framerate": np.array(120.0)}
     np.savez(tmp_path / "a.npz", **given, fps=np.array(60.0))
-    with pytest.raises(InputError, match=r"a\.npz: has two frame rates, 120 and fps=60; allowed is one"):
+    with pytest.raises(InputError, match=r"a\.npz: two frame rates, 120 and fps=60"):
         read_clip(tmp_path / "a.npz", "a")
     np.savez(tmp_path / "a.npz", **given, fps=np.array(120))
     assert read_clip(tmp_path / "a.npz", "a").fps == 120
@@ -288,7 +288,7 @@ def test_a_motion_under_several_names_must_be_one(key, tmp_path):
     assert len(read_clip(path, "a")) == 20
     for wrong in (copies[key] + 0.1, copies[key][1:], copies[key] * np.nan):
         path.write_bytes(npz(**good, **{**copies, key: wrong}))
-        with pytest.raises(InputError, match=rf"a\.npz: {key} is another motion than poses, trans; allowed"):
+        with pytest.raises(InputError, match=rf"a\.npz: {key} and poses, trans"):
             read_clip(path, "a")
 
 
@@ -312,7 +312,7 @@ def test_a_huge_directory_is_not_read(tmp_path, monkeypatch):
 
 def test_what_is_no_zip_is_said_without_advice_to_unpickle(tmp_path):
     (tmp_path / "a.npz").write_text("not an npz\n")
-    with pytest.raises(InputError, match=r"a\.npz: no zip, so no npz") as caught:
+    with pytest.raises(InputError, match=r"a\.npz: not a zip") as caught:
         read_clip(tmp_path / "a.npz", "a")
     assert "unsafe" not in str(caught.value)
     assert "pickle" not in str(caught.value)

@@ -21,7 +21,7 @@ def without(*names: str) -> np.ndarray:
 
 def test_segments_go_on_past_joints_that_are_missing() -> None:
     assert len(anatomy.segments(ALL)) == 17
-    names = [segment.name for segment in anatomy.segments(without("spine3", "neck", "left_foot"))]
+    names = [str(segment) for segment in anatomy.segments(without("spine3", "neck", "left_foot"))]
     assert "spine2 to head" in names
     assert not [name for name in names if "left_foot" in name]
 
@@ -148,11 +148,3 @@ def test_bends_and_hinges() -> None:
         positions[:, end] = positions[:, middle] + straight
         assert anatomy.hinge(upper, positions, joint) is None
         assert anatomy.bend(positions[2], joint) is None
-
-
-def test_a_limb_is_turned_about_itself_to_its_hinge() -> None:
-    bone = REST[18] - REST[16]
-    wanted = anatomy.unit(np.cross(bone, [0.3, 0.2, 1.0]))
-    own = anatomy.turned_to_hinge(np.eye(3), 16, bone, wanted)
-    np.testing.assert_allclose(own @ bone, bone, atol=1e-12)
-    assert anatomy.angles(own @ np.array(HINGES[16]), wanted) < 3

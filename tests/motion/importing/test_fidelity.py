@@ -51,14 +51,14 @@ def walk(tmp_path: Path) -> Converted:
 
 def test_a_right_import_has_no_fault(walk: Converted) -> None:
     assert walk.fidelity.faults == ()
-    again = compare(walk.clip, walk.mapped_motion, REST, "cmu_daz")
+    again = compare(walk.clip, walk.motion, REST, "cmu_daz")
     assert again == walk.fidelity
 
 
 @pytest.mark.parametrize("place", [(60, 0, 0), (-60, 0, 0), (0, 60, 0), (0, -60, 0)], ids=str)
 def test_feet_point_forward_wherever_the_walk_is(walk: Converted, place: tuple[float, float, float]) -> None:
     elsewhere = replace(walk.clip, trans=walk.clip.trans + np.array(place))
-    faults = compare(elsewhere, walk.mapped_motion, REST, "cmu_daz").faults
+    faults = compare(elsewhere, walk.motion, REST, "cmu_daz").faults
     assert not any("feet" in fault for fault in faults)
 
 
@@ -81,7 +81,7 @@ def bent(clip: Clip, joint: str, frame: int | slice, vector: list[float]) -> Cli
 )
 def test_a_joint_that_is_off_in_one_frame_is_named(walk: Converted, joint: str, segment: str) -> None:
     clip = bent(walk.clip, joint, 31, [0.0, 0.1, 0.25])
-    fidelity = compare(clip, walk.mapped_motion, REST, "cmu_daz")
+    fidelity = compare(clip, walk.motion, REST, "cmu_daz")
     assert fidelity.degrees.value > 3
     assert (fidelity.mm.frame, fidelity.degrees.frame) == (31, 31)
     assert any("in frame 31" in fault for fault in fidelity.faults)
@@ -100,21 +100,21 @@ def test_a_joint_that_is_off_in_one_frame_is_named(walk: Converted, joint: str, 
     ],
 )
 def test_what_no_person_does_is_said(walk: Converted, change: Callable[[Clip], Clip], said: str) -> None:
-    faults = compare(change(walk.clip), walk.mapped_motion, REST, "cmu_daz").faults
+    faults = compare(change(walk.clip), walk.motion, REST, "cmu_daz").faults
     assert any(said in fault for fault in faults)
 
 
 def test_a_head_that_flips_for_a_while_is_said(walk: Converted) -> None:
     """As in CMU's salsa/07, where the head's markers change places; 1 % of the frames is enough."""
     flipped = bent(walk.clip, "head", slice(40, 46), [0.0, 0.0, np.pi])
-    said = compare(flipped, walk.mapped_motion, REST, "cmu_daz").faults
+    said = compare(flipped, walk.motion, REST, "cmu_daz").faults
     assert any(f"{6 / len(flipped):.0%} of the frames, first in frame 40" in fault for fault in said)
 
 
 def test_segments_that_stretch_are_said(walk: Converted) -> None:
-    positions = walk.mapped_motion.positions.copy()
+    positions = walk.motion.positions.copy()
     positions[10:, JOINT["left_wrist"]] += 0.1
-    faults = compare(walk.clip, replace(walk.mapped_motion, positions=positions), REST, "cmu_daz").faults
+    faults = compare(walk.clip, replace(walk.motion, positions=positions), REST, "cmu_daz").faults
     assert any("left_elbow to left_wrist changes its length by" in fault for fault in faults)
 
 

@@ -17,8 +17,8 @@ from memmlp.common.errors import InputError
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.dataset import MotionDataset
-from memmlp.motion.features import motion_frames
 from memmlp.motion.formats.npz import read_clip, write_clip
+from memmlp.motion.geometry import motion_frames
 from memmlp.motion.preparing import cache as module
 from memmlp.motion.preparing import survey as survey_module
 from memmlp.motion.preparing.cache import ClipFolder, prepare

@@ -12,8 +12,8 @@ from skeleton_families import family, walking
 
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.formats.bvh import read_bvh
+from memmlp.motion.importing.convert import view_stance
 from memmlp.motion.importing.skeleton_map import find_skeleton
-from memmlp.motion.importing.stance_with_all_nodes import find_stance_with_all_nodes
 from memmlp.report.pictures.skeleton_picture import HEIGHT, LEFT, MIDDLE, RIGHT, WIDTH, skeleton_png, spread
 
 
@@ -38,7 +38,7 @@ def pixels(picture: np.ndarray, colour: str) -> np.ndarray:
 
 def draw(folder: Path, name: str, far: bool = False) -> np.ndarray:
     bvh = read_bvh(write(folder, walking(name).text()))
-    stance = find_stance_with_all_nodes(bvh, find_skeleton(bvh), builtin_rest_joints())
+    stance = view_stance(bvh, find_skeleton(bvh), builtin_rest_joints())
     if far:
         stance.positions[stance.nodes.index("HeadTop_End")] += [5.0, 0.0, 5.0]
     skeleton_png(folder / "out.png", stance, "a file")

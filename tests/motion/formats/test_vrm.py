@@ -9,8 +9,9 @@ import pytest
 from glb import Glb
 
 from memmlp.motion.body import JOINTS, builtin_rest_joints
-from memmlp.motion.formats.humanoid_bones import UNITY, VRM
-from memmlp.motion.formats.vrm_writer import write_vrm
+from memmlp.motion.formats.vrm import UNITY_BONES as UNITY
+from memmlp.motion.formats.vrm import VRM_BONES as VRM
+from memmlp.motion.formats.vrm import write_vrm
 
 REST = builtin_rest_joints()
 REQUIRED = {

@@ -11,7 +11,7 @@ from glb import Glb
 
 from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
 from memmlp.motion.clip import Clip
-from memmlp.motion.formats.gltf_writer import mannequin, write_gltf
+from memmlp.motion.formats.gltf import mannequin, write_gltf
 from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics
 
 REST = builtin_rest_joints()

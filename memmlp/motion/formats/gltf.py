@@ -20,8 +20,7 @@ from scipy.spatial.transform import Rotation
 import memmlp
 from memmlp.common.files import atomic_file
 from memmlp.motion.body import JOINTS, N_JOINTS, PARENTS
-from memmlp.motion.clip import Clip
-from memmlp.motion.formats.y_up import y_up_motion
+from memmlp.motion.clip import Clip, y_up_motion
 from memmlp.motion.limb_shapes import LIMBS, ends
 
 COMPONENTS = {"<f4": 5126, "<u2": 5123, "|u1": 5121}  # glTF's numbers for types of components
@@ -34,20 +33,11 @@ def write_gltf(path: Path, clip: Clip, rest: np.ndarray) -> None:
     """Write a clip on a body with these rest joints (22, 3), metres, as a .glb file, atomically."""
     buffer = Buffer()
     bind = rest - [0, rest[:, 1].min(), 0]  # the lowest joint on the floor
-    content = {
-        "asset": {"version": "2.0", "generator": f"memmlp {memmlp.__version__}"},
-        "scene": 0,
-        "scenes": [{"nodes": [0, N_JOINTS]}],
-        "nodes": [*joint_nodes(bind), {"name": "mannequin", "mesh": 0, "skin": 0}],
-        "skins": [skin(buffer, bind)],
-        "meshes": [{"name": "mannequin", "primitives": [primitive(buffer, mannequin(bind))]}],
-        "materials": [{"name": "mannequin", "pbrMetallicRoughness": _MATERIAL}],
-        "animations": [_animation(buffer, clip, rest)],
-    }
-    write_glb(path, content, buffer)
-
-
-_MATERIAL = {"baseColorFactor": COLOUR, "metallicFactor": 0.0, "roughnessFactor": 0.7}
+    look = {"baseColorFactor": COLOUR, "metallicFactor": 0.0, "roughnessFactor": 0.7}
+    figure = skinned_figure(buffer, bind, [mannequin(bind)])
+    materials = [{"name": "mannequin", "pbrMetallicRoughness": look}]
+    animations = [_animation(buffer, clip, rest)]
+    write_glb(path, {**figure, "materials": materials, "animations": animations}, buffer)
 
 
 @dataclass
@@ -68,79 +58,18 @@ class Buffer:
             bounds: whether the smallest and largest values are given, as glTF demands for times and
                 positions.
         """
-        about: dict[str, Any] = {"bufferView": len(self.views), "componentType": COMPONENTS[array.dtype.str]}
-        about |= {"count": len(array), "type": kind}
+        accessor: dict[str, Any] = {
+            "bufferView": len(self.views), "componentType": COMPONENTS[array.dtype.str],
+            "count": len(array), "type": kind,
+        }  # fmt: skip
         if bounds:
             rows = array.reshape(len(array), -1)
-            about |= {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
+            accessor |= {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
         view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": array.nbytes}
         self.views.append(view | ({} if target is None else {"target": target}))
         self.data += array.tobytes() + bytes(-array.nbytes % 4)  # each view begins at a multiple of 4 bytes
-        self.accessors.append(about)
+        self.accessors.append(accessor)
         return len(self.accessors) - 1
-
-
-def joint_nodes(bind: np.ndarray) -> list[dict[str, Any]]:
-    """Return the nodes of the 22 joints in the bind pose (22, 3), metres."""
-    nodes: list[dict[str, Any]] = []
-    for joint, parent in enumerate(PARENTS):
-        offset = bind[joint] - (bind[parent] if joint else 0)
-        children = [child for child, above in enumerate(PARENTS) if above == joint]
-        node = {"name": JOINTS[joint], "translation": offset.tolist()}
-        nodes.append(node | ({"children": children} if children else {}))
-    return nodes
-
-
-def skin(buffer: Buffer, bind: np.ndarray) -> dict[str, Any]:
-    """Return the skin: the joints, and the matrices from the bind pose (22, 3) to each joint's frame."""
-    inverse = np.tile(np.eye(4, dtype="<f4"), (N_JOINTS, 1, 1))
-    inverse[:, 3, :3] = -bind  # glTF stores matrices by columns
-    joints = list(range(N_JOINTS))
-    return {"joints": joints, "skeleton": 0, "inverseBindMatrices": buffer.add(inverse, "MAT4")}
-
-
-def _animation(buffer: Buffer, clip: Clip, rest: np.ndarray) -> dict[str, Any]:
-    """Return the animation: each joint's rotation and the root's translation, at the clip's frames."""
-    quaternions, root = _curves(clip, rest)
-    times = buffer.add((np.arange(len(clip)) / clip.fps).astype("<f4"), "SCALAR", bounds=True)
-    outputs = [(0, "translation", buffer.add(root, "VEC3"))]
-    for joint in range(N_JOINTS):
-        outputs.append((joint, "rotation", buffer.add(np.ascontiguousarray(quaternions[:, joint]), "VEC4")))
-    return {
-        "name": clip.name.encode("utf-8", "replace").decode(),
-        "samplers": [{"input": times, "interpolation": "LINEAR", "output": made} for *_, made in outputs],
-        "channels": [
-            {"sampler": index, "target": {"node": joint, "path": path}}
-            for index, (joint, path, _) in enumerate(outputs)
-        ],
-    }
-
-
-def _curves(clip: Clip, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the joints' quaternions xyzw (N, 22, 4) and the root's positions (N, 3), metres, float32."""
-    quaternions = np.empty((len(clip), N_JOINTS, 4), "<f4")
-    roots = np.empty((len(clip), 3), "<f4")
-    end = 0
-    for piece in clip.pieces():
-        rotations, root = y_up_motion(piece, rest)
-        before = quaternions[end - 1] if end else None
-        here = slice(end, end := end + len(piece))
-        quaternions[here], roots[here] = continuous_quaternions(rotations, before), root
-    return quaternions, roots
-
-
-def continuous_quaternions(rotations: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
-    """Return unit quaternions xyzw (N, J, 4) of rotations (N, J, 3, 3).
-
-    Two quaternions stand for each rotation; each frame has the one nearer to the frame before. The first
-    frame's are near the quaternions (J, 4) `before` it, if there are some.
-    """
-    quaternions = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat().reshape(*rotations.shape[:2], 4)
-    away = (quaternions[1:] * quaternions[:-1]).sum(-1, keepdims=True) < 0
-    quaternions[1:] *= np.cumprod(np.where(away, -1, 1), axis=0)
-    if before is not None:
-        quaternions *= np.where((quaternions[0] * before).sum(-1, keepdims=True) < 0, -1, 1)
-    return quaternions
 
 
 class Mesh(NamedTuple):
@@ -159,20 +88,99 @@ class Mesh(NamedTuple):
     triangles: np.ndarray
 
 
+def skinned_figure(buffer: Buffer, bind: np.ndarray, parts: Sequence[Mesh]) -> dict[str, Any]:
+    """Return the glTF content of meshes that follow the 22 joints, without materials.
+
+    Args:
+        buffer: gets the meshes.
+        bind: the joints in the bind pose (22, 3), metres.
+        parts: the meshes; each has the material of its index.
+    """
+    nodes: list[dict[str, Any]] = []
+    for joint, parent in enumerate(PARENTS):
+        offset = bind[joint] - (bind[parent] if joint else 0)
+        children = [child for child, above in enumerate(PARENTS) if above == joint]
+        node = {"name": JOINTS[joint], "translation": offset.tolist()}
+        nodes.append(node | ({"children": children} if children else {}))
+    inverse = np.tile(np.eye(4, dtype="<f4"), (N_JOINTS, 1, 1))
+    inverse[:, 3, :3] = -bind  # glTF stores matrices by columns
+    matrices = buffer.add(inverse, "MAT4")
+    skin = {"joints": list(range(N_JOINTS)), "skeleton": 0, "inverseBindMatrices": matrices}
+    primitives = [_primitive(buffer, part, material) for material, part in enumerate(parts)]
+    return {
+        "asset": {"version": "2.0", "generator": f"memmlp {memmlp.__version__}"},
+        "scene": 0,
+        "scenes": [{"nodes": [0, N_JOINTS]}],
+        "nodes": [*nodes, {"name": "mannequin", "mesh": 0, "skin": 0}],
+        "skins": [skin],
+        "meshes": [{"name": "mannequin", "primitives": primitives}],
+    }
+
+
+def _primitive(buffer: Buffer, mesh: Mesh, material: int) -> dict[str, Any]:
+    """Return a mesh as a glTF primitive, with four joints per vertex, of which only one is used."""
+    joints = np.zeros((len(mesh.joints), 4), "|u1")
+    weights = np.zeros((len(mesh.joints), 4), "<f4")
+    joints[:, 0], weights[:, 0] = mesh.joints, 1
+    attributes = {
+        "POSITION": buffer.add(mesh.positions.astype("<f4"), "VEC3", VERTICES, bounds=True),
+        "NORMAL": buffer.add(mesh.normals.astype("<f4"), "VEC3", VERTICES),
+        "JOINTS_0": buffer.add(joints, "VEC4", VERTICES),
+        "WEIGHTS_0": buffer.add(weights, "VEC4", VERTICES),
+    }
+    indices = buffer.add(mesh.triangles.astype("<u2").reshape(-1), "SCALAR", INDICES)
+    return {"attributes": attributes, "indices": indices, "material": material}
+
+
+def _animation(buffer: Buffer, clip: Clip, rest: np.ndarray) -> dict[str, Any]:
+    """Return the animation: each joint's rotation and the root's translation, at the clip's frames."""
+    quaternions = np.empty((len(clip), N_JOINTS, 4), "<f4")
+    root = np.empty((len(clip), 3), "<f4")
+    end = 0
+    for piece in clip.pieces():
+        rotations, positions = y_up_motion(piece, rest)
+        before = quaternions[end - 1] if end else None
+        here = slice(end, end := end + len(piece))
+        quaternions[here], root[here] = continuous_quaternions(rotations, before), positions
+    times = buffer.add((np.arange(len(clip)) / clip.fps).astype("<f4"), "SCALAR", bounds=True)
+    outputs = [(0, "translation", buffer.add(root, "VEC3"))]
+    for joint in range(N_JOINTS):
+        outputs.append((joint, "rotation", buffer.add(np.ascontiguousarray(quaternions[:, joint]), "VEC4")))
+    return {
+        "name": clip.name.encode("utf-8", "replace").decode(),
+        "samplers": [{"input": times, "interpolation": "LINEAR", "output": made} for *_, made in outputs],
+        "channels": [
+            {"sampler": index, "target": {"node": joint, "path": path}}
+            for index, (joint, path, _) in enumerate(outputs)
+        ],
+    }
+
+
+def continuous_quaternions(rotations: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
+    """Return unit quaternions xyzw (N, J, 4) of rotations (N, J, 3, 3).
+
+    Two quaternions stand for each rotation; each frame has the one nearer to the frame before. The first
+    frame's are near the quaternions (J, 4) `before` it, if they are given.
+    """
+    quaternions = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat().reshape(*rotations.shape[:2], 4)
+    away = (quaternions[1:] * quaternions[:-1]).sum(-1, keepdims=True) < 0
+    quaternions[1:] *= np.cumprod(np.where(away, -1, 1), axis=0)
+    if before is not None:
+        quaternions *= np.where((quaternions[0] * before).sum(-1, keepdims=True) < 0, -1, 1)
+    return quaternions
+
+
 def mannequin(bind: np.ndarray) -> Mesh:
     """Return the limbs of the bind pose (22, 3), metres, as capsules."""
-    return merged([capsule(limb.first, limb.radii, *ends(limb, bind)) for limb in LIMBS])
+    return merge_meshes([capsule(limb.first, limb.radii, *ends(limb, bind)) for limb in LIMBS])
 
 
-def merged(parts: Sequence[Mesh]) -> Mesh:
+def merge_meshes(parts: Sequence[Mesh]) -> Mesh:
     """Return several meshes as one."""
     starts = np.cumsum([0, *(len(part.positions) for part in parts)])
-    return Mesh(
-        np.concatenate([part.positions for part in parts]),
-        np.concatenate([part.normals for part in parts]),
-        np.concatenate([part.joints for part in parts]),
-        np.concatenate([part.triangles + start for part, start in zip(parts, starts, strict=False)]),
-    )
+    triangles = [part.triangles + start for part, start in zip(parts, starts, strict=False)]
+    positions, normals, joints = map(np.concatenate, zip(*(part[:3] for part in parts), strict=True))
+    return Mesh(positions, normals, joints, np.concatenate(triangles))
 
 
 def capsule(joint: int, radii: tuple[float, float], start: np.ndarray, end: np.ndarray) -> Mesh:
@@ -192,33 +200,13 @@ def capsule(joint: int, radii: tuple[float, float], start: np.ndarray, end: np.n
     height = np.concatenate([cap - np.pi / 2, cap])  # latitudes of the rings: start's half sphere, then end's
     normals = np.cos(height)[:, None, None] * ring + np.sin(height)[:, None, None] * along
     centres = np.repeat([start, end], CAP, axis=0)[:, None]
-    around = np.repeat(radii, CAP)[:, None, None]
-    positions = centres + around * normals
-    joints = np.full(normals.shape[0] * AROUND, joint)
-    return Mesh(positions.reshape(-1, 3), normals.reshape(-1, 3), joints, _tube(2 * CAP))
-
-
-def _tube(rings: int) -> np.ndarray:
-    """Return the triangles (T, 3) between rings of AROUND vertices, one ring after the other."""
-    this = np.arange((rings - 1) * AROUND)
-    beside = this // AROUND * AROUND + (this + 1) % AROUND
-    above, aslant = this + AROUND, beside + AROUND
-    return np.concatenate([np.stack([this, beside, aslant], 1), np.stack([this, aslant, above], 1)])
-
-
-def primitive(buffer: Buffer, mesh: Mesh, material: int = 0) -> dict[str, Any]:
-    """Return the mesh as a glTF primitive, with four joints per vertex, of which only one is used."""
-    joints = np.zeros((len(mesh.joints), 4), "|u1")
-    weights = np.zeros((len(mesh.joints), 4), "<f4")
-    joints[:, 0], weights[:, 0] = mesh.joints, 1
-    attributes = {
-        "POSITION": buffer.add(mesh.positions.astype("<f4"), "VEC3", VERTICES, bounds=True),
-        "NORMAL": buffer.add(mesh.normals.astype("<f4"), "VEC3", VERTICES),
-        "JOINTS_0": buffer.add(joints, "VEC4", VERTICES),
-        "WEIGHTS_0": buffer.add(weights, "VEC4", VERTICES),
-    }
-    indices = buffer.add(mesh.triangles.astype("<u2").reshape(-1), "SCALAR", INDICES)
-    return {"attributes": attributes, "indices": indices, "material": material}
+    positions = centres + np.repeat(radii, CAP)[:, None, None] * normals
+    corner = np.arange((len(normals) - 1) * AROUND)  # of the squares between the rings
+    beside = corner // AROUND * AROUND + (corner + 1) % AROUND
+    above, aslant = corner + AROUND, beside + AROUND
+    triangles = np.concatenate([np.stack([corner, beside, aslant], 1), np.stack([corner, aslant, above], 1)])
+    joints = np.full(len(normals) * AROUND, joint)
+    return Mesh(positions.reshape(-1, 3), normals.reshape(-1, 3), joints, triangles)
 
 
 def write_glb(path: Path, content: dict[str, Any], buffer: Buffer) -> None:
@@ -229,12 +217,9 @@ def write_glb(path: Path, content: dict[str, Any], buffer: Buffer) -> None:
         content: the JSON, without the buffer's entries.
         buffer: the binary data.
     """
-    buffers = {"accessors": buffer.accessors, "bufferViews": buffer.views}
     size = len(buffer.data)
-    text = json.dumps(
-        content | buffers | {"buffers": [{"byteLength": size}]}, separators=(",", ":"), allow_nan=False
-    )
-    encoded = text.encode()
+    buffers = {"accessors": buffer.accessors, "bufferViews": buffer.views, "buffers": [{"byteLength": size}]}
+    encoded = json.dumps(content | buffers, separators=(",", ":"), allow_nan=False).encode()
     encoded += b" " * (-len(encoded) % 4)
     with atomic_file(path) as file:
         file.write(struct.pack("<4sII", b"glTF", 2, 28 + len(encoded) + size))

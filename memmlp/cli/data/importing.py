@@ -1,0 +1,213 @@
+"""`memmlp data import`, `verify` and `skeleton`: clips from files of other skeletons."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from memmlp.cli.data.printing import amount, show_skipped, show_some
+from memmlp.cli.options import PATH, body_option, strict_option
+from memmlp.common.errors import InputError
+
+skeleton_option = click.option(
+    "--skeleton", help="A shipped skeleton map or the path of one.  [default: by the joints' names]"
+)
+up_option = click.option(
+    "--up", type=click.Choice(["y", "z"]), help="The files' up axis; by default the map's."
+)
+
+
+@click.command("import")
+@click.argument("source", type=PATH)
+@click.option("--out", required=True, type=PATH, help="Folder for the npz files.")
+@skeleton_option
+@click.option("--fps", multiple=True, metavar="[FOLDER=]HZ", help="True frame rate, for all or one folder.")
+@click.option(
+    "--floor",
+    "--ground",
+    "floor",
+    default="auto",
+    show_default=True,
+    metavar="auto|none|METRES",
+    help="auto puts the lowest stable contact of the feet at 0; METRES is the floor's height in the files.",
+)
+@up_option
+@click.option(
+    "--take", multiple=True, metavar="REGEX", help="Clips with the same match share one floor; repeatable."
+)
+@body_option
+@strict_option
+@click.option("--sound", is_flag=True, help="Skip faulty clips instead of writing them with a warning.")
+def import_(
+    source: Path,
+    out: Path,
+    skeleton: str | None,
+    fps: tuple[str, ...],
+    floor: str,
+    up: str | None,
+    take: tuple[str, ...],
+    body: str,
+    strict: bool,
+    sound: bool,
+) -> None:
+    """Import BVH files, or exponential maps of the CMU layout (.txt), as AMASS npz.
+
+    SOURCE is a folder or one file. The clips are brought to the 22-joint tree, and each is compared with its
+    file; faults are reported.
+    """
+    from memmlp.config.clip_groupings import grouping_to_choose
+    from memmlp.motion.importing.import_folder import ImportSettings, import_folder
+
+    settings = ImportSettings(skeleton, _rates(fps), body, _floor(floor), take, strict, sound, up)
+    report = import_folder(source, out, settings)
+    for note in report.notes:
+        click.echo(f"note: {note}")
+    show_skipped(report.skipped)
+    faulty = [f"warning: {clip.source}: {'; '.join(clip.faults)}" for clip in report.clips if clip.faults]
+    show_some(faulty, "clips with warnings")
+    seconds = sum(clip.frames / clip.fps for clip in report.clips)
+    maps = ", ".join(sorted({clip.skeleton for clip in report.clips}))
+    click.echo(f"{amount(len(report.clips), seconds)}, skeleton {maps}, in {out}")
+    grouping = grouping_to_choose([Path(clip.clip).with_suffix("").as_posix() for clip in report.clips])
+    chosen = [f"data/grouping@data.split={grouping}"] if grouping else []
+    click.echo("next: " + shlex.join(["memmlp", "train", "data=mocap", f"data.root={out}", *chosen]))
+
+
+def _rates(texts: Sequence[str]) -> dict[str, float]:
+    """Parse FOLDER=HZ or HZ into rates by folder ("" for all)."""
+    rates: dict[str, float] = {}
+    for text in texts:
+        folder, _, rate = text.rpartition("=")
+        if folder in rates:
+            raise InputError(f"--fps {text}: a second rate for {folder or 'all'}; expected one")
+        try:
+            rates[folder] = float(rate)
+        except ValueError:
+            raise InputError(f"--fps {text}: must be HZ or FOLDER=HZ, such as salsa=60") from None
+    return rates
+
+
+def _floor(text: str) -> str | float:
+    """Parse auto, none or metres."""
+    if text in ("auto", "none"):
+        return text
+    try:
+        height = float(text)
+    except ValueError:
+        height = math.nan
+    if not abs(height) <= 1000:
+        raise InputError(f"--floor {text}: must be auto, none, or metres up to 1000")
+    return height
+
+
+@click.command("verify")
+@click.argument("source", type=PATH)
+@skeleton_option
+@body_option
+@up_option
+@click.option("--all", "every", is_flag=True, help="Show every file and not only those with faults.")
+def verify(source: Path, skeleton: str | None, body: str, up: str | None, every: bool) -> None:
+    """Check imports against the files themselves.
+
+    Each file is imported, and the result is compared with the file's own joints: "worst mm" is the largest
+    distance of any mapped joint on the file's own bones, "worst degrees" the largest angle between a segment
+    (trunk, neck, arms, legs, feet) on the body and in the file. Impossible postures are faults too: the head
+    below the pelvis, knees that bend forward, feet that point backward or hang above the floor, odd lengths.
+    Goes on past bad files; exits with 1 if any file has a fault or can't be imported.
+    """
+    from memmlp.motion.clip import Skipped
+    from memmlp.motion.importing.import_folder import verify_folder
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    table.add_column("file", overflow="fold")
+    table.add_column("skeleton")
+    for name in ("frames", "worst\nmm", "worst\ndegrees"):
+        table.add_column(name, justify="right")
+    table.add_column("at")
+    sound, bad, errors = 0, [], [(0.0, 0.0)]
+    for row in verify_folder(source, skeleton=skeleton, body=body, up=up):
+        if isinstance(row, Skipped):
+            bad.append(f"{row.file}: {row.reason}")
+            continue
+        errors.append((row.mm.value, row.degrees.value))
+        sound += not row.faults
+        bad += [f"{row.name}: {fault}" for fault in row.faults]
+        if every or row.faults:
+            numbers = (str(row.frames), f"{row.mm.value:.4f}", f"{row.degrees.value:.4f}")
+            table.add_row(row.name, row.skeleton, *numbers, f"{row.mm}\n{row.degrees}")
+    if table.row_count:
+        Console(highlight=False, markup=False).print(table)  # a file's name may have brackets
+    for line in bad:
+        click.echo(line)
+    mm, degrees = map(max, zip(*errors, strict=True))
+    deviation = f"; worst {mm:.4f} mm, {degrees:.4f} degrees" if len(errors) > 1 else ""
+    click.echo(f"{sound} file{'s' * (sound != 1)} without a fault{deviation}")
+    if bad:
+        raise click.ClickException(f"{len(bad)} fault{'s' * (len(bad) != 1)}")
+
+
+@click.group("skeleton")
+def skeleton() -> None:
+    """Propose a map for an unknown skeleton, and show a map's result for a file."""
+
+
+@skeleton.command("guess")
+@click.argument("file", type=PATH)
+@click.option("--out", type=PATH, help="Also write the map there; an existing file is not replaced.")
+def guess(file: Path, out: Path | None) -> None:
+    """Propose a map for a file, from its joints' names and its tree.
+
+    Prints the map with comments that mark guesses and missing joints, imports the file with it, and prints
+    the faults of the result. Exits with 1 if the file can't be imported with it.
+    """
+    from memmlp.motion.importing.guess import as_yaml, check, write_map
+    from memmlp.motion.importing.guess import guess as guess_map
+    from memmlp.motion.importing.recordings import read_recording
+
+    recording = read_recording(file)
+    proposed = guess_map(recording, file.stem)
+    text = as_yaml(proposed, recording)
+    click.echo(text, nl=False)
+    if out is not None:
+        write_map(out, text)
+    try:
+        stance, faults = check(recording, proposed)
+    except InputError as error:
+        raise click.ClickException(f"the file cannot be imported with this map: {error}") from None
+    for fault in faults:
+        click.echo(f"warning: {fault}", err=True)
+    click.echo(f"imports from {stance}, with {len(faults)} fault{'s' * (len(faults) != 1)}", err=True)
+    click.echo(f"next: memmlp data skeleton show {file} --skeleton {out or 'MAP'} --out PNG", err=True)
+
+
+@skeleton.command("show")
+@click.argument("file", type=PATH)
+@click.option(
+    "--skeleton", "which", help="A shipped map or the path of one.  [default: by the joints' names]"
+)
+@click.option("--out", required=True, type=PATH, help="The picture, a .png.")
+def show(file: Path, which: str | None, out: Path) -> None:
+    """Draw the stance that a file's skeleton is read from, with the nodes that a map picks.
+
+    The built-in body stands beside it in the same stance: if the two differ, the map is wrong.
+    """
+    from memmlp.motion.body import load_rest_joints
+    from memmlp.motion.importing.convert import view_stance
+    from memmlp.motion.importing.recordings import read_recording
+    from memmlp.motion.importing.skeleton_map import find_skeleton, load_skeleton
+    from memmlp.report.pictures.clip_pictures import check_picture
+    from memmlp.report.pictures.skeleton_picture import skeleton_png
+
+    check_picture(out, "--out", (".png",))
+    recording = read_recording(file)
+    chosen = find_skeleton(recording, None if which is None else load_skeleton(which))
+    stance = view_stance(recording, chosen, load_rest_joints("builtin"))
+    skeleton_png(out, stance, f"{file.name}: {chosen.name}")
+    click.echo(f"{chosen.name}, read from {stance.source}: {out}")

@@ -1,0 +1,251 @@
+"""Exports clips to files that other programs open: a folder of AMASS npz, or a single file."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from memmlp.common.errors import InputError, one_line
+from memmlp.common.progress import progress_bar
+from memmlp.motion.body import load_rest_joints
+from memmlp.motion.clip import Clip, Skipped, resample
+from memmlp.motion.formats.bvh import write_bvh
+from memmlp.motion.formats.gltf import write_gltf
+from memmlp.motion.formats.npz import NoMotion, read_clip, write_clip
+from memmlp.motion.plausibility import check_plausible, unusual
+from memmlp.motion.preparing.find_clips import clip_name, find_clips
+from memmlp.motion.preparing.imported_body import check_imported_body
+
+T = TypeVar("T")
+
+
+class Format(NamedTuple):
+    """A format that clips are written in.
+
+    Attributes:
+        suffix: the suffix of the format's files.
+        write: writes a clip on a body with rest joints (22, 3), metres, atomically.
+        has_bones: whether the file contains the body; readers of AMASS' npz supply it.
+    """
+
+    suffix: str
+    write: Callable[[Path, Clip, np.ndarray], None]
+    has_bones: bool = True
+
+
+FORMATS = {
+    "bvh": Format(".bvh", write_bvh),
+    "npz": Format(".npz", lambda path, clip, rest: write_clip(path, clip), has_bones=False),
+    "gltf": Format(".glb", write_gltf),
+}
+SUFFIXES = {each.suffix: each for each in FORMATS.values()}
+
+
+def format_of(path: Path, key: str = "path") -> Format:
+    """Return the format that belongs to a file's suffix.
+
+    Raises:
+        InputError: for any other suffix; its message names the path by `key`, the option or argument.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"{key} {path}: the suffix must be one of {', '.join(SUFFIXES)}")
+    return SUFFIXES[path.suffix.lower()]
+
+
+def write_motion(path: Path, clip: Clip, rest: np.ndarray, chosen: Format) -> None:
+    """Write a clip in a format, atomically; missing folders are made.
+
+    Raises:
+        InputError: if the file cannot be written there.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        chosen.write(path, clip, rest)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+@dataclass(frozen=True)
+class Target:
+    """A clip to be written.
+
+    Attributes:
+        name: the clip's name: its path below the source folder, without suffix.
+        source: the clip's npz file.
+        path: the file to write.
+    """
+
+    name: str
+    source: Path
+    path: Path
+
+
+@dataclass(frozen=True)
+class ExportPlan:
+    """The clips that an export writes, and their format.
+
+    Attributes:
+        targets: the clips.
+        format: the format of the files.
+        skipped: folders that cannot be listed.
+    """
+
+    targets: tuple[Target, ...]
+    format: Format
+    skipped: tuple[Skipped, ...] = ()
+
+
+@dataclass(frozen=True)
+class ExportReport:
+    """The result of an export.
+
+    Attributes:
+        written: the files that were written.
+        seconds: the total duration of the written clips.
+        skipped: the clips that were skipped.
+        unusual: clip -> what is odd about it, though it may be sound.
+    """
+
+    written: tuple[Path, ...]
+    seconds: float
+    skipped: tuple[Skipped, ...]
+    unusual: Mapping[str, str] = field(default_factory=dict)
+
+
+def plan_export(source: Path, out: Path, name: str | None = None) -> ExportPlan:
+    """Plan the export of an npz file to the file `out`, or of a folder's npz files to the folder `out`.
+
+    Args:
+        source: file or folder.
+        out: file or folder; in a folder each file has its source's path, with the format's suffix.
+        name: the format, one of FORMATS; by default a file's suffix decides.
+
+    Raises:
+        InputError: if there is nothing to export, the format is unclear, `out` is a file where a folder is
+            needed or the other way round, or a file would be written over a source.
+    """
+    if not source.exists():
+        raise InputError(f"{source}: no such file or folder; expected an npz file, or a folder of npz files")
+    chosen = choose_format(out, name, folder=source.is_dir())
+    if not source.is_dir():
+        if out.resolve() == source.resolve():
+            raise InputError(f"--out {out}: must not be the source itself")
+        return ExportPlan((Target(source.stem, source, out),), chosen)
+    above, below = source.resolve(), out.resolve()
+    if below.is_relative_to(above) or above.is_relative_to(below):
+        raise InputError(f"--out {out}: must not be in {source}, or around it; expected a folder beside it")
+    found = find_clips(source)
+    names = {file: clip_name(file) for file in found.files}
+    first, count = Counter(names.values()).most_common(1)[0]
+    if count > 1:
+        raise InputError(f"{source / first}: {count} npz files with this name; expected one")
+    targets = tuple(Target(n, source / file, out / (n + chosen.suffix)) for file, n in names.items())
+    return ExportPlan(targets, chosen, tuple(Skipped(*each) for each in found.unreadable.items()))
+
+
+def choose_format(out: Path, name: str | None, folder: bool) -> Format:
+    """Return the format of the file, or the folder of files, `out`: the named format, or its suffix's.
+
+    Raises:
+        InputError: if neither determines the format, they contradict each other, a folder has a file's
+            suffix, or a file is a folder.
+    """
+    if folder and name is None:
+        raise InputError(f"--format: needed for a folder; must be one of {', '.join(FORMATS)}")
+    if folder and (out.is_file() or out.suffix.lower() in SUFFIXES):
+        raise InputError(f"--out {out}: must be a folder for several clips, not a file")
+    if not folder and out.is_dir():
+        raise InputError(f"--out {out}: must be a file for one clip, not a folder")
+    if folder:
+        return FORMATS[str(name)]
+    chosen = format_of(out, "--out")
+    if name is not None and FORMATS[name] is not chosen:
+        raise InputError(f"--out {out}: the suffix must be {FORMATS[name].suffix} for --format {name}")
+    return chosen
+
+
+def export(
+    plan: ExportPlan, *, body: str = "builtin", fps: float | None = None, strict: bool = False
+) -> ExportReport:
+    """Write a plan's clips.
+
+    Args:
+        plan: what to write.
+        body: `builtin`, or an SMPL-H model.npz; it gives the bones in formats that have bones.
+        fps: frame rate, Hz, to which the clips are resampled; by default each keeps its own.
+        strict: whether a bad file raises; otherwise it is skipped and reported, if there are other files.
+
+    Raises:
+        InputError: for a bad body, or one that the clips were not imported onto where the format has bones;
+            if no clip could be read, or a file cannot be written.
+    """
+    rest = load_rest_joints(body)
+    if plan.format.has_bones:
+        check_imported_body([target.source for target in plan.targets], rest, f"--body {body}")
+    written: list[Path] = []
+    skipped, odd = list(plan.skipped), dict[str, str]()
+    seconds = 0.0
+
+    def read(target: Target) -> Clip:
+        clip = read_motion(target, odd)
+        return clip if fps is None else resample(clip, fps)[0]
+
+    for target, clip in read_targets(plan, read, skipped, strict):
+        write_motion(target.path, clip, rest, plan.format)
+        written.append(target.path)
+        seconds += len(clip) / clip.fps
+    return ExportReport(tuple(written), seconds, tuple(skipped), odd)
+
+
+def read_targets(
+    plan: ExportPlan, read: Callable[[Target], T], skipped: list[Skipped], strict: bool = False
+) -> Iterator[tuple[Target, T]]:
+    """Yield each target of a plan with the result of reading its source, while a progress bar counts them.
+
+    Args:
+        plan: the targets.
+        read: reads a target's source, or raises InputError: NoMotion for a file that is not a clip.
+        skipped: gets the other sources that cannot be read, unless the plan has only one target.
+        strict: whether the first source that cannot be read raises instead.
+
+    Raises:
+        InputError: as described above, and at the end if every source was skipped.
+    """
+    single, usable = len(plan.targets) == 1, False
+    for target in progress_bar(plan.targets, "export"):
+        try:
+            content = read(target)
+        except InputError as error:
+            if single or (strict and not isinstance(error, NoMotion)):
+                raise
+            if not isinstance(error, NoMotion):  # AMASS has files of shapes beside its clips
+                reason = str(error).removeprefix(one_line(f"{target.source}: "))
+                skipped.append(Skipped(target.name + target.source.suffix, reason))
+        else:
+            usable = True
+            yield target, content
+    if not usable:
+        first = f"; the first: {skipped[0].file}: {skipped[0].reason}" if skipped else ""
+        raise InputError(f"no usable clip in {len(plan.targets)} files{first}; expected AMASS npz files")
+
+
+def read_motion(target: Target, odd: dict[str, str]) -> Clip:
+    """Read a target's clip.
+
+    Args:
+        target: the target.
+        odd: gets a remark on a clip that is unusual, by its name.
+
+    Raises:
+        InputError: if it is damaged or can't be a person's motion.
+    """
+    clip = read_clip(target.source, target.name)
+    check_plausible(target.source, clip)
+    if reason := unusual(clip):
+        odd[target.name] = reason
+    return clip

@@ -1,1 +1,0 @@
-"""From clips on the 22-joint tree to files that other programs open."""

@@ -1,0 +1,232 @@
+"""A skeleton map proposed for a file: the limbs by the words in its nodes' names, the trunk by its tree.
+
+Joints of arms and legs are found by known words, each below the one before it. Between pelvis and arms, the
+spine is spread over the nodes; the head is the node of that name, else the end of the line above the arms.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import yaml
+
+from memmlp.common.errors import InputError
+from memmlp.motion.body import JOINTS, load_rest_joints
+from memmlp.motion.formats.recording import END, Recording
+from memmlp.motion.importing.anatomy import CHAINS
+from memmlp.motion.importing.convert import JUMP, convert, find_unit_and_up, first_step
+from memmlp.motion.importing.skeleton_map import REQUIRED, SkeletonMap, without_namespace
+
+LEG = {  # joint of a leg -> words for it, the clearest first
+    "hip": ("thigh", "upleg", "upperleg", "femur", "uplegs", "hip"),
+    "knee": ("knee", "shin", "calf", "lowerleg", "lowleg", "loleg", "tibia", "leg"),
+    "ankle": ("ankle", "foot"),
+    "foot": ("toe", "toes", "toebase", "ball", "foot", "toe0"),
+}
+ARM = {
+    "shoulder": ("upperarm", "uparm", "humerus", "shldr", "arm", "shoulder"),
+    "elbow": ("elbow", "forearm", "lowerarm", "lowarm", "loarm", "radius"),
+    "wrist": ("wrist", "hand"),
+}
+COLLAR = ("collar", "clavicle", "thorax", "shoulder", "collarbone")
+KNOWN = frozenset(
+    word for each in (*LEG.values(), *ARM.values(), COLLAR) for word in each
+) | {"hipjoint", "fingers", "thumb"}  # fmt: skip
+
+SIDES = {"left": "left", "l": "left", "lf": "left", "right": "right", "r": "right", "rt": "right"}
+TOKENS = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
+GLUED = re.compile(r"(left|right|l|r)(.+)")  # leftupleg, lfemur
+
+
+class NodeWords(NamedTuple):
+    """The parts of a node's name: `left`, `right` or nothing, and the rest in small letters."""
+
+    side: str
+    word: str
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A proposed map.
+
+    Attributes:
+        skeleton: the map.
+        by_tree: the joints that were found by the tree, without their names.
+        missing: the joints that a map must have and that were not found.
+    """
+
+    skeleton: SkeletonMap
+    by_tree: tuple[str, ...]
+    missing: tuple[str, ...]
+
+
+def split_words(name: str) -> NodeWords:
+    """Return the side and the word of a name without namespace.
+
+    The side letter of a name like `lfemur` is split off only if the rest is a known word.
+
+    Args:
+        name: such as `LeftUpLeg`, `lShldr`, `UpperArm_L`, `thigh.r`, `lfemur`.
+    """
+    tokens = [token.lower() for token in TOKENS.findall(name.removesuffix(END))]
+    sides = {SIDES[token] for token in tokens if token in SIDES}
+    if len(sides) == 1:
+        return NodeWords(sides.pop(), "".join(token for token in tokens if token not in SIDES))
+    word = "".join(tokens)
+    glued = GLUED.fullmatch(word)
+    if glued and glued[2] in KNOWN:
+        return NodeWords(SIDES[glued[1]], glued[2])
+    return NodeWords("", word)
+
+
+def guess(recording: Recording, name: str) -> Guess:
+    """Propose a map with the given name for a file."""
+    tree = _Tree(recording)
+    found: dict[str, int] = {}
+    for side in ("left", "right"):
+        leg, arm = tree.limb(side, LEG), tree.limb(side, ARM)
+        found |= {f"{side}_{part}": node for part, node in (leg | arm).items()}
+        if "shoulder" in arm:
+            above = tree.line(arm["shoulder"])[:-1]
+            collars = [n for n in above if tree.words[n].word in COLLAR and tree.words[n].side == side]
+            found |= {f"{side}_collar": collars[-1]} if collars else {}
+    by_name = set(found)
+    found |= tree.trunk(found)
+    by_name |= {
+        joint for joint in ("neck", "head") if joint in found and joint in tree.words[found[joint]].word
+    }
+    for side in ("left", "right"):
+        ankle = found.get(f"{side}_ankle")
+        tips = [] if ankle is None or f"{side}_foot" in found else tree.children(ankle)
+        found |= {f"{side}_foot": tips[0]} if len(tips) == 1 else {}
+    joints = {joint: recording.nodes[found[joint]] for joint in JOINTS if joint in found}
+    skeleton = SkeletonMap(name, joints, calibration_frame=first_step(recording) > JUMP)
+    by_tree = tuple(joint for joint in joints if joint not in by_name)
+    return Guess(skeleton, by_tree, tuple(joint for joint in REQUIRED if joint not in joints))
+
+
+class _Tree:
+    """The nodes of a recording, with the words of their names."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.parents, self.nodes = recording.node_parents, recording.nodes
+        self.words = [split_words(name) for name in without_namespace(recording.nodes)]
+
+    def line(self, node: int) -> list[int]:
+        """Return the nodes from the root to a node."""
+        line = [node]
+        while self.parents[line[0]] >= 0:
+            line.insert(0, self.parents[line[0]])
+        return line
+
+    def children(self, node: int) -> list[int]:
+        return [child for child, parent in enumerate(self.parents) if parent == node]
+
+    def is_end(self, node: int) -> bool:
+        return self.nodes[node].endswith(END)
+
+    def limb(self, side: str, parts: dict[str, tuple[str, ...]]) -> dict[str, int]:
+        """Return the joints of a limb that names identify, each below the one before it."""
+        found: dict[str, int] = {}
+        for part, spellings in parts.items():
+            above = next(reversed(found.values()), None)
+            below = [
+                node
+                for node in range(len(self.nodes))
+                if not self.is_end(node) and (above is None or above in self.line(node)[:-1])
+            ]
+            named = [n for word in spellings for n in below if self.words[n] == (side, word)]
+            if named:
+                found[part] = named[0]
+        return found
+
+    def trunk(self, limbs: dict[str, int]) -> dict[str, int]:
+        """Return pelvis, spine, neck and head, given the joints of the limbs."""
+        ends = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
+        if not set(ends) <= set(limbs):
+            return {}
+        lines = [self.line(limbs[joint]) for joint in ends]
+        hips, shoulders = ([n for n in left if n in right] for left, right in (lines[:2], lines[2:]))
+        shared = [node for node in hips if node in shoulders]  # down to where legs and arms part
+        spine = shoulders[len(shared) :]
+        found = {"pelvis": shared[-1]}
+        if spine:
+            picked = np.linspace(0, len(spine) - 1, min(3, len(spine))).astype(int)
+            found |= {f"spine{step}": spine[index] for step, index in enumerate(picked, start=1)}
+        heads = [n for n, words in enumerate(self.words) if words.word == "head" and not self.is_end(n)]
+        if heads:
+            line = self.line(heads[0])
+        else:  # the longest line of nodes above the shoulders that is not an arm
+            arms = {node for arm in lines[2:] for node in arm} - set(shoulders)
+            every = [self.line(n) for n in range(len(self.nodes))]
+            line = max((x for x in every if shoulders[-1] in x and not arms & set(x)), key=len)
+        above = [node for node in line if node not in shoulders and not self.is_end(node)]
+        if above:
+            necks = [node for node in above[:-1] if "neck" in self.words[node].word] or above[:-1]
+            found |= {"head": above[-1]} | ({"neck": necks[0]} if necks else {})
+        return found
+
+
+def check(recording: Recording, proposed: Guess, body: str = "builtin") -> tuple[str, tuple[str, ...]]:
+    """Import a file with a proposed map; return the stance from which it was read, and the faults.
+
+    Raises:
+        InputError: if the file can't be imported with this map.
+    """
+    if proposed.missing:
+        raise InputError(
+            f"joints.{proposed.missing[0]}: not found; add {', '.join(proposed.missing)} by hand"
+        )
+    done = convert(recording, proposed.skeleton, load_rest_joints(body), name=proposed.skeleton.name)
+    return done.stance, done.fidelity.faults
+
+
+def as_yaml(proposed: Guess, recording: Recording) -> str:
+    """Return the map as YAML, with comments that mark guesses and missing joints."""
+    skeleton = proposed.skeleton
+    lines = [
+        f"# Proposed for {recording.path.name} by `memmlp data skeleton guess`.",
+        "# Check it with `memmlp data skeleton show` before you use it.",
+        f"name: {_scalar(skeleton.name)}",
+    ]
+    try:
+        settled = find_unit_and_up(recording, skeleton)
+        lines += [
+            f"unit: auto  # in this file {settled.unit or 0:.4g} m",
+            f"up: auto  # in this file {settled.up}",
+        ]
+    except InputError as error:
+        lines += [f"# In doubt: {str(error).removeprefix(f'{recording.path}: ')}.", "unit: auto", "up: auto"]
+    if skeleton.calibration_frame:
+        lines.append("calibration_frame: true  # guessed: frame 0 is far from frame 1")
+    lines.append("joints:")
+    for joint in (JOINTS[index] for chain in CHAINS for index in chain):
+        if joint in skeleton.joints:
+            comment = "  # guessed from the tree" if joint in proposed.by_tree else ""
+            lines.append(f"  {joint}: {_scalar(skeleton.joints[joint])}{comment}")
+        else:
+            required = "is required: add it by hand" if joint in proposed.missing else "has no counterpart"
+            lines.append(f"  # {joint} {required}.")
+    return "\n".join(lines) + "\n"
+
+
+def _scalar(text: str) -> str:
+    """Return a text as a YAML scalar that is read back as text."""
+    plain = yaml.safe_dump(text, width=1000, allow_unicode=True).splitlines()[0]
+    return plain if yaml.safe_load(plain) == text else json.dumps(text)
+
+
+def write_map(path: Path, text: str) -> None:
+    """Write a map to a new file. Raises InputError if the file exists, or can't be written."""
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise InputError(f"--out {path}: the file exists already; expected a new file") from None
+    except OSError as error:
+        raise InputError(f"--out {path}: {error.strerror}; expected a new file") from None

@@ -1,0 +1,131 @@
+"""Proposed maps: limbs by names, the trunk by the tree, and their YAML."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from bvh_samples import refuse, write
+from skeleton_families import FAMILIES, joints, renamed, walking
+
+from memmlp.motion.formats.bvh import Bvh, read_bvh
+from memmlp.motion.importing.guess import as_yaml, check, guess, split_words, write_map
+from memmlp.motion.importing.skeleton_map import find_skeleton, load_skeleton
+
+
+@pytest.fixture(params=FAMILIES)
+def name(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+def walks(folder: Path, name: str, turned: bool = False) -> Bvh:
+    return read_bvh(write(folder, walking(name, turned).text()))
+
+
+@pytest.mark.parametrize(
+    ("name", "side", "word"),
+    [
+        ("LeftUpLeg", "left", "upleg"),
+        ("lShldr", "left", "shldr"),
+        ("UpperArm_L", "left", "upperarm"),
+        ("upper_arm.R", "right", "upperarm"),
+        ("LHipJoint", "left", "hipjoint"),
+        ("lfemur", "left", "femur"),
+        ("rclavicle", "right", "clavicle"),
+        ("leftupleg", "left", "upleg"),
+        ("lowerback", "", "lowerback"),
+        ("RightHandThumb1", "right", "handthumb1"),
+        ("LeftRight", "", "leftright"),
+    ],
+)
+def test_words(name: str, side: str, word: str):
+    assert split_words(name) == (side, word)
+
+
+def test_the_shipped_map_is_guessed(tmp_path: Path, name: str):
+    proposed = guess(walks(tmp_path, name), "mine")
+    assert proposed.skeleton.joints == load_skeleton(name).joints
+    assert not proposed.missing
+
+
+HDM = {  # names of joints in ASF files, as in HDM05 and CMU's database
+    "Hips": "root", "LHipJoint": "lhipjoint", "LeftUpLeg": "lfemur", "LeftLeg": "ltibia", "LeftFoot": "lfoot",
+    "LeftToeBase": "ltoes", "RHipJoint": "rhipjoint", "RightUpLeg": "rfemur", "RightLeg": "rtibia",
+    "RightFoot": "rfoot", "RightToeBase": "rtoes", "LowerBack": "lowerback", "Spine": "upperback",
+    "Spine1": "thorax", "Neck": "lowerneck", "Neck1": "upperneck", "Head": "head",
+    "LeftShoulder": "lclavicle", "LeftArm": "lhumerus", "LeftForeArm": "lradius", "LeftHand": "lhand",
+    "RightShoulder": "rclavicle",
+    "RightArm": "rhumerus", "RightForeArm": "rradius", "RightHand": "rhand",
+}  # fmt: skip
+BLENDER = {
+    "Hips": "spine", "LeftUpLeg": "thigh.L", "LeftLeg": "shin.L", "LeftFoot": "foot.L", "LeftToe": "toe.L",
+    "RightUpLeg": "thigh.R", "RightLeg": "shin.R", "RightFoot": "foot.R", "RightToe": "toe.R",
+    "Spine": "spine.001", "Spine1": "spine.002", "Spine2": "spine.003", "Neck": "spine.004",
+    "Head": "spine.006", "LeftShoulder": "shoulder.L", "LeftArm": "upper_arm.L", "LeftForeArm": "forearm.L",
+    "LeftHand": "hand.L", "RightShoulder": "shoulder.R", "RightArm": "upper_arm.R",
+    "RightForeArm": "forearm.R", "RightHand": "hand.R",
+}  # fmt: skip
+UNREAL = {
+    "Hips": "pelvis", "LeftUpLeg": "thigh_l", "LeftLeg": "calf_l", "LeftFoot": "foot_l", "LeftToe": "ball_l",
+    "RightUpLeg": "thigh_r", "RightLeg": "calf_r", "RightFoot": "foot_r", "RightToe": "ball_r",
+    "Spine": "spine_01", "Spine1": "spine_02", "Spine2": "spine_03", "Neck": "neck_01", "Head": "head",
+    "LeftShoulder": "clavicle_l", "LeftArm": "upperarm_l", "LeftForeArm": "lowerarm_l", "LeftHand": "hand_l",
+    "RightShoulder": "clavicle_r", "RightArm": "upperarm_r", "RightForeArm": "lowerarm_r",
+    "RightHand": "hand_r",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("family", "names"), [("cmu_motionbuilder", HDM), ("lafan1", BLENDER), ("lafan1", UNREAL)]
+)
+def test_names_of_other_programs_are_known(tmp_path: Path, family: str, names: dict[str, str]):
+    bvh = renamed(walks(tmp_path, family), names)
+    proposed = guess(bvh, "mine")
+    expected = {joint: names[node] for joint, node in load_skeleton(family).joints.items()}
+    assert proposed.skeleton.joints == expected
+
+
+def test_a_proposed_map_imports(tmp_path: Path):
+    bvh = walks(tmp_path, "lafan1", turned=True)
+    stance, faults = check(bvh, guess(bvh, "mine"))
+    assert "straightest" in stance
+    assert faults == ()
+
+
+def test_a_calibration_frame_is_found(tmp_path: Path):
+    assert guess(walks(tmp_path, "cmu_daz"), "mine").skeleton.calibration_frame
+    assert not guess(walks(tmp_path, "mixamo"), "mine").skeleton.calibration_frame
+
+
+def test_a_joint_without_a_known_name_is_left_to_the_user(tmp_path: Path):
+    bvh = walks(tmp_path, "lafan1")
+    names = {joint: joint for joint in joints(bvh)} | {"LeftForeArm": "bone7"}
+    bvh = renamed(bvh, names)
+    proposed = guess(bvh, "mine")
+    assert proposed.missing == ("left_elbow",)
+    assert "# left_elbow is required" in as_yaml(proposed, bvh)
+    with refuse("joints.left_elbow"):
+        check(bvh, proposed)
+    nothing = renamed(bvh, {joint: f"bone{number}" for number, joint in enumerate(joints(bvh))})
+    assert "left_hip" in guess(nothing, "mine").missing
+
+
+def test_the_yaml_is_a_map_of_the_same_joints(tmp_path: Path, name: str):
+    bvh = walks(tmp_path, name)
+    proposed = guess(bvh, "on: 1")
+    text = as_yaml(proposed, bvh)
+    write_map(tmp_path / "mine.yaml", text)
+    loaded = load_skeleton(str(tmp_path / "mine.yaml"))
+    assert (loaded.name, loaded.joints) == ("on: 1", proposed.skeleton.joints)
+    assert loaded.calibration_frame == proposed.skeleton.calibration_frame
+    assert find_skeleton(bvh, loaded).joints == loaded.joints
+    assert text.count("# in this file") == 2
+
+
+def test_an_existing_map_is_not_replaced(tmp_path: Path):
+    path = write(tmp_path, "mine", "map.yaml")
+    with refuse("--out"):
+        write_map(path, "other")
+    assert path.read_text() == "mine"
+    with refuse("--out"):
+        write_map(tmp_path / "no" / "map.yaml", "other")
