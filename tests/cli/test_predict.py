@@ -95,7 +95,7 @@ def names(folder: Path, suffix: str) -> set[str]:
     [
         (["nobody", "--out", "b.bvh"], ("SOURCE nobody", "no test clip", "allowed test clips")),
         (["CLIP", "--out", "b.fbx"], ("--out b.fbx", ".bvh, .npz, .glb")),
-        (["CLIP", "--out", "b.glb", "--format", "bvh"], ("--out b.glb", "*.bvh")),
+        (["CLIP", "--out", "b.glb", "--format", "bvh"], ("--out b.glb", ".bvh")),
         (["CLIP", "--out", "b.bvh", "--branch", "combined"], ("--branch combined", "--ik lbfgs")),
         (["clips", "--out", "b"], ("--format", "bvh, npz, gltf")),
         (["clips/none.npz", "--out", "b.bvh"], ("clips/none.npz", "no file")),
