@@ -20,7 +20,7 @@ from remembered import keep_exports, remember
 from scratch_in_memory import remove_at_exit, scratch_in_memory
 from small_pictures import draw_large, draw_small
 
-from memmlp.common.python_gc import collect_seldom
+from memmlp.common.processes import collect_garbage_rarely
 
 if Path("/dev/nvidiactl").exists():
     os.environ["CUDA_VISIBLE_DEVICES"] = ""  # what the tests compare with was computed on a CPU
@@ -64,7 +64,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.timeout(SLOW_TIMEOUT))
 
 
-collect_seldom()
+collect_garbage_rarely()
 
 
 def pytest_collection_finish() -> None:
@@ -133,7 +133,7 @@ def clean(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("COLUMNS", "80")
     # How far work is, is said every so many seconds: never, however slow the machine is.
-    monkeypatch.setattr("memmlp.common.progress.EVERY", math.inf)
+    monkeypatch.setattr("memmlp.common.progress.INTERVAL", math.inf)
 
 
 @pytest.fixture(autouse=True)

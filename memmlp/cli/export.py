@@ -232,13 +232,13 @@ def write_exact(opened: OpenedRun, out: Path, form: Form, count: int) -> str:
     """
     import numpy as np
 
-    from memmlp.common.progress import tell
+    from memmlp.common.progress import announce
     from memmlp.deploy.parity import TOLERANCE, clips_to_check, differences, matches
     from memmlp.live.trackers_to_body_graph import full_differences, full_matches
 
     model, network = load(opened, form)
     clips = clips_to_check(model, opened.data.open("test").clips(), count)
-    tell(f"export: write {out}, and compare it with torch on {count_clips(clips)}")
+    announce(f"export: write {out}, and compare it with torch on {count_clips(clips)}")
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
         path = Path(folder) / "step.onnx"
         write_graph(network, path, opened.run.id, form)
@@ -282,7 +282,7 @@ def write_lower(opened: OpenedRun, out: Path, form: Form, max_growth: float) -> 
             then.
     """
     from memmlp.common.errors import InputError
-    from memmlp.common.progress import tell
+    from memmlp.common.progress import announce
     from memmlp.deploy.lower_precision import compare_accuracy, lower
     from memmlp.live.trackers_to_body_graph import full_differences
     from memmlp.networks.motion_model import StreamingGraph
@@ -295,7 +295,7 @@ def write_lower(opened: OpenedRun, out: Path, form: Form, max_growth: float) -> 
         raise InputError(f"--precision {precision}: needs --scope step")
     test = opened.data.open("test").clips()
     train = opened.data.open("train").clips() if precision == "int8" else []
-    tell(f"export: write {out} in {precision}, and measure its cost on {count_clips(test)}")
+    announce(f"export: write {out} in {precision}, and measure its cost on {count_clips(test)}")
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
         exact, other = Path(folder) / "fp32.onnx", Path(folder) / "other.onnx"
         write_graph(network, exact, opened.run.id, form._replace(full=None))

@@ -286,7 +286,7 @@ def serve(given: InputOptions, shown: ShowOptions) -> None:
     import threading
     import webbrowser
 
-    from memmlp.common.termination import closed_in_peace
+    from memmlp.common.processes import finish_uninterrupted
     from memmlp.live.session.loop import greeting, run_loop, with_avatar
     from memmlp.live.session.page_server import Hub, LiveServer
     from memmlp.live.session.wearer_fitting import Fitting
@@ -300,7 +300,7 @@ def serve(given: InputOptions, shown: ShowOptions) -> None:
         fitting = Fitting(stream, source.space, shown.calibration, hub.tell) if source.worn else None
         ask = fitting.ask if fitting else None
         with (
-            closed_in_peace(outputs),
+            finish_uninterrupted(outputs.close),
             LiveServer(hub, shown.port, shown.host, shown.token, files, ask) as server,
         ):
             if words["remark"]:

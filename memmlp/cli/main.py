@@ -16,9 +16,8 @@ import click
 import memmlp
 from memmlp.common import distributed
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
-from memmlp.common.progress import telling
-from memmlp.common.python_gc import collect_seldom
-from memmlp.common.termination import termination_interrupts
+from memmlp.common.processes import collect_garbage_rarely, termination_interrupts
+from memmlp.common.progress import announce_to
 
 
 class Command(NamedTuple):
@@ -116,7 +115,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     own = argv is None
     if own:
-        collect_seldom()
+        collect_garbage_rarely()
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         with termination_interrupts() if own else nullcontext():
@@ -134,12 +133,12 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _run(arguments: list[str]) -> None:
-    if distributed.size() > 1 and arguments[:1] != ["train"]:
+    if distributed.world_size() > 1 and arguments[:1] != ["train"]:
         raise InputError("torchrun: allowed are several processes for memmlp train alone")
     if arguments[:1] in (["-sc"], ["--shell-completion"]):
         _complete(arguments)
     else:
-        with telling():
+        with announce_to():
             commands.main(arguments, prog_name="memmlp", standalone_mode=False)
 
 

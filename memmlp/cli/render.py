@@ -74,7 +74,7 @@ def render(
     pictures a second. All share one colour scale.
     """
     from memmlp.common.errors import InputError
-    from memmlp.common.progress import tell
+    from memmlp.common.progress import announce
     from memmlp.config.open_run import open_run
     from memmlp.report.pictures.clip_pictures import check_picture, write_picture
 
@@ -87,7 +87,7 @@ def render(
     if len(set(names)) < len(names):
         raise InputError(f"{'--label' if labels else 'RUNS'}: must differ from each other")
     piece = _predict_piece(dict(zip(names, opened, strict=True)), clip, begin, end, branch, mode)
-    tell(f"render: draw {out}")
+    announce(f"render: draw {out}")
     write_picture(out, piece, poses, "--out")
     errors = ", ".join(f"{label} {error.mean():.1f} cm" for label, error in piece.errors.items())
     click.echo(f"{out}: {piece.title}, {errors}")
@@ -105,7 +105,7 @@ def _predict_piece(
     import numpy as np
 
     from memmlp.common.errors import InputError
-    from memmlp.common.progress import tell
+    from memmlp.common.progress import announce
     from memmlp.config.open_run import clip_of
     from memmlp.evaluation.predictions import predict_clip
     from memmlp.report.pictures.clip_piece import ClipPiece, span
@@ -115,7 +115,7 @@ def _predict_piece(
     first, last = span(len(clip_of(first_run.test, title)), title, begin, end, ("--from", "--to"))
     truths, predictions = [], {}
     for label, run in runs.items():
-        tell(f"render: {label} on {title}")
+        announce(f"render: {label} on {title}")
         frames = clip_of(run.test, title)
         if mode == "stream":  # a stream does not use later frames; windows may
             frames = frames[:last]

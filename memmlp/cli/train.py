@@ -62,7 +62,7 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
         click.echo(help_text(args))
         return
     jobs = [] if shows else preflight(args)
-    if len(jobs) > 1 and distributed.size() > 1:
+    if len(jobs) > 1 and distributed.world_size() > 1:
         raise InputError("torchrun: several processes train one run; start it without --multirun")
     _check_predictions(jobs)
     failures: list[Exception] = []
@@ -159,7 +159,7 @@ def run_training(cfg: DictConfig) -> Outcome | None:
     from memmlp.training.request import finished_outcome
 
     outcome = None
-    if distributed.size() == 1:
+    if distributed.world_size() == 1:
         outcome = finished_outcome(build_request(cfg))  # needs no torch
     if outcome is None:
         from memmlp.config.build import build_experiment

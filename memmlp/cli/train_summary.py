@@ -10,7 +10,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from memmlp.common.thread_core_share import LEAST_CORE_SHARE
+from memmlp.common.processes import MIN_CORE_SHARE
 from memmlp.evaluation.metric_facts import UNITS
 from memmlp.runs.deployment_folder import (
     INT8_PRECISIONS,
@@ -99,7 +99,7 @@ def show_latency(console: Console, record: Mapping[str, Any]) -> None:
     )
     if said := less_precise_words(record):
         console.print(said, style="yellow", soft_wrap=True)
-    if (share := min(measured.get(key, 1.0) for key in CORE_SHARES.values())) < LEAST_CORE_SHARE:
+    if (share := min(measured.get(key, 1.0) for key in CORE_SHARES.values())) < MIN_CORE_SHARE:
         busy = f"the machine was busy: it had a core for {share:.0%} of the time, and its times are too long"
         console.print(busy, style="yellow", soft_wrap=True)
     if "pose_median_ms" in measured:  # runs of earlier versions lack it

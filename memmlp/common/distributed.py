@@ -27,22 +27,22 @@ class _Step:
     shared = False
 
 
-def size() -> int:
+def world_size() -> int:
     """Return how many processes train the run; 1 without torchrun."""
     return int(os.environ["WORLD_SIZE"]) if "TORCHELASTIC_RUN_ID" in os.environ else 1
 
 
 def rank() -> int:
     """Return this process' number among all."""
-    return int(os.environ["RANK"]) if size() > 1 else 0
+    return int(os.environ["RANK"]) if world_size() > 1 else 0
 
 
 def local_rank() -> int:
     """Return this process' number among those on its machine, which is also the index of its GPU."""
-    return int(os.environ["LOCAL_RANK"]) if size() > 1 else 0
+    return int(os.environ["LOCAL_RANK"]) if world_size() > 1 else 0
 
 
-def first() -> bool:
+def is_first() -> bool:
     """Return whether this process is the first, which writes files."""
     return rank() == 0
 
@@ -51,7 +51,7 @@ def connect(kind: str) -> None:
     """Join the other processes, unless that was done before; `kind` is the device's kind, such as "cuda"."""
     from torch import distributed
 
-    if size() == 1 or distributed.is_initialized():
+    if world_size() == 1 or distributed.is_initialized():
         return
     if kind == "cuda":
         import torch
@@ -60,9 +60,9 @@ def connect(kind: str) -> None:
     distributed.init_process_group("nccl" if kind == "cuda" else "gloo", timeout=PATIENCE)
 
 
-def leave() -> None:
+def disconnect() -> None:
     """Leave the other processes once all have received the last message; otherwise a late receiver aborts."""
-    if size() > 1:
+    if world_size() > 1:
         from torch import distributed
 
         distributed.barrier()
@@ -71,7 +71,7 @@ def leave() -> None:
 
 def broadcast(value: T) -> T:
     """Send the first process' value to all processes, and return it in each; all have to call this."""
-    if size() == 1:
+    if world_size() == 1:
         return value
     from torch import distributed
 
@@ -81,38 +81,38 @@ def broadcast(value: T) -> T:
 
 
 @contextlib.contextmanager
-def sharing() -> Iterator[None]:
+def share_batch() -> Iterator[None]:
     """Within this context, tensors are this process' share of a batch, if there are several processes."""
-    _Step.shared = size() > 1
+    _Step.shared = world_size() > 1
     try:
         yield
     finally:
         _Step.shared = False
 
 
-def shared() -> bool:
-    """Return whether this process is working on its share of a batch, inside `sharing()`."""
+def is_shared() -> bool:
+    """Return whether this process is working on its share of a batch, inside `share_batch()`."""
     return _Step.shared
 
 
-def own_rows(batch: Tensor) -> Tensor:
+def local_rows(batch: Tensor) -> Tensor:
     """Return this process' rows of a whole batch (B, ...); the number of processes divides B."""
-    return batch.chunk(size())[rank()] if _Step.shared else batch
+    return batch.chunk(world_size())[rank()] if _Step.shared else batch
 
 
-def whole(rows: Tensor) -> Tensor:
+def gather_rows(rows: Tensor) -> Tensor:
     """Return the rows (b, ...) of all processes together (B, ...), without gradients."""
     if not _Step.shared:
         return rows
     import torch
     from torch import distributed
 
-    parts = [torch.empty_like(rows, memory_format=torch.contiguous_format) for _ in range(size())]
+    parts = [torch.empty_like(rows, memory_format=torch.contiguous_format) for _ in range(world_size())]
     distributed.all_gather(parts, rows.detach().contiguous())
     return torch.cat(parts)
 
 
-def drawn(draw: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
+def draw_rows(draw: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
     """Draw random numbers for the whole batch, as a single process does, and return this process' rows.
 
     Args:
@@ -121,35 +121,35 @@ def drawn(draw: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
     """
     if not _Step.shared:
         return draw(like)
-    return own_rows(draw(like.detach().repeat(size(), *[1] * (like.dim() - 1))))
+    return local_rows(draw(like.detach().repeat(world_size(), *[1] * (like.dim() - 1))))
 
 
-def mean(values: Tensor) -> Tensor:
+def average(values: Tensor) -> Tensor:
     """Return a tensor's mean over all processes, whose shares of the batch are equally large."""
-    if size() == 1:
+    if world_size() == 1:
         return values
     from torch import distributed
 
     total = values.detach().clone()
     distributed.all_reduce(total)
-    return total / size()
+    return total / world_size()
 
 
 def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
     """Replace the gradients by their means over all processes."""
-    if size() == 1:
+    if world_size() == 1:
         return
     import torch
 
     found = [one.grad for one in parameters if one.grad is not None]
-    means = mean(torch.cat([grad.flatten() for grad in found]))
+    means = average(torch.cat([grad.flatten() for grad in found]))
     for grad, part in zip(found, means.split([grad.numel() for grad in found]), strict=True):
         grad.copy_(part.view_as(grad))
 
 
-def align(module: nn.Module) -> None:
+def copy_from_first(module: nn.Module) -> None:
     """Copy the first process' parameters and buffers to all processes, so that they can't drift apart."""
-    if size() == 1:
+    if world_size() == 1:
         return
     from torch import distributed
 

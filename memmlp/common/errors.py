@@ -6,7 +6,7 @@ import unicodedata
 from importlib.util import find_spec
 from types import ModuleType
 
-BREAKING = ("Cc", "Cs", "Zl", "Zp")  # Unicode's controls, surrogates, separators of lines and of paragraphs
+BREAKING = ("Cc", "Cs", "Zl", "Zp")  # Unicode's controls, surrogates, line and paragraph separators
 
 
 def one_line(text: str) -> str:
@@ -15,10 +15,10 @@ def one_line(text: str) -> str:
 
 
 class InputError(ValueError):
-    """Bad user input; the message is one line that names the file or key, what is wrong and what is allowed.
+    """Bad user input; the message names the file or key, what is wrong and what is expected.
 
-    The command line prints it without a traceback and exits with code 2. Its message is one line, even if it
-    contains a file name with a line feed.
+    The command line prints it without a traceback and exits with code 2. It is one line, even if it has a
+    file name with a line feed.
     """
 
     def __init__(self, message: str) -> None:
@@ -26,11 +26,11 @@ class InputError(ValueError):
 
 
 def why_unreadable(error: Exception) -> str:
-    """Return in words why a text or YAML file could not be read, without the file's name."""
+    """Return why a text or YAML file could not be read, without the file's name."""
     if isinstance(error, OSError):
         return "no such file" if error.errno == errno.ENOENT else error.strerror or str(error)
     if (mark := getattr(error, "problem_mark", None)) is not None:
-        return f"line {mark.line + 1}, column {mark.column + 1}: {getattr(error, 'problem', 'no YAML')}"
+        return f"line {mark.line + 1}, column {mark.column + 1}: {getattr(error, 'problem', 'not YAML')}"
     return " ".join(str(error).replace('"<unicode string>"', "it").split())
 
 
@@ -65,10 +65,10 @@ class TrainingDiverged(RuntimeError):
 class LeaseLost(RuntimeError):
     """Another process took over the folder that this one held, because this one stood still for too long.
 
-    What this process was about to write is not written. The message is one line; the exit code is 1.
+    Nothing more is written there. The message is one line; the exit code is 1.
     """
 
 
-def of_the_disk(error: Exception) -> bool:
-    """Return whether an error means that the disk is full or read-only, which is no run's fault."""
+def is_disk_error(error: Exception) -> bool:
+    """Return whether an error means that the disk is full or read-only, so the run itself did not fail."""
     return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS)

@@ -23,20 +23,15 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-WORDS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
-"""The numbers that JSON does not have, by the strings that stand for them."""
-
-
-def number_of(value: Any) -> Any:
-    """Return a measured number as JSON holds it, with NaN and infinities converted back to numbers."""
-    return WORDS.get(value, value) if isinstance(value, str) else value
+def to_number(value: Any) -> Any:
+    """Convert NaN and infinities, which JSON holds as strings, back to numbers; other values stay."""
+    return float(value) if value in ("nan", "inf", "-inf") else value
 
 
 def plain(value: Any) -> Any:
     """Return the value in a form that JSON can hold.
 
-    Tuples become lists, keys become strings, and NaN and infinities become the strings "nan", "inf" and
-    "-inf".
+    Tuples become lists, keys become strings, and NaN and infinities become strings.
     """
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
@@ -60,7 +55,7 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
     It is written under a temporary name, then synced and renamed.
 
     Raises:
-        LeaseLost: if this process held the file's folder and has lost it (memmlp.common.lease_fences).
+        LeaseLost: if this process held the file's folder and has lost it (memmlp.common.lease).
     """
     unfinished = temporary(path)
     try:
@@ -70,7 +65,7 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
             os.fsync(file.fileno())
         publish(unfinished, path)
     except BaseException:
-        with contextlib.suppress(OSError):  # the disk may refuse this, too; the first error tells why
+        with contextlib.suppress(OSError):  # the disk may refuse this, too; the first error says why
             unfinished.unlink(missing_ok=True)
         raise
     sync_folder(path.parent)

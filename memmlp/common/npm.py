@@ -1,13 +1,13 @@
 """Pinned packages from the npm registry, whose files are parts of pages: fetched once, checked, and kept.
 
-The registry is the one that npm would ask: `NPM_CONFIG_REGISTRY`, else what `npm config get registry` says,
-else `~/.npmrc`, else registry.npmjs.org. Tarballs are kept below the user's cache folder. They are read
-member by member, and never unpacked.
+The registry is `NPM_CONFIG_REGISTRY`, else npm's own (`npm config get registry`), else registry.npmjs.org.
+Tarballs are kept below the user's cache folder. They are read member by member, and never unpacked.
 """
 
 from __future__ import annotations
 
 import base64
+import contextlib
 import hashlib
 import os
 import shutil
@@ -22,14 +22,14 @@ from urllib.error import URLError
 
 from memmlp.common.errors import InputError, why_unreadable
 from memmlp.common.files import atomic_write
-from memmlp.common.progress import tell
+from memmlp.common.progress import announce
 
 DEFAULT_REGISTRY = "https://registry.npmjs.org/"
 FOLDER = "MEMMLP_NPM"
-"""The environment's variable for a folder of tarballs, as `npm pack` writes them, that is asked first."""
+"""The environment variable of a folder of tarballs, as `npm pack` writes them, that is searched first."""
 
-SECONDS = 60  # without a byte, after which a download has failed
-LARGEST = 300_000_000  # bytes of a tarball
+TIMEOUT = 60  # seconds without a byte
+MAX_SIZE = 300_000_000  # bytes of a tarball
 
 
 @dataclass(frozen=True)
@@ -91,13 +91,13 @@ def read(package: Package, names: Collection[str]) -> dict[str, bytes]:
     found = {}
     with tarfile.open(tarball(package), "r:gz") as archive:
         for member in archive:
-            name = member.name.split("/", 1)[-1]  # all lie in one folder, "package" as a rule
+            name = member.name.split("/", 1)[-1]  # all lie in one folder, usually "package"
             if member.isfile() and name in names and (file := archive.extractfile(member)):
                 found[name] = file.read()
             if len(found) == len(set(names)):
-                break  # what follows need not be unpacked
+                break  # the rest need not be unpacked
     if missing := sorted(set(names) - set(found)):
-        raise KeyError(f"{package} has no {', '.join(missing)}")
+        raise KeyError(f"{package} does not have {', '.join(missing)}")
     return found
 
 
@@ -108,11 +108,11 @@ def tarball(package: Package) -> Path:
         InputError: if it can't be fetched, or does not have the pinned digest.
     """
     if (given := os.environ.get(FOLDER)) and (path := Path(given) / package.file).is_file():
-        if _is(package, path.read_bytes()):
+        if _has_digest(package, path.read_bytes()):
             return path
         raise InputError(f"{path}: not {package} as pinned ({package.integrity[:20]}...)")
     path = cache() / package.file
-    if not (path.is_file() and _is(package, path.read_bytes())):
+    if not (path.is_file() and _has_digest(package, path.read_bytes())):
         content = _download(package, registry())
         path.parent.mkdir(parents=True, exist_ok=True)
         atomic_write(path, content)
@@ -126,56 +126,34 @@ def cache() -> Path:
 
 def registry() -> str:
     """Return the address of the registry with which npm is configured."""
-    asked = next((value for key, value in os.environ.items() if key.upper() == "NPM_CONFIG_REGISTRY"), "")
-    return asked or _of_npm() or _of_npmrc() or DEFAULT_REGISTRY
-
-
-def _of_npm() -> str | None:
-    """Return the registry that npm itself reports; None without npm."""
-    npm = shutil.which("npm")
-    if npm is None:
-        return None
-    try:
+    given = (value for name, value in os.environ.items() if name.upper() == "NPM_CONFIG_REGISTRY")
+    if address := next(given, ""):
+        return address
+    if npm := shutil.which("npm"):
         command = [npm, "config", "get", "registry"]
-        said = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=False).stdout
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return said.strip() if said.startswith("http") else None
-
-
-def _of_npmrc() -> str | None:
-    """Return the registry in the user's npmrc; None if there is none."""
-    path = Path(os.environ.get("NPM_CONFIG_USERCONFIG") or Path.home() / ".npmrc")
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError):
-        return None
-    pairs = [line.split("=", 1) for line in lines if "=" in line]
-    named = [value.strip().strip("\"'") for key, value in pairs if key.strip() == "registry"]
-    return named[-1] if named else None
+        with contextlib.suppress(OSError, subprocess.TimeoutExpired):
+            ran = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, check=False)
+            if ran.stdout.startswith("http"):
+                return ran.stdout.strip()
+    return DEFAULT_REGISTRY
 
 
 def _download(package: Package, host: str) -> bytes:
     """Fetch a package's tarball. Raises InputError if that fails, or if the file is another one."""
-    tell(f"fetch {package} from the npm registry; it is kept in {cache()}")
+    announce(f"fetch {package} from the npm registry; it is kept in {cache()}")
+    instead = f"or set {FOLDER} to a folder with {package.file}, as npm pack {package} writes it"
     try:
-        with urllib.request.urlopen(package.url(host), timeout=SECONDS) as answer:
-            content = answer.read(LARGEST)
-    except (OSError, ValueError, HTTPException) as error:  # a ValueError: an address that is none
+        with urllib.request.urlopen(package.url(host), timeout=TIMEOUT) as answer:
+            content = answer.read(MAX_SIZE)
+    except (OSError, ValueError, HTTPException) as error:  # a ValueError: not a valid address
         reason = error.reason if isinstance(error, URLError) else why_unreadable(error)
         raise InputError(
-            f"{package}: cannot be fetched from the npm registry ({reason}); {_way(package)}"
+            f"{package}: cannot be fetched from the npm registry ({reason}); try again, {instead}"
         ) from None
-    if not _is(package, content):
-        raise InputError(f"{package}: the npm registry gave another file than the pinned; {_way(package)}")
+    if not _has_digest(package, content):
+        raise InputError(f"{package}: the npm registry sent another file than the pinned one; {instead}")
     return content
 
 
-def _way(package: Package) -> str:
-    """Say how to continue without the registry."""
-    return f"allowed is also {FOLDER}=FOLDER with {package.file} in it, as npm pack {package} writes it"
-
-
-def _is(package: Package, content: bytes) -> bool:
-    """Return whether a tarball's content has the pinned digest."""
+def _has_digest(package: Package, content: bytes) -> bool:
     return f"sha512-{base64.b64encode(hashlib.sha512(content).digest()).decode()}" == package.integrity

@@ -1,4 +1,4 @@
-"""Progress reports on long work: bars with the time left on a terminal, elsewhere lines for a log."""
+"""Progress reports on long work: bars with the remaining time on a terminal, elsewhere lines for a log."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-EVERY = 30.0  # seconds between two lines about how far the same work is
+INTERVAL = 30.0  # seconds between two lines about the progress of the same work
 
-_DURING: ContextVar[str] = ContextVar("what the work is part of", default="")
-
-_SAY: ContextVar[Callable[[str], None] | None] = ContextVar("what is told of work", default=None)
+_label: ContextVar[str] = ContextVar("label of the larger work", default="")
+_listener: ContextVar[Callable[[str], None] | None] = ContextVar("listener to lines about work", default=None)
 
 
 def to_stderr(line: str) -> None:
@@ -27,47 +26,47 @@ def to_stderr(line: str) -> None:
 
 
 def to_log(line: str) -> None:
-    """Write a line to stderr, unless stderr is a terminal, which has the bars."""
+    """Write a line to stderr, unless stderr is a terminal, which shows the bars."""
     if not sys.stderr.isatty():
         to_stderr(line)
 
 
 @contextmanager
-def telling(say: Callable[[str], None] = to_log) -> Iterator[None]:
-    """Send the lines about work in this context to `say`: what begins and, now and then, the progress."""
-    token = _SAY.set(say)
+def announce_to(listener: Callable[[str], None] = to_log) -> Iterator[None]:
+    """Send the lines about work in this context to a listener: what begins, and the progress at times."""
+    token = _listener.set(listener)
     try:
         yield
     finally:
-        _SAY.reset(token)
+        _listener.reset(token)
 
 
-def tell(line: str) -> None:
-    """Report a line about the work, such as what begins now, to the listener set by `telling`, if any."""
-    if say := _SAY.get():
-        say(line)
+def announce(line: str) -> None:
+    """Send a line about the work, such as what begins now, to the listener, if any (`announce_to`)."""
+    if listener := _listener.get():
+        listener(line)
 
 
-def remark(line: str) -> None:
-    """Report what the user should know, such as skipped files: as `tell` does, but on a terminal, too."""
-    if say := _SAY.get():
-        (to_stderr if say is to_log else say)(line)
+def notify(line: str) -> None:
+    """Send what the user should know, such as skipped files: as `announce` does, but on a terminal, too."""
+    if listener := _listener.get():
+        (to_stderr if listener is to_log else listener)(line)
 
 
 @contextmanager
-def during(name: str) -> Iterator[None]:
+def label_progress(name: str) -> Iterator[None]:
     """Label the progress bars of this context with the larger work that they are a part of: a validation."""
-    token = _DURING.set(name)
+    token = _label.set(name)
     try:
         yield
     finally:
-        _DURING.reset(token)
+        _label.reset(token)
 
 
 class Count:
     """Counts how much of some work is done.
 
-    A terminal shows a bar; a listener (`telling`) gets a line every EVERY seconds.
+    A terminal shows a bar; a listener (`announce_to`) gets a line every INTERVAL seconds.
 
     Args:
         display: draws the bar.
@@ -77,36 +76,34 @@ class Count:
 
     def __init__(self, display: Progress, row: TaskID, unit: str = ""):
         self.display, self.row, self.unit = display, row, unit
-        self.said = time.monotonic()
+        self.announced = time.monotonic()
 
     def advance(self) -> None:
         """Count one more."""
         self.display.advance(self.row)
-        if time.monotonic() - self.said >= EVERY:
-            self.said = time.monotonic()
-            tell(self.line)
+        if time.monotonic() - self.announced >= INTERVAL:
+            self.announced = time.monotonic()
+            announce(self.line)
 
     def note(self, text: str) -> None:
-        """Replace the remark after the numbers, such as the loss."""
+        """Replace the text after the numbers, such as the loss."""
         self.display.update(self.row, note=text)
 
     @property
     def line(self) -> str:
         """The progress in a line, such as "Mem-MLP: 400 of 4000 steps, loss 2.31, 6 min left"."""
         task = self.display.tasks[0]
-        far = f"{task.completed:.0f}" + ("" if task.total is None else f" of {task.total:.0f}")
-        far = f"{far} {self.unit}".rstrip()
-        left = "" if task.time_remaining is None else f"{duration(task.time_remaining)} left"
-        return f"{task.description}: {', '.join(filter(None, (far, task.fields['note'], left)))}"
-
-
-def duration(seconds: float) -> str:
-    """Return a duration as text, in minutes if it is long."""
-    return f"{seconds / 60:.0f} min" if seconds >= 90 else f"{seconds:.0f} s"
+        total = "" if task.total is None else f" of {task.total:.0f}"
+        count = f"{task.completed:.0f}{total} {self.unit}".rstrip()
+        seconds = task.time_remaining
+        left = ""
+        if seconds is not None:
+            left = f"{seconds / 60:.0f} min left" if seconds >= 90 else f"{seconds:.0f} s left"
+        return f"{task.description}: {', '.join(filter(None, (count, task.fields['note'], left)))}"
 
 
 @contextmanager
-def counting(
+def show_progress(
     description: str, total: float | None, done: int = 0, shown: bool = True, unit: str = ""
 ) -> Iterator[Count]:
     """Show the progress of some work on stderr: description, bar, count, elapsed and remaining time, a note.
@@ -118,7 +115,7 @@ def counting(
         shown: whether this process shows it.
         unit: what is counted, such as frames.
     """
-    from rich import progress  # here, since the help of all commands comes by without it
+    from rich import progress  # here, since the help of all commands does without it
     from rich.console import Console
 
     console = Console(stderr=True)
@@ -128,14 +125,14 @@ def counting(
         progress.MofNCompleteColumn(),
         *([progress.TextColumn(unit)] if unit else []),
         progress.TimeElapsedColumn(),
-        progress.TextColumn("gone,"),
+        progress.TextColumn("elapsed,"),
         progress.TimeRemainingColumn(),
         progress.TextColumn("left"),
         progress.TextColumn("{task.fields[note]}"),
         console=console,
         disable=not (shown and console.is_terminal),
     )
-    label = ", ".join(filter(None, (_DURING.get(), description)))
+    label = ", ".join(filter(None, (_label.get(), description)))
     with display:
         yield Count(display, display.add_task(label, total=total, completed=done, note=""), unit)
 
@@ -153,7 +150,7 @@ def progress_bar(
     """
     if total is None and isinstance(items, Sized):
         total = len(items)
-    with counting(description, total, unit=unit) as count:
+    with show_progress(description, total, unit=unit) as count:
         for item in items:
             yield item
             count.advance()

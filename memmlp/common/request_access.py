@@ -1,8 +1,8 @@
-"""Who may send requests to a page's server: this machine's own browser, or whoever has the token.
+"""Who may send requests to a page's server: a browser on this machine, or whoever has the token.
 
-At this machine's own address, a request must name that address, since another name that leads here is DNS
-rebinding, and must not come from another site's page. At any other address, each request needs the token:
-first in the printed address, and from then on in a cookie, so that the token is in no browser history.
+At the loopback address, a request must name that address (another name would be DNS rebinding), and must not
+come from another site's page. At any other address, each request needs the token: first in the printed
+address, then in a cookie, so that the browser's history does not contain it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from memmlp.common.errors import InputError
 
 LOCAL = ("127.0.0.1", "localhost")
 COOKIE = "memmlp_token"
-SHORTEST = 16  # characters of a token
+MIN_LENGTH = 16  # characters of a token
 
 
 class Access:
@@ -26,15 +26,15 @@ class Access:
 
     Args:
         host: the address at which the server listens.
-        token: what requests need at any address but this machine's own; None for a new random token.
+        token: what requests need at any address but the loopback address; None for a new random token.
 
     Attributes:
-        token: the token; None at this machine's own address, which needs none.
+        token: the token; None at the loopback address, which does not need one.
     """
 
     def __init__(self, host: str, token: str | None = None):
         self.host = host
-        self.token = None if loopback(host) else token or secrets.token_urlsafe(24)
+        self.token = None if is_loopback(host) else token or secrets.token_urlsafe(24)
 
     def allows(self, path: str, headers: Message, port: int) -> bool:
         """Return whether a request may be answered, given its host, its origin and its token."""
@@ -42,18 +42,18 @@ class Access:
         if headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
             return headers.get("Sec-Fetch-Mode") == "navigate" and url.path == "/"
         if self.token is None:
-            return _name(headers.get("Host", "")) in (*LOCAL, self.host)
-        given = self.given(url.query) or _cookie(headers, port)
+            host = headers.get("Host", "")
+            return (host.rpartition(":")[0] or host) in (*LOCAL, self.host)
+        given = self.token_in(url.query) or _cookie(headers, port)
         return secrets.compare_digest(given.encode(), self.token.encode())
 
     def allows_change(self, path: str, headers: Message, port: int) -> bool:
         """Return whether a request may change something: it must not come from another site's page."""
         origin = headers.get("Origin")  # browsers send it with every POST
-        own = (None, f"http://{headers.get('Host', '')}")
-        return origin in own and self.allows(path, headers, port)
+        return origin in (None, f"http://{headers.get('Host', '')}") and self.allows(path, headers, port)
 
-    def given(self, query: str) -> str:
-        """Return the token in the query of an address, or nothing."""
+    def token_in(self, query: str) -> str:
+        """Return the token in the query of an address; empty if it does not have one."""
         return dict(urllib.parse.parse_qsl(query)).get("token", "")
 
     def redirect_headers(self, token: str, port: int) -> Mapping[str, str]:
@@ -67,7 +67,7 @@ class Access:
         return f"http://{name}:{port}/{ending}"
 
 
-def loopback(host: str) -> bool:
+def is_loopback(host: str) -> bool:
     """Return whether an address is 127.0.0.1 or localhost, at which no other machine can reach this one."""
     try:
         return host == "localhost" or (ip_address(host).is_loopback and ip_address(host).version == 4)
@@ -77,15 +77,10 @@ def loopback(host: str) -> bool:
 
 def check_token(host: str, token: str | None) -> None:
     """Raise InputError for a token that is too short, or not needed at an address."""
-    if token is not None and loopback(host):
-        raise InputError("--token: goes with --host; this machine's own address needs none")
-    if token is not None and len(token) < SHORTEST:
-        raise InputError(f"--token: {len(token)} characters; allowed are {SHORTEST} or more")
-
-
-def _name(host: str) -> str:
-    """Return the name in a Host header, without the port."""
-    return host.rpartition(":")[0] or host
+    if token is not None and is_loopback(host):
+        raise InputError("--token: is only for --host; the loopback address does not need it")
+    if token is not None and len(token) < MIN_LENGTH:
+        raise InputError(f"--token: must have at least {MIN_LENGTH} characters")
 
 
 def _cookie(headers: Message, port: int) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from memmlp.common.errors import InputError
-from memmlp.common.progress import counting
+from memmlp.common.progress import show_progress
 from memmlp.config.build import build_deployment, untrained
 from memmlp.config.compose import composed
 from memmlp.deploy.deployment import GRAPHS, Deployment
@@ -32,7 +32,7 @@ def with_costs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> tuple[dict[str, 
     timed = not set(sweep.metrics) <= set(SIZES)
     without = [arm for arm in sweep.runnable() if not runs[arm.label]]
     costs: dict[str, RunsBySeed] = {}
-    with counting("networks", len(without)) as count:
+    with show_progress("networks", len(without)) as count:
         for arm in without:
             count.note(arm.label)  # a large one takes minutes
             costs[arm.label] = {sweep.seeds_of(arm)[0]: measure_costs(sweep.all_overrides(arm), timed)}

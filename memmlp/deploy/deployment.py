@@ -10,7 +10,7 @@ from typing import Any
 
 from torch import Tensor
 
-from memmlp.common.progress import tell
+from memmlp.common.progress import announce
 from memmlp.deploy import latency
 from memmlp.deploy.lower_precision import compare_accuracy, lower
 from memmlp.deploy.opsets import NATIVE
@@ -78,7 +78,9 @@ class Deployment:
         export(network, deployed.onnx, run_id, self.opset)
         (clip,) = clips_to_check(model, test)
         if len(clip) < frames_of_full_past(model):
-            tell(f"export: the longest test clip has {len(clip)} frames, too few to compare with a full past")
+            announce(
+                f"export: the longest test clip has {len(clip)} frames, too few to compare with a full past"
+            )
         apart = differences(model, deployed.onnx, clip)
         worst = float(apart.max())
         if not matches(model, deployed.onnx, clip, apart):
@@ -99,7 +101,7 @@ class Deployment:
             times = latency.measure_step(path, self.latency_steps)
             record[self.precision] = {**cost, **times, "onnx_bytes": path.stat().st_size}
         elif self.precision != "fp32":
-            tell(f"export: no file in {self.precision}; {type(model).__name__} has no streaming graph")
+            announce(f"export: no file in {self.precision}; {type(model).__name__} has no streaming graph")
         return record
 
     def times(self, model: MotionModel, path: Path) -> dict[str, float]:

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from onnx import TensorProto, helper
 from torch import Tensor
 
-from memmlp.common.thread_core_share import CoreClock
+from memmlp.common.processes import CoreClock
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.motion.body import MOTION_DIM, N_JOINTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Change, Normalizer

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from memmlp.common.thread_core_share import CoreClock
+from memmlp.common.processes import CoreClock
 from memmlp.deploy.latency import SETTLING, InTurn, in_turn
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.live.rotations import quaternion_to_matrix

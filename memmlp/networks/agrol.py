@@ -216,6 +216,6 @@ class AGRoLDiffusion(WholeWindow):
         _, kept = self.append_inputs(sparse, state)
         window, frames = true_frames[..., :SPARSE_DIM], self.normalizer.encode(true_frames)
         encoded, clean = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:][..., ROTATION]
-        time = distributed.drawn(self.diffusion.random_times, true_frames)
-        noisy = self.diffusion.add_noise(clean, time, distributed.drawn(torch.randn_like, clean))
+        time = distributed.draw_rows(self.diffusion.random_times, true_frames)
+        noisy = self.diffusion.add_noise(clean, time, distributed.draw_rows(torch.randn_like, clean))
         return TrainingOutputs(self.normalizer.posed(self.denoise(noisy, time, encoded), window), kept, {})

@@ -230,8 +230,8 @@ class BoDiffusion(WholeWindow):
         _, kept = self.append_inputs(sparse, state)
         window, frames = true_frames[..., :SPARSE_DIM], self.normalizer.encode(true_frames)
         encoded, clean = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:][..., ROTATION]
-        time = distributed.drawn(self.diffusion.random_times, true_frames)
-        noise = distributed.drawn(torch.randn_like, clean)
+        time = distributed.draw_rows(self.diffusion.random_times, true_frames)
+        noise = distributed.draw_rows(torch.randn_like, clean)
         noisy = self.diffusion.add_noise(clean, time, noise)
         made = self.denoise(noisy, time, encoded)
         error, bound = self.diffusion.losses(clean, noise, time, made, self.limits())

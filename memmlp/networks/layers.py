@@ -111,9 +111,9 @@ class Dropout(nn.Dropout):
 
     def forward(self, h: Tensor) -> Tensor:
         """Set random elements of features (B, ...) to 0 in training, and scale the others up."""
-        if not (self.training and distributed.shared()):
+        if not (self.training and distributed.is_shared()):
             return super().forward(h)
-        return h * distributed.drawn(lambda like: F.dropout(torch.ones_like(like), self.p), h)
+        return h * distributed.draw_rows(lambda like: F.dropout(torch.ones_like(like), self.p), h)
 
 
 def find_batch_dependent(module: nn.Module) -> list[str]:

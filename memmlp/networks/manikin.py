@@ -200,7 +200,7 @@ class Manikin(MotionModel):
 
     def heading(self, true_frames: Tensor) -> Tensor:
         """Draw a turn about the world's vertical axis for each window, as an origin (B, 1, 5) of Heading."""
-        angle = self.turned * 2 * math.pi * distributed.drawn(torch.rand_like, true_frames[:, :1, :1])
+        angle = self.turned * 2 * math.pi * distributed.draw_rows(torch.rand_like, true_frames[:, :1, :1])
         return torch.cat([torch.zeros_like(true_frames[:, :1, :3]), angle.cos(), angle.sin()], -1)
 
     def losses(self, made: Tensor, true: Tensor) -> dict[str, Tensor]:

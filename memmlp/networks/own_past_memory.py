@@ -58,7 +58,7 @@ class Blend(nn.Module):
     def forward(self, like: Tensor) -> Tensor | float:
         """Return m: a number, or draws of the shape (B, T, k) of `like`."""
         if self.training or isinstance(self.value, str):
-            return distributed.drawn(torch.rand_like, like)
+            return distributed.draw_rows(torch.rand_like, like)
         return self.value
 
 

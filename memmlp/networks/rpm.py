@@ -195,7 +195,7 @@ class RPM(WindowlessModel):
             true_frames: the same frames (B, context, 252) in the world.
         """
         motion = self.normalizer.encode(true_frames)[..., SPARSE_DIM:][..., ROTATION]
-        known = (distributed.drawn(torch.rand_like, true_frames[:, :1, 0]) >= FRESH).to(true_frames.dtype)
+        known = (distributed.draw_rows(torch.rand_like, true_frames[:, :1, 0]) >= FRESH).to(true_frames.dtype)
         return fresh | {
             "sparse": known[..., None] * encoded,
             "motion": known[..., None] * motion,

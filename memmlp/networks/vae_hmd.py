@@ -81,7 +81,7 @@ def divergence(latent: Tensor) -> Tensor:
 def drawn(latent: Tensor) -> Tensor:
     """Draw samples (..., z) from latents (..., 2 z), which are means and log variances."""
     mean, log_variance = latent.chunk(2, -1)
-    return mean + (0.5 * log_variance).exp() * distributed.drawn(torch.randn_like, mean)
+    return mean + (0.5 * log_variance).exp() * distributed.draw_rows(torch.randn_like, mean)
 
 
 class VAEHMDGraph(FrameGraph):
@@ -158,7 +158,7 @@ class VAEHMD(WindowlessModel):
             state: see `advance`.
             true_frames: world frames [X | Theta] (B, T, 252).
         """
-        posed = (distributed.drawn(torch.rand_like, sparse[:, :1, :1]) < 0.5).to(sparse.dtype)
+        posed = (distributed.draw_rows(torch.rand_like, sparse[:, :1, :1]) < 0.5).to(sparse.dtype)
         of_pose = self.pose_encoder(self.normalizer.encode(true_frames)[..., SPARSE_DIM:])
         latent = posed * of_pose + (1 - posed) * self.latent(sparse)
         sample = drawn(latent)

@@ -109,7 +109,7 @@ class EMACodebook(Codebook):
 
         Where several processes share a batch, the running means are those of the whole batch.
         """
-        latent = distributed.whole(latent)
+        latent = distributed.gather_rows(latent)
         if not self.started:
             self._restart(torch.ones_like(self.counts, dtype=torch.bool), latent)
             self.started.fill_(True)
@@ -119,7 +119,7 @@ class EMACodebook(Codebook):
         self.sums.lerp_(chosen.T @ latent, 1 - self.decay)
         self._restart(self.counts < self.DEAD, latent)
         self.vectors.copy_(self.sums / self.counts[:, None])
-        return distributed.own_rows(codes), distributed.own_rows(index)
+        return distributed.local_rows(codes), distributed.local_rows(index)
 
     def _restart(self, dead: Tensor, latent: Tensor) -> None:
         """Replace the codes that are `dead` (K,) by random latents of the batch (B, width)."""

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from memmlp.common.files import number_of, read_json
+from memmlp.common.files import read_json, to_number
 from memmlp.runs.evaluation_file import check_report, combined_by, of_one_solver, outdated_by, preference
 from memmlp.runs.identity import used_as_configured
 
@@ -43,7 +43,7 @@ class EvaluationsAsConfigured:
         for report in of_one_solver(self._reports()):
             branches = found.setdefault(report["mode"], {})
             for branch, errors in report["mean"].items():  # those of one's own metrics may be in one alone
-                numbers = {name: number_of(value) for name, value in errors.items()}
+                numbers = {name: to_number(value) for name, value in errors.items()}
                 branches[branch] = {**branches.get(branch, {}), **numbers}
         return found
 

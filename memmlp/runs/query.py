@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import number_of
+from memmlp.common.files import to_number
 from memmlp.runs.deployment_folder import with_times_as_deployed
 from memmlp.runs.evaluation_file import with_solvers
 from memmlp.runs.former_keys import present_key
@@ -47,7 +47,7 @@ def record(run: Run) -> dict[str, Any]:
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
     found = with_solvers(run.results, run.evaluations_as_configured.combined_by)
-    results = {key: number_of(value) for key, value in flatten(with_times_as_deployed(found)).items()}
+    results = {key: to_number(value) for key, value in flatten(with_times_as_deployed(found)).items()}
     flat = flatten(config)
     short = {key.replace(".rotation.", "."): value for key, value in results.items()}
     slots = {slot: option_in_slot(config, slot) for slot in SLOTS if slot in config}

@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged, of_the_disk
+from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged, is_disk_error
 from memmlp.common.files import read_json, write_json
 from memmlp.common.lease import Changes, current_process, is_alive
 from memmlp.runs.run import Run
@@ -109,7 +109,7 @@ def _perform(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
     except (InputError, TrainingDiverged) as error:
         run.fail(str(error))
     except Exception as error:
-        if of_the_disk(error):
+        if is_disk_error(error):
             raise
         run.fail(f"{type(error).__name__}: {error}", traceback.format_exc())
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from memmlp.common.thread_core_share import LEAST_CORE_SHARE
+from memmlp.common.processes import MIN_CORE_SHARE
 from memmlp.runs.motion_seen import hardly_trained
 from memmlp.sweep.definition import COSTS, TIMES, Sweep, Variant
 from memmlp.tables import flags_of_code
@@ -337,7 +337,7 @@ def _busy(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
         counted = undisturbed(runs[variant.label])
         shares = [share for run in counted.values() if (share := core_share(run)) is not None]
         ratios = [run.costs["ratio"] for run in counted.values() if "ratio" in run.costs]
-        if shares and min(shares) < LEAST_CORE_SHARE:
+        if shares and min(shares) < MIN_CORE_SHARE:
             found.append(had_core(variant.label, min(shares)))
         elif ratios and max(ratios) > STEADY * min(ratios):
             found.append(f"'{variant.label}' (ratio {min(ratios):.3g} to {max(ratios):.3g} over seeds)")

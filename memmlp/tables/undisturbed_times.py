@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from memmlp.common.thread_core_share import LEAST_CORE_SHARE
+from memmlp.common.processes import MIN_CORE_SHARE
 from memmlp.sweep.definition import TIMES
 from memmlp.tables.measured_run import CORE_SHARES, Measured
 
@@ -19,7 +19,7 @@ def undisturbed(runs: Mapping[int, Measured]) -> Mapping[int, Measured]:
 
     A time does not depend on the seed, so that one undisturbed measurement says more than a mean with others.
     """
-    alone = {seed: run for seed, run in runs.items() if (core_share(run) or 0) >= LEAST_CORE_SHARE}
+    alone = {seed: run for seed, run in runs.items() if (core_share(run) or 0) >= MIN_CORE_SHARE}
     return alone or runs
 
 

@@ -48,7 +48,7 @@ def _checked(name: str, index: int) -> int:
     count = torch.cuda.device_count()
     if index >= count:
         raise InputError(f"device={name}: allowed here is cuda:0{f' to cuda:{count - 1}' * (count > 1)}")
-    if distributed.size() > 1:
+    if distributed.world_size() > 1:
         raise InputError(f"device={name}: allowed with several processes is device=cuda, one GPU for each")
     return index
 

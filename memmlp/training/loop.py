@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from memmlp.common import distributed
 from memmlp.common.errors import InputError, TrainingDiverged
-from memmlp.common.progress import Count, counting, during, remark
+from memmlp.common.progress import Count, label_progress, notify, show_progress
 from memmlp.motion.dataset import MotionDataset
 from memmlp.networks import checkpoint, layers
 from memmlp.runs.run import Run
@@ -108,28 +108,28 @@ def train(
     average = optim.average(task.module, optimiser)
     start, spent = resume(task, optimiser, average, run)
     started = time.monotonic() - spent
-    if start and distributed.first():
-        remark(f"{description}: resumes at step {start} of {optim.steps}, the last checkpoint")
-    distributed.align(task.module)
-    with counting(description, optim.steps, start, shown=distributed.first(), unit="steps") as count:
+    if start and distributed.is_first():
+        notify(f"{description}: resumes at step {start} of {optim.steps}, the last checkpoint")
+    distributed.copy_from_first(task.module)
+    with show_progress(description, optim.steps, start, shown=distributed.is_first(), unit="steps") as count:
         for step in range(start, optim.steps):
             seed_step(seed, step)
             result = train_step(task, optim, optimiser, step)
             average.update(step + 1)
-            first = distributed.first()
+            first = distributed.is_first()
             validation = record(task, optim, average, run, step + 1, result, count) if first else {}
             if (step + 1) % optim.checkpoint_every == 0 or step + 1 == optim.steps:
                 save(task, optimiser, average, run, step + 1, time.monotonic() - started)
             if validation and on_validation:
                 on_validation(step + 1, validation)
-    if distributed.first():
+    if distributed.is_first():
         run.took("train", time.monotonic() - started)
     average.put_in_place()
 
 
 def check_processes(task: TrainingTask, optim: Optim, description: str) -> None:
     """Raise InputError if a batch shared by several processes does not give the same step as on one."""
-    count = distributed.size()
+    count = distributed.world_size()
     if optim.batch % count:
         raise InputError(
             f"{description}: optim.batch or vqvae.batch={optim.batch}: must be a multiple of {count}, "
@@ -150,7 +150,7 @@ def train_step(task: TrainingTask, optim: Optim, optimiser: torch.optim.Optimize
         group["lr"] = group["initial_lr"] * optim.factor(step)
     device = task.dataset.frames.device
     mixed = torch.autocast(device.type, torch.bfloat16) if optim.precision == "bf16" else nullcontext()
-    with mixed, distributed.sharing():
+    with mixed, distributed.share_batch():
         result = task.step(step)
         seen = gather_batch(result)
     check_finite(task, seen, step)
@@ -165,11 +165,13 @@ def train_step(task: TrainingTask, optim: Optim, optimiser: torch.optim.Optimize
 
 def gather_batch(result: StepResult) -> StepResult:
     """Return the mean loss and terms, and all clips, of a batch that several processes may share."""
-    if not distributed.shared():
+    if not distributed.is_shared():
         return result
     terms = torch.stack([result.loss, *result.terms.values()])
-    loss, *means = distributed.mean(terms.detach())
-    return StepResult(loss, dict(zip(result.terms, means, strict=True)), distributed.whole(result.clips))
+    loss, *means = distributed.average(terms.detach())
+    return StepResult(
+        loss, dict(zip(result.terms, means, strict=True)), distributed.gather_rows(result.clips)
+    )
 
 
 def check_finite(task: TrainingTask, result: StepResult, step: int) -> None:
@@ -205,7 +207,7 @@ def record(
 def validate(task: TrainingTask, average: Average) -> dict[str, float]:
     """Validate the weights that count, and return the task's values."""
     task.module.eval()
-    with average.in_place(), during("validation"):
+    with average.in_place(), label_progress("validation"):
         return task.validate()
 
 
@@ -221,8 +223,8 @@ def save(
 
     Of several processes the first one writes, and the others continue with its weights.
     """
-    distributed.align(task.module)
-    if not distributed.first():
+    distributed.copy_from_first(task.module)
+    if not distributed.is_first():
         return
     rates = [group["initial_lr"] for group in optimiser.param_groups]
     tensors = checkpoint.module_tensors("module", task.module) | checkpoint.optimiser_tensors(optimiser)
@@ -235,7 +237,7 @@ def resume(
     task: TrainingTask, optimiser: torch.optim.Optimizer, average: Average, run: Run
 ) -> tuple[int, float]:
     """Load the run's checkpoint, if any; return the number of finished steps and the seconds they took."""
-    found = checkpoint.read(run.checkpoint) if distributed.first() and run.checkpoint.exists() else None
+    found = checkpoint.read(run.checkpoint) if distributed.is_first() and run.checkpoint.exists() else None
     found = distributed.broadcast(found)
     if found is None:
         return 0, 0.0

@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from memmlp.common.progress import remark, tell
+from memmlp.common.progress import announce, notify
 from memmlp.motion.motion_source import MotionSource, Prepared
 from memmlp.runs.environment import packages_of_ones_own
 from memmlp.runs.evaluation_file import read_report
@@ -134,18 +134,18 @@ def finished_outcome(request: RunRequest) -> Outcome | None:
     run = Run.of(request.outputs, request.identity(data.digest).id)
     if not run.done or not all(map(run.has, request.stage_ids)) or unmeasured(request, run):
         return None
-    announce(data)
+    announce_data(data)
     with run.lock():
         run.want(request.stage_ids)
     return Outcome(run, (), results_of(request, run), request.stage_ids)
 
 
-def announce(data: Prepared) -> None:
+def announce_data(data: Prepared) -> None:
     """Print what the user should know of the data before a run begins."""
     clips = data.manifest.clips
-    tell(f"data: {len(clips)} clips ({tested_clips_remark(clips)}), prepared in {data.cache}")
+    announce(f"data: {len(clips)} clips ({tested_clips_remark(clips)}), prepared in {data.cache}")
     for text in data_remarks(data):
-        remark(f"data: {text}")
+        notify(f"data: {text}")
 
 
 def unmeasured(request: RunRequest, run: Run) -> list[str]:

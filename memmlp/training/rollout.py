@@ -59,7 +59,7 @@ class TeacherForcing(Rollout):
         self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int
     ) -> TrainingCall:
         """Draw the training call of a step."""
-        clips, end = map(distributed.own_rows, sampler.draw(step))
+        clips, end = map(distributed.local_rows, sampler.draw(step))
         past, stride = model.past_frames, model.stride
         stretch = dataset.stretches(clips, end, past + stride)
         state = model.true_state(stretch[:, :past])
@@ -81,7 +81,7 @@ class OwnPredictions(Rollout):
         self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int
     ) -> TrainingCall:
         """Draw the training call of a step, after the calls that make its history."""
-        clips, end = map(distributed.own_rows, sampler.draw(step))
+        clips, end = map(distributed.local_rows, sampler.draw(step))
         past, stride = model.past_frames, model.stride
         passes = int(torch.randint(self.max_passes + 1, ())) if model.shift else 0
         stretch = dataset.stretches(clips, end, past + stride * (passes + 1))
@@ -144,7 +144,7 @@ class PersistentStreams(Rollout):
         self.clip[who] = torch.where(going, self.clip[who], clips)
         self.end[who] = torch.where(going, self.end[who] + model.stride, end)
         self.lives[who] = True
-        self.who, mine, going = who, distributed.own_rows(who), distributed.own_rows(going)
+        self.who, mine, going = who, distributed.local_rows(who), distributed.local_rows(going)
         past, stride = model.past_frames, model.stride
         stretch = dataset.stretches(self.clip[mine], self.end[mine], past + stride)
         fresh = model.running_state(stretch[:, :past, :SPARSE_DIM])
@@ -159,4 +159,4 @@ class PersistentStreams(Rollout):
     def keep(self, state: State) -> None:
         """Keep the streams' states after the training call."""
         for name, tensor in state.items():
-            self.get_buffer(f"state_{name}")[self.who] = distributed.whole(tensor.detach())
+            self.get_buffer(f"state_{name}")[self.who] = distributed.gather_rows(tensor.detach())

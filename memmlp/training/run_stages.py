@@ -17,9 +17,9 @@ from typing import Any
 import torch
 
 from memmlp.common import distributed
-from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged, of_the_disk
+from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged, is_disk_error
 from memmlp.common.files import write_json
-from memmlp.common.progress import remark, tell
+from memmlp.common.progress import announce, notify
 from memmlp.evaluation.evaluation import predict_first_clip
 from memmlp.evaluation.predictions import save_predictions
 from memmlp.live.pose_latency import measure_pose
@@ -43,7 +43,7 @@ from memmlp.training.data_remarks import data_warnings, partial_words
 from memmlp.training.devices import described, overlooked_gpu
 from memmlp.training.experiment import Experiment, PrerequisiteTraining
 from memmlp.training.loop import ValidationCallback
-from memmlp.training.request import Outcome, announce, own_code, results_of, unmeasured
+from memmlp.training.request import Outcome, announce_data, own_code, results_of, unmeasured
 
 
 def run_in_processes(experiment: Experiment) -> Outcome | None:
@@ -55,15 +55,15 @@ def run_in_processes(experiment: Experiment) -> Outcome | None:
     Returns:
         The outcome in the first process, None in the others.
     """
-    if experiment.unrefined and distributed.size() > 1:
+    if experiment.unrefined and distributed.world_size() > 1:
         raise InputError("refiner: several processes cannot train it; start one process, or set refiner=null")
     distributed.connect(experiment.device.type)
-    if not distributed.first():
+    if not distributed.is_first():
         _train_along(experiment)
         return None
     outcome = run_experiment(experiment)
     distributed.broadcast("end")
-    distributed.leave()
+    distributed.disconnect()
     return outcome
 
 
@@ -77,7 +77,7 @@ def _train_along(experiment: Experiment) -> None:
         training = (*experiment.prerequisites, experiment.training)[number]
         weights = runs[number - 1].weights() if number else None
         training.train(experiment.architecture, data, weights, runs[number], experiment.device)
-    distributed.leave()
+    distributed.disconnect()
 
 
 def run_experiment(experiment: Experiment, on_validation: ValidationCallback | None = None) -> Outcome:
@@ -89,14 +89,14 @@ def run_experiment(experiment: Experiment, on_validation: ValidationCallback | N
     """
     config = experiment.config
     data = experiment.motion.prepare()
-    announce(data)
+    announce_data(data)
     run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
     if not run.done:
         if experiment.evaluations:
             data.open("test")  # raises the error of absent test clips before the training, not after it
         experiment.training.optim.check_installed()
         if overlooked := overlooked_gpu(config["device"]):
-            remark(overlooked)
+            notify(overlooked)
     before = None if run.done and not config["force"] else make_prerequisites(experiment, data)
     with run.lock():
         if config["force"]:
@@ -147,7 +147,7 @@ def make_missing_stages(experiment: Experiment, run: Run, data: Prepared) -> lis
     run.want(experiment.stage_ids)
     if missing := unmeasured(experiment, run):
         if any(run.has(experiment.evaluations[mode]) for mode in missing):
-            tell("evaluation: code of the metrics' packages has changed since they were measured")
+            announce("evaluation: code of the metrics' packages has changed since they were measured")
         evaluate_run(experiment, run, data, missing)
         made.append("evaluation")
     if experiment.deployment_id and not run.has(experiment.deployment_id):
@@ -189,7 +189,7 @@ def find_or_train(
         with recording_outcome(experiment, run):
             begin(experiment, run, identity, dict(identity.config), before)
             run.write_manifest({"partial": partial_words(experiment.config, data)})
-            tell(f"{training.description} (run {run.id})")
+            announce(f"{training.description} (run {run.id})")
             weights = before.weights() if before else None
             distributed.broadcast(training.kind)  # tells the others what is trained now
             errors = training.train(experiment.architecture, data, weights, run, experiment.device)
@@ -217,7 +217,7 @@ def recording_outcome(experiment: Experiment, run: Run, again: bool = False) -> 
             run.fail(str(error))
             raise
         except (RuntimeError, OSError) as error:
-            if not of_the_disk(error):
+            if not is_disk_error(error):
                 run.fail(f"{type(error).__name__}: {error}", traceback.format_exc())
             raise
         run.forgive()
@@ -232,10 +232,10 @@ def train_run(
 ) -> None:
     """Train the network of a run upon the weights of the run before it, and mark the run as done."""
     steps = experiment.training.optim.steps
-    tell(f"network: train it for {steps} steps (run {run.id})")
+    announce(f"network: train it for {steps} steps (run {run.id})")
     begin(experiment, run, experiment.identity(data.digest), experiment.config, before)
     if files := computed_imports(run.manifest.get("plugins") or {}):
-        remark(f"plugins: edits are not noticed in modules imported by computed names ({files})")
+        notify(f"plugins: edits are not noticed in modules imported by computed names ({files})")
     run.write_manifest({"body": data.manifest.body, **data_warnings(experiment.config, data)})
     run.want(experiment.stage_ids)
     run.clear_stages()
@@ -251,7 +251,7 @@ def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequen
     Each evaluation is one file, which is written completely or not at all. The picture is drawn once.
     """
     run.attempt("evaluation")
-    tell(f"evaluation: measure the errors on the test clips, in {' and '.join(modes)} mode")
+    announce(f"evaluation: measure the errors on the test clips, in {' and '.join(modes)} mode")
     with timed(run, "evaluate"):
         model = experiment.architecture.load(run.weights()).to(experiment.device)
         test = data.open("test").to(experiment.device)
@@ -277,7 +277,7 @@ def draw_first_clip(model: MotionModel, test: MotionDataset, path: Path) -> None
 def deploy_run(experiment: Experiment, run: Run, data: Prepared) -> None:
     """Make the deployment: export a trained run, check the file against torch, time it."""
     run.attempt("deployment")
-    tell("deployment: export to ONNX, compare with torch, and time a frame")
+    announce("deployment: export to ONNX, compare with torch, and time a frame")
     deployment, name = experiment.deployment, experiment.deployment_id
     assert deployment is not None
     assert name is not None
@@ -308,7 +308,7 @@ def begin(
         "recipes": identity.recipes,
         "what": identity.what,
         **machine(experiment),
-        "processes": distributed.size(),
+        "processes": distributed.world_size(),
         **own_code(experiment),
         "name": experiment.make_name(identity.kind, counting),
         "user": user(),

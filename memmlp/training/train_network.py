@@ -75,7 +75,7 @@ class NetworkTraining:
         """
         task = self.task(architecture, data, upstream, device)
         train(task, self.optim, run, self.seed, "network", on_validation)
-        if distributed.first():
+        if distributed.is_first():
             checkpoint.write(run.model, checkpoint.module_tensors("model", task.model), {})
         return task.model.eval()
 

@@ -178,7 +178,7 @@ class PartTraining:
         windows = Windows(self.network, dataset, data.open("val").to(device), net.frames)
         task = PartTask(part.requires_grad_(True), make_objective(self.kind, halves), windows)
         train(task, self.network.optim, run, self.network.seed, self.kind.replace("_", " "))
-        if distributed.first():
+        if distributed.is_first():
             checkpoint.write(run.model, before | checkpoint.module_tensors(name, part), {})
         return last_errors(run)
 
@@ -222,7 +222,7 @@ class Windows:
 
     def draw(self, step: int) -> tuple[Tensor, Tensor]:
         """Return the world frames (B, T, 252) of a step's windows, and the indices (B,) of their clips."""
-        clips, end = map(distributed.own_rows, self.sampler.draw(step))
+        clips, end = map(distributed.local_rows, self.sampler.draw(step))
         return self.dataset.stretches(clips, end, self.frames), clips
 
 
@@ -277,7 +277,7 @@ def compute_code_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training
     """
     rotation, encoded = encode_windows(net, frames)
     sixd = rotation.unflatten(-1, (N_JOINTS, 6))
-    hidden = distributed.drawn(torch.rand_like, sixd[:, 0, :, 0]) < HIDDEN_SHARE
+    hidden = distributed.draw_rows(torch.rand_like, sixd[:, 0, :, 0]) < HIDDEN_SHARE
     hidden[:, codes.joints[0]] = False
     shown = sixd.masked_fill(hidden[:, None, :, None], HIDDEN) if training else sixd
     latent, codebook = codes.encode(shown.flatten(-2), encoded)
@@ -364,7 +364,7 @@ def encode_latents(codes: HalfVQVAE, rotation: Tensor, encoded: Tensor) -> Tenso
 
 def add_noise(net: SAGENet, clean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return noisy latents (B, T // 2, 384), their random times (B,), and random hidden joints (B, 22)."""
-    time = distributed.drawn(net.diffusion.random_times, clean)
-    noisy = net.diffusion.add_noise(clean, time, distributed.drawn(torch.randn_like, clean))
-    drawn = distributed.drawn(lambda like: torch.rand_like(like[:, 0, :HIDDEN_COUNT]), clean) * N_JOINTS
+    time = distributed.draw_rows(net.diffusion.random_times, clean)
+    noisy = net.diffusion.add_noise(clean, time, distributed.draw_rows(torch.randn_like, clean))
+    drawn = distributed.draw_rows(lambda like: torch.rand_like(like[:, 0, :HIDDEN_COUNT]), clean) * N_JOINTS
     return noisy, time, F.one_hot(drawn.long(), N_JOINTS).sum(1) > 0

@@ -65,7 +65,7 @@ class VQVAETraining:
         training = MirroredDataset(dataset) if self.mirror else dataset
         task = VQVAETask(model, normalizer, training, validation, optim, self.seed)
         train(task, optim, run, self.seed, "VQ-VAE")
-        if distributed.first():
+        if distributed.is_first():
             checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
         return task.validate()
 
@@ -89,10 +89,10 @@ class VQVAETask(TrainingTask):
 
     def step(self, step: int) -> StepResult:
         """Compute the loss on a batch of single frames."""
-        clips, end = map(distributed.own_rows, self.sampler.draw(step))
+        clips, end = map(distributed.local_rows, self.sampler.draw(step))
         frames = self.normalizer.encode(self.dataset.stretches(clips, end, 1))[:, 0]
         terms, indices = self.model.loss_terms(frames, self.normalizer)
-        self.used = torch.bincount(distributed.whole(indices), minlength=len(self.used)).float()
+        self.used = torch.bincount(distributed.gather_rows(indices), minlength=len(self.used)).float()
         return StepResult(torch.stack(list(terms.values())).sum(), terms, clips)
 
     def report(self) -> dict[str, float]:

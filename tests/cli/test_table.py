@@ -84,7 +84,7 @@ def test_command_prints_all_tables(memmlp: Memmlp, planned: None):
 
 
 def test_the_progress_of_many_tables_is_told(memmlp: Memmlp, planned: None, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("memmlp.common.progress.EVERY", 0.0)
+    monkeypatch.setattr("memmlp.common.progress.INTERVAL", 0.0)
     assert "tables: 1 of 17" in memmlp("table", "all", "bad=1").err
 
 

@@ -10,7 +10,7 @@ from conftest import Memmlp, one_line
     ("words", "told"),
     [
         (["--token", "a token of many letters"], "--token: goes with --host"),
-        (["--host", "0.0.0.0", "--token", "short"], "--token: 5 characters; allowed are 16 or more"),
+        (["--host", "0.0.0.0", "--token", "short"], "--token: must have at least 16"),
         (["--host", "nowhere.invalid"], "--host nowhere.invalid --port 8787"),
     ],
 )

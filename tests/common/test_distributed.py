@@ -92,20 +92,20 @@ def test_two_processes_train_the_weights_of_one_and_take_over_from_each_other(tm
 @pytest.fixture
 def two(monkeypatch: pytest.MonkeyPatch) -> None:
     """This process is the second of two, which are not connected."""
-    monkeypatch.setattr(distributed, "size", lambda: 2)
+    monkeypatch.setattr(distributed, "world_size", lambda: 2)
     monkeypatch.setattr(distributed, "rank", lambda: 1)
 
 
 def test_rows_and_draws_of_the_second_of_two(two: None):
     batch = torch.arange(8.0).reshape(4, 2)
-    assert torch.equal(distributed.own_rows(batch), batch)  # outside of a step
-    with distributed.sharing():
-        assert torch.equal(distributed.own_rows(batch), batch[2:])
+    assert torch.equal(distributed.local_rows(batch), batch)  # outside of a step
+    with distributed.share_batch():
+        assert torch.equal(distributed.local_rows(batch), batch[2:])
         torch.manual_seed(3)
-        rows = distributed.drawn(torch.rand_like, batch[2:])
+        rows = distributed.draw_rows(torch.rand_like, batch[2:])
     torch.manual_seed(3)
     assert torch.equal(rows, torch.rand_like(batch)[2:])
-    assert torch.equal(distributed.own_rows(batch), batch)
+    assert torch.equal(distributed.local_rows(batch), batch)
 
 
 def test_dropout_is_that_of_the_whole_batch(two: None):
@@ -113,7 +113,7 @@ def test_dropout_is_that_of_the_whole_batch(two: None):
     torch.manual_seed(1)
     expected = layer(batch)
     torch.manual_seed(1)
-    with distributed.sharing():
+    with distributed.share_batch():
         assert torch.equal(layer(batch[3:]), expected[3:])
         assert torch.equal(layer.eval()(batch), batch)
 
@@ -149,10 +149,10 @@ def test_one_process_shares_nothing(monkeypatch: pytest.MonkeyPatch):
     """Variables that a cluster sets for its own jobs are none of torchrun's."""
     monkeypatch.setenv("WORLD_SIZE", "4")
     monkeypatch.delenv("TORCHELASTIC_RUN_ID", raising=False)
-    assert (distributed.size(), distributed.rank(), distributed.first()) == (1, 0, True)
+    assert (distributed.world_size(), distributed.rank(), distributed.is_first()) == (1, 0, True)
     value = torch.rand(3)
-    with distributed.sharing():
-        assert distributed.own_rows(value) is value
-        assert distributed.whole(value) is value
-        assert distributed.mean(value) is value
+    with distributed.share_batch():
+        assert distributed.local_rows(value) is value
+        assert distributed.gather_rows(value) is value
+        assert distributed.average(value) is value
     assert distributed.broadcast("a") == "a"

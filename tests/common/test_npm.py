@@ -63,14 +63,14 @@ def test_it_is_fetched_once_and_read_member_by_member(package, place, monkeypatc
     source.unlink()
     assert npm.read(pinned, ["package.json"]) == {"package.json": b"{}"}
     assert [path.name for path in (place / "cache" / "memmlp" / "npm").iterdir()] == ["scope-name-1.2.3.tgz"]
-    with pytest.raises(KeyError, match=r"@scope/name@1.2.3 has no dist/c.js"):
+    with pytest.raises(KeyError, match=r"@scope/name@1.2.3 does not have dist/c.js"):
         npm.read(pinned, ["dist/a.js", "dist/c.js"])
 
 
 def test_another_file_is_refused_and_not_kept(package, place, monkeypatch):
     pinned, _ = package
     serve(place, packed({"package/dist/a.js": b"evil"}), monkeypatch)
-    with pytest.raises(InputError, match=r"^@scope/name@1.2.3: the npm registry gave another file"):
+    with pytest.raises(InputError, match=r"^@scope/name@1.2.3: the npm registry sent another file"):
         npm.tarball(pinned)
     assert not list(npm.cache().glob("*"))
 
@@ -86,7 +86,7 @@ def test_a_folder_of_tarballs_comes_first(package, place, monkeypatch):
     pinned, content = package
     monkeypatch.setenv(npm.FOLDER, str(place / "given"))
     monkeypatch.setenv("NPM_CONFIG_REGISTRY", (place / "nothing").as_uri())
-    with pytest.raises(InputError, match=r"cannot be fetched .*MEMMLP_NPM=FOLDER with scope-name-1.2.3.tgz"):
+    with pytest.raises(InputError, match=r"cannot be fetched .*MEMMLP_NPM.*scope-name-1.2.3.tgz"):
         npm.tarball(pinned)
     (place / "given").mkdir()
     file = place / "given" / "scope-name-1.2.3.tgz"
@@ -109,8 +109,6 @@ def test_a_registry_out_of_reach_is_one_line(package, address, monkeypatch):
 def test_the_registry_is_npm_s(place, monkeypatch):
     monkeypatch.setattr(npm.shutil, "which", lambda name: None)
     assert npm.registry() == DEFAULT_REGISTRY
-    (place / ".npmrc").write_text("fund=false\nregistry = https://mine.example/npm\n")
-    assert npm.registry() == "https://mine.example/npm"
     monkeypatch.setattr(npm.shutil, "which", lambda name: "/bin/npm")
     said = subprocess.CompletedProcess([], 0, "https://asked.example/\n", "")
     monkeypatch.setattr(npm.subprocess, "run", lambda *_, **__: said)

@@ -7,7 +7,15 @@ import re
 import pytest
 
 from memmlp.common import progress
-from memmlp.common.progress import counting, during, progress_bar, remark, tell, telling, to_log
+from memmlp.common.progress import (
+    announce,
+    announce_to,
+    label_progress,
+    notify,
+    progress_bar,
+    show_progress,
+    to_log,
+)
 
 
 @pytest.mark.parametrize(("terminal", "said"), [(True, ""), (False, "data: once\n")])
@@ -20,29 +28,29 @@ def test_a_terminal_has_its_progress_bars_alone(capsys, monkeypatch: pytest.Monk
 @pytest.mark.parametrize("terminal", [True, False])
 def test_a_remark_is_shown_on_a_terminal_too(capsys, monkeypatch: pytest.MonkeyPatch, terminal):
     monkeypatch.setattr("sys.stderr.isatty", lambda: terminal, raising=False)
-    remark("data: before")
-    with telling():
-        remark("data: 1 file was skipped")
+    notify("data: before")
+    with announce_to():
+        notify("data: 1 file was skipped")
     assert capsys.readouterr().err == "data: 1 file was skipped\n"
     told: list[str] = []
-    with telling(told.append):
-        remark("data: 1 file was skipped")
+    with announce_to(told.append):
+        notify("data: 1 file was skipped")
     assert told == ["data: 1 file was skipped"]
 
 
 def test_lines_are_told_to_who_listens_alone():
     told: list[str] = []
-    tell("data: before")
-    with telling(told.append):
-        tell("data: within")
-    tell("data: after")
+    announce("data: before")
+    with announce_to(told.append):
+        announce("data: within")
+    announce("data: after")
     assert told == ["data: within"]
 
 
 def test_long_work_tells_how_far_it_is(monkeypatch: pytest.MonkeyPatch):
     told: list[str] = []
-    monkeypatch.setattr(progress, "EVERY", 0.0)
-    with telling(told.append), counting("network", 4000, done=398) as count:
+    monkeypatch.setattr(progress, "INTERVAL", 0.0)
+    with announce_to(told.append), show_progress("network", 4000, done=398) as count:
         count.advance()
         count.note("loss 2.31")
         count.advance()
@@ -52,24 +60,24 @@ def test_long_work_tells_how_far_it_is(monkeypatch: pytest.MonkeyPatch):
 
 def test_quick_work_tells_nothing_of_how_far_it_is():
     told: list[str] = []
-    with telling(told.append):
+    with announce_to(told.append):
         assert list(progress_bar("abc", "reading")) == ["a", "b", "c"]
     assert told == []
 
 
 def test_work_of_unknown_length_tells_what_is_done(monkeypatch: pytest.MonkeyPatch):
     told: list[str] = []
-    monkeypatch.setattr(progress, "EVERY", 0.0)
-    with telling(told.append):
+    monkeypatch.setattr(progress, "INTERVAL", 0.0)
+    with announce_to(told.append):
         list(progress_bar(iter("ab"), "reading"))
     assert told == ["reading: 1", "reading: 2"]
 
 
 def test_a_line_names_the_unit_and_the_stage(monkeypatch: pytest.MonkeyPatch):
     told: list[str] = []
-    monkeypatch.setattr(progress, "EVERY", 0.0)
-    with telling(told.append):
-        with during("validation"):
+    monkeypatch.setattr(progress, "INTERVAL", 0.0)
+    with announce_to(told.append):
+        with label_progress("validation"):
             list(progress_bar(iter("a"), "stream", unit="frames"))
         list(progress_bar(iter("a"), "stream", unit="frames"))
     assert told == ["validation, stream: 1 frames", "stream: 1 frames"]

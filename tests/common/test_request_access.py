@@ -8,7 +8,7 @@ from urllib.parse import quote
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.common.request_access import COOKIE, Access, check_token, loopback
+from memmlp.common.request_access import COOKIE, Access, check_token, is_loopback
 
 TOKEN = "a token of many letters"
 
@@ -33,7 +33,7 @@ def headers(**given: str) -> Message:
     ],
 )
 def test_which_addresses_are_this_machine_s_alone(host: str, alone: bool):
-    assert loopback(host) is alone
+    assert is_loopback(host) is alone
     assert (Access(host).token is None) is alone
 
 

@@ -5,7 +5,7 @@ import pytest
 import tiny
 import torch
 
-from memmlp.common import thread_core_share
+from memmlp.common import processes
 from memmlp.deploy import latency
 from memmlp.deploy.export import export
 from memmlp.deploy.latency import NoConversion, macs, strip_conversions
@@ -111,8 +111,8 @@ def test_a_thread_without_a_core_is_seen(exported, small_yardstick, monkeypatch)
 def test_the_order_of_files_is_reversed_and_each_rounds_share_of_a_core_is_kept(monkeypatch):
     """By clocks of the test's own: a step is 2 s, and the second round's `b` waits 6 s more for a core."""
     clock, order = {"passed": 0.0, "busy": 0.0}, []
-    monkeypatch.setattr(thread_core_share.time, "perf_counter", lambda: clock["passed"])
-    monkeypatch.setattr(thread_core_share.time, "thread_time", lambda: clock["busy"])
+    monkeypatch.setattr(processes.time, "perf_counter", lambda: clock["passed"])
+    monkeypatch.setattr(processes.time, "thread_time", lambda: clock["busy"])
 
     def time_round(key):
         order.append(key)

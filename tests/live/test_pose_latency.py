@@ -2,7 +2,7 @@
 
 import pytest
 
-from memmlp.common import thread_core_share
+from memmlp.common import processes
 from memmlp.live.pose_latency import alternate, measure_pose, time_poses_in_turn
 from memmlp.live.stream import Stream
 
@@ -22,7 +22,7 @@ def test_a_whole_pose_is_timed(step_files):
 
 def test_a_pose_whose_thread_had_no_core_is_seen(step_files, monkeypatch):
     clock = iter([5.0, 5.0 + 1e-9])
-    monkeypatch.setattr(thread_core_share.time, "thread_time", lambda: next(clock))
+    monkeypatch.setattr(processes.time, "thread_time", lambda: next(clock))
     assert measure_pose(step_files("no_memory"), 1)["pose_core_share"] < 1e-6
 
 

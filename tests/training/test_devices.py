@@ -67,7 +67,7 @@ def test_without_gpus(gpus, monkeypatch: pytest.MonkeyPatch):
 
 def test_of_several_processes_each_has_its_own(gpus, monkeypatch: pytest.MonkeyPatch):
     gpus(2)
-    monkeypatch.setattr(distributed, "size", lambda: 2)
+    monkeypatch.setattr(distributed, "world_size", lambda: 2)
     monkeypatch.setenv("LOCAL_RANK", "1")
     assert str(device("auto")) == "cuda:1"
     with pytest.raises(InputError, match="device=cuda:1: allowed with several processes is device=cuda"):

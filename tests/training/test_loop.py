@@ -211,7 +211,7 @@ def test_perplexity():
 
 def test_what_is_counted_in_a_validation_says_so(monkeypatch: pytest.MonkeyPatch):
     told: list[str] = []
-    monkeypatch.setattr(progress, "EVERY", 0.0)
+    monkeypatch.setattr(progress, "INTERVAL", 0.0)
     task = mock.MagicMock(validate=lambda: list(progress.progress_bar(iter("a"), "stream", unit="frames")))
     with progress.telling(told.append):
         loop.validate(task, mock.MagicMock())

@@ -79,6 +79,6 @@ def test_a_sweep_trains_what_is_upstream_first():
 
 
 def test_several_processes_are_refused(monkeypatch):
-    monkeypatch.setattr(distributed, "size", lambda: 2)
+    monkeypatch.setattr(distributed, "world_size", lambda: 2)
     with pytest.raises(InputError, match="refiner: several processes"):
         run_in_processes(experiment("refiner=sage"))

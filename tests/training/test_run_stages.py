@@ -20,7 +20,7 @@ from PIL import Image
 
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 from memmlp.common.files import file_digest
-from memmlp.common.progress import telling
+from memmlp.common.progress import announce_to
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.config.package_data import packaged
@@ -83,7 +83,7 @@ def test_a_training_says_on_a_terminal_what_is_odd_about_its_data(capsys, monkey
         motion=SimpleNamespace(prepare=lambda: prepared), config={"data": {"split": {}}}
     )
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
-    with telling(), pytest.raises(AttributeError, match="outputs"):  # it comes no further than to the run
+    with announce_to(), pytest.raises(AttributeError, match="outputs"):  # it comes no further than to the run
         run_stages.run_experiment(experiment)
     said = "data: 1 clip is unusual, first a (Z is not up); details: memmlp data inspect\n"
     assert capsys.readouterr().err == said

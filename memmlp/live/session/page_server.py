@@ -144,7 +144,7 @@ class LiveHandler(BaseHTTPRequestHandler):
         with contextlib.suppress(ConnectionError):  # raised when the page was closed
             if not access.allows(self.path, self.headers, port):
                 self.send_error(403)
-            elif token := access.given(url.query):
+            elif token := access.token_in(url.query):
                 self._head(303, "text/plain", access.redirect_headers(token, port))
             elif name == "events":
                 self._events()

@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.common.progress import remark
+from memmlp.common.progress import notify
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
 from memmlp.live.session.packets import Packet, Parse, QuaternionPoses
 from memmlp.live.spaces import Space, SpaceName
@@ -140,7 +140,7 @@ def npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
     check_imported_body([path], rest, "the network")
     check_plausible(path, recorded)
     if reason := unusual(recorded):
-        remark(f"{path}: unusual, {reason}")
+        notify(f"{path}: unusual, {reason}")
     clip, _ = resample(recorded)
     if len(clip) < 3:
         raise InputError(f"{path}: {len(clip)} frames at 60 Hz; allowed are 3 or more")

@@ -13,7 +13,7 @@ import numpy as np
 import onnx
 from torch import Tensor
 
-from memmlp.common.progress import tell
+from memmlp.common.progress import announce
 from memmlp.deploy.export import export
 from memmlp.deploy.lower_precision import lower
 from memmlp.live.rotations import BodyTree
@@ -75,7 +75,7 @@ class Writer:
 
     def write(self, network: SiteNetwork) -> Entry:
         """Write a network's graphs, and return the entry that tells the page about them."""
-        tell(f"web: export {network.name}")
+        announce(f"web: export {network.name}")
         model = network.model.cpu().eval()
         stream = streaming(model) if has_stream(model) else None
         with tempfile.TemporaryDirectory() as temporary:

@@ -19,8 +19,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from memmlp.common.child_process_imports import child_imports
 from memmlp.common.errors import InputError
+from memmlp.common.processes import import_environment
 from memmlp.sweep.executors.executor import Work
 from memmlp.sweep.executors.gpus import VISIBLE
 
@@ -161,7 +161,7 @@ def _apart(work: Work, stop: str, gpus: bool) -> str | None:
     declared = get_worker().state.total_resources.get(GPU, 0)
     if gpus and declared > 1:  # nobody would say which of them is this task's
         return f"a Dask worker declares {declared:g} GPUs; allowed is one, each with its CUDA_VISIBLE_DEVICES"
-    environment = {**os.environ, **child_imports(), **({} if gpus else {VISIBLE: ""})}
+    environment = {**os.environ, **import_environment(), **({} if gpus else {VISIBLE: ""})}
     with tempfile.TemporaryDirectory() as folder:
         said = Path(folder, "said")
         line = [sys.executable, "-m", __name__, str(said)]

@@ -12,7 +12,7 @@ import submitit
 from submitit.core.utils import JobPaths
 from submitit.local import local
 
-from memmlp.common.child_process_imports import children_import_the_same
+from memmlp.common.processes import children_import_the_same
 from memmlp.sweep.executors.executor import Work
 from memmlp.sweep.executors.gpus import Share
 from memmlp.sweep.executors.submitit_jobs import UNLIMITED, Requeued, Submitted, explained

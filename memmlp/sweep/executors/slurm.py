@@ -13,8 +13,8 @@ from typing import Any
 import submitit
 import submitit.helpers
 
-from memmlp.common.child_process_imports import children_import_the_same
 from memmlp.common.errors import InputError
+from memmlp.common.processes import children_import_the_same
 from memmlp.sweep.executors.executor import Work
 from memmlp.sweep.executors.submitit_jobs import UNLIMITED, Requeued, Submitted, explained
 

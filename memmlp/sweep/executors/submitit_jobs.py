@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.python_gc import collect_seldom
+from memmlp.common.processes import collect_garbage_rarely
 from memmlp.sweep.executors.executor import Work
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ class Requeued:
 
     def __call__(self) -> str | None:
         """Do the work, in the process that submitit started for it."""
-        collect_seldom()
+        collect_garbage_rarely()
         return self.work()
 
     def checkpoint(self) -> Any:

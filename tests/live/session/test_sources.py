@@ -12,7 +12,7 @@ import pytest
 from processes import PATIENCE
 
 from memmlp.common.errors import InputError
-from memmlp.common.progress import telling
+from memmlp.common.progress import announce_to
 from memmlp.live.rotations import quaternion_to_matrix
 from memmlp.live.session.packets import from_json, from_osc, to_json, to_osc
 from memmlp.live.session.sources import HOST, PAUSE, ClipSource, PacketSource, TrackedClip, npz_frames, send
@@ -123,7 +123,7 @@ def test_a_file_that_is_unusual_is_said(tmp_path: Path):
     turns = 1e-3 * np.arange(5.0)[:, None, None] + np.zeros((5, 22, 3))
     write_clip(tmp_path / "a.npz", Clip("a", turns, np.zeros((5, 3)), 60.0))
     said: list[str] = []
-    with telling(said.append):
+    with announce_to(said.append):
         assert len(npz_frames(tmp_path / "a.npz", builtin_rest_joints())) == 4
     assert said[0].startswith(f"{tmp_path / 'a.npz'}: unusual, the head is never above the pelvis")
 
