@@ -106,7 +106,7 @@ def test_a_killed_training_says_from_where_it_goes_on_and_counts_all_its_seconds
         return made
 
     said: list[str] = []
-    with progress.telling(said.append):
+    with progress.announce_to(said.append):
         with pytest.raises(Kill):
             train(task(7), OPTIM, run, 0, "killed")
         assert not said
@@ -213,6 +213,6 @@ def test_what_is_counted_in_a_validation_says_so(monkeypatch: pytest.MonkeyPatch
     told: list[str] = []
     monkeypatch.setattr(progress, "INTERVAL", 0.0)
     task = mock.MagicMock(validate=lambda: list(progress.progress_bar(iter("a"), "stream", unit="frames")))
-    with progress.telling(told.append):
+    with progress.announce_to(told.append):
         loop.validate(task, mock.MagicMock())
     assert told == ["validation, stream: 1 frames"]
