@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from memmlp.api import Prediction, Runs, TrainedRun, load_run
     from memmlp.common.errors import InputError
-    from memmlp.live.sample_warnings import SampleWarning
-    from memmlp.live.stream import Offsets, Pose, Stream
+    from memmlp.live.stream import Pose, Stream
+    from memmlp.live.tracker_input import SampleWarning
+    from memmlp.live.wearer import Offsets
 
 __version__ = "0.2.0"
 
@@ -25,11 +26,11 @@ __all__ = [
 
 _HOMES = {
     "InputError": "memmlp.common.errors",
-    "Offsets": "memmlp.live.stream",
+    "Offsets": "memmlp.live.wearer",
     "Pose": "memmlp.live.stream",
     "Prediction": "memmlp.api",
     "Runs": "memmlp.api",
-    "SampleWarning": "memmlp.live.sample_warnings",
+    "SampleWarning": "memmlp.live.tracker_input",
     "Stream": "memmlp.live.stream",
     "TrainedRun": "memmlp.api",
     "load_run": "memmlp.api",

@@ -18,7 +18,8 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.evaluation.metric_facts import UNITS
-from memmlp.live.stream import Offsets, Stream
+from memmlp.live.stream import Stream
+from memmlp.live.wearer import Offsets
 from memmlp.runs.evaluation_file import COMBINED
 from memmlp.runs.lookup import check_trained, find_run, is_trained, list_runs
 from memmlp.runs.run import Run

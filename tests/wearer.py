@@ -9,7 +9,7 @@ import numpy as np
 import tiny
 import torch
 
-from memmlp.live.stream import Pose, Stream
+from memmlp.live.stream import BodyFrame, Pose, Stream
 from memmlp.motion.body import TRACKED
 from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics, motion_frames
 from memmlp.motion.normalizer import Normalizer
@@ -20,6 +20,13 @@ def at_ease(network: MotionModel, frames: torch.Tensor) -> MotionModel:
     """The network with random weights, but about the mean pose of frames (N, 252), as a person stands."""
     network.normalizer = Normalizer.fit(network.normalizer.coordinates, tiny.REST, frames)
     return network
+
+
+def body_frame(
+    time: float, local: np.ndarray, positions: np.ndarray, rest: np.ndarray, restarted: bool = False
+) -> BodyFrame:
+    """A frame for outputs, of a wearer of the network's size."""
+    return BodyFrame(time, local, positions, positions, rest, 1.0, (), True, restarted)
 
 
 class Person(NamedTuple):

@@ -27,15 +27,15 @@ LABELS = [word for name in NETWORKS for word in ("--label", name)]
 def demo(overrides: tuple[str, ...]) -> None:
     """Run synthetic motion -> VQ-VAE -> Mem-MLP -> metrics -> ONNX -> latency, in minutes, on the CPU.
 
-    RecurrentPoser, this project's own network, goes the same way after it, and both are shown side by side.
-    OVERRIDES are those of `memmlp train`, for example profile=tiny. With another model, or overrides that
-    RecurrentPoser has no place for, the one network is shown alone.
+    RecurrentPoser, this project's own network, follows, and both are shown side by side. OVERRIDES are those
+    of `memmlp train`, for example profile=tiny. With another model, or overrides that RecurrentPoser does not
+    have, only the first network is trained.
     """
     from memmlp.cli.train_summary import show_side_by_side
     from memmlp.runs.motion_seen import frames_seen, hardly_trained
 
     started = time.monotonic()
-    both = fit_recurrent_poser(overrides)  # asked first: the first network takes minutes
+    both = fit_recurrent_poser(overrides)  # before the minutes of the first network
     outcomes = train_demo(overrides)
     if both:
         outcomes += train_demo([*overrides, RECURRENT_POSER])
@@ -44,11 +44,11 @@ def demo(overrides: tuple[str, ...]) -> None:
         for said in dict.fromkeys(filter(None, (hardly_trained(frames_seen(one.run)) for one in outcomes))):
             click.echo(said)
     click.echo(f"the demo took {(time.monotonic() - started) / 60:.1f} minutes")
-    click.echo(next_steps(overrides, unentered(), [one.run.id for one in outcomes]))
+    click.echo(next_steps(overrides, inactive_environment(), [one.run.id for one in outcomes]))
 
 
 def fit_recurrent_poser(overrides: Sequence[str]) -> bool:
-    """Return whether a demo's overrides choose no other network, and can be used for RecurrentPoser, too."""
+    """Return whether a demo's overrides leave the network open, and are valid for RecurrentPoser, too."""
     from memmlp.common.errors import InputError
     from memmlp.config.compose import parse, preflight
 
@@ -80,33 +80,25 @@ def next_steps(overrides: Sequence[str], environment: Path | None = None, runs: 
 
     Args:
         overrides: the demo's overrides, which the same network without its memory needs, too.
-        environment: the folder of an environment that is not activated in this shell; None for none.
+        environment: the folder of a virtual environment that this shell has not activated, or None.
         runs: ids of the demo's runs; two of them are drawn beside the truth.
     """
     words = " ".join(map(shlex.quote, ["memmlp", "train", *overrides, "memory=none"]))
-    both = (
-        []
-        if len(runs) < 2
-        else [shlex.join(["memmlp", "render", *runs, *LABELS, "--to", "3", "--out", "both.gif"])]
-    )
-    enter = [f"source {shlex.quote(str(environment / 'bin' / 'activate'))}"] if environment else []
+    kept = [shlex.quote(word) for word in overrides if word.startswith(("profile=", "threads=", "device="))]
     lines = [
-        *enter,
-        *both,
         f"{words}          the same without the memory; then memmlp runs list",
         "memmlp data import BVH_FOLDER --out outputs/data/mine",
-        " ".join(["memmlp train", *machine(overrides), "data=mocap data.root=outputs/data/mine"]),
+        " ".join(["memmlp train", *kept, "data=mocap data.root=outputs/data/mine"]),
     ]
+    if len(runs) > 1:
+        lines.insert(0, shlex.join(["memmlp", "render", *runs, *LABELS, "--to", "3", "--out", "both.gif"]))
+    if environment:
+        lines.insert(0, f"source {shlex.quote(str(environment / 'bin' / 'activate'))}")
     return "next: " + "\n      ".join(lines)
 
 
-def machine(overrides: Sequence[str]) -> list[str]:
-    """Return the overrides for the size of the training and the machine, which don't depend on the data."""
-    return [shlex.quote(word) for word in overrides if word.startswith(("profile=", "threads=", "device="))]
-
-
-def unentered() -> Path | None:
-    """Return the folder of this Python's virtual environment if that is not activated, else None."""
+def inactive_environment() -> Path | None:
+    """Return the folder of this Python's virtual environment if the shell has not activated it, else None."""
     here = Path(sys.prefix)
     found = shutil.which("memmlp")
     inside = found is not None and Path(found).parent == here / "bin"

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 @click.command("predict")
 @click.argument("run")
 @click.argument("source")
-@click.option("--out", required=True, type=PATH, help="A file for a clip, a folder for a folder.")
+@click.option("--out", required=True, type=PATH, help="File to write; a folder for a folder.")
 @format_option
 @click.option("--mode", default="stream", show_default=True, type=click.Choice(["stream", "window"]))
 @click.option(
@@ -57,10 +57,10 @@ def predict(
     device: str,
     outputs: Path,
 ) -> None:
-    """Write what the network of a finished RUN (id, its beginning, or folder) makes of clips.
+    """Write the predictions of a finished RUN (id, its beginning, or folder) for clips.
 
-    SOURCE is an AMASS npz file, a folder of such, or else a test clip's name. Predictions are at 60 Hz on the
-    body that the network was trained on; their first frame is the clip's second.
+    SOURCE is an AMASS npz file, a folder of such files, or a test clip's name. Predictions are at 60 Hz on
+    the body that the network was trained on; their first frame is the clip's second.
     """
     check_runs(outputs, run)
     from memmlp.cli.data.printing import show_exported
@@ -72,7 +72,7 @@ def predict(
 
     found = find_run(outputs, run)
     experiment = experiment_of(found, device, [] if ik is None else [f"evaluation.ik={ik}"])
-    chosen = chosen_branch(experiment.evaluation, branch)
+    chosen = choose_branch(experiment.evaluation, branch)
     interpolation = experiment.motion.clips.interpolation
     predictor = ClipPredictor(
         trained_network(found, experiment), mode, chosen, experiment.evaluation, interpolation
@@ -89,8 +89,8 @@ def predict(
     remark_on([found])
 
 
-def chosen_branch(evaluation: Evaluation, branch: str | None) -> str:
-    """Return the branch of --branch, else the evaluation's best one: with inverse kinematics if it has any.
+def choose_branch(evaluation: Evaluation, branch: str | None) -> str:
+    """Return the branch of --branch, else the evaluation's best one: combined where it solves kinematics.
 
     Raises:
         InputError: for --branch combined without inverse kinematics.
@@ -100,9 +100,7 @@ def chosen_branch(evaluation: Evaluation, branch: str | None) -> str:
 
     solved = not isinstance(evaluation.ik, NoIK)
     if branch == "combined" and not solved:
-        raise InputError(
-            "--branch combined: the run's evaluation has no such result; allowed: with --ik lbfgs or arms"
-        )
+        raise InputError("--branch combined: needs --ik lbfgs or arms")
     return branch or ("combined" if solved else "rotation")
 
 
@@ -120,8 +118,8 @@ def predict_test_clip(
 
     chosen, test = choose_format(out, format_, folder=False), run.test
     if name not in test.names:
-        wrong = f"SOURCE {name}: no file, no folder and no test clip of the run"
-        raise InputError(f"{wrong}; allowed test clips: {', '.join(test.names)}")
+        known = ", ".join(test.names)
+        raise InputError(f"SOURCE {name}: must be a file, a folder, or a test clip of the run: {known}")
     (clip,) = predictor.predict([name], [test.clip(test.names.index(name))])
     write_motion(out, clip, predictor.rest, chosen)
     return ExportReport((out,), len(clip) / FPS, ())

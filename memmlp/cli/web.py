@@ -12,13 +12,11 @@ from memmlp.cli.run_remarks import remark_on
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
-    from memmlp.live.web.clips import SiteClip
     from memmlp.live.web.networks import SiteNetwork
+    from memmlp.live.web.site import SiteClip
 
 BASE = ("profile=paper", "model=avatar_poser")
 """The network with which the bench compares: AvatarPoser in the paper's size, with random weights."""
-
-
 CALIBRATION = 2  # clips: int8's ranges do not matter for the time
 
 
@@ -26,21 +24,17 @@ CALIBRATION = 2  # clips: int8's ranges do not matter for the time
 @click.argument("runs", nargs=-1, required=True)
 @click.option("--out", required=True, type=PATH, help="Folder to write the site into.")
 @click.option(
-    "--clips",
-    default=3,
-    show_default=True,
-    type=click.IntRange(1, 50),
-    help="How many test clips of each run are on it.",
+    "--clips", default=3, show_default=True, type=click.IntRange(1, 50), help="Test clips of each run."
 )
 @click.option(
     "--seconds",
     default=20.0,
     show_default=True,
     type=Finite(1, 600),
-    help="How much of a clip, of its middle, at most.",
+    help="Longest part of a clip, from its middle, seconds.",
 )
-@click.option("--no-webgpu", is_flag=True, help="Leave out what WebGPU needs, 6.7 MB.")
-@click.option("--no-bench", is_flag=True, help="Leave out the bench, and the graphs that are timed there.")
+@click.option("--no-webgpu", is_flag=True, help="Leave out WebGPU's files, 6.7 MB.")
+@click.option("--no-bench", is_flag=True, help="Leave out the bench, and the graphs that it times.")
 @plugins_option
 @outputs_option
 def web(
@@ -54,23 +48,27 @@ def web(
 ) -> None:
     """Make a site of finished RUNS (ids, their beginnings, or folders) that any static server can serve.
 
-    In the browser in which it is opened, such as a headset's, it times each network, plays test clips, and
-    shows the wearer's own body in a mirror (docs/guides/web.md). It takes onnxruntime-web and three.js from
-    the npm registry, once.
+    In the browser, such as a headset's, it times each network, plays test clips, and shows the wearer's body
+    in a mirror (docs/guides/web.md). The command downloads onnxruntime-web and three.js from the npm
+    registry, once.
     """
     check_runs(outputs, *runs)
     from memmlp.common.errors import InputError
+    from memmlp.config.build import untrained
     from memmlp.config.open_run import open_run
+    from memmlp.live.web.networks import SiteNetwork
     from memmlp.live.web.site import Site, check_place
 
     check_place(out)
     opened = [open_run(outputs, run) for run in dict.fromkeys(runs)]
     if len({one.run.id for one in opened}) < len(opened):
-        raise InputError(f"{' '.join(runs)}: a run is named twice; allowed is each run once")
-    found = {one.run.id: clips_of(one, clips, seconds) for one in opened}
+        raise InputError(f"{' '.join(runs)}: expected each run only once")
+    found = {one.run.id: pack_clips(one, clips, seconds) for one in opened}
+    networks = [describe_network(one, found[one.run.id]) for one in opened]
+    base = None if no_bench else SiteNetwork("avatar-poser", "AvatarPoser", "random", untrained(BASE))
     site = Site(
-        networks=[network_of(one, found[one.run.id]) for one in opened],
-        base=None if no_bench else base(),
+        networks=networks,
+        base=base,
         clips=list({clip.key: clip for some in found.values() for clip in some}.values()),
         calibration=[] if no_bench else opened[0].data.open("train").clips()[:CALIBRATION],
         webgpu=not no_webgpu,
@@ -80,18 +78,18 @@ def web(
     remark_on(one.run for one in opened)
 
 
-def clips_of(opened: OpenedRun, count: int, seconds: float) -> list[SiteClip]:
+def pack_clips(opened: OpenedRun, count: int, seconds: float) -> list[SiteClip]:
     """Return the middle parts of some test clips of a run, evenly spread over all of them."""
     import numpy as np
 
-    from memmlp.live.web.clips import packed
+    from memmlp.live.web.site import pack_clip
 
     test = opened.test
     chosen = np.linspace(0, len(test.names) - 1, min(count, len(test.names))).round().astype(int)
-    return [packed(test.names[index], test.clip(index).numpy(), seconds) for index in chosen.tolist()]
+    return [pack_clip(test.names[index], test.clip(index).numpy(), seconds) for index in chosen.tolist()]
 
 
-def network_of(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:
+def describe_network(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:
     """Return a run's network in the form that a site needs."""
     from memmlp.live.web.networks import SiteNetwork
     from memmlp.networks.streaming import check_streams
@@ -106,11 +104,3 @@ def network_of(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:
     name = name if f"model={model}" in name else f"{model} {name}"
     keys = tuple(clip.key for clip in clips)
     return SiteNetwork(run.id, name, run.id, network, keys, hardly_trained(frames_seen(run)))
-
-
-def base() -> SiteNetwork:
-    """Return AvatarPoser in the paper's size."""
-    from memmlp.config.build import untrained
-    from memmlp.live.web.networks import SiteNetwork
-
-    return SiteNetwork("avatar-poser", "AvatarPoser", "random", untrained(BASE))

@@ -1,4 +1,4 @@
-"""How long a whole pose takes on a CPU: from a sample of the trackers to the joints in the caller's space."""
+"""The time of a whole pose on a CPU: from a sample of the trackers to the joints in the caller's space."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from typing import TypeVar
 import numpy as np
 
 from memmlp.common.processes import CoreClock
-from memmlp.deploy.latency import SETTLING, InTurn, in_turn
+from memmlp.deploy.latency import SETTLING, WARM_UP, InTurn, in_turn
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.live.rotations import quaternion_to_matrix
 from memmlp.live.stream import Stream
 from memmlp.motion.body import SPARSE_DIM
 
-WARM_UP = 30  # samples before the timed ones
 Key = TypeVar("Key", bound=Hashable)
 LEAST = 200  # samples that are timed, at least
 
@@ -44,11 +43,7 @@ def time_poses_in_turn(paths: Mapping[Key, Path], rounds: int, steps: int) -> di
     The first poses of a round are left out.
     """
     streams = {key: Stream(path) for key, path in paths.items()}
-
-    def time_round(key: Key) -> np.ndarray:
-        return alternate(streams[key], None, SETTLING + steps)[SETTLING:, 1]
-
-    return in_turn(paths, rounds, time_round)
+    return in_turn(paths, rounds, lambda key: alternate(streams[key], None, SETTLING + steps)[SETTLING:, 1])
 
 
 def alternate(stream: Stream, network: OnnxStream | None, frames: int) -> np.ndarray:
@@ -65,14 +60,14 @@ def alternate(stream: Stream, network: OnnxStream | None, frames: int) -> np.nda
     random, seconds = np.random.default_rng(0), np.zeros((frames, 2))
     sparse = random.standard_normal((frames, 1, SPARSE_DIM), np.float32)
     quaternions = random.normal(size=(frames, 3, 4))
-    turns = quaternion_to_matrix(quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True))
-    places = random.normal(size=(frames, 3, 3))
+    rotations = quaternion_to_matrix(quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True))
+    positions = random.normal(size=(frames, 3, 3))
     for index in range(frames):
         start = time.perf_counter()
         if network is not None:
             network.step(sparse[index])
         middle = time.perf_counter()
-        head, left, right = zip(places[index], turns[index], strict=True)
+        head, left, right = zip(positions[index], rotations[index], strict=True)
         stream.step(head, left, right)
         seconds[index] = middle - start, time.perf_counter() - middle
     return seconds

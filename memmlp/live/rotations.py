@@ -1,6 +1,6 @@
 """Rotations and forward kinematics on NumPy arrays, one frame at a time. Quaternions are x, y, z, w.
 
-`memmlp.motion.geometry` has the same on torch tensors; a live stream does without torch.
+`memmlp.motion.geometry` has the same on torch tensors; a live stream does not import torch.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def matrix_to_quaternion(matrix: np.ndarray) -> np.ndarray:
     return quaternion
 
 
-def turned_by(matrix: np.ndarray, share: np.ndarray | float) -> np.ndarray:
+def rotate_by_share(matrix: np.ndarray, share: np.ndarray | float) -> np.ndarray:
     """Return rotations (n, 3, 3) about the same axes by a share, (n,) or one, of the angles (0 to pi)."""
     quaternion = matrix_to_quaternion(matrix)
     vector, w = quaternion[:, :3], quaternion[:, 3]
@@ -58,26 +58,21 @@ def slerp(a: np.ndarray, b: np.ndarray, weight: float) -> np.ndarray:
 
     Weights beyond 1 extrapolate.
     """
-    return a @ turned_by(a.swapaxes(-1, -2) @ b, weight)
+    return a @ rotate_by_share(a.swapaxes(-1, -2) @ b, weight)
 
 
 def sixd_to_matrix(sixd: np.ndarray) -> np.ndarray:
-    """Convert (n, 6) to matrices (n, 3, 3) by Gram-Schmidt, as `memmlp.motion.geometry.sixd_to_matrix`."""
+    """Convert (n, 6) to matrices (n, 3, 3) by Gram-Schmidt, like `memmlp.motion.geometry.sixd_to_matrix`."""
     columns = np.empty((3, 5, len(sixd)), sixd.dtype)  # x y z x y, so that a cross product takes slices
     columns[:2, :3] = sixd.T.reshape(2, 3, -1)
     first, second = columns[:2, :3]
-    first /= np.sqrt(_dot(first, first))
-    second -= _dot(first, second) * first
-    second /= np.sqrt(_dot(second, second))
+    first /= np.sqrt(np.add.reduce(first * first, 0))
+    second -= np.add.reduce(first * second, 0) * first
+    second /= np.sqrt(np.add.reduce(second * second, 0))
     columns[:2, 3:] = columns[:2, :2]
     a, b, third = columns
     third[:3] = a[1:4] * b[2:5] - a[2:5] * b[1:4]
     return columns[:, :3].transpose(2, 1, 0)
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the dot products (n,) of the columns of (3, n) and (3, n)."""
-    return np.add.reduce(a * b, 0)
 
 
 class BodyTree:

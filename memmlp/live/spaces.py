@@ -29,7 +29,7 @@ class Space:
     """A frame of reference. Arrays may have any leading shape.
 
     Attributes:
-        name: the name by which users call it.
+        name: its name for users.
         world: orthogonal (3, 3), from its positions to AMASS' world; it includes a mirroring if the space is
             left-handed.
         body: signs (3,), from the axes of its T-pose to SMPL's body frame; they include a mirroring if
@@ -85,7 +85,7 @@ SPACES = {
 
 
 def space_of(name: str) -> Space:
-    """Return the space with that name. Raises InputError if there is none."""
+    """Return the space with that name. Raises InputError for an unknown name."""
     if not isinstance(name, str) or name not in SPACES:
-        raise InputError(f"space={name}: no such frame of reference; allowed: {', '.join(SPACES)}")
+        raise InputError(f"space={name}: must be one of {', '.join(SPACES)}")
     return SPACES[name]

@@ -8,13 +8,13 @@ The rules apply in this order:
   true pose over `RECOVERY` seconds, because the network would take a jump for a fast movement.
 - **Frames** lie on a grid of 1 / fps from the first sample on. A frame is made as soon as there is a sample
   at or after its time, by interpolation between the samples beside it (positions linearly, rotations by
-  slerp). No sample of the future is waited for, and a pose is at most one frame older than the newest sample.
-  A frame may also lie a little after its sample, by `EARLY` at most, since times are rounded; it is then
-  extrapolated, but no further than `FURTHEST`. A slow tracker gives several frames at once, a fast one none
-  at some samples, and the rate may change at any time.
+  slerp). There is no look-ahead, and a pose is at most one frame older than the newest sample. A frame may
+  also lie up to `EARLY` after its sample, since times are rounded; it is then extrapolated, but no further
+  than `FURTHEST`. A slow tracker gives several frames at once, a fast one gives none at some samples, and
+  the rate may change at any time.
 - A sample that is not newer than the last one is **ignored**.
 - After a **gap** (no sample for longer than `GAP` seconds, or a clock that was set back by more) everything
-  begins anew.
+  restarts.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from memmlp.live.rotations import BodyTree, slerp, turned_by
+from memmlp.live.rotations import BodyTree, rotate_by_share, slerp
 from memmlp.motion.body import (
     SPARSE_ANGULAR_VELOCITY,
     SPARSE_DIM,
@@ -32,16 +32,15 @@ from memmlp.motion.body import (
     SPARSE_VELOCITY,
 )
 
-GAP = 0.5  # seconds without a sample after which everything begins anew
+GAP = 0.5  # seconds without a sample after which everything restarts
 RECOVERY = 0.2  # seconds over which a tracker that returns is led to its true pose
 EARLY = 5e-4  # seconds that a frame may lie after its sample, since times are rounded to milliseconds
-FURTHEST = 1.1  # of the way from one sample to the next; two that came together tell no speed
+FURTHEST = 1.1  # of the way between two samples; two that arrive together do not show a speed
 SAME = 1e-6  # seconds; a sample this near to a frame is taken as the frame
 
 TRACKERS = ("head", "left", "right")
-NOBODY = (False, False, False)
+NONE_LOST = (False, False, False)
 UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # SMPL's body frame (Y up) to AMASS' (Z up)
-
 
 Lost = tuple[bool, ...]  # whether head, left and right wrist are lost
 
@@ -60,11 +59,10 @@ class TrackerSample(NamedTuple):
     rotations: np.ndarray
 
 
-def between(a: TrackerSample, b: TrackerSample, time: float) -> TrackerSample:
+def interpolate(a: TrackerSample, b: TrackerSample, time: float) -> TrackerSample:
     """Return the trackers at a time, interpolated between the samples before and after it.
 
-    A time shortly after both samples is extrapolated, as it comes from rounded times, but no further than
-    `FURTHEST`: two samples that arrived almost together do not tell a speed.
+    A time shortly after both samples is extrapolated, but no further than `FURTHEST`.
     """
     weight = min((time - a.time) / (b.time - a.time), FURTHEST)
     positions = a.positions + weight * (b.positions - a.positions)
@@ -79,12 +77,12 @@ def t_pose(body: BodyTree, place: np.ndarray, heading: float) -> TrackerSample:
         place: the head's position.
         heading: radians to the left of looking along -Y, where the person's left is +X.
     """
-    turn = about_vertical(heading) @ UPRIGHT
+    turn = rotation_about_vertical(heading) @ UPRIGHT
     rest = body.rest[body.tracked]
     return TrackerSample(0.0, place + (rest - rest[0]) @ turn.T, np.tile(turn, (3, 1, 1)))
 
 
-def about_vertical(angle: float) -> np.ndarray:
+def rotation_about_vertical(angle: float) -> np.ndarray:
     """Return the rotation (3, 3) about AMASS' Z axis by an angle, radians."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -103,7 +101,7 @@ class Hold:
     """Holds lost trackers at their last poses, and leads them smoothly to their true poses on their return.
 
     Args:
-        body: the body whose T-pose stands for a tracker that was never seen.
+        body: the body whose T-pose stands for a tracker before its first sample.
         recovery: seconds over which a tracker that returns is led to its true pose; 0 for a jump.
     """
 
@@ -112,27 +110,31 @@ class Hold:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything, as if no tracker had been seen yet."""
+        """Forget all samples."""
         self.last: TrackerSample | None = None
-        self.lost: Lost = NOBODY
+        self.lost: Lost = NONE_LOST
         self.settled = -np.inf  # time from which all trackers that returned are at their true poses
         self.returned = np.full(3, -np.inf)  # time from which each tracker's difference shrinks
         self.shift, self.turn = np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1))
 
-    def __call__(self, sample: TrackerSample, lost: Lost) -> TrackerSample:
+    def fill(self, sample: TrackerSample, lost: Lost) -> TrackerSample:
         """Return the sample with lost trackers filled in, and returning ones on the way to true poses."""
-        last = self.last or self._first(sample, lost)
+        last = self.last or self._stand_in(sample, lost)
         returning = [was and not is_lost for was, is_lost in zip(self.lost, lost, strict=True)]
-        self.last, self.lost = sample, lost
+        self.lost = lost
         if any(returning):
-            self._return(returning, last, sample)
+            self.returned[returning], self.settled = last.time, last.time + self.recovery
+            self.shift[returning] = (last.positions - sample.positions)[returning]
+            self.turn[returning] = (last.rotations @ sample.rotations.swapaxes(1, 2))[returning]
         if sample.time < self.settled:
-            self.last = self._on_their_way(sample)
-        if any(lost):
-            self.last = held(self.last, lost, last)
+            share = np.clip(1 - (sample.time - self.returned) / self.recovery, 0, 1)
+            positions = sample.positions + share[:, None] * self.shift
+            rotations = rotate_by_share(self.turn, share) @ sample.rotations
+            sample = TrackerSample(sample.time, positions, rotations)
+        self.last = hold_lost(sample, lost, last) if any(lost) else sample
         return self.last
 
-    def _first(self, sample: TrackerSample, lost: Lost) -> TrackerSample:
+    def _stand_in(self, sample: TrackerSample, lost: Lost) -> TrackerSample:
         """Return a stand-in for the sample before the first: the first itself, if no tracker is lost.
 
         Otherwise it is the T-pose under the head; without a head, the T-pose of a person standing at the
@@ -145,79 +147,17 @@ class Hold:
             return t_pose(self.body, np.array([0.0, 0.0, height]), 0.0)
         return t_pose(self.body, sample.positions[0], heading_of(sample.rotations[0]))
 
-    def _return(self, which: list[bool], last: TrackerSample, sample: TrackerSample) -> None:
-        """Remember how far the returning trackers are from the poses at which they were held."""
-        self.returned[which], self.settled = last.time, last.time + self.recovery
-        self.shift[which] = (last.positions - sample.positions)[which]
-        self.turn[which] = (last.rotations @ sample.rotations.swapaxes(1, 2))[which]
 
-    def _on_their_way(self, sample: TrackerSample) -> TrackerSample:
-        """Return the sample with the remaining share of these differences added."""
-        left = np.clip(1 - (sample.time - self.returned) / self.recovery, 0, 1)
-        positions = sample.positions + left[:, None] * self.shift
-        return TrackerSample(sample.time, positions, turned_by(self.turn, left) @ sample.rotations)
-
-
-def held(sample: TrackerSample, lost: Lost, last: TrackerSample) -> TrackerSample:
+def hold_lost(sample: TrackerSample, lost: Lost, last: TrackerSample) -> TrackerSample:
     """Return the sample with lost trackers at their last poses, as seen from the head."""
     positions, rotations = sample.positions.copy(), sample.rotations.copy()
     if lost[0]:
         positions[0], rotations[0] = last.positions[0], last.rotations[0]
-    turn = about_vertical(heading_of(rotations[0]) - heading_of(last.rotations[0]))
+    turn = rotation_about_vertical(heading_of(rotations[0]) - heading_of(last.rotations[0]))
     hands = [index for index in (1, 2) if lost[index]]
     positions[hands] = positions[0] + (last.positions[hands] - last.positions[0]) @ turn.T
     rotations[hands] = turn @ last.rotations[hands]
     return TrackerSample(sample.time, positions, rotations)
-
-
-class Taken(NamedTuple):
-    """The result of a sample: the frames that are due, and whether everything began anew with it."""
-
-    frames: list[TrackerSample]
-    restarted: bool
-
-
-class Resampler:
-    """Turns samples into frames at times 1 / fps apart, from the first sample on.
-
-    Args:
-        fps: frames per second.
-        gap: seconds without a sample after which frames begin anew.
-    """
-
-    def __init__(self, fps: float, gap: float = GAP):
-        self.fps, self.gap = fps, gap
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget everything: the next sample counts as the first."""
-        self.last: TrackerSample | None = None
-        self.origin, self.count = 0.0, 0
-
-    @property
-    def next(self) -> float:
-        """The time of the next frame, seconds."""
-        return self.origin + self.count / self.fps
-
-    def restarts(self, time: float) -> bool:
-        """Return whether frames begin anew with a sample at the given time."""
-        return self.last is None or abs(time - self.last.time) > self.gap
-
-    def is_old(self, time: float) -> bool:
-        """Return whether a sample at the given time is not newer than the last one."""
-        return self.last is not None and -self.gap <= time - self.last.time <= 0
-
-    def take(self, sample: TrackerSample) -> list[TrackerSample]:
-        """Return the frames that are due with a sample, which must be newer than the last one."""
-        if self.last is None:
-            self.origin, self.last = sample.time, sample
-        frames = []
-        while (time := self.next) <= sample.time + EARLY:
-            same = abs(time - sample.time) <= SAME
-            frames.append(sample if same else between(self.last, sample, time))
-            self.count += 1
-        self.last = sample
-        return frames
 
 
 class TrackerFrames:
@@ -229,15 +169,24 @@ class TrackerFrames:
     """
 
     def __init__(self, body: BodyTree, fps: float):
-        self.hold, self.grid = Hold(body), Resampler(fps)
+        self.hold, self.fps = Hold(body), fps
+        self.reset()
 
     def reset(self) -> None:
-        """Begin anew."""
+        """Restart: the next sample counts as the first."""
         self.hold.reset()
-        self.grid.reset()
+        self.last: TrackerSample | None = None
+        self.origin, self.count = 0.0, 0
 
-    def take(self, time: float | None, positions: np.ndarray, rotations: np.ndarray, lost: Lost) -> Taken:
-        """Return the frames that are due with a sample.
+    @property
+    def next(self) -> float:
+        """The time of the next frame, seconds."""
+        return self.origin + self.count / self.fps
+
+    def take(
+        self, time: float | None, positions: np.ndarray, rotations: np.ndarray, lost: Lost
+    ) -> tuple[list[TrackerSample], bool]:
+        """Return the frames that are due with a sample, and whether everything restarts with it.
 
         Args:
             time: seconds; None for the time of the next frame, which is then exactly this sample.
@@ -246,14 +195,20 @@ class TrackerFrames:
             lost: which trackers are lost.
         """
         if time is None:
-            time = self.grid.next
-        if self.grid.is_old(time):
-            return Taken([], False)
-        restarted = self.grid.restarts(time)
-        if restarted:
+            time = self.next
+        if self.last is not None and -GAP <= time - self.last.time <= 0:
+            return [], False
+        restarts = self.last is None or abs(time - self.last.time) > GAP
+        if restarts:
             self.reset()
-        sample = self.hold(TrackerSample(time, positions, rotations), lost)
-        return Taken(self.grid.take(sample), restarted)
+            self.origin = time
+        sample = self.hold.fill(TrackerSample(time, positions, rotations), lost)
+        last, frames = self.last or sample, []
+        while (due := self.next) <= time + EARLY:
+            frames.append(sample if abs(due - time) <= SAME else interpolate(last, sample, due))
+            self.count += 1
+        self.last = sample
+        return frames, restarts
 
 
 class Features:

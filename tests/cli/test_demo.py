@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from command_line import TINY
 
-from memmlp.cli.demo import fit_recurrent_poser, next_steps, unentered
+from memmlp.cli.demo import fit_recurrent_poser, inactive_environment, next_steps
 
 
 @pytest.mark.slow
@@ -74,8 +74,8 @@ def test_an_environment_that_was_not_entered_is_entered_first(
         (folder / "bin" / name).touch(mode=0o755)
     monkeypatch.setattr(sys, "prefix", str(folder))
     monkeypatch.setenv("PATH", "")
-    found = unentered()
+    found = inactive_environment()
     assert found == folder
     assert next_steps([], found).startswith(f"next: source {folder}/bin/activate\n")
     monkeypatch.setenv("PATH", str(folder / "bin"))
-    assert unentered() is None
+    assert inactive_environment() is None

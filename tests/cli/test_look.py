@@ -21,8 +21,7 @@ from conftest import Memmlp, one_line
 from PIL import Image
 from processes import PATIENCE, forked, started
 
-from memmlp.live.session.packets import Packet
-from memmlp.live.session.sources import PacketSource
+from memmlp.live.session.sources import Packet, PacketSource
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
 
@@ -133,8 +132,8 @@ def test_without_pyav_nothing_is_computed(memmlp: Memmlp, finished: Run, monkeyp
     [
         (["--clip", "nobody"], ("--clip nobody", "no such test clip")),
         (["--clip", "no.npz"], ("no.npz",)),
-        (["--udp", "9000", "--osc", "9001"], ("more than one source",)),
-        (["--udp", "9000", "--clip", "a"], ("more than one source",)),
+        (["--udp", "9000", "--osc", "9001"], ("--clip, --udp, --osc",)),
+        (["--udp", "9000", "--clip", "a"], ("--clip, --udp, --osc",)),
         (["--send"], ("--send", "--udp PORT or --osc PORT")),
         (["--hz", "nan"], ("--hz", "no finite number")),
     ],
@@ -158,7 +157,7 @@ def test_a_taken_port_is_one_line(memmlp: Memmlp, finished: Run, option: str):
         if option == "--port":
             taken.listen()
         port = str(taken.getsockname()[1])
-        assert one_line(memmlp("live", finished.id, "--no-browser", option, port), f"port {port}: taken")
+        assert one_line(memmlp("live", finished.id, "--no-browser", option, port), f"port {port}: ")
 
 
 class Watched:

@@ -10,7 +10,7 @@ import command_line
 import pytest
 import tiny
 
-from memmlp.cli.web import network_of
+from memmlp.cli.web import describe_network
 from memmlp.common.errors import InputError
 from memmlp.common.npm import ONNXRUNTIME_WEB, THREE, tarball
 from memmlp.runs.lookup import is_trained, list_runs
@@ -46,13 +46,13 @@ def test_a_site_to_play_and_wear(home: Path):
 def test_a_network_that_makes_frames_with_later_ones_is_on_no_site():
     model = tiny.baseline("bodiffusion", offline=True, sampling_steps=2, depth=1)
     with pytest.raises(InputError, match=r"model\.offline=true"):
-        network_of(SimpleNamespace(network=lambda: model), [])
+        describe_network(SimpleNamespace(network=lambda: model), [])
 
 
 def test_what_it_refuses(home: Path):
     (run,) = [run.id for run in list_runs(home / "outputs") if is_trained(run)]
     said = command_line.run(home, "web", run, run[:5], "--out", "site", code=2)
-    assert "a run is named twice" in said
-    assert "has something else in it" in command_line.run(home, "web", run, "--out", "outputs", code=2)
+    assert "only once" in said
+    assert "other content" in command_line.run(home, "web", run, "--out", "outputs", code=2)
     assert "begins so" in command_line.run(home, "web", "zzz", "--out", "site", code=2)
     assert not (home / "site").exists()

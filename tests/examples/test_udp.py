@@ -12,7 +12,7 @@ import pytest
 from engine_clips import EXAMPLES
 from scipy.spatial.transform import Rotation
 
-from memmlp.live.session.packets import from_json
+from memmlp.live.session.sources import from_json
 
 SEND = EXAMPLES / "udp/send.py"
 sender = runpy.run_path(str(SEND))

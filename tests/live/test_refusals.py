@@ -11,7 +11,8 @@ import pytest
 
 from memmlp.common.errors import InputError
 from memmlp.evaluation.ik import LBFGS
-from memmlp.live.stream import Offsets, Stream
+from memmlp.live.stream import Stream
+from memmlp.live.wearer import Offsets
 
 pytestmark = pytest.mark.slow
 
@@ -26,13 +27,13 @@ def file(step_files) -> Path:
 @pytest.mark.parametrize(
     ("tracker", "words"),
     [
-        (([0, 0], np.eye(3)), "left: a position of shape .2,.; allowed is .3,."),
+        (([0, 0], np.eye(3)), "left: a position of shape .2,."),
         (([0, 0, 0], np.eye(4)), "left: a rotation of shape .4, 4."),
         (([0, 0, 0], [0, 0, 0, 2]), "left: a quaternion of norm 2;"),
         (([0, 0, 0], 2 * np.eye(3)), "left: the matrix is not orthonormal"),
         (([0, 0, 0], np.diag([1, 1, -1])), "left: the matrix is a mirror image"),
-        ("no", "left: allowed is .position, rotation."),
-        (([0, 0, 0],), "left: allowed is .position, rotation."),
+        ("no", "left: expected .position, rotation."),
+        (([0, 0, 0],), "left: expected .position, rotation."),
     ],
 )
 def test_bad_trackers_are_refused(tracker, words, file):
@@ -42,15 +43,15 @@ def test_bad_trackers_are_refused(tracker, words, file):
 
 def test_bad_times_spaces_and_outputs_are_refused(file):
     for time in (float("nan"), 1e20, -math.inf, "1.0", [1]):
-        with pytest.raises(InputError, match=r"time=.*allowed is a number of seconds"):
+        with pytest.raises(InputError, match="time="):
             Stream(file).step(ONE, ONE, ONE, time)
     for space in ("up", ["amass"]):
-        with pytest.raises(InputError, match=r"space=.*up|space=.*amass"):
+        with pytest.raises(InputError, match="space="):
             Stream(file, space=space)
     for source in (None, 5, ""):
         with pytest.raises(InputError, match="source="):
             Stream(source)
-    with pytest.raises(InputError, match=r"rotations=euler.*matrix, quaternion"):
+    with pytest.raises(InputError, match="rotations=euler"):
         Stream(file, rotations="euler")
     with pytest.raises(InputError, match="offsets: shapes"):
         Stream(file, offsets=Offsets(np.zeros(3), np.eye(3)))
@@ -59,7 +60,7 @@ def test_bad_times_spaces_and_outputs_are_refused(file):
             Stream(file, offsets=offsets)
     with pytest.raises(InputError, match="calibrate: the hands are not apart"):
         Stream(file).calibrate(ONE, ONE, ONE)
-    with pytest.raises(InputError, match="calibrate: no pose of left"):
+    with pytest.raises(InputError, match=r"calibrate: .*left"):
         Stream(file).calibrate(ONE, None, ONE)
 
 
@@ -67,18 +68,18 @@ def test_bad_files_are_refused(file, tmp_path):
     with pytest.raises(InputError, match="no such file"):
         Stream(tmp_path)
     (tmp_path / "text.onnx").write_text("no network")
-    with pytest.raises(InputError, match="no ONNX file"):
+    with pytest.raises(InputError, match=r"text\.onnx"):
         Stream(tmp_path / "text.onnx")
     graph = onnx.load(file)
     old = [prop for prop in graph.metadata_props if prop.key != "rest"]
     del graph.metadata_props[:]
     graph.metadata_props.extend(old)
     onnx.save(graph, tmp_path / "old.onnx")
-    with pytest.raises(InputError, match="without rest in it; export it again with memmlp export"):
+    with pytest.raises(InputError, match="rest; export it again"):
         Stream(tmp_path / "old.onnx")
     del graph.metadata_props[:]
     onnx.save(graph, tmp_path / "foreign.onnx")
-    with pytest.raises(InputError, match="no network of memmlp"):
+    with pytest.raises(InputError, match=r"foreign\.onnx"):
         Stream(tmp_path / "foreign.onnx")
 
 
@@ -108,10 +109,10 @@ def test_networks_of_other_programs_are_refused(name, kind, shape, tmp_path):
     graph = onnx.helper.make_graph([node], "foreign", ends[:1], ends[1:])
     model = onnx.helper.make_model(graph, ir_version=9, opset_imports=[onnx.helper.make_opsetid("", 18)])
     onnx.save(model, tmp_path / "foreign.onnx")
-    with pytest.raises(InputError, match="no network of memmlp"):
+    with pytest.raises(InputError, match=r"foreign\.onnx"):
         Stream(tmp_path / "foreign.onnx")
 
 
 def test_inverse_kinematics_need_a_position_branch(step_files):
-    with pytest.raises(InputError, match="no position branch"):
+    with pytest.raises(InputError, match="position branch"):
         Stream(step_files("rotation_only"), ik=LBFGS())

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation, Slerp
 
-from memmlp.live.rotations import BodyTree, sixd_to_matrix, slerp, turned_by
+from memmlp.live.rotations import BodyTree, rotate_by_share, sixd_to_matrix, slerp
 from memmlp.motion import geometry
 from memmlp.motion.body import HEAD, JOINTS, PARENTS, builtin_rest_joints
 
@@ -39,5 +39,5 @@ def test_slerp_is_scipys():
 
 def test_a_share_of_no_turn_is_no_turn():
     tiny = Rotation.from_rotvec([[0, 0, 0], [1e-12, 0, 0], [2e-3, 0, 0]]).as_matrix()
-    found = Rotation.from_matrix(turned_by(tiny, np.full(3, 0.5))).as_rotvec()
+    found = Rotation.from_matrix(rotate_by_share(tiny, np.full(3, 0.5))).as_rotvec()
     np.testing.assert_allclose(found, [[0, 0, 0], [5e-13, 0, 0], [1e-3, 0, 0]], atol=1e-14)

@@ -70,7 +70,7 @@ def test_a_head_that_turns_left_turns_left_everywhere():
 
 
 def test_an_unknown_space_is_refused():
-    with pytest.raises(InputError, match=r"space=maya.*allowed: amass, openxr, unity"):
+    with pytest.raises(InputError, match="space=maya"):
         space_of("maya")
 
 

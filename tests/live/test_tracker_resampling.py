@@ -9,13 +9,13 @@ import wearer
 
 from memmlp.live.rotations import BodyTree
 from memmlp.live.tracker_resampling import (
-    NOBODY,
+    NONE_LOST,
     Features,
     Hold,
     TrackerFrames,
     TrackerSample,
-    about_vertical,
     heading_of,
+    rotation_about_vertical,
     t_pose,
 )
 from memmlp.motion.body import JOINTS, PARENTS, SPARSE_DIM
@@ -30,13 +30,13 @@ def frames_of(times: np.ndarray) -> list[TrackerSample]:
     """Return the frames at 60 Hz of samples of the person at those times."""
     trackers, person = TrackerFrames(SKELETON, 60), wearer.person(times)
     samples = zip(times, person.positions, person.rotations, strict=True)
-    return [frame for sample in samples for frame in trackers.take(*sample, NOBODY).frames]
+    return [frame for sample in samples for frame in trackers.take(*sample, NONE_LOST)[0]]
 
 
 def filled(lost: tuple[bool, ...], first: int, count: int, hold: Hold) -> np.ndarray:
     """Return the positions (240, 3, 3) of all trackers, some of which are lost for a while."""
     gone = range(first, first + count)
-    return np.stack([hold(s, lost if i in gone else NOBODY).positions for i, s in enumerate(SAMPLES)])
+    return np.stack([hold.fill(s, lost if i in gone else NONE_LOST).positions for i, s in enumerate(SAMPLES)])
 
 
 def speed(positions: np.ndarray) -> float:
@@ -60,11 +60,11 @@ def test_frames_lie_between_samples(rate, millimetres):
 def test_two_samples_that_come_together_throw_no_frame_away(apart):
     """The frame is 0.1 to 0.5 ms ahead of the second; on the line through both it would be up to 80 cm on."""
     trackers = TrackerFrames(SKELETON, 60)
-    trackers.take(0.0, *SAMPLES[0][1:], NOBODY)
+    trackers.take(0.0, *SAMPLES[0][1:], NONE_LOST)
     first, second = SAMPLES[30], SAMPLES[31]
     early = 1 / 60 - 4.95e-4
-    assert not trackers.take(early - apart, *first[1:], NOBODY).frames
-    (frame,) = trackers.take(early, *second[1:], NOBODY).frames
+    assert not trackers.take(early - apart, *first[1:], NONE_LOST)[0]
+    (frame,) = trackers.take(early, *second[1:], NONE_LOST)[0]
     assert frame.time == pytest.approx(1 / 60)
     step = np.abs(second.positions - first.positions).max()
     assert np.abs(frame.positions - second.positions).max() <= 0.1 * step + 1e-9
@@ -76,8 +76,8 @@ def test_no_frame_is_lost_in_an_hour_of_unix_time():
     """Such times have a resolution of 2e-7 s; at 60 Hz each sample still makes one frame, at its own time."""
     trackers, start = TrackerFrames(SKELETON, 60), 1.7e9
     for index in range(216_000):
-        taken = trackers.take(start + index / 60, *SAMPLES[0][1:], NOBODY)
-        assert len(taken.frames) == 1
+        frames, _ = trackers.take(start + index / 60, *SAMPLES[0][1:], NONE_LOST)
+        assert len(frames) == 1
 
 
 @pytest.mark.parametrize("lost", [(False, True, False), (True, False, False), (False, True, True)])
@@ -102,7 +102,7 @@ def test_a_hand_is_held_as_the_head_sees_it():
     positions = filled((False, True, False), 100, 60, Hold(SKELETON))
     np.testing.assert_array_equal(positions[:, [0, 2]], PERSON.positions[:, [0, 2]])
     seen = [
-        about_vertical(-heading_of(PERSON.rotations[i, 0])) @ (positions[i, 1] - positions[i, 0])
+        rotation_about_vertical(-heading_of(PERSON.rotations[i, 0])) @ (positions[i, 1] - positions[i, 0])
         for i in range(99, 160)
     ]
     np.testing.assert_allclose(seen, np.tile(seen[0], (61, 1)), atol=1e-9)

@@ -1,7 +1,8 @@
-"""Wearers of other heights and on other floors: the same stream, at their size."""
+"""Wearers of other heights and on other floors, and their calibrations as files."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,14 +12,22 @@ import wearer as moving
 
 from memmlp.common.errors import InputError
 from memmlp.live.rotations import BodyTree
-from memmlp.live.sample_warnings import SampleWarning
 from memmlp.live.spaces import SPACES
-from memmlp.live.stream import Offsets, Stream
+from memmlp.live.stream import Stream
+from memmlp.live.tracker_input import SampleWarning
 from memmlp.live.tracker_resampling import t_pose
-from memmlp.live.wearer import stature, wearer
+from memmlp.live.wearer import (
+    Calibration,
+    Offsets,
+    make_wearer,
+    read_calibration,
+    save_calibration,
+    stature,
+)
 from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
 
-BODY = BodyTree(JOINTS, PARENTS, builtin_rest_joints())
+REST = builtin_rest_joints()
+BODY = BodyTree(JOINTS, PARENTS, REST)
 PERSON = moving.person(np.arange(40) / 60)
 HEIGHT, FLOOR = 1.95, 0.4
 SIZE = HEIGHT / 1.72
@@ -31,11 +40,11 @@ def file(step_files: Callable[[str], Path]) -> Path:
 
 def test_the_built_in_body_is_as_tall_as_it_says():
     assert stature(BODY) == pytest.approx(1.72)
-    assert wearer(BODY).scale == 1
+    assert make_wearer(BODY).scale == 1
 
 
 def test_in_and_out_again_and_the_floor_comes_to_zero():
-    tall = wearer(BODY, 2.0, 0.3)
+    tall = make_wearer(BODY, 2.0, 0.3)
     standing = np.array([[0.5, -0.25, 0.3], [0.0, 0.0, 2.3]])  # on the floor, and the top of the head
     np.testing.assert_allclose(tall.positions_in(standing)[:, 2], [0, 1.72], atol=1e-12)
     np.testing.assert_allclose(tall.positions_out(tall.positions_in(standing)), standing, atol=1e-12)
@@ -44,14 +53,14 @@ def test_in_and_out_again_and_the_floor_comes_to_zero():
 
 @pytest.mark.parametrize("height", [0.1, 180, float("nan"), "tall"])
 def test_no_height_of_a_person_is_refused(height):
-    with pytest.raises(InputError, match=r"height=.*allowed are 0.5 to 2.5 metres"):
-        wearer(BODY, height)
+    with pytest.raises(InputError, match="height="):
+        make_wearer(BODY, height)
 
 
 @pytest.mark.parametrize("floor", [1e3, float("inf"), None])
 def test_no_floor_is_refused(floor):
-    with pytest.raises(InputError, match=r"floor=.*allowed is a height in metres"):
-        wearer(BODY, None, floor)
+    with pytest.raises(InputError, match="floor="):
+        make_wearer(BODY, None, floor)
 
 
 @pytest.mark.slow
@@ -113,7 +122,85 @@ def test_another_height_forgets_offsets_and_says_so(file: Path):
     stream = Stream(file, height=HEIGHT, offsets=offsets)
     stream.fit(HEIGHT, floor=0.1)
     assert stream.offsets is not None
-    with pytest.warns(SampleWarning, match="offsets: the calibration was of another height"):
+    with pytest.warns(SampleWarning, match="offsets: "):
         stream.fit(HEIGHT - 0.1)
     assert stream.offsets is None
     stream.fit(HEIGHT)  # without offsets there is nothing to say
+
+
+# Files
+
+TURNS = np.stack([np.eye(3), np.eye(3)[[1, 2, 0]], np.diag([1.0, -1, -1])])
+WORDS = {
+    "memmlp": "calibration", "space": "unity", "body": 1.72, "height": 1.8, "floor": 0,
+    "joints": (REST[BODY.tracked] - REST[BODY.tracked].mean(0)).tolist(),
+}  # fmt: skip
+WORN = Calibration("unity", Offsets(np.arange(9.0).reshape(3, 3) / 7, TURNS), 1.815, -0.02)
+
+
+@pytest.mark.parametrize("made", [WORN, Calibration("openxr")])
+def test_there_and_back(made: Calibration, tmp_path: Path):
+    save_calibration(tmp_path / "me.json", made, BODY)
+    again = read_calibration(tmp_path / "me.json", made.space, BODY)
+    assert (again.space, again.height, again.floor) == (made.space, made.height, made.floor)
+    assert (again.offsets is None) == (made.offsets is None)
+    if again.offsets and made.offsets:
+        for part, before in zip(again.offsets, made.offsets, strict=True):
+            np.testing.assert_array_equal(part, before)
+
+
+def test_offsets_of_another_frame_of_reference_are_refused(tmp_path: Path):
+    """They would be taken for offsets along other axes, in silence."""
+    save_calibration(tmp_path / "me.json", WORN, BODY)
+    with pytest.raises(InputError, match=r"me\.json: .*unity.*openxr"):
+        read_calibration(tmp_path / "me.json", "openxr", BODY)
+
+
+def wider(by: float) -> np.ndarray:
+    """Return a body of the same height whose left wrist is `by` metres further out."""
+    rest = REST.copy()
+    rest[JOINTS.index("left_wrist"), 0] += by
+    return rest
+
+
+@pytest.mark.parametrize(
+    ("rest", "said"),
+    [
+        (REST * 1.68 / 1.72, r"body of 1\.72 m, .* 1\.68 m"),
+        (wider(0.03), r"head or wrists are 2\.0 cm away"),
+        (wider(-0.03), r"head or wrists are 2\.0 cm away"),
+    ],
+)
+def test_offsets_of_a_network_with_another_body_are_refused(rest: np.ndarray, said: str, tmp_path: Path):
+    """They would hold the hands elsewhere, in silence."""
+    save_calibration(tmp_path / "me.json", WORN, BODY)
+    with pytest.raises(InputError, match=rf"me\.json: .* {said}"):
+        read_calibration(tmp_path / "me.json", "unity", BodyTree(JOINTS, PARENTS, rest))
+
+
+def test_rounding_is_no_other_body(tmp_path: Path):
+    save_calibration(tmp_path / "me.json", WORN, BODY)
+    near = BodyTree(JOINTS, PARENTS, wider(0.003))
+    assert read_calibration(tmp_path / "me.json", "unity", near).height == 1.815
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "", "[]", "{}", "[" * 5000, '{"memmlp": "calibration", "space": "unity"}', '{"memmlp": "calibr',
+        json.dumps(WORDS), json.dumps(WORDS | {"offsets": {}}), json.dumps(WORDS | {"offsets": 5}),
+        json.dumps(WORDS | {"offsets": None, "body": "tall"}),
+        json.dumps(WORDS | {"offsets": None, "joints": [1, 2]}),
+        json.dumps(WORDS | {"offsets": None, "joints": [[float("nan")] * 3] * 3}),
+        json.dumps(WORDS | {"offsets": {"positions": [[0] * 3] * 3, "rotations": [[[1] * 3] * 3] * 3}}),
+    ],
+)  # fmt: skip
+def test_what_is_no_calibration_is_refused(content: str, tmp_path: Path):
+    (tmp_path / "me.json").write_text(content)
+    with pytest.raises(InputError, match=r"me\.json"):
+        read_calibration(tmp_path / "me.json", "unity", BODY)
+
+
+def test_a_folder_that_does_not_exist_is_one_line(tmp_path: Path):
+    with pytest.raises(InputError, match="cannot be written"):
+        save_calibration(tmp_path / "none" / "me.json", WORN, BODY)

@@ -1,53 +1,74 @@
-"""The loop of `memmlp live`: samples go from a source through the stream to outputs and to open pages."""
+"""The loop of `memmlp live`: samples go from a source through the stream to outputs and to open pages.
+
+Between the samples it carries out the page's orders, which fit the stream to its wearer. They arrive in the
+server's threads. The wearer has to walk away from the keyboard before a calibration, so it waits for a
+countdown.
+"""
 
 from __future__ import annotations
 
+import math
+import queue
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.live.outputs.output import Outputs
+from memmlp.live.outputs import Outputs
 from memmlp.live.rotations import matrix_to_quaternion
-from memmlp.live.sample_warnings import OddSamples
-from memmlp.live.session.sources import TrackerSource
-from memmlp.live.session.wearer_fitting import Fitting
-from memmlp.live.spaces import SPACES, Space
-from memmlp.live.stream import Pose, Stream
+from memmlp.live.session.sources import QuaternionPoses, TrackerSource
+from memmlp.live.spaces import SPACES, SpaceName
+from memmlp.live.stream import FORGOTTEN, BodyFrame, Stream, raise_by
+from memmlp.live.tracker_input import OddSamples
+from memmlp.live.wearer import Calibration, save_calibration
 from memmlp.motion.body import FPS, JOINTS, PARENTS, ROOT
-from memmlp.motion.formats.vrm import VRM_BONES as VRM
+from memmlp.motion.formats.vrm import VRM_BONES
 from memmlp.motion.limb_shapes import HEAT, LIMBS
 
 PAGE_SPACE = SPACES["openxr"]  # the page's axes: those of three.js
 TOP = 20  # cm at the top of the page's colour scale
 UNIT = 10_000  # whole numbers that a quaternion's 1 is sent as
+COUNTDOWN = 5.0  # seconds
+LONGEST = 60.0  # seconds of a countdown
+ACTIONS = ("calibrate", "touch_floor", "height", "floor", "forget", "cancel")
 
 Publish = Callable[[dict[str, Any]], None]
+Tell = Callable[[str, Mapping[str, Any]], None]
 
 
-def greeting(
-    source: TrackerSource, network: str, outputs: Outputs | None = None, remark: str = ""
+def make_greeting(
+    source: TrackerSource,
+    network: str,
+    outputs: Outputs | None = None,
+    remark: str = "",
+    avatar: bool = False,
 ) -> dict[str, Any]:
     """Return the message that a page gets before the first frame.
 
     Args:
         source: where the trackers' samples come from.
         network: the network's name.
-        outputs: where poses go beside the page.
-        remark: what people should know who see the network move, such as that it is hardly trained.
+        outputs: the other receivers of poses.
+        remark: a warning about the network, such as that it is hardly trained.
+        avatar: whether the page shows an avatar, whose bones it needs.
     """
-    limbs = [{"start": a, "end": b, "radii": radii, "tip": tip} for a, b, radii, tip in LIMBS]
-    words = {"network": network, "remark": remark, "source": source.name, "fps": FPS, "joints": JOINTS}
-    words |= {"outputs": [output.name for output in outputs.outputs] if outputs else []}
-    return words | {"limbs": limbs, "heat": HEAT, "top": TOP, "worn": source.worn}
-
-
-def with_avatar(words: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a greeting with an avatar's bones added."""
-    return dict(words) | {"avatar": {"bones": VRM, "parents": PARENTS, "unit": UNIT}}
+    return {
+        "network": network,
+        "remark": remark,
+        "source": source.name,
+        "fps": FPS,
+        "joints": JOINTS,
+        "outputs": [output.name for output in outputs.outputs] if outputs else [],
+        "limbs": [{"start": a, "end": b, "radii": radii, "tip": tip} for a, b, radii, tip in LIMBS],
+        "heat": HEAT,
+        "top": TOP,
+        "worn": source.worn,
+        **({"avatar": {"bones": VRM_BONES, "parents": PARENTS, "unit": UNIT}} if avatar else {}),
+    }
 
 
 def run_loop(
@@ -63,11 +84,10 @@ def run_loop(
     """Feed samples to the stream, and its frames to the outputs and to open pages, until `stopped` is set.
 
     A message has the frame's number and time (s); the milliseconds that the exported step took (`ms`), and
-    those that passed from the sample's arrival until all outputs had the pose (`whole`); how many
-    samples were dropped, malformed, or foreign so far; whether the samples' times jump (`OddSamples`); the
-    trackers that are held; and the joints' positions, predicted and true (66 whole millimetres each, in
-    openxr's axes).
-    Packets that are not taken are reported at once, by a message with these counts alone.
+    those that passed from the sample's arrival until all outputs had the pose (`whole`); how many samples
+    were dropped, malformed, or foreign so far; whether the samples' times jump (`OddSamples`); the trackers
+    that are held; and the joints' positions, predicted and true (66 whole millimetres each, in openxr's
+    axes). Rejected packets are reported at once, by a message with these counts alone.
 
     Args:
         stream: the stream of poses; its network is `stream.network`.
@@ -76,83 +96,197 @@ def run_loop(
         stopped: ends the loop.
         outputs: get the frames first.
         fitting: fits the stream to its wearer between the samples.
-        avatar: whether messages have what an avatar needs as well (`avatar_message`).
-        tell: gets a line if samples are odd (`OddSamples`), or the first time that one is refused.
+        avatar: whether messages include the avatar's pose (`avatar_message`).
+        tell: gets a line if samples are odd (`OddSamples`), and for the first rejected sample.
     """
     stream.odd = OddSamples(tell)
-    number, refused, dropped, told = 0, 0, 0, (0, 0)
+    number, refused, dropped, reported = 0, 0, 0, (0, 0)
     while not stopped.is_set():
         sample = source.read()
         if fitting:
             fitting.step(sample and sample.trackers)
-        if (source.malformed + refused, source.foreign) != told:
-            told = source.malformed + refused, source.foreign
-            publish(refusals_message(dropped, *told))
+        if (source.malformed + refused, source.foreign) != reported:
+            reported = source.malformed + refused, source.foreign
+            publish({"dropped": dropped, "malformed": reported[0], "foreign": reported[1]})
         if sample is None:
             continue
         dropped += sample.dropped
         arrived = sample.arrived or time.perf_counter()
         try:
-            pose = stream.step(*sample.trackers, time=sample.time)
+            frame = stream.step_body(*sample.trackers, time=sample.time)
         except InputError as error:
             refused += 1
             if refused == 1:
-                tell(f"a sample is not taken: {error}")
+                tell(f"a sample is rejected: {error}")
             continue
-        if not pose.fresh:
+        if not frame.fresh:
             continue
         if outputs:
-            outputs.take(stream, pose)
+            outputs.take(frame)
         whole = 1000 * (time.perf_counter() - arrived)
-        times = {"ms": round(1000 * stream.step_seconds, 3), "whole": round(whole, 3)}
-        told = source.malformed + refused, source.foreign
-        opening = {
+        reported = source.malformed + refused, source.foreign
+        message = {
             "number": number,
-            "time": round(pose.time, 4),
-            "held": pose.held,
+            "time": round(frame.time, 4),
+            "held": frame.held,
             "jumping": stream.odd.jumping,
+            "ms": round(1000 * stream.step_seconds, 3),
+            "whole": round(whole, 3),
+            "dropped": dropped,
+            "malformed": reported[0],
+            "foreign": reported[1],
+            "positions": to_millimetres(raise_by(frame.positions, stream.wearer.floor)),
+            "truth": to_millimetres(source.truth(frame.time)),
         }
-        message = (
-            opening
-            | times
-            | refusals_message(dropped, *told)
-            | positions_message(stream.space, pose, source.truth(pose.time))
-        )
-        publish(message | (avatar_message(stream.space, pose, stream.rest) if avatar else {}))
+        publish(message | (avatar_message(frame) if avatar else {}))
         number += 1
 
 
-def refusals_message(dropped: int, malformed: int, foreign: int) -> dict[str, Any]:
-    """Return the part of a message about samples that were not taken."""
-    return {"dropped": dropped, "malformed": malformed, "foreign": foreign}
-
-
-def positions_message(space: Space, pose: Pose, truth: np.ndarray | None) -> dict[str, Any]:
-    """Return the part of a message with the joints' positions."""
-    return {"positions": millimetres(space, pose.positions), "truth": millimetres(space, truth)}
-
-
-def millimetres(space: Space, joints: np.ndarray | None) -> list[int] | None:
-    """Return joints (22, 3) of a space, in metres, as a flat list of whole millimetres in the page's axes."""
+def to_millimetres(joints: np.ndarray | None) -> list[int] | None:
+    """Return joints (22, 3), metres, AMASS' world, as a flat list of millimetres in the page's axes."""
     if joints is None:
         return None
-    positions = PAGE_SPACE.positions_out(space.positions_in(np.asarray(joints, np.float64)))
+    positions = PAGE_SPACE.positions_out(np.asarray(joints, np.float64))
     return (1000 * positions).round().astype(int).ravel().tolist()
 
 
-def avatar_message(space: Space, pose: Pose, rest: np.ndarray) -> dict[str, Any]:
+def avatar_message(frame: BodyFrame) -> dict[str, Any]:
     """Return the part of a message for an avatar: the joints' rotations, and the wearer's hips, metres.
 
     The rotations are 22 quaternions xyzw as 88 whole numbers, relative to VRM's T-pose, which is SMPL's: Y
-    up, facing +Z. The root's is in the page's axes. The height of the hips in the rest pose (22, 3), metres,
-    gives the avatar its size; the wearer may change it on the page at any time.
+    up, facing +Z. The root's is in the page's axes. The height of the hips in the rest pose, metres, gives
+    the avatar its size; the wearer may change it on the page at any time.
     """
-    local = space.pose_in(pose.rotations)
+    local = frame.local.copy()
     local[0] = PAGE_SPACE.world.T @ local[0]
     turns = (UNIT * matrix_to_quaternion(local)).round().astype(int).ravel().tolist()
-    return {"turns": turns, "hips": round(hips_height(rest), 4)}
+    hips = float(frame.rest[ROOT, 1] - frame.rest[:, 1].min())  # above the lowest joint
+    return {"turns": turns, "hips": round(hips, 4)}
 
 
-def hips_height(rest: np.ndarray) -> float:
-    """Return the height of the hips above the lowest joint, in a rest pose (22, 3), metres."""
-    return float(rest[ROOT, 1] - rest[:, 1].min())
+class Order(NamedTuple):
+    """An order from the page.
+
+    Attributes:
+        action: one of ACTIONS.
+        value: metres for height and floor; seconds of the countdown for calibrate and touch_floor.
+    """
+
+    action: str
+    value: float | None
+
+
+def read_order(fields: object) -> Order:
+    """Read an order: {"action": ..., "value": ...}. Raises InputError for any other."""
+    if not isinstance(fields, dict) or fields.get("action") not in ACTIONS:
+        raise InputError(f"action: must be one of {', '.join(ACTIONS)}")
+    value = fields.get("value")
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if value is not None and not (number and math.isfinite(value)):
+        raise InputError("value: must be a finite number")
+    return Order(fields["action"], value)
+
+
+class Fitting:
+    """Fits a stream to its wearer by orders: body height, floor, calibration in a T-pose.
+
+    Args:
+        stream: the stream.
+        space: the stream's frame of reference.
+        path: the file to which each change is saved; None to save nothing.
+        tell: gets "wearer" and the state whenever the state changes.
+        clock: returns the time, seconds.
+    """
+
+    def __init__(
+        self,
+        stream: Stream,
+        space: SpaceName,
+        path: Path | None,
+        tell: Tell,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        self.stream, self.space, self.path = stream, space, path
+        self.tell, self.clock = tell, clock
+        self.orders: queue.SimpleQueue[Order] = queue.SimpleQueue()
+        self.waiting: Order | None = None
+        self.due = 0.0
+        self.height: float | None = None if stream.wearer.scale == 1 else stream.wearer.height
+        self._publish_state("")
+
+    def ask(self, fields: object) -> None:
+        """Take an order, from any thread. Raises InputError if it is not a valid order."""
+        self.orders.put(read_order(fields))
+
+    def step(self, trackers: QuaternionPoses | None) -> None:
+        """Carry out the orders that are due: new ones at once, and a waiting one after its countdown.
+
+        Args:
+            trackers: the devices' current poses; None if no sample came.
+        """
+        while not self.orders.empty():
+            order = self.orders.get()
+            if order.action in ("calibrate", "touch_floor"):
+                seconds = COUNTDOWN if order.value is None else min(max(order.value, 0.0), LONGEST)
+                self.waiting, self.due = order, self.clock() + seconds
+                self._publish_state("")
+            else:
+                self.waiting = None
+                self._carry_out(order, None)
+        if self.waiting and trackers and self.clock() >= self.due:
+            order, self.waiting = self.waiting, None
+            self._carry_out(order, trackers)
+
+    def _carry_out(self, order: Order, trackers: QuaternionPoses | None) -> None:
+        """Carry out an order, save what it changed, and publish the result."""
+        try:
+            said = self._change(order, trackers)
+            if self.path is not None and order.action != "cancel":
+                stream = self.stream
+                made = Calibration(self.space, stream.offsets, self.height, stream.wearer.floor)
+                save_calibration(self.path, made, stream.network.body)
+        except InputError as error:
+            self._publish_state(str(error), failed=True)
+        else:
+            self._publish_state(said)
+
+    def _change(self, order: Order, trackers: QuaternionPoses | None) -> str:
+        """Change the stream by an order, and return a line about the result."""
+        stream, value = self.stream, order.value
+        if order.action == "calibrate" and trackers:
+            offsets = stream.calibrate(*trackers)
+            said = (
+                f"Calibrated; the devices are up to {100 * offsets.distances.max():.0f} cm from the joints."
+            )
+            return f"{said} But {offsets.doubt}" if offsets.doubt else said
+        if order.action == "height":
+            forgotten = stream.refit(value, stream.wearer.floor)
+            self.height = value
+            return f"Calibrate again: {FORGOTTEN}." if forgotten else ""
+        if order.action == "touch_floor" and trackers:
+            hands = [tracker[0] for tracker in trackers[1:] if tracker is not None]
+            if not hands:
+                raise InputError("floor: no hand is tracked; touch the floor with one")
+            value = round(min(float(stream.space.positions_in(hand)[2]) for hand in hands), 4)
+        if order.action in ("floor", "touch_floor"):
+            stream.fit(self.height, value or 0.0)
+            return f"The floor is at {100 * (value or 0.0):.0f} cm."
+        if order.action == "forget":
+            stream.offsets = None
+            stream.reset()
+            return "The calibration is forgotten."
+        return ""  # cancel
+
+    def _publish_state(self, said: str, failed: bool = False) -> None:
+        stream, waiting = self.stream, self.waiting
+        remaining = round(max(self.due - self.clock(), 0.0), 2)
+        state = {
+            "height": round(100 * stream.wearer.height, 1),
+            "floor": round(100 * stream.wearer.floor, 1),
+            "calibrated": stream.offsets is not None,
+            "waiting": waiting and {"action": waiting.action, "seconds": remaining},
+            "said": said,
+            "failed": failed,
+            "file": self.path and self.path.name,
+        }
+        self.tell("wearer", state)

@@ -1,6 +1,6 @@
 """The server of the page: it serves the page's files, sends frames as server-sent events, and takes orders.
 
-It listens on 127.0.0.1 unless another address is asked for; in that case every request needs a token. Pages
+It listens on 127.0.0.1 unless another address is requested; in that case every request needs a token. Pages
 may be opened and closed at any time; a slow page misses frames, and does not delay the others.
 """
 
@@ -11,17 +11,24 @@ import errno
 import json
 import queue
 import socket
+import struct
+import tempfile
 import threading
 import urllib.parse
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
+from pathlib import Path
 from typing import Any, NamedTuple
 
-from memmlp.common.errors import InputError
+import numpy as np
+
+from memmlp.common import npm
+from memmlp.common.errors import InputError, why_unreadable
 from memmlp.common.request_access import Access
 from memmlp.live.session.sources import EVERYWHERE, HOST
+from memmlp.motion.formats.vrm import write_vrm
 
 QUEUED = 240  # the most events that wait for a watcher; beyond, its oldest frames are dropped
 FRAME = b"event: frame\n"  # how a frame's event begins
@@ -34,6 +41,12 @@ SCRIPT, STYLE, HTML = (
 )
 SCRIPTS = ("main.js", "stage.js", "history.js", "wearer.js", "avatar.js")
 THREE = ("three/three.module.min.js", "three/three.core.min.js", "three/OrbitControls.js")
+AVATAR_SCRIPTS = {
+    npm.THREE: ("build/three.module.js", "build/three.core.js", "examples/jsm/loaders/GLTFLoader.js",
+                "examples/jsm/utils/BufferGeometryUtils.js", "examples/jsm/utils/SkeletonUtils.js"),
+    npm.THREE_VRM: ("lib/three-vrm.module.min.js",),
+}  # fmt: skip
+EXTENSIONS = ("VRMC_vrm", "VRM")  # of VRM 1.0, and 0.x
 
 
 class File(NamedTuple):
@@ -60,6 +73,45 @@ FILES: dict[str, File] = {
 }
 
 
+def avatar_files(vrm: bytes) -> dict[str, File]:
+    """Return the page's files with a VRM avatar, and three-vrm from its npm package.
+
+    The page's three.js is replaced by that of the npm package to which the loader belongs.
+
+    Raises:
+        InputError: if an npm package can't be downloaded.
+    """
+    page = read_page("index.html").replace(b"./three/three.module.min.js", b"./npm/build/three.module.js")
+    files = FILES | {"": File(HTML, lambda: page), "avatar.vrm": File("model/gltf-binary", lambda: vrm)}
+    for package, names in AVATAR_SCRIPTS.items():
+        for name, content in npm.read(package, names).items():
+            files[f"npm/{name}"] = File(SCRIPT, partial(bytes, content))
+    return files
+
+
+def mannequin_vrm(rest: np.ndarray) -> bytes:
+    """Return the built-in avatar as a VRM file, with the given rest joints (22, 3), metres."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "mannequin.vrm"
+        write_vrm(path, rest)
+        return path.read_bytes()
+
+
+def read_vrm(path: Path) -> bytes:
+    """Return a VRM file's content. Raises InputError if the file is not a VRM file."""
+    try:
+        content = path.read_bytes()
+        if content[:4] != b"glTF":
+            raise ValueError("not a binary glTF")
+        (size,) = struct.unpack_from("<I", content, 12)
+        extensions = json.loads(content[20 : 20 + size]).get("extensions", {})
+    except (OSError, ValueError, struct.error, AttributeError) as error:
+        raise InputError(f"--avatar {path}: {why_unreadable(error)}; expected a VRM file") from None
+    if not any(name in extensions for name in EXTENSIONS):
+        raise InputError(f"--avatar {path}: a glTF file without a VRM avatar; expected a VRM file")
+    return content
+
+
 class Hub:
     """Hands frames to all watchers, which are the open pages.
 
@@ -68,18 +120,18 @@ class Hub:
     """
 
     def __init__(self, greeting: Mapping[str, Any]):
-        self.states = {"greeting": event("greeting", greeting)}
+        self.states = {"greeting": to_event("greeting", greeting)}
         self.watchers: set[queue.Queue[bytes | None]] = set()
         self.lock = threading.Lock()
         self.closed = False
 
     def publish(self, message: Mapping[str, Any]) -> None:
-        """Hand a frame's message to all present watchers."""
-        self._hand(event("frame", message))
+        """Hand a frame's message to all current watchers."""
+        self._hand(to_event("frame", message))
 
     def tell(self, name: str, state: Mapping[str, Any]) -> None:
-        """Hand a state to all present watchers, and to later ones until the state changes."""
-        line = event(name, state)
+        """Hand a state to all current watchers, and to later ones until the state changes."""
+        line = to_event(name, state)
         with self.lock:
             self.states[name] = line
         self._hand(line)
@@ -116,8 +168,8 @@ class Hub:
 def _put(watcher: queue.Queue[bytes | None], line: bytes | None) -> None:
     """Append a line to a watcher's queue; if the queue is full, drop its oldest frame.
 
-    States stay, since a page would go on showing the one before. Only of a queue without frames the oldest
-    line is dropped.
+    States stay, since a page would go on showing the one before. A queue without frames drops its oldest
+    line.
     """
     with watcher.mutex:
         waiting = watcher.queue
@@ -127,7 +179,7 @@ def _put(watcher: queue.Queue[bytes | None], line: bytes | None) -> None:
     watcher.put_nowait(line)
 
 
-def event(name: str, value: Mapping[str, Any]) -> bytes:
+def to_event(name: str, value: Mapping[str, Any]) -> bytes:
     """Return a server-sent event."""
     return f"event: {name}\ndata: {json.dumps(value, separators=(',', ':'))}\n\n".encode()
 
@@ -147,40 +199,35 @@ class LiveHandler(BaseHTTPRequestHandler):
             elif token := access.token_in(url.query):
                 self._head(303, "text/plain", access.redirect_headers(token, port))
             elif name == "events":
-                self._events()
+                self._send_events()
             elif name in self.server.files:
-                self._file(self.server.files[name])
+                file = self.server.files[name]
+                self._send(200, file.kind, file.read())
             else:
                 self.send_error(404)
 
     def do_POST(self) -> None:
-        """Take an order from the page; the answer is empty, or a line that says what is wrong with it."""
+        """Take an order from the page; the answer is empty, or a line about its error."""
+        ask = self.server.ask
         with contextlib.suppress(ConnectionError):
             if not self.server.access.allows_change(self.path, self.headers, self.server.server_port):
-                self.send_error(403)
-            elif self.path != "/wearer" or self.server.ask is None:
-                self.send_error(404)
+                return self.send_error(403)
+            if self.path != "/wearer" or ask is None:
+                return self.send_error(404)
+            try:
+                size = min(int(self.headers.get("Content-Length", 0)), LARGEST)
+                ask(json.loads(self.rfile.read(size)))
+            except (ValueError, RecursionError) as error:
+                said = str(error) if isinstance(error, InputError) else "not JSON"
+                self._send(400, "text/plain; charset=utf-8", said.encode())
             else:
-                self._order(self.server.ask)
-
-    def _order(self, ask: Callable[[object], None]) -> None:
-        try:
-            size = min(int(self.headers.get("Content-Length", 0)), LARGEST)
-            ask(json.loads(self.rfile.read(size)))
-        except (ValueError, RecursionError) as error:
-            said = str(error) if isinstance(error, InputError) else "no JSON"
-            self._send(400, "text/plain; charset=utf-8", said.encode())
-        else:
-            self._send(200, "text/plain; charset=utf-8", b"")
-
-    def _file(self, file: File) -> None:
-        self._send(200, file.kind, file.read())
+                self._send(200, "text/plain; charset=utf-8", b"")
 
     def _send(self, code: int, kind: str, content: bytes) -> None:
         self._head(code, kind, {"Content-Length": str(len(content))})
         self.wfile.write(content)
 
-    def _events(self) -> None:
+    def _send_events(self) -> None:
         """Send the greeting and all frames as they come, until the page or the server is closed."""
         self._head(200, "text/event-stream", {})
         with self.server.hub.watch() as watcher:
@@ -209,18 +256,18 @@ class LiveHandler(BaseHTTPRequestHandler):
 
 
 class LiveServer(ThreadingHTTPServer):
-    """Serves the page, from threads of its own, inside a `with` block.
+    """Serves the page, from its own threads, inside a `with` block.
 
     Args:
         hub: gives the frames to the pages.
         port: the port; 0 for any free one.
-        host: the address to serve at; 127.0.0.1 is this machine alone.
-        token: what every request needs at any other address; None for a new random token.
+        host: the address to serve at; at 127.0.0.1 only this machine reaches it.
+        token: every request's token at any other address; None for a new random token.
         files: the page's files, by their paths.
-        ask: takes an order from the page, or raises InputError; None where the stream takes no orders.
+        ask: takes an order from the page, or raises InputError; None to reject all orders.
 
     Raises:
-        InputError: if the address does not belong to this machine, or the port is taken.
+        InputError: if the address does not belong to this machine, or the port is in use.
     """
 
     daemon_threads = True
@@ -240,10 +287,10 @@ class LiveServer(ThreadingHTTPServer):
         try:
             super().__init__((host, port), LiveHandler)
         except (OSError, OverflowError) as error:
-            taken = getattr(error, "errno", None) == errno.EADDRINUSE
-            reason = "taken" if taken else getattr(error, "strerror", None) or error
-            allowed = "allowed are this machine's addresses and free ports (--port 0: any that is free)"
-            raise InputError(f"--host {host} --port {port}: {reason}; {allowed}") from None
+            in_use = getattr(error, "errno", None) == errno.EADDRINUSE
+            reason = "in use" if in_use else getattr(error, "strerror", None) or error
+            expected = "expected an address of this machine and a free port (--port 0: any that is free)"
+            raise InputError(f"--host {host} --port {port}: {reason}; {expected}") from None
 
     def server_bind(self) -> None:
         """Bind to the address, without asking a name server for the host's name."""

@@ -1,24 +1,38 @@
-"""Sources of tracker poses: a clip that is played, or packets that arrive at this machine."""
+"""Sources of tracker poses: a clip that is played, or packets that arrive at this machine.
+
+One datagram is one sample, as JSON or as an OSC bundle. A pose is seven numbers, `x y z qx qy qz qw`: metres
+and a unit quaternion. In JSON:
+
+    {"time": 12.25, "seq": 735, "head": [x, y, z, qx, qy, qz, qw], "left": null, "right": [...]}
+
+In OSC a bundle has the messages `/memmlp/head`, `/memmlp/left`, `/memmlp/right` (seven floats each),
+`/memmlp/time` (a double or float) and `/memmlp/seq` (an integer).
+
+A tracker that is null or missing is lost. A packet without a time gets its time of arrival. By the sample's
+number, seq, missing packets are counted, and those that others have overtaken are left out.
+"""
 
 from __future__ import annotations
 
 import errno
+import json
+import logging
 import math
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from importlib.util import find_spec
 from ipaddress import IPv4Network, ip_address
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.common.progress import notify
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
-from memmlp.live.session.packets import Packet, Parse, QuaternionPoses
 from memmlp.live.spaces import Space, SpaceName
-from memmlp.live.tracker_resampling import TrackerSample, between
+from memmlp.live.tracker_resampling import TRACKERS, TrackerSample, interpolate
 from memmlp.motion.body import (
     FPS,
     MOTION_DIM,
@@ -31,12 +45,126 @@ from memmlp.motion.body import (
 
 HOST = "127.0.0.1"
 EVERYWHERE = "0.0.0.0"
-TOLD = 3  # strangers that are told of
+PREFIX = "/memmlp/"
+POSE = 7  # numbers of a pose
+FARTHEST = 1e6  # the largest absolute value of a number in a pose
+REPORTED = 3  # strangers that are reported
 WAIT = 0.25  # seconds that `read` waits at most
-PAUSE = 1.0  # seconds between two rounds of a clip, so long that the stream begins anew
+PAUSE = 1.0  # seconds between two rounds of a clip, so long that the stream restarts
 LARGEST = 65_536  # the largest datagram, bytes
-OVERTAKEN = 20  # packets that may overtake another; a number further back is a sender that began anew
-FORGOTTEN = 10_000  # so many missing numbers are not lost packets but another sender
+OVERTAKEN = 20  # packets that may overtake another; a number further back is a sender that restarted
+FORGOTTEN = 10_000  # so many missing numbers are another sender, not lost packets
+
+QuaternionPose = tuple[np.ndarray, np.ndarray] | None
+"""A tracker's position (3,), metres, and quaternion xyzw (4,); None for a lost tracker."""
+QuaternionPoses = tuple[QuaternionPose, QuaternionPose, QuaternionPose]
+"""The poses of head, left and right."""
+
+
+class Packet(NamedTuple):
+    """One sample of the trackers.
+
+    Attributes:
+        trackers: head, left and right.
+        time: seconds of the sender's clock; None if the packet does not have a time.
+        seq: the sample's number; None if the packet does not have one.
+    """
+
+    trackers: QuaternionPoses
+    time: float | None = None
+    seq: int | None = None
+
+
+def from_json(datagram: bytes) -> Packet:
+    """Read the packet of a JSON datagram. Raises ValueError for anything else."""
+    try:
+        fields = json.loads(datagram)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    if not isinstance(fields, dict):
+        raise ValueError("not a JSON object")
+    return make_packet(fields)
+
+
+def to_json(packet: Packet) -> bytes:
+    """Return the JSON datagram of a packet."""
+    return json.dumps(_fields(packet)).encode()
+
+
+def from_osc(datagram: bytes) -> Packet:
+    """Read the packet of an OSC bundle. Raises ValueError for anything else."""
+    from pythonosc.osc_bundle import OscBundle
+    from pythonosc.osc_message import OscMessage
+
+    logging.disable(logging.WARNING)  # the library warns of each datagram that it can't read
+    try:
+        parts = [part for part in OscBundle(datagram) if isinstance(part, OscMessage)]
+        arguments = {part.address.removeprefix(PREFIX): list(part.params) for part in parts}
+    except Exception as error:  # the library raises many kinds over bytes that are not OSC
+        raise ValueError(f"not an OSC bundle ({error})") from None
+    finally:
+        logging.disable(logging.NOTSET)
+    numbers = {key: arguments[key][0] for key in ("time", "seq") if arguments.get(key)}
+    return make_packet(arguments | numbers)
+
+
+def to_osc(packet: Packet) -> bytes:
+    """Return the OSC bundle of a packet."""
+    from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
+    from pythonosc.osc_message_builder import OscMessageBuilder
+
+    bundle = OscBundleBuilder(IMMEDIATELY)
+    for name, value in _fields(packet).items():
+        if value is None:
+            continue
+        message = OscMessageBuilder(PREFIX + name)
+        for number in value if isinstance(value, list) else [value]:
+            message.add_arg(number, {"time": "d", "seq": "i"}.get(name, "f"))
+        bundle.add_content(message.build())
+    return bundle.build().dgram
+
+
+def make_packet(fields: Mapping[str, Any]) -> Packet:
+    """Return the packet with named values. Raises ValueError if they are malformed."""
+    if not any(name in fields for name in TRACKERS):
+        raise ValueError(f"expected {', '.join(TRACKERS)}")
+    sent, seq = fields.get("time"), fields.get("seq")
+    if sent is not None and not _is_number(sent):
+        raise ValueError("time: not a number")
+    if seq is not None and (not isinstance(seq, int) or isinstance(seq, bool)):
+        raise ValueError("seq: not an integer")
+    head, left, right = (_read_pose(name, fields.get(name)) for name in TRACKERS)
+    return Packet((head, left, right), sent, seq)
+
+
+def _read_pose(name: str, values: Any) -> QuaternionPose:
+    """Return a tracker from its seven numbers. Raises ValueError if they are not a pose."""
+    if values is None:
+        return None
+    if not isinstance(values, list) or len(values) != POSE or not all(map(_is_number, values)):
+        raise ValueError(f"{name}: not {POSE} numbers")
+    pose = np.array(values, np.float64)
+    norm = float(np.linalg.norm(pose[3:]))
+    if np.abs(pose).max() > FARTHEST or abs(norm - 1) > 1e-2:
+        raise ValueError(f"{name}: not a pose")
+    return pose[:3], pose[3:] / norm
+
+
+def _is_number(value: Any) -> bool:
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    return abs(value) < 1e300 and math.isfinite(value)
+
+
+def _fields(packet: Packet) -> dict[str, Any]:
+    poses = [None if t is None else [float(v) for part in t for v in part] for t in packet.trackers]
+    return {"time": packet.time, "seq": packet.seq, **dict(zip(TRACKERS, poses, strict=True))}
+
+
+def require_osc(option: str = "--osc", instead: str = "--udp") -> None:
+    """Raise InputError if python-osc, which an option needs, is not installed."""
+    if find_spec("pythonosc") is None:
+        raise InputError(f"{option}: needs python-osc: pip install 'memmlp[osc]'; or use {instead}")
 
 
 class SourceSample(NamedTuple):
@@ -63,7 +191,7 @@ class TrackerSource(Protocol):
         name: the source in words.
         space: the frame of reference of its poses.
         malformed: how many packets could not be read.
-        foreign: how many packets came from machines whose packets are not taken.
+        foreign: how many packets came from machines whose packets are rejected.
         worn: whether the poses come from a wearer's devices, so that the stream can be fitted.
     """
 
@@ -77,10 +205,10 @@ class TrackerSource(Protocol):
         """Return the next sample; None if none came within `WAIT` seconds."""
 
     def truth(self, time: float) -> np.ndarray | None:
-        """Return the true joints (22, 3), metres, at a time; None if they are not known."""
+        """Return the true joints (22, 3), metres, AMASS' world, at a time; None if they are unknown."""
 
     def close(self) -> None:
-        """Release what the source holds."""
+        """Release the source's resources."""
 
 
 class TrackedClip:
@@ -103,7 +231,7 @@ class TrackedClip:
         """Return position and quaternion (xyzw) of head, left and right wrist at a time, interpolated."""
         first, _ = self._place(time)
         a, b = (TrackerSample(i / FPS, self.positions[i], self.rotations[i]) for i in (first, first + 1))
-        sample = between(a, b, time)
+        sample = interpolate(a, b, time)
         head, left, right = zip(sample.positions, matrix_to_quaternion(sample.rotations), strict=True)
         return head, left, right
 
@@ -143,17 +271,9 @@ def npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
         notify(f"{path}: unusual, {reason}")
     clip, _ = resample(recorded)
     if len(clip) < 3:
-        raise InputError(f"{path}: {len(clip)} frames at 60 Hz; allowed are 3 or more")
+        raise InputError(f"{path}: {len(clip)} frames at 60 Hz; must have 3 or more")
     tensors = (torch.tensor(part) for part in (clip.poses, clip.trans, rest))
     return motion_frames(*tensors).numpy()
-
-
-def in_space(trackers: QuaternionPoses, space: Space) -> QuaternionPoses:
-    """Convert trackers, positions and quaternions (xyzw), from AMASS' world to a frame of reference."""
-    positions, rotations = (np.stack(part) for part in zip(*filter(None, trackers), strict=True))
-    matrices = space.rotations_out(quaternion_to_matrix(rotations))
-    head, left, right = zip(space.positions_out(positions), matrix_to_quaternion(matrices), strict=True)
-    return head, left, right
 
 
 class ClipSource:
@@ -185,7 +305,7 @@ class ClipSource:
         self.count = int(clip.seconds * hz + 1e-9) + 1  # samples of a round
         self.rounds, self.clock, self.sleep = rounds, clock, sleep
         self.next = 0
-        self.began: float | None = None
+        self.start: float | None = None
 
     @property
     def over(self) -> bool:
@@ -195,12 +315,12 @@ class ClipSource:
     def read(self) -> SourceSample | None:
         """Wait for the sample that is due next, and return it."""
         now = self.clock()
-        self.began = now if self.began is None else self.began
-        due = int((now - self.began) * self.hz + 1e-6)
-        last = self.rounds * self.count - 1  # who comes late to the end gets it, and no round that is none
+        self.start = now if self.start is None else self.start
+        due = int((now - self.start) * self.hz + 1e-6)
+        last = self.rounds * self.count - 1  # a late reader gets the last sample, not another round
         dropped = int(max(min(due, last) - self.next, 0))
         index = self.next + dropped
-        self.sleep(max(self.began + index / self.hz - now, 0))
+        self.sleep(max(self.start + index / self.hz - now, 0))
         self.next = index + 1
         turn, step = divmod(index, self.count)
         within = step / self.hz
@@ -213,7 +333,7 @@ class ClipSource:
 
     def truth(self, time: float) -> np.ndarray:
         """Return the true joints (22, 3), metres, AMASS' world."""
-        half = PAUSE / 2  # nearer to a round's beginning it belongs to it, even where floats put it before
+        half = PAUSE / 2  # so that a time that rounding puts before a round's beginning belongs to it
         return self.clip.truth((time + half) % self.round_seconds - half)
 
     def close(self) -> None:
@@ -228,12 +348,12 @@ class PacketSource:
         port: the port; 0 for any free one.
         parse: reads the packet of a datagram, or raises ValueError.
         space: the frame of reference of the poses.
-        senders: the other machines whose packets are taken; without any, only this machine can reach the
+        senders: the other machines whose packets are accepted; without any, only this machine can reach the
             port.
-        tell: gets a line about each machine whose packets are refused.
+        tell: gets a line about each machine whose packets are rejected.
 
     Raises:
-        InputError: if the port is taken.
+        InputError: if the port is in use.
     """
 
     worn = True
@@ -242,7 +362,7 @@ class PacketSource:
         self,
         name: str,
         port: int,
-        parse: Parse,
+        parse: Callable[[bytes], Packet],
         space: SpaceName,
         senders: Sequence[IPv4Network] = (),
         tell: Callable[[str], None] = lambda line: None,
@@ -252,96 +372,76 @@ class PacketSource:
         self.strangers: set[str] = set()
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.settimeout(WAIT)
-        bind(self.socket, port, EVERYWHERE if senders else HOST)
+        try:
+            self.socket.bind((EVERYWHERE if senders else HOST, port))
+        except OSError as error:
+            self.socket.close()
+            if error.errno not in (errno.EADDRINUSE, errno.EACCES):
+                raise
+            raise InputError(f"port {port}: is in use or forbidden; use another one, 1024 to 65535") from None
         self.port = self.socket.getsockname()[1]
         self.name = f"{name} packets on port {self.port}"
         self.last: int | None = None
 
     def read(self) -> SourceSample | None:
-        """Return the next packet's sample; None if no packet came in time, or if the packet is not taken.
+        """Return the next packet's sample; None if no packet came in time, or if the packet is rejected.
 
-        A packet that others have overtaken is not taken; it was counted as lost when they came.
+        A packet that others have overtaken is rejected; it was counted as lost when they came.
         """
         try:
             datagram, (sender, _) = self.socket.recvfrom(LARGEST)
         except TimeoutError:
             return None
         arrived = time.perf_counter()
-        if not self._known(sender):
-            self._refuse(sender)
+        address = ip_address(sender)
+        if not address.is_loopback and not any(address in network for network in self.senders):
+            self.foreign += 1
+            if sender not in self.strangers and len(self.strangers) < REPORTED:
+                self.strangers.add(sender)
+                self.tell(f"packets from {sender} are ignored; accept them with --sender {sender}")
             return None
         try:
             packet = self.parse(datagram)
         except ValueError:
             self.malformed += 1
             return None
-        if self._overtaken(packet):
-            return None
+        dropped = 0
+        if self.last is not None and packet.seq is not None:
+            if 0 < self.last - packet.seq <= OVERTAKEN:
+                return None
+            missing = packet.seq - self.last - 1
+            dropped = missing if 0 < missing < FORGOTTEN else 0
+        self.last = packet.seq
         now = time.monotonic() if packet.time is None else packet.time
-        return SourceSample(now, packet.trackers, self._dropped(packet), arrived)
-
-    def _known(self, sender: str) -> bool:
-        address = ip_address(sender)
-        return address.is_loopback or any(address in network for network in self.senders)
-
-    def _refuse(self, sender: str) -> None:
-        self.foreign += 1
-        if sender not in self.strangers and len(self.strangers) < TOLD:
-            self.strangers.add(sender)
-            self.tell(f"packets from {sender} are ignored; --sender {sender} takes them")
-
-    def _overtaken(self, packet: Packet) -> bool:
-        """Return whether a later packet came before, after which these poses would be taken for new ones."""
-        if self.last is None or packet.seq is None:
-            return False
-        return 0 < self.last - packet.seq <= OVERTAKEN
-
-    def _dropped(self, packet: Packet) -> int:
-        """Return how many sample numbers are missing between the last packet and this one."""
-        last, self.last = self.last, packet.seq
-        if last is None or packet.seq is None:
-            return 0
-        missing = packet.seq - last - 1
-        return missing if 0 < missing < FORGOTTEN else 0
+        return SourceSample(now, packet.trackers, dropped, arrived)
 
     def truth(self, time: float) -> None:
-        """Return None, since the truth is not known."""
+        """Return None, since the truth is unknown."""
 
     def close(self) -> None:
         """Release the port."""
         self.socket.close()
 
 
-def bind(listener: socket.socket, port: int, host: str = HOST) -> None:
-    """Bind a socket to a port, by default on this machine alone. Raises InputError if the port is taken."""
-    try:
-        listener.bind((host, port))
-    except OSError as error:
-        listener.close()
-        if error.errno not in (errno.EADDRINUSE, errno.EACCES):
-            raise
-        raise InputError(
-            f"port {port}: taken, or not allowed; allowed is another one, 1024 to 65535"
-        ) from None
-
-
 def send(source: ClipSource, port: int, pack: Callable[[Packet], bytes], space: Space) -> tuple[int, bool]:
     """Send a clip's samples in a frame of reference to a UDP port of this machine, for all rounds.
 
     Returns:
-        The number of samples sent, and whether any was refused, since nothing listened at the port then.
-        Not every system tells.
+        The number of samples sent, and whether any was refused because nothing listened at the port. Not
+        every system reports that.
     """
     sent, refused = 0, False
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        sender.connect((HOST, port))  # so that a refusal is told, with the next packet
+        sender.connect((HOST, port))  # so that the system reports a refusal, with the next packet
         while not source.over and (sample := source.read()) is not None:
-            trackers = in_space(sample.trackers, space)
-            packet = pack(Packet(trackers, sample.time, source.next - 1))
+            positions, rotations = (np.stack(p) for p in zip(*filter(None, sample.trackers), strict=True))
+            turned = matrix_to_quaternion(space.rotations_out(quaternion_to_matrix(rotations)))
+            head, left, right = zip(space.positions_out(positions), turned, strict=True)
+            datagram = pack(Packet((head, left, right), sample.time, source.next - 1))
             try:
-                sender.send(packet)
-            except ConnectionRefusedError:  # of the one before
+                sender.send(datagram)
+            except ConnectionRefusedError:  # of the packet before
                 refused = True
-                sender.send(packet)
+                sender.send(datagram)
             sent += 1
     return sent, refused

@@ -11,10 +11,9 @@ import pytest
 from chromium import Browser
 from processes import PATIENCE, until
 
-from memmlp.live.session.loop import greeting, run_loop
+from memmlp.live.session.loop import Fitting, make_greeting, run_loop
 from memmlp.live.session.page_server import Hub, LiveServer
 from memmlp.live.session.sources import ClipSource, TrackedClip
-from memmlp.live.session.wearer_fitting import Fitting
 from memmlp.live.stream import Stream
 
 pytestmark = pytest.mark.slow
@@ -27,7 +26,7 @@ NEWEST = "Number(document.querySelector('#scrub').max)"
 def url(network: Path, clip: TrackedClip) -> Iterator[str]:
     """Serve a page on which a clip plays, and yield its address."""
     stopped, source = threading.Event(), ClipSource(clip, 60)
-    with LiveServer(Hub(greeting(source, "tiny")), 0) as server:
+    with LiveServer(Hub(make_greeting(source, "tiny")), 0) as server:
         parts = (Stream(network), source, server.hub.publish, stopped)
         loop = threading.Thread(target=run_loop, args=parts, daemon=True)
         loop.start()
@@ -85,7 +84,7 @@ def test_it_says_what_it_waits_for_and_when_the_command_has_ended(
     browser: Browser, clip: TrackedClip, worn: bool, what: str
 ):
     browser.size(240, 200)  # nothing is clicked
-    words = greeting(ClipSource(clip, 60), "tiny", remark="hardly trained" if worn else "")
+    words = make_greeting(ClipSource(clip, 60), "tiny", remark="hardly trained" if worn else "")
     with LiveServer(Hub(words | {"worn": worn}), 0) as server:
         browser.open(server.url)
         browser.wait(f"document.querySelector('#status').textContent == 'waiting for {what}'")
@@ -112,13 +111,13 @@ def test_another_command_at_the_address_gets_a_page_of_its_own(browser: Browser,
     browser.size(240, 200)  # nothing is clicked
     # Both looked for while the next page loads, too.
     source, about = ClipSource(clip, 60), "document.querySelector('#about')?.textContent"
-    with LiveServer(Hub(greeting(source, "tiny")), 0) as server:
+    with LiveServer(Hub(make_greeting(source, "tiny")), 0) as server:
         port = server.server_port
         browser.open(server.url)
         browser.wait(f"{about} == 'tiny · person at 60 Hz'")
         server.hub.publish(frame(5))
         browser.wait(f"{SHOWN} == 5")
-    with LiveServer(Hub(greeting(source, "other")), port) as server:
+    with LiveServer(Hub(make_greeting(source, "other")), port) as server:
         browser.wait(f"{about} == 'other · person at 60 Hz'")
         server.hub.publish(frame(100))
         browser.wait(f"{SHOWN} == 100 && {NEWEST} == 100")
@@ -136,7 +135,7 @@ def test_the_wearer_fits_the_stream_from_the_page(
 ):
     monkeypatch.setattr("memmlp.live.stream.FAR", 0.0)  # nobody stands so well in a T-pose
     stopped, source, stream = threading.Event(), Worn(clip, 60), Stream(network)
-    hub = Hub(greeting(source, "tiny"))
+    hub = Hub(make_greeting(source, "tiny"))
     fitting = Fitting(stream, "amass", None, hub.tell, clock=lambda: 0.0)  # a countdown ends when cancelled
     with LiveServer(hub, 0, ask=fitting.ask) as server:
         parts = (stream, source, hub.publish, stopped, None, fitting)
@@ -169,7 +168,7 @@ def test_the_wearer_fits_the_stream_from_the_page(
 def test_the_printed_address_opens_the_page_for_others(browser: Browser, clip: TrackedClip):
     """Scripts, frames and orders go by the cookie, and the token stands in the address no more."""
     asked: list[object] = []
-    hub = Hub(greeting(Worn(clip, 60), "tiny"))
+    hub = Hub(make_greeting(Worn(clip, 60), "tiny"))
     with LiveServer(hub, 0, "0.0.0.0", ask=asked.append) as server:
         address = f"http://127.0.0.1:{server.server_port}/"
         browser.call("Page.navigate", url=f"{address}?{server.url.partition('?')[2]}")

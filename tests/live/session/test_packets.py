@@ -13,7 +13,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from memmlp.common.errors import InputError
-from memmlp.live.session.packets import Packet, from_json, from_osc, needs_osc, to_json, to_osc
+from memmlp.live.session.sources import Packet, from_json, from_osc, require_osc, to_json, to_osc
 
 KINDS = {"json": (to_json, from_json), "osc": (to_osc, from_osc)}
 POSE = (np.array([0.5, -1.25, 1.75]), np.array([0.5, 0.5, -0.5, 0.5]))
@@ -111,4 +111,4 @@ def test_damaged_packets_are_a_packet_or_refused(kind: str, place: int, byte: in
 def test_without_python_osc_a_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pythonosc", None)
     with pytest.raises(InputError, match=r"pip install 'memmlp\[osc\]'"):
-        needs_osc()
+        require_osc()

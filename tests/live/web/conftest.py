@@ -19,9 +19,8 @@ from memmlp.common.errors import InputError
 from memmlp.common.npm import ONNXRUNTIME_WEB, Package, read
 from memmlp.deploy.export import export
 from memmlp.live.trackers_to_body_graph import export_full
-from memmlp.live.web.clips import packed
 from memmlp.live.web.networks import SiteNetwork
-from memmlp.live.web.site import Site
+from memmlp.live.web.site import Site, pack_clip
 from memmlp.networks.memory import NoMemory
 from memmlp.networks.motion_model import MotionModel
 
@@ -73,11 +72,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Made:
     with FileLock(home / "lock"), pytest.MonkeyPatch.context() as patched:
         patched.setattr("memmlp.live.web.networks.export", once(export))
         patched.setattr("memmlp.live.web.networks.export_full", once(export_full))
-        patched.setattr(
-            "memmlp.live.web.weightless_files.LEAST", 1_000_000
-        )  # the yardstick's alone are drawn on the page
+        patched.setattr("memmlp.live.web.networks.LEAST", 1_000_000)  # only the yardstick's are drawn
         if not made.step.exists():
-            clip = packed("walk", PERSON.frames.numpy(), 4.0)
+            clip = pack_clip("walk", PERSON.frames.numpy(), 4.0)
             Site(
                 networks=[SiteNetwork(RUN, "tiny", RUN, network(), (clip.key,), REMARK)],
                 base=SiteNetwork("base", "AvatarPoser", "random", network()),

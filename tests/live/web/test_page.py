@@ -15,7 +15,8 @@ from chromium import Browser
 from live.web.conftest import PERSON, REMARK, RUN, Made, package_files
 
 from memmlp.common.npm import IWER
-from memmlp.live.stream import Offsets, Stream
+from memmlp.live.stream import Stream
+from memmlp.live.wearer import Offsets
 from memmlp.tables.rows_measured_in_browsers import read
 
 pytestmark = pytest.mark.slow
@@ -110,9 +111,9 @@ def go(browser: Browser, page: str, until: str) -> None:
 
 def joints() -> list[list[dict[str, Any]]]:
     """The person's head and wrists, frame by frame, as the site's clip has them."""
-    from memmlp.live.web.clips import NUMBERS, packed
+    from memmlp.live.web.site import NUMBERS, pack_clip
 
-    numbers = np.frombuffer(packed("", PERSON.frames.numpy(), 4.0).content, "<f4").reshape(-1, NUMBERS)
+    numbers = np.frombuffer(pack_clip("", PERSON.frames.numpy(), 4.0).content, "<f4").reshape(-1, NUMBERS)
     return [
         [
             {"position": row[3 * i :][:3].tolist(), "rotation": row[9 + 4 * i :][:4].tolist()}

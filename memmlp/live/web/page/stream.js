@@ -1,94 +1,165 @@
-// A trained network that is fed live: three trackers' poses in, a body's pose out, as memmlp.live.stream.Stream.
+// A trained network that is fed live: three trackers' poses in, a body's pose out, as memmlp.live.stream.Stream and
+// memmlp.live.tracker_resampling, rule by rule; tests/live/web/test_stream_js.py compares them.
 //
-// Everything is in OpenXR's frame of reference: metres, Y up, -Z forward; a rotation is the identity for a person in
-// T-pose who looks along -Z. This module knows neither three.js nor what runs the network: `run` does one frame of the
-// full graph (memmlp.live.trackers_to_body_graph, space openxr), and its caller is a page, a worker or node.
+// Everything is in OpenXR's frame of reference: metres, Y up, -Z forward; a rotation is a quaternion, the identity for a
+// person in T-pose who looks along -Z. A sample is { time, positions, rotations } of head, left and right wrist. `run` does
+// one frame of the full graph (memmlp.live.trackers_to_body_graph); its caller is a page, a worker or node.
 
-import { headingOf, inverse, matrix, minus, multiply, plus, rotate } from './rotations.js';
-import { tPose, TrackerFrames } from './trackers.js';
+import { aboutVertical, headingOf, IDENTITY, inverse, matrix, minus, multiply, plus, rotate, slerp, turnedBy } from './rotations.js';
 
-export const TRACKERS = ['head', 'left', 'right'];
+const TRACKERS = ['head', 'left', 'right'];
+const EACH = [0, 1, 2];
+const GAP = 0.5; // seconds without a sample after which everything restarts
+const RECOVERY = 0.2; // seconds over which a tracker that returns is led to its true pose
+const EARLY = 5e-4; // seconds that a frame may be ahead of its sample, for times that are rounded to milliseconds
+const FURTHEST = 1.1; // of the way between two samples; two that arrive together do not show a speed
+const SAME = 1e-6; // seconds; a sample this near to a frame is taken as the frame
 const FARTHEST = 1e6; // metres; a tracker farther from the origin is taken as lost
-const FAR = 0.25; // metres from a T-pose's joint, beyond which a device is not worn there
+const FAR = 0.25; // metres; a device farther from a T-pose's joint is not attached there
 const UNIT = 1e-2; // how far a quaternion's norm may be from 1
 const APART = 0.1; // metres between the hands, at least, in a T-pose
-const TILTED = Math.PI / 3; // from upright; which way a device that is tilted further looks, nobody knows
-const NEUTRAL = { position: [0, 0, 0], rotation: [0, 0, 0, 1], lost: true };
+const TILTED = Math.PI / 3; // from upright; a device that is tilted further has no heading
+const NEUTRAL = { position: [0, 0, 0], rotation: IDENTITY, lost: true };
+
+const scaled = (vector, factor) => vector.map(x => factor * x);
+
+// The trackers at a time, interpolated between the samples before and after it, or extrapolated up to FURTHEST.
+function interpolate(a, b, time) {
+  const weight = Math.min((time - a.time) / (b.time - a.time), FURTHEST);
+  return {
+    time,
+    positions: EACH.map(i => plus(a.positions[i], minus(b.positions[i], a.positions[i]), weight)),
+    rotations: EACH.map(i => slerp(a.rotations[i], b.rotations[i], weight)),
+  };
+}
+
+// Head and wrists of a person in T-pose whose head is at `place`, turned to the left of -Z by `heading` radians.
+function tPose(body, place, heading) {
+  const turn = aboutVertical(heading);
+  const positions = body.rest.map(joint => plus(place, rotate(turn, minus(joint, body.rest[0]))));
+  return { time: 0, positions, rotations: EACH.map(() => turn) };
+}
+
+// The sample with lost trackers at their last poses, as seen from the head.
+function holdLost(sample, lost, last) {
+  const [positions, rotations] = [[...sample.positions], [...sample.rotations]];
+  if (lost[0]) [positions[0], rotations[0]] = [last.positions[0], last.rotations[0]];
+  const turn = aboutVertical(headingOf(rotations[0]) - headingOf(last.rotations[0]));
+  for (const hand of [1, 2].filter(i => lost[i])) {
+    positions[hand] = plus(positions[0], rotate(turn, minus(last.positions[hand], last.positions[0])));
+    rotations[hand] = multiply(turn, last.rotations[hand]);
+  }
+  return { time: sample.time, positions, rotations };
+}
+
+// Turns samples of three trackers into frames at the network's rate; lost trackers are held.
+class TrackerFrames {
+  constructor(body, fps) {
+    Object.assign(this, { body, fps });
+    this.reset();
+  }
+
+  reset() {
+    Object.assign(this, { last: null, lost: [false, false, false], origin: 0, count: 0, settled: -Infinity });
+    this.returned = EACH.map(() => -Infinity); // time from which each tracker's difference shrinks
+    this.shift = EACH.map(() => [0, 0, 0]);
+    this.turn = EACH.map(() => IDENTITY);
+  }
+
+  get next() { return this.origin + this.count / this.fps; }
+
+  // The frames that are due with a sample, and whether everything restarts with it. Without a time, the sample is the
+  // next frame. lost: which of head, left and right wrist are lost.
+  take(time, positions, rotations, lost) {
+    time ??= this.next;
+    const later = this.last ? time - this.last.time : Infinity;
+    if (-GAP <= later && later <= 0) return { frames: [], restarted: false };
+    const restarted = Math.abs(later) > GAP;
+    if (restarted) {
+      this.reset();
+      this.origin = time;
+    }
+    const before = this.last;
+    const sample = this.fill({ time, positions, rotations }, lost);
+    const frames = [];
+    for (let due = this.next; due <= time + EARLY; due = this.next) {
+      frames.push(Math.abs(due - time) <= SAME ? sample : interpolate(before ?? sample, sample, due));
+      this.count++;
+    }
+    return { frames, restarted };
+  }
+
+  // The sample with lost trackers filled in, and with returning ones on their way to their true poses.
+  fill(sample, lost) {
+    const last = this.last ?? this.standIn(sample, lost);
+    const returning = EACH.filter(i => this.lost[i] && !lost[i]);
+    if (returning.length) this.settled = last.time + RECOVERY;
+    for (const i of returning) {
+      this.returned[i] = last.time;
+      this.shift[i] = minus(last.positions[i], sample.positions[i]);
+      this.turn[i] = multiply(last.rotations[i], inverse(sample.rotations[i]));
+    }
+    if (sample.time < this.settled) {
+      const share = this.returned.map(since => Math.min(Math.max(1 - (sample.time - since) / RECOVERY, 0), 1));
+      sample = {
+        time: sample.time,
+        positions: EACH.map(i => plus(sample.positions[i], this.shift[i], share[i])),
+        rotations: EACH.map(i => multiply(turnedBy(this.turn[i], share[i]), sample.rotations[i])),
+      };
+    }
+    this.lost = lost;
+    this.last = lost.includes(true) ? holdLost(sample, lost, last) : sample;
+    return this.last;
+  }
+
+  // A stand-in for the sample before the first: itself, if no tracker is lost; else the T-pose under the head; without a
+  // head, that of a person who stands at the origin and looks along +Z.
+  standIn(sample, lost) {
+    if (!lost.includes(true)) return sample;
+    if (lost[0]) return tPose(this.body, [0, this.body.rest[0][1] - this.body.floor, 0], Math.PI);
+    return tPose(this.body, sample.positions[0], headingOf(sample.rotations[0]));
+  }
+}
 
 export class Stream {
-  // fps: the network's frames a second.
+  // fps: the network's frames per second.
   // body: { rest, floor }: head and wrists in the rest pose of the network's body, and its lowest joint's height, metres.
   // run: takes { positions (9 numbers), rotations (27), fresh } of a frame and resolves to { positions (66),
-  //      rotations (198), joints (66) } as the full graph gives them; `fresh` says that the past is to be forgotten.
-  // offsets: { positions, rotations } of the joints on the devices, as `calibrate` finds them; null for none.
-  // scale: the height of the network's body over the person's, as memmlp.live.wearer has it; the floor is at height 0.
+  //      rotations (198), joints (66) } as the full graph gives them; with `fresh` it forgets the past.
+  // offsets: { positions, rotations } of the joints on the devices, as `calibrate` finds them, or null.
+  // scale: the network's body height over the person's (memmlp.live.wearer); the floor is at height 0.
   constructor({ fps, body, run, offsets = null, scale = 1 }) {
     Object.assign(this, { body, run, offsets, scale });
     this.trackers = new TrackerFrames(body, fps);
     this.reset();
   }
 
-  // Begin anew: the next sample is the first. Its frame still waits for those that are being worked on.
+  // Restart: the next sample is the first. Its frame still waits for those in progress.
   reset() {
     this.trackers.reset();
     const forget = () => null;
     this.newest = (this.newest ?? Promise.resolve()).then(forget, forget);
   }
 
-  // Take in one sample, { position, rotation } of each tracker or null where it is lost, at a time in seconds of any
-  // clock; without one, exactly one frame after the last. Resolves to the newest frame's pose:
-  // { time, positions, rotations, joints, held, fresh, restarted }, positions by forward kinematics, joints of the
-  // network's position branch. Samples may be given before the last one's pose is there: they are worked on in turn.
+  // Take one sample, { position, rotation } of each tracker or null where it is lost, at a time in seconds of any clock;
+  // without one, exactly one frame after the last. Resolves to the newest frame's pose: { time, positions, rotations,
+  // joints, held, fresh, restarted }, positions by forward kinematics, joints of the network's position branch. Samples
+  // may be given before the last one's pose is there; they are processed in turn.
   step(head, left, right, time = null) {
-    if (time !== null && !Number.isFinite(time)) throw new Error(`time=${time}: allowed is a number of seconds, or null`);
-    const { positions, rotations, lost } = this.joints([head, left, right].map(read));
+    if (time !== null && !Number.isFinite(time)) throw new Error(`time=${time}: must be a number of seconds, or null`);
+    const devices = [head, left, right].map(read);
+    const { offsets: on, scale } = this;
+    const positions = devices.map(({ position, rotation }, i) =>
+      scaled(on ? plus(position, rotate(rotation, on.positions[i])) : position, scale));
+    const rotations = devices.map(({ rotation }, i) => (on ? multiply(rotation, on.rotations[i]) : rotation));
+    const lost = devices.map(device => device.lost);
     const { frames, restarted } = this.trackers.take(time, positions, rotations, lost);
     const held = TRACKERS.filter((_, i) => lost[i]);
-    const { scale } = this;
-    this.newest = this.newest.then(last => this.posed(frames, { restarted, held, scale }, last));
+    this.newest = this.newest.then(last => this.compute(frames, { restarted, held, scale }, last));
     return this.newest;
   }
 
-  // Learn the offsets from a person who stands upright in T-pose, and use them from now on. The line between the hands
-  // tells which way the person looks; the network's body in that pose is laid as near to the devices as possible.
-  // scale: the one to use from now on, as in the constructor. An error leaves offsets and scale as they were.
-  calibrate(head, left, right, scale = this.scale) {
-    const devices = [head, left, right].map(read);
-    const missing = TRACKERS.filter((_, i) => devices[i].lost);
-    if (missing.length) throw new Error(`no pose of ${missing.join(', ')}; all three are needed`);
-    const world = devices.map(device => times(device.position, scale));
-    const across = minus(world[1], world[2]);
-    if (Math.hypot(across[0], across[2]) < APART) throw new Error('the hands are not apart; stand in T-pose, the arms to the sides');
-    const heading = Math.atan2(across[2], -across[0]);
-    if (looksBack(devices[0].rotation, heading)) {
-      throw new Error("the head looks backwards as seen from the hands; left and right look exchanged, or the head's device is mounted backwards");
-    }
-    const pose = tPose(this.body, world[0], heading);
-    const away = [0, 1, 2].map(axis => mean(world.map((place, i) => place[axis] - pose.positions[i][axis])));
-    const offsets = {
-      positions: devices.map((device, i) =>
-        rotate(inverse(device.rotation), minus(times(plus(pose.positions[i], away), 1 / scale), device.position))),
-      rotations: devices.map((device, i) => multiply(inverse(device.rotation), pose.rotations[i])),
-    };
-    checkWorn(offsets);
-    Object.assign(this, { offsets, scale });
-    this.reset();
-    return offsets;
-  }
-
-  // The joints on the devices, in metres of the network's body.
-  joints(devices) {
-    const rotations = devices.map(device => device.rotation);
-    const positions = devices.map(device => device.position);
-    const on = this.offsets;
-    return {
-      positions: positions.map((place, i) => times(on ? plus(place, rotate(rotations[i], on.positions[i])) : place, this.scale)),
-      rotations: rotations.map((rotation, i) => (on ? multiply(rotation, on.rotations[i]) : rotation)),
-      lost: devices.map(device => device.lost),
-    };
-  }
-
-  async posed(frames, { restarted, held, scale }, last) {
+  async compute(frames, { restarted, held, scale }, last) {
     if (!frames.length) return { ...last, held, fresh: false, restarted: false };
     let made = null;
     for (const [index, { positions, rotations }] of frames.entries()) {
@@ -99,38 +170,52 @@ export class Stream {
       });
     }
     const metres = joints => joints.map(x => x / scale);
-    return {
-      time: frames.at(-1).time, positions: metres(made.positions), rotations: made.rotations, joints: metres(made.joints),
-      held, fresh: true, restarted,
+    const { time } = frames.at(-1);
+    return { time, positions: metres(made.positions), rotations: made.rotations, joints: metres(made.joints), held, fresh: true, restarted };
+  }
+
+  // Learn the offsets from a person who stands upright in T-pose, and use them from now on. The line between the hands
+  // gives the heading; the network's body in that pose is placed as near to the devices as possible.
+  // scale: the one to use from now on, as in the constructor. An error leaves offsets and scale unchanged.
+  calibrate(head, left, right, scale = this.scale) {
+    const devices = [head, left, right].map(read);
+    const missing = TRACKERS.filter((_, i) => devices[i].lost);
+    if (missing.length) throw new Error(`lost ${missing.join(', ')}; all three trackers are needed`);
+    const world = devices.map(device => scaled(device.position, scale));
+    const across = minus(world[1], world[2]);
+    if (Math.hypot(across[0], across[2]) < APART) throw new Error('the hands are not apart; stand in T-pose, the arms to the sides');
+    const heading = Math.atan2(across[2], -across[0]);
+    const { rotation } = devices[0];
+    const upright = rotate(rotation, [0, 1, 0])[1] > Math.cos(TILTED);
+    if (upright && Math.cos(headingOf(rotation) - heading) < 0) {
+      throw new Error("the head looks backwards as seen from the hands; are left and right exchanged, or is the head's device mounted backwards?");
+    }
+    const pose = tPose(this.body, world[0], heading);
+    const away = EACH.map(axis => EACH.reduce((sum, i) => sum + (world[i][axis] - pose.positions[i][axis]) / 3, 0));
+    const offsets = {
+      positions: devices.map((device, i) =>
+        rotate(inverse(device.rotation), minus(scaled(plus(pose.positions[i], away), 1 / scale), device.position))),
+      rotations: devices.map((device, i) => multiply(inverse(device.rotation), pose.rotations[i])),
     };
+    const distances = offsets.positions.map(place => Math.hypot(...place));
+    const farthest = Math.max(...distances);
+    if (farthest > FAR) {
+      const name = TRACKERS[distances.indexOf(farthest)];
+      throw new Error(`${name} is ${(100 * farthest).toFixed(0)} cm from its joint in a T-pose; stand upright, arms straight to the sides`);
+    }
+    Object.assign(this, { offsets, scale });
+    this.reset();
+    return offsets;
   }
 }
-
-// Whether a head's device looks away from a heading by over 90 degrees. One that is far from upright is not asked.
-const looksBack = (rotation, heading) =>
-  rotate(rotation, [0, 1, 0])[1] > Math.cos(TILTED) && Math.cos(headingOf(rotation) - heading) < 0;
-
-// Throw an error if a device is farther from its joint than it can be on a person in T-pose.
-function checkWorn({ positions }) {
-  const distances = positions.map(place => Math.hypot(...place));
-  const worst = distances.indexOf(Math.max(...distances));
-  if (distances[worst] <= FAR) return;
-  throw new Error(`${TRACKERS[worst]} is ${(100 * distances[worst]).toFixed(0)} cm from where a T-pose has it; stand upright, arms straight to the sides`);
-}
-
-// The heading of a head, radians to the left of -Z.
-export const heading = tracker => headingOf(tracker.rotation);
-
-const times = (vector, factor) => vector.map(x => factor * x);
-const mean = numbers => numbers.reduce((a, b) => a + b, 0) / numbers.length;
 
 // A tracker with a unit quaternion; one that is null, far away, or has NaN or a quaternion of zeros is lost.
 function read(tracker, index) {
   if (!tracker) return NEUTRAL;
   const numbers = [...tracker.position, ...tracker.rotation];
-  if (numbers.length !== 7) throw new Error(`${TRACKERS[index]}: allowed are a position of 3 and a rotation of 4 numbers`);
+  if (numbers.length !== 7) throw new Error(`${TRACKERS[index]}: expected a position of 3 and a rotation of 4 numbers`);
   const norm = Math.hypot(...tracker.rotation);
   if (norm === 0 || !numbers.every(x => Math.abs(x) <= FARTHEST)) return NEUTRAL;
-  if (Math.abs(norm - 1) > UNIT) throw new Error(`${TRACKERS[index]}: a quaternion of norm ${norm.toPrecision(3)}; allowed is 1`);
-  return { position: [...tracker.position], rotation: tracker.rotation.map(x => x / norm), lost: false };
+  if (Math.abs(norm - 1) > UNIT) throw new Error(`${TRACKERS[index]}: a quaternion of norm ${norm.toPrecision(3)}; must be 1`);
+  return { position: [...tracker.position], rotation: scaled(tracker.rotation, 1 / norm), lost: false };
 }

@@ -4,7 +4,8 @@ import { h, replace, select } from './dom.js';
 import { kindsOf, trackersOf, usualOffsets } from './headset.js';
 import { WornScene } from './worn_scene.js';
 import { WorkerProxy } from './worker_proxy.js';
-import { heading, Stream } from './stream.js';
+import { headingOf } from './rotations.js';
+import { Stream } from './stream.js';
 import { median, percentile } from './timing.js';
 
 const MODES = { 'immersive-vr': 'Enter VR', 'immersive-ar': 'Enter AR' };
@@ -164,7 +165,7 @@ class Wear {
   }
 
   stand(head) {
-    this.mirror.stand(head.position, heading(head));
+    this.mirror.stand(head.position, headingOf(head.rotation));
     this.worn.placed = true;
   }
 

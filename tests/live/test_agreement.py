@@ -15,10 +15,8 @@ from glb import Glb
 from plain_kinematics import bvh_positions
 from vmc_receiver import Marionette, posed
 
-from memmlp.live.outputs.osc import Receiver
-from memmlp.live.outputs.output import Outputs
-from memmlp.live.outputs.recorder import Recorder
-from memmlp.live.outputs.vmc import VMC
+from memmlp.live.outputs import VMC, Outputs, Receiver
+from memmlp.live.recorder import Recorder
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream
 from memmlp.motion.body import JOINTS, N_JOINTS
@@ -49,7 +47,9 @@ def played(tmp_path_factory: pytest.TempPathFactory, step_files: Callable[[str],
     """Stream twenty seconds of a tall person's trackers, on a raised floor, as fast as it goes."""
     folder, space = tmp_path_factory.mktemp("played"), SPACES["openxr"]
     person = wearer.person(np.arange(60 * SECONDS) / 60)
-    stream = Stream(step_files("no_memory"), space="openxr", height=HEIGHT, floor=FLOOR)
+    stream, shown = (
+        Stream(step_files("no_memory"), space="openxr", height=HEIGHT, floor=FLOOR) for _ in range(2)
+    )
     marionette = Marionette()
     files = {kind: folder / f"played.{kind}" for kind in ("npz", "bvh", "glb")}
     recording = Recorder(list(files.values()), stream.network.body.rest, stream.network.fps, lambda _: None)
@@ -58,8 +58,9 @@ def played(tmp_path_factory: pytest.TempPathFactory, step_files: Callable[[str],
     rotations = space.rotations_out(person.rotations)
     poses, received = [], []
     for index in range(60 * SECONDS):
-        pose = stream.step(*zip(positions[index], rotations[index], strict=True), time=index / 60)
-        outputs.take(stream, pose)
+        trackers = list(zip(positions[index], rotations[index], strict=True))
+        outputs.take(stream.step_body(*trackers, time=index / 60))
+        pose = shown.step(*trackers, time=index / 60)
         marionette.receive(), marionette.receive()
         poses.append(pose.positions - [0, FLOOR, 0])
         received.append([marionette.root, *(marionette.bones[name] for name in UNITY)])

@@ -10,7 +10,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from memmlp.deploy import latency
 from memmlp.deploy.latency import YARDSTICK_SHAPE, yardstick
-from memmlp.live.web.weightless_files import LEAST, LOCATION, without_weights
+from memmlp.live.web.networks import LEAST, LOCATION, remove_weights
 
 
 def drawn_bytes(drawn: list) -> bytearray:
@@ -30,7 +30,7 @@ def test_the_yardstick_runs_with_drawn_weights(monkeypatch: pytest.MonkeyPatch):
     assert YARDSTICK_SHAPE[2] == 8
     whole = yardstick().SerializeToString()
     model = yardstick()
-    (part,) = drawn = without_weights(model)
+    (part,) = drawn = remove_weights(model)
     _, width, _ = YARDSTICK_SHAPE
     assert (part.offset, part.size, part.kind) == (0, width * width, "float32")
     assert part.scale == pytest.approx(1 / np.sqrt(width), rel=0.02)
@@ -64,7 +64,7 @@ def test_masks_indices_and_small_tensors_stay():
         half=np.full(2 * count + 8, 0.25, np.float16),
         bytes=np.full(5 * count, -3, np.int8),
     )
-    drawn = without_weights(model)
+    drawn = remove_weights(model)
     assert [(part.size, part.kind, part.scale) for part in drawn] == [
         (2 * count, "float32", 0.5),
         (2 * count + 8, "float16", 0.25),

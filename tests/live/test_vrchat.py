@@ -8,10 +8,10 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from vmc_receiver import Marionette
+from wearer import body_frame
 
-from memmlp.live.outputs.osc import Receiver
-from memmlp.live.outputs.output import BodyFrame
-from memmlp.live.outputs.vrchat import VRChat, euler_degrees, trackers
+from memmlp.live.outputs import Receiver, VRChat, euler_degrees, place_trackers
+from memmlp.live.stream import BodyFrame
 from memmlp.motion.body import JOINTS, builtin_rest_joints
 
 REST = builtin_rest_joints()
@@ -48,13 +48,13 @@ def standing(**turns: np.ndarray) -> BodyFrame:
         local[JOINTS.index(name)] = turn
     local[0] = UPRIGHT @ AROUND @ local[0]
     positions = np.arange(22.0)[:, None] * [1, 10, 100]
-    return BodyFrame(0.0, local, positions, REST, 1.0, False)
+    return body_frame(0.0, local, positions, REST)
 
 
 def test_where_the_trackers_are_and_how_they_turn():
     """A thigh that is lifted turns the knee's tracker; the shank does not."""
     lifted, bent = (Rotation.from_euler("x", angle, degrees=True).as_matrix() for angle in (-60, 80))
-    found = trackers(standing(left_hip=lifted, left_knee=bent))
+    found = place_trackers(standing(left_hip=lifted, left_knee=bent))
     names = [
         "pelvis",
         "spine3",
@@ -77,7 +77,7 @@ def test_where_the_trackers_are_and_how_they_turn():
 def test_a_head_that_looks_to_the_right_has_a_positive_y():
     """As Unity turns: clockwise, seen from above."""
     right = Rotation.from_euler("y", -30, degrees=True).as_matrix()  # SMPL's Y is up, its right -X
-    assert trackers(standing(head=right))[8, 1] == pytest.approx([0, 30, 0], abs=1e-6)
+    assert place_trackers(standing(head=right))[8, 1] == pytest.approx([0, 30, 0], abs=1e-6)
 
 
 def test_the_datagram():
@@ -93,4 +93,4 @@ def test_the_datagram():
     assert [m.address for m in found] == expected
     assert {m.types for m in found} == {",fff"}
     values = np.array([m.values for m in found])
-    np.testing.assert_allclose(values, trackers(frame).reshape(-1, 3), atol=1e-4)
+    np.testing.assert_allclose(values, place_trackers(frame).reshape(-1, 3), atol=1e-4)

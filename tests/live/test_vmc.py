@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from vmc_receiver import TREE, Marionette
+from wearer import body_frame
 
-from memmlp.live.outputs.osc import LARGEST, Receiver
-from memmlp.live.outputs.output import BodyFrame
-from memmlp.live.outputs.vmc import VMC
+from memmlp.live.outputs import LARGEST, VMC, Receiver
+from memmlp.live.stream import BodyFrame
 from memmlp.motion.body import JOINTS, builtin_rest_joints
 
 REST = builtin_rest_joints()
@@ -24,7 +24,7 @@ def frame(
     """A frame of a body, whose joints but the root are not needed; upright in T-pose by default."""
     turns = np.tile(np.eye(3), (22, 1, 1)) if local is None else local.copy()
     turns[0] = UPRIGHT @ turns[0]
-    return BodyFrame(time, turns, np.tile(np.array(root), (22, 1)), REST, 1.0, False)
+    return body_frame(time, turns, np.tile(np.array(root), (22, 1)), REST)
 
 
 @pytest.fixture

@@ -1,1 +1,0 @@
-"""Where a live body is sent: other programs, and files."""
