@@ -13,7 +13,7 @@ from processes import finished
 
 import memmlp.runs.recipe_versions
 from memmlp.cli.runs.listing import shown_number
-from memmlp.cli.runs.printing import measured_numbers
+from memmlp.cli.runs.show import measured_numbers
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.report.ui.run_index import read_facts

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import click
 
-from memmlp.cli.runs.differences import diff
 from memmlp.cli.runs.listing import list_runs
-from memmlp.cli.runs.notes import note, tag
-from memmlp.cli.runs.show import show
-from memmlp.cli.runs.storage import export, gc, import_
+from memmlp.cli.runs.show import diff, show
+from memmlp.cli.runs.storage import export, gc, import_, note, tag
 
 
 @click.group("runs")

@@ -1,19 +1,49 @@
-"""`memmlp runs gc`, `memmlp runs export` and `memmlp runs import`."""
+"""`memmlp runs tag`, `note`, `gc`, `export` and `import`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
-from rich.table import Table
 
 from memmlp.cli.options import PATH, Finite, outputs_option
-from memmlp.cli.runs.printing import age, console, plain_table
+from memmlp.cli.runs.show import age, console, plain_table
 
-if TYPE_CHECKING:
-    from memmlp.runs.garbage_runs import Garbage
+
+@click.command("tag")
+@click.argument("run")
+@click.argument("tags", nargs=-1, required=True)
+@click.option("--remove", is_flag=True, help="Remove the tags instead.")
+@outputs_option
+def tag(run: str, tags: tuple[str, ...], remove: bool, outputs: Path) -> None:
+    """Give a run tags.
+
+    They lie in its folder, and do not change its id. `memmlp runs list --where tag=WORD` finds them, and
+    `memmlp runs gc` keeps runs with tags.
+    """
+    from memmlp.runs.lookup import find_run
+    from memmlp.runs.notes import add_tags, remove_tags
+
+    found = find_run(outputs, run)
+    notes = remove_tags(found, tags) if remove else add_tags(found, tags)
+    click.echo(f"{found.id}: {', '.join(notes.tags) or 'no tags'}")
+
+
+@click.command("note")
+@click.argument("run")
+@click.argument("text", required=False)
+@outputs_option
+def note(run: str, text: str | None, outputs: Path) -> None:
+    """Replace a run's note by TEXT, or print it.
+
+    An empty TEXT removes it.
+    """
+    from memmlp.runs.lookup import find_run
+    from memmlp.runs.notes import read_notes, set_note
+
+    found = find_run(outputs, run)
+    notes = read_notes(found) if text is None else set_note(found, text)
+    click.echo(f"{found.id}: {notes.note or 'no note'}")
 
 
 @click.command("gc")
@@ -22,16 +52,16 @@ if TYPE_CHECKING:
     "kinds",
     multiple=True,
     type=click.Choice(["failed", "old", "orphaned"]),
-    help="Delete these alone; may be repeated.  [default: all three]",
+    help="Delete only these; may be repeated.  [default: all three]",
 )
 @click.option("--yes", is_flag=True, help="Delete them. Without it they are only shown.")
 @outputs_option
 def gc(kinds: tuple[str, ...], yes: bool, outputs: Path) -> None:
-    """Show, or delete, runs that nobody needs.
+    """Show, or delete, runs that are not needed.
 
-    These have failed, are of an older recipe, or are orphaned: no longer in a sweep, a VQ-VAE that no run
-    uses, a folder in which nothing began. Runs with a tag or a note, runs that are going on, and what other
-    runs build upon stay.
+    These are runs that failed, runs by older component versions, and orphans: no longer in a sweep, a VQ-VAE
+    that no run uses, a folder without a run. Runs with a tag or a note, runs in progress, and runs that other
+    runs need are kept.
     """
     from memmlp.runs.garbage_runs import REASONS, delete, garbage
 
@@ -39,23 +69,19 @@ def gc(kinds: tuple[str, ...], yes: bool, outputs: Path) -> None:
     if not found:
         click.echo("nothing to delete")
         return
-    console().print(_garbage_table(found))
+    table = plain_table("run", "kind", "reason", "age", "MB")
+    for one in found:
+        table.add_row(one.run.id, one.kind, one.reason, age(one.run), f"{one.size / 1e6:.1f}")
+    console().print(table)
     if not yes:
         size = sum(one.size for one in found) / 1e6
         click.echo(f"{len(found)} runs, {size:.1f} MB; delete them with --yes")
         return
-    gone = [one for one in found if delete(one)]
-    click.echo(f"deleted {len(gone)} runs, {sum(one.size for one in gone) / 1e6:.1f} MB")
+    deleted = [one for one in found if delete(one)]
+    click.echo(f"deleted {len(deleted)} runs, {sum(one.size for one in deleted) / 1e6:.1f} MB")
     for one in found:
-        if one not in gone:
-            click.echo(f"run {one.run.id} stays: somebody is at it, or gave it a tag or a note", err=True)
-
-
-def _garbage_table(found: Sequence[Garbage]) -> Table:
-    table = plain_table("run", "why", "reason", "age", "MB")
-    for one in found:
-        table.add_row(one.run.id, one.kind, one.reason, age(one.run), f"{one.size / 1e6:.1f}")
-    return table
+        if one not in deleted:
+            click.echo(f"run {one.run.id} is kept: it is in use, or has a tag or a note", err=True)
 
 
 @click.command("export")
@@ -65,7 +91,7 @@ def _garbage_table(found: Sequence[Garbage]) -> Table:
 def export(run: str, out: Path | None, outputs: Path) -> None:
     """Write a finished run to one file, which another machine can import.
 
-    It has the run's config, record, weights, results, tags and note, and no checkpoint.
+    It contains the run's config, manifest, weights, results, tags and note, but no checkpoint.
     """
     from memmlp.runs.archive import export_run
     from memmlp.runs.lookup import find_run
@@ -80,15 +106,17 @@ def export(run: str, out: Path | None, outputs: Path) -> None:
 @click.command("import")
 @click.argument("path", type=PATH)
 @click.option("--sha256", help="The digest that `memmlp runs export` printed.  [default: any]")
-@click.option("--max-gb", type=Finite(0, min_open=True), default=4.0, show_default=True, help="Size at most.")
+@click.option(
+    "--max-gb", type=Finite(0, min_open=True), default=4.0, show_default=True, help="Largest allowed size."
+)
 @outputs_option
 def import_(path: Path, sha256: str | None, max_gb: float, outputs: Path) -> None:
-    """Take a run from a file that `memmlp runs export` wrote.
+    """Add the run in a file that `memmlp runs export` wrote.
 
-    It is refused if a digest in it does not hold. With --sha256 it is the very file that was exported. A run
-    that is there already stays as it is, also where the file has more of its evaluations and deployments.
+    A file is refused if a digest in it is wrong. --sha256 proves that it is the file that was exported. A run
+    that exists already is not changed, even if the file has more of its evaluations and deployments.
     """
     from memmlp.runs.archive import import_run
 
     run, new = import_run(path, outputs, sha256, int(max_gb * 1e9), lambda line: click.echo(line, err=True))
-    click.echo(f"run {run.id}: {'imported' if new else 'was there already'}")
+    click.echo(f"run {run.id}: {'imported' if new else 'exists already'}")
