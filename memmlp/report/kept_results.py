@@ -19,28 +19,14 @@ from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, plain
-from memmlp.runs.former_keys import with_present_keys
 from memmlp.sweep.definition import Sweep
 from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.measured_run import Errors, Measured, Origin
 
 DIGITS = 6
-FLAT_LIST = re.compile(r"\[\n([^\[\]{}]*?)\n *\]")  # of plain values; no string has a line's end in it
-LATER_FACTS = (
-    "partial",
-    "processes",
-    "offline",
-    "deployed",
-    "timed_on",
-    "divided",
-    "resampled",
-    "unusual",
-    "computed_imports",
-    "upstream_recipes",
-    "upstream_weights",
-)  # the origins of older files have none of these
-NO_LATER_FACTS = asdict(Origin(code="", changed=False, data="", hardware=""))
-OLDER_NAMES = {"vqvae": "upstream"}  # what the origins of older files call otherwise
+FLAT_LIST = re.compile(r"\[\n([^\[\]{}]*?)\n *\]")  # of plain values; no string contains a line break
+DEFAULT_ORIGIN = plain(asdict(Origin(code="", changed=False, data="", hardware="")))
+REQUIRED = ("code", "changed", "data", "hardware")  # facts of an origin that a file always has
 
 
 @dataclass(frozen=True)
@@ -50,17 +36,17 @@ class Kept:
     Attributes:
         sweep: the sweep's name, as commands take it.
         overrides: the command line's overrides.
-        runs: the finished runs by the arm's label and the seed.
-        arms: the overrides with which each arm's runs were made.
+        runs: the finished runs by the variant's label and the seed.
+        variants: the overrides with which each variant's runs were made.
         rounds: the rounds in which seeds were spent, in types for JSON; None if they were not spent in
             rounds.
-        flags: what a reader has to know about how the seeds were chosen.
+        flags: warnings about how the seeds were chosen.
     """
 
     sweep: str
     overrides: tuple[str, ...]
     runs: Mapping[str, RunsBySeed]
-    arms: Mapping[str, tuple[str, ...]]
+    variants: Mapping[str, tuple[str, ...]]
     rounds: Mapping[str, Any] | None = None
     flags: tuple[str, ...] = ()
 
@@ -76,7 +62,7 @@ class Kept:
 
     @property
     def every(self) -> list[Measured]:
-        """The runs, once for each evaluation and deployment that arms show, sorted by name."""
+        """The runs, once for each evaluation and deployment that variants show, sorted by name."""
         return [run for _, run in sorted(self.named.items())]
 
     @property
@@ -86,45 +72,32 @@ class Kept:
 
     @cached_property
     def named(self) -> dict[str, Measured]:
-        """The runs by their names in the file.
+        """The runs by their names in the file."""
+        objects = {id(run): run for by_seed in self.runs.values() for run in by_seed.values()}
+        return {self.names[key]: run for key, run in objects.items()}
 
-        A run's name is its id. If arms show several evaluations of one run, such as two kinds of inverse
-        kinematics, a digest of the errors is appended; if they show several deployments, a digest of the
-        costs follows.
+    @cached_property
+    def names(self) -> dict[int, str]:
+        """The runs' names in the file, by their objects' `id()`.
+
+        A name is the run's id. If variants show several evaluations or deployments of one run, a digest of
+        its record is appended.
         """
-        of_id: dict[str, list[Measured]] = defaultdict(list)
-        for run in (run for runs in self.runs.values() for run in runs.values()):
-            of_id[run.id].append(run)
-        named: dict[str, Measured] = {}
-        for run_id, runs in of_id.items():
-            if all(run is runs[0] for run in runs):
-                named[run_id] = runs[0]
-                continue
-            found = {_key(run): run for run in runs}
-            named |= {self._name(key, found): run for key, run in found.items()}
-        return named
+        by_id: dict[str, list[Measured]] = defaultdict(list)
+        for run in {id(run): run for by_seed in self.runs.values() for run in by_seed.values()}.values():
+            by_id[run.id].append(run)
+        names = {}
+        for run_id, runs in by_id.items():
+            digests = [_digest(_record(run))[:8] for run in runs] if len(runs) > 1 else [""]
+            several = len(set(digests)) > 1
+            names |= {
+                id(run): f"{run_id}/{digest}" if several else run_id
+                for run, digest in zip(runs, digests, strict=True)
+            }
+        return names
 
-    def name(self, run: Measured) -> str:
-        """Return a run's name in the file."""
-        if run.id in self.named:
-            return run.id
-        run_id, errors, costs = _key(run)
-        return next(
-            name for name in (f"{run_id}/{errors}", f"{run_id}/{errors}-{costs}") if name in self.named
-        )
-
-    @staticmethod
-    def _name(key: tuple[str, str, str], every: Iterable[tuple[str, str, str]]) -> str:
-        """Return the name for an id and digests of errors and costs, unique among all that are kept."""
-        run_id, errors, costs = key
-        same = [one[1:] for one in every if one[0] == run_id]
-        if len(same) == 1:
-            return run_id
-        alike = [one for one in same if one[0] == errors]
-        return f"{run_id}/{errors}" if len(alike) == 1 else f"{run_id}/{errors}-{costs}"
-
-    def merged(self, other: Kept) -> Kept:
-        """Return the results with another's runs added; if both have an arm and seed, the other's is used.
+    def merge(self, other: Kept) -> Kept:
+        """Return the results with another's runs added; if both have a variant and seed, the other's is used.
 
         Raises:
             InputError: if the two are not from the same sweep with the same overrides, or if a fixed number
@@ -134,82 +107,80 @@ class Kept:
             raise InputError(f"holds the results of '{self.command}', not of '{other.command}'")
         if self.rounds and not other.rounds:
             raise InputError("holds seeds that were spent in rounds, and these were not")
-        self.check(other.arms)
+        self.check(other.variants)
         labels = dict.fromkeys([*self.runs, *other.runs])
         runs = {label: {**self.runs.get(label, {}), **other.runs.get(label, {})} for label in labels}
-        arms, flags = {**self.arms, **other.arms}, tuple(dict.fromkeys([*self.flags, *other.flags]))
-        return replace(self, runs=runs, arms=arms, rounds=other.rounds, flags=flags)
+        flags = tuple(dict.fromkeys([*self.flags, *other.flags]))
+        variants = {**self.variants, **other.variants}
+        return replace(self, runs=runs, variants=variants, rounds=other.rounds, flags=flags)
 
-    def check_runs(self, wanted: Mapping[tuple[str, int], str]) -> None:
-        """Check that the arms and seeds have the same runs that the sweep gives them now.
+    def check_runs(self, planned: Mapping[tuple[str, int], str]) -> None:
+        """Check that the variants and seeds have the same runs that the sweep gives them now.
 
-        An arm's overrides may be unchanged although their meaning has changed, by a default or a recipe.
+        A variant's overrides may be unchanged although their meaning has changed, by a default or a component
+        version.
 
         Args:
-            wanted: the runs' ids by the arm's label and the seed; other runs are not checked.
+            planned: the runs' ids by the variant's label and the seed; other runs are not checked.
 
         Raises:
-            InputError: if an arm and seed has another run.
+            InputError: if a variant and seed has another run.
         """
-        others = {
-            label: sorted(seed for seed, run in runs.items() if wanted.get((label, seed), run.id) != run.id)
-            for label, runs in self.runs.items()
-        }
-        for label, seeds in others.items():
+        for label, runs in self.runs.items():
+            seeds = sorted(seed for seed, run in runs.items() if planned.get((label, seed), run.id) != run.id)
             if seeds:
-                several = ", ".join(map(str, seeds))
                 raise InputError(
-                    f"arm '{label}' has other runs than today's config, data and code make (seed {several})"
+                    f"variant '{label}' has other runs than the current config, data and code make (seed "
+                    f"{', '.join(map(str, seeds))})"
                 )
 
-    def check(self, arms: Mapping[str, tuple[str, ...]]) -> None:
-        """Check that the arms have the overrides with which their runs were made.
+    def check(self, variants: Mapping[str, tuple[str, ...]]) -> None:
+        """Check that the variants have the overrides with which their runs were made.
 
         Raises:
-            InputError: if an arm has other overrides, so that its runs belong to another arm with the same
-                label.
+            InputError: if a variant has other overrides, so that its runs belong to another variant with the
+                same label.
         """
-        for label, words in arms.items():
-            if self.runs.get(label) and self.arms.get(label, words) != words:
-                before, now = ", ".join(self.arms[label]) or "none", ", ".join(words) or "none"
-                raise InputError(f"arm '{label}' was made with the overrides {before}, and has {now}")
+        for label, words in variants.items():
+            if self.runs.get(label) and self.variants.get(label, words) != words:
+                before, now = ", ".join(self.variants[label]) or "none", ", ".join(words) or "none"
+                raise InputError(f"variant '{label}' was made with the overrides {before}, and now has {now}")
 
     @property
     def sources(self) -> tuple[str, ...]:
         """The names of the sources of the test clips; empty if there is only one source."""
-        every = (run for runs in self.runs.values() for run in runs.values())
-        return tuple(sorted({source for run in every for source in run.clip_sources.values()}))
+        return tuple(sorted({source for run in self.every for source in run.clip_sources.values()}))
 
     def of(self, sweep: Sweep) -> dict[str, RunsBySeed]:
-        """Return the runs of the arms and seeds that the sweep has now.
+        """Return the runs of the variants and seeds that the sweep has now.
 
         Raises:
             InputError: as `check` does.
         """
         self.check(overrides_of(sweep))
         return {
-            arm.label: {
+            variant.label: {
                 seed: run
-                for seed, run in sorted(self.runs.get(arm.label, {}).items())
-                if seed in sweep.seeds_of(arm)
+                for seed, run in sorted(self.runs.get(variant.label, {}).items())
+                if seed in sweep.seeds_of(variant)
             }
-            for arm in sweep.runnable()
+            for variant in sweep.runnable()
         }
 
 
 def overrides_of(sweep: Sweep) -> dict[str, tuple[str, ...]]:
-    """Return the overrides that a sweep's file gives each arm, including those of the base."""
+    """Return the overrides that a sweep's file gives each variant, including those of the base."""
     bare = replace(sweep, command_line=())
-    return {arm.label: without_paths(bare.all_overrides(arm)) for arm in sweep.runnable()}
+    return {variant.label: shorten_paths(bare.all_overrides(variant)) for variant in sweep.runnable()}
 
 
-def without_paths(overrides: Iterable[str]) -> tuple[str, ...]:
+def shorten_paths(overrides: Iterable[str]) -> tuple[str, ...]:
     """Return the overrides with absolute paths shortened to their last part, as they differ by machine."""
 
     def last(found: re.Match[str]) -> str:
         return f".../{PurePath(found[0]).name}"
 
-    return tuple(re.sub(r"(?<==)/\S*|(?<=file://)/[^\s,\]]*", last, word) for word in overrides)
+    return tuple(re.sub(r"(?<==)/\S*|(?<=file://)/[^\s,\]]*", last, text) for text in overrides)
 
 
 def save(path: Path, kept: Kept) -> None:
@@ -223,95 +194,73 @@ def save(path: Path, kept: Kept) -> None:
 
 def dumps(kept: Kept) -> str:
     """Return the text of a file of results."""
-    clips = {_clips_key(run): _clips(run) for run in kept.every}
     content = {
         "sweep": kept.sweep,
         "overrides": list(kept.overrides),
         "command": kept.command,
-        "arms": {label: list(words) for label, words in sorted(kept.arms.items())},
+        "variants": {label: list(words) for label, words in sorted(kept.variants.items())},
         "rounds": kept.rounds,
-        **({"flags": list(kept.flags)} if kept.flags else {}),
-        "clips": dict(sorted(clips.items())),
+        "flags": list(kept.flags),
+        "clips": dict(sorted({_digest(_clips(run))[:8]: _clips(run) for run in kept.every}.items())),
         "cells": {
-            label: {str(seed): kept.name(runs[seed]) for seed in sorted(runs)}
+            label: {str(seed): kept.names[id(runs[seed])] for seed in sorted(runs)}
             for label, runs in sorted(kept.runs.items())
             if runs
         },
-        "runs": {kept.name(run): _record(run) for run in kept.every},
+        "runs": {name: _record(run) for name, run in sorted(kept.named.items())},
     }
     content["digest"] = _digest(content)
     text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
-    return FLAT_LIST.sub(_on_one_line, text) + "\n"
-
-
-def _on_one_line(found: re.Match[str]) -> str:
-    values = (line.strip() for line in found[1].split("\n"))
-    return f"[{' '.join(values)}]"
+    return FLAT_LIST.sub(lambda found: f"[{' '.join(map(str.strip, found[1].splitlines()))}]", text) + "\n"
 
 
 def load_kept(path: Path) -> Kept:
-    """Read a file of results. Raises InputError if it is none, or was edited after it was saved."""
+    """Read a file of results. Raises InputError if it is damaged, or was edited after it was saved."""
     try:
         content = json.loads(path.read_bytes())
-        if content.pop("digest", None) not in (None, _digest(content)):  # None: an older file
+        if content.pop("digest") != _digest(content):
             raise ValueError("edited since it was saved")
-        measured = {
+        runs = {
             name: _measured(name, record, content["clips"][record["clips"]])
             for name, record in content["runs"].items()
         }
         cells = {
-            label: {int(seed): measured[name] for seed, name in seeds.items()}
+            label: {int(seed): runs[name] for seed, name in seeds.items()}
             for label, seeds in content["cells"].items()
         }
-        typed, own = content["overrides"], content["arms"]
-        words = with_present_keys(typed, beside=[word for arm in own.values() for word in arm])
-        arms = {label: with_present_keys(arm, beside=typed) for label, arm in own.items()}
-        flags = tuple(content.get("flags", ()))
-        return Kept(content["sweep"], words, cells, arms, content["rounds"], flags)
+        variants = {label: tuple(words) for label, words in content["variants"].items()}
+        overrides, flags = tuple(content["overrides"]), tuple(content["flags"])
+        return Kept(content["sweep"], overrides, cells, variants, content["rounds"], flags)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: no file of results ({error}); make it with memmlp results save") from None
+        raise InputError(
+            f"{path}: not a file of results ({error}); make it again with memmlp results save"
+        ) from None
 
 
-def _digest(content: Mapping[str, Any]) -> str:
+def _digest(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _errors(run: Measured) -> dict[str, Any]:
-    """Return each metric of every test clip, by mode and branch, rounded to six digits."""
+def _record(run: Measured) -> dict[str, Any]:
+    """Return the record of a run in the file: origin, costs, and each metric of every test clip."""
     names = list(run.clips)
-    return {
+    origin = {
+        key: value
+        for key, value in plain(asdict(run.origin)).items()
+        if key in REQUIRED or value != DEFAULT_ORIGIN[key]
+    }
+    errors = {
         mode: {
-            branch: {
-                metric: [_short(float(value)) for value in run.by_clip(names, mode, branch, metric)]
-                for metric in metrics
-            }
+            branch: {metric: _shorten(run.by_clip(names, mode, branch, metric)) for metric in metrics}
             for branch, metrics in branches.items()
         }
         for mode, branches in run.means.items()
     }
-
-
-def _key(run: Measured) -> tuple[str, str, str]:
-    """Return a run's id, and digests of its kept errors and costs."""
-    parts = (json.dumps(part, sort_keys=True) for part in (_errors(run), _shortened_costs(run)))
-    errors, costs = (hashlib.sha256(part.encode()).hexdigest()[:8] for part in parts)
-    return run.id, errors, costs
-
-
-def _shortened_costs(run: Measured) -> dict[str, Any]:
-    return {name: _short(cost) for name, cost in run.costs.items()}
-
-
-def _record(run: Measured) -> dict[str, Any]:
-    """Return the record of a run in the file."""
-    costs = _shortened_costs(run)
-    origin = plain(asdict(run.origin))
-    for name in LATER_FACTS:
-        if origin[name] == NO_LATER_FACTS[name]:
-            del origin[name]
-    training = {"training": {name: _short(number) for name, number in run.training.items()}}
-    record = {"origin": origin, "clips": _clips_key(run), "costs": costs}
-    return record | (training if run.training else {}) | {"errors": _errors(run)}
+    numbers = {
+        kind: dict(zip(values, _shorten(values.values()), strict=True))
+        for kind, values in (("costs", run.costs), ("training", run.training))
+    }
+    return {"origin": origin, "clips": _digest(_clips(run))[:8], **numbers, "errors": errors}
 
 
 def _clips(run: Measured) -> list[list[str]]:
@@ -320,50 +269,29 @@ def _clips(run: Measured) -> list[list[str]]:
     return [[name, run.group(name), *([sources[name]] if sources else [])] for name in run.clips]
 
 
-def _clips_key(run: Measured) -> str:
-    return hashlib.sha256(json.dumps(_clips(run)).encode()).hexdigest()[:8]
+def _shorten(values: Iterable[float]) -> list[float | str | None]:
+    """Return numbers rounded to six digits; None for NaN, and infinity as a word."""
+    short = [float(f"{float(value):.{DIGITS}g}") for value in values]
+    return [None if math.isnan(value) else value if math.isfinite(value) else str(value) for value in short]
 
 
 def _measured(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str]]) -> Measured:
     """Return a run from its record in the file."""
     names, errors = [clip for clip, *_ in clips], record["errors"]
-    if any(len(values) != len(names) for values in _every(errors)):
-        raise ValueError(f"run {name} has not as many errors as clips")
-    origin = {OLDER_NAMES.get(key, key): value for key, value in record["origin"].items()}
-    measured = Measured(
-        id=name.partition("/")[0],
-        means=errors,
-        clips=_of_clips(errors, names),
-        groups={clip: group for clip, group, *_ in clips},
-        clip_sources={clip: source[0] for clip, _, *source in clips if source},
-        costs=record["costs"],
-        origin=Origin(**origin),
-        training=record.get("training", {}),
-    )
-    return measured.over(names)
-
-
-def _of_clips(errors: Mapping[str, Any], names: Sequence[str]) -> Mapping[str, Errors]:
-    """Return the errors of each clip, from each metric's list of values."""
-    clips: dict[str, dict[str, dict[str, Any]]] = {name: {mode: {} for mode in errors} for name in names}
+    of_clips: dict[str, Errors] = {name: {mode: {} for mode in errors} for name in names}
     for mode, branches in errors.items():
         for branch, metrics in branches.items():
             rows = zip(*metrics.values(), strict=True) if metrics else [()] * len(names)
-            for name, row in zip(names, rows, strict=True):
-                clips[name][mode][branch] = dict(zip(metrics, row, strict=True))
-    return clips
-
-
-def _every(errors: Mapping[str, Any]) -> list[Sequence[Any]]:
-    """Return each metric's list of values."""
-    return [
-        values for branches in errors.values() for metrics in branches.values() for values in metrics.values()
-    ]
-
-
-def _short(value: float) -> float | str | None:
-    """Return a number rounded to six digits; None for NaN, and infinity as a word."""
-    short = float(f"{value:.{DIGITS}g}")
-    if math.isfinite(short):
-        return short
-    return None if math.isnan(short) else str(short)
+            for clip, row in zip(names, rows, strict=True):
+                of_clips[clip][mode][branch] = dict(zip(metrics, row, strict=True))  # type: ignore[index]
+    measured = Measured(
+        id=name.partition("/")[0],
+        means=errors,
+        clips=of_clips,
+        groups={clip: group for clip, group, *_ in clips},
+        clip_sources={clip: source[0] for clip, _, *source in clips if source},
+        costs=record["costs"],
+        origin=Origin(**record["origin"]),
+        training=record["training"],
+    )
+    return measured.over(names)

@@ -6,12 +6,10 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
-from jinja2 import Environment, StrictUndefined, TemplateError
-
-from memmlp.common.errors import InputError
+from memmlp.common.errors import InputError, require
 from memmlp.report.kept_results import Kept
 from memmlp.tables.formats import escaped, markdown
-from memmlp.tables.measured_run import UNKNOWN, Measured
+from memmlp.tables.measured_run import UNKNOWN
 from memmlp.tables.statistics import Verdict
 from memmlp.tables.table import Cell, Row, Table
 from memmlp.tables.table_text import (
@@ -31,27 +29,26 @@ ORIGIN = {
     "code": "commit", "torch": "torch", "hardware": "processor", "device": "device", "gpu": "GPU",
     "threads": "threads", "precision": "precision", "data": "data", "body": "body",
 }  # fmt: skip
-
-
-TURNED = {Verdict.HIGHER: Verdict.LOWER, Verdict.LOWER: Verdict.HIGHER}
-"""The verdicts that change when a difference's sign is reversed."""
+REVERSED = {Verdict.HIGHER: Verdict.LOWER, Verdict.LOWER: Verdict.HIGHER}
 
 
 class KeptTable(NamedTuple):
     """The content of a page: kept results, and the table computed from them now.
 
-    `by_source` are the tables of each source's test clips alone, if the data has several sources; `trends`
-    are the effects against the sweep's scale, if it has one. `together` makes the same table with test clips
-    in one group, too, that match one of some patterns alike.
+    Attributes:
+        kept: the results.
+        table: their table.
+        by_source: the tables of each source's test clips alone, if the data has several sources.
+        regroup: makes the same table with test clips that match the same text of a pattern in one group.
     """
 
     kept: Kept
     table: Table
     by_source: tuple[Table, ...] = ()
-    together: Callable[[Sequence[str]], Table] | None = None
+    regroup: Callable[[Sequence[str]], Table] | None = None
 
 
-def pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -> dict[str, str]:
+def make_pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -> dict[str, str]:
     """Return the texts of all pages by file name.
 
     Args:
@@ -59,160 +56,135 @@ def pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -> dic
         templates: the templates' texts by file name.
 
     Raises:
-        InputError: for a template that names what does not exist.
+        InputError: for a template with the name of a table's page, or with an unknown name in a placeholder.
     """
-    made = {f"{name}.md": _table_page(source) for name, source in sorted(sources.items())}
-    twice = sorted(made.keys() & templates.keys())
-    if twice:
-        raise InputError(
-            f"{twice[0]}: a template and a table's page at once; allowed is another name for one"
-        )
-    words = Placeholders(sources)
-    return made | {name: _filled(name, text, words) for name, text in sorted(templates.items())}
+    pages = {}
+    for name, source in sorted(sources.items()):
+        tables = "\n".join(map(markdown, (source.table, *source.by_source)))
+        pages[f"{name}.md"] = f"{MARK}\n\n{tables}\n{describe_origin(source.kept)}\n"
+    for name in sorted(pages.keys() & templates.keys()):
+        raise InputError(f"{name}: a template and a table's page have the same name; rename one of them")
+    placeholders = Placeholders(sources).functions()
+    return pages | {name: _fill(name, text, placeholders) for name, text in sorted(templates.items())}
 
 
-def _filled(name: str, text: str, words: Placeholders) -> str:
+def _fill(name: str, text: str, placeholders: Mapping[str, object]) -> str:
     """Return a page: its template, filled in. Raises InputError, which names the template."""
-    environment = Environment(undefined=StrictUndefined, keep_trailing_newline=True, trim_blocks=True)
-    environment.globals = words.functions()
+    jinja2 = require("jinja2", "plots", name)
+    environment = jinja2.Environment(
+        undefined=jinja2.StrictUndefined, keep_trailing_newline=True, trim_blocks=True
+    )
+    environment.globals = dict(placeholders)
     try:
         return f"{MARK}\n\n{environment.from_string(text).render()}"
-    except TemplateError as error:
+    except (jinja2.TemplateError, InputError) as error:
         raise InputError(f"{name}: {' '.join(str(error).split())}") from None
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from None
 
 
-def _table_page(source: KeptTable) -> str:
-    tables = "\n".join(map(markdown, (source.table, *source.by_source)))
-    return f"{MARK}\n\n{tables}\n{origin_words(source.kept)}\n"
-
-
-def origin_words(kept: Kept) -> str:
-    """Say where the runs come from, and which command makes them again."""
+def describe_origin(kept: Kept) -> str:
+    """Return the command that makes kept runs again, and where they come from, in words."""
     counts = {"run": kept.count - kept.untrained, "untrained network": kept.untrained}
     parts = [" and ".join(f"{count} {what}{'s' * (count != 1)}" for what, count in counts.items() if count)]
     for attribute, what in ORIGIN.items():
-        values = {str(getattr(run.origin, attribute)) for run in kept.every}
-        # A run has several where others went on with it, or made what it builds upon; each is named once.
-        values = {one for words in values for one in words.split(", ")}
-        parts += [f"{what} {escaped(_listed(sorted(values - {UNKNOWN})))}"] if values - {UNKNOWN} else []
+        # A run has several values if several machines worked on it or on its prerequisites.
+        values = {one for run in kept.every for one in str(getattr(run.origin, attribute)).split(", ")}
+        *others, last = sorted(values - {UNKNOWN}) or [""]
+        if last:
+            parts.append(f"{what} {escaped(' and '.join(filter(None, [', '.join(others), last])))}")
     parts += sorted({escaped(run.origin.partial) for run in kept.every if run.origin.partial})
-    recipes = _recipes(kept.every)
-    parts += [f"recipes {recipes}"] if recipes else []
-    command = (
-        f"{kept.command} --untrained".replace("sweep", "table", 1) if not counts["run"] else kept.command
-    )
+    recipes = sorted({recipe for run in kept.every for recipe in run.origin.every_recipe.items()})
+    if recipes:
+        parts.append(f"recipes {', '.join(f'{escaped(name)} {number}' for name, number in recipes)}")
+    command = kept.command
+    if not counts["run"]:
+        command = f"{command} --untrained".replace("sweep", "table", 1)
     return f"`{command}`: {', '.join(parts)}."
 
 
-def _listed(words: Sequence[str]) -> str:
-    """Return words as a list: `a`, `a and b`, `a, b and c`."""
-    *rest, last = words
-    return f"{', '.join(rest)} and {last}" if rest else last
-
-
-def _recipes(runs: Iterable[Measured]) -> str:
-    """Return the recipe versions of the components."""
-    found = sorted({(name, number) for run in runs for name, number in run.origin.every_recipe.items()})
-    return ", ".join(f"{escaped(name)} {number}" for name, number in found)
-
-
 class Placeholders:
-    """The placeholders of templates; each raises InputError for a wrong name, and says what is allowed."""
+    """The placeholders of templates; each raises InputError for a wrong name, and lists the right ones."""
 
     def __init__(self, sources: Mapping[str, KeptTable]):
         self.sources = sources
 
     def functions(self) -> dict[str, object]:
         """Return the placeholders by the names with which templates call them."""
-        names = (
-            "has",
-            "effect",
-            "verdict",
-            "value",
-            "paper",
-            "seen",
-            "table",
-            "title",
-            "origin",
-            "summary",
-            "held",
-            "way",
-            "decided",
-        )
-        return {"names": sorted(self.sources), **{name: getattr(self, name) for name in names}}
+        functions = (
+            self.has, self.title, self.origin, self.effect, self.verdict, self.value, self.detectable,
+            self.summary, self.held, self.steps, self.decided,
+        )  # fmt: skip
+        return {"names": sorted(self.sources), **{one.__name__: one for one in functions}}
 
     def has(self, name: str) -> bool:
         """Return whether there are results with that name."""
         return name in self.sources
-
-    def effect(self, name: str, arm: str, mode: str, metric: str) -> str:
-        """Return a measured difference with its interval and verdict: `+1.17 [0.40, 2.23], inconclusive`."""
-        cell = self._cell(name, arm, mode, metric)
-        words = effect_words(cell, metric)
-        number = " ".join(word.replace("*", "") for word in words[:2])
-        return f"{number}, {self.verdict(name, arm, mode, metric)}"
-
-    def verdict(self, name: str, arm: str, mode: str, metric: str) -> str:
-        """Return the verdict on an arm's difference, in a word."""
-        effect = self._cell(name, arm, mode, metric).effect
-        return "not measured" if effect is None or effect.verdict is None else str(effect.verdict)
-
-    def value(self, name: str, arm: str, mode: str, metric: str) -> str:
-        """Return an arm's mean and standard deviation over seeds."""
-        return value_words(self._cell(name, arm, mode, metric), metric)
-
-    def paper(self, name: str, arm: str, metric: str) -> str:
-        """Return the paper's difference."""
-        printed = self._cell(name, arm, self._table(name).modes[0], metric).paper_effect
-        return "not printed" if printed is None else f"{printed:+.2f}".replace("-", MINUS)
-
-    def seen(self, name: str, mode: str, metric: str, arm: str | None = None) -> str:
-        """Return the smallest difference detectable with 80 % power, for one arm or for every arm."""
-        if arm is None:
-            least = self._table(name).detectable(mode, metric)
-        else:
-            effect = self._cell(name, arm, mode, metric).effect
-            least = effect.detectable if effect else None
-        return "unknown" if least is None else f"{number_words(least)} {unit(metric)}".rstrip()
-
-    def table(self, name: str) -> str:
-        """Return the whole table in Markdown."""
-        return markdown(self._table(name)).rstrip()
 
     def title(self, name: str) -> str:
         """Return a table's title."""
         return escaped(caption(self._table(name)))
 
     def origin(self, name: str) -> str:
-        """Say where a table's runs come from, and which command makes them again."""
+        """Return where a table's runs come from, and which command makes them again."""
         self._table(name)
-        return origin_words(self.sources[name].kept)
+        return describe_origin(self.sources[name].kept)
+
+    def effect(self, name: str, variant: str, mode: str, metric: str) -> str:
+        """Return a measured difference with its interval and verdict: `+1.17 [0.40, 2.23], holds`."""
+        words = effect_words(self._cell(name, variant, mode, metric), metric)
+        number = " ".join(word.replace("*", "") for word in words[:2])
+        return f"{number}, {self.verdict(name, variant, mode, metric)}"
+
+    def verdict(self, name: str, variant: str, mode: str, metric: str) -> str:
+        """Return the verdict on a variant's difference, in a word."""
+        effect = self._cell(name, variant, mode, metric).effect
+        return "not measured" if effect is None or effect.verdict is None else str(effect.verdict)
+
+    def value(self, name: str, variant: str, mode: str, metric: str) -> str:
+        """Return a variant's mean and standard deviation over seeds."""
+        return value_words(self._cell(name, variant, mode, metric), metric)
+
+    def detectable(self, name: str, mode: str, metric: str, variant: str) -> str:
+        """Return the smallest difference of a variant that is detectable with 80 % power."""
+        effect = self._cell(name, variant, mode, metric).effect
+        least = effect.detectable if effect else None
+        return "unknown" if least is None else f"{number_words(least)} {unit(metric)}".rstrip()
 
     def summary(self, name: str, mode: str = "stream") -> str:
-        """Return a table with a line for each arm: measured and the paper's differences, and verdicts.
+        """Return a table with a line for each variant: measured and the paper's differences, and verdicts.
 
         For a table without errors, return its costs beside the paper's.
         """
         table = self._table(name)
         metrics = table.measured_metrics
         if not metrics:
-            return self._costs(name)
-        lines = [
-            f"In {mode} mode:",
-            "",
-            f"| variant | compared with | {' | '.join(metrics)} |",
-            f"| --- | --- |{' --- |' * len(metrics)}",
+            return self._summarize_costs(name)
+        rows = [
+            [row.label, row.against or "", *(self._summarize(name, row, mode, metric) for metric in metrics)]
+            for row in table.rows
+            if row.found and row.against
         ]
-        for row in table.rows:
-            if row.found and row.against:
-                cells = [self._summed(name, row, mode, metric) for metric in metrics]
-                lines.append(f"| {escaped(row.label)} | {escaped(row.against)} | {' | '.join(cells)} |")
-        return "\n".join(lines)
+        return f"In {mode} mode:\n\n{_markdown(['variant', 'compared with', *metrics], rows)}"
+
+    def _summarize(self, name: str, row: Row, mode: str, metric: str) -> str:
+        printed = row.cells[mode][metric].paper_effect
+        paper = "" if printed is None else f"; paper {printed:+.2f}".replace("-", MINUS)
+        return f"{self.effect(name, row.label, mode, metric)}{paper}"
+
+    def _summarize_costs(self, name: str) -> str:
+        table = self._table(name)
+        rows = []
+        for row in (row for row in table.rows if row.found):
+            costs = row.cells[table.modes[0]]
+            papers = {metric: costs[metric].paper for metric in table.metrics}
+            cells = [
+                value_words(costs[metric], metric) + ("" if paper is None else f"; paper {paper:.2f}")
+                for metric, paper in papers.items()
+            ]
+            rows.append([row.label, *cells])
+        return _markdown(["variant", *map(with_unit, table.metrics)], rows)
 
     def held(self, names: Sequence[str], mode: str = "stream") -> str:
-        """Return which of the paper's effects hold: the counts of verdicts, and a line for each arm.
+        """Return which of the paper's effects hold: the counts of verdicts, and a line for each variant.
 
         Effects whose sign the paper prints are counted, and shown with a verdict; the others are shown as
         `-`.
@@ -221,134 +193,108 @@ class Placeholders:
             names: the names of the tables' results.
             mode: the mode of evaluation.
         """
-        rows = [(name, row) for name in names for row in self._table(name).rows if row.found and row.against]
         metrics = list(dict.fromkeys(m for name in names for m in self._table(name).measured_metrics))
-        words = [[self._held(name, row, mode, metric) for metric in metrics] for name, row in rows]
-        verdicts = tuple(map(str, Verdict))
-        counts = Counter(word for cells in words for word in cells if word in verdicts)
-        said = ", ".join(f"{word} {counts[word]}" for word in verdicts if counts[word])
-        lines = [
-            f"Of {counts.total()} effects with a sign in the paper, in {mode} mode: {said}.",
-            "",
-            f"| table | variant | compared with | {' | '.join(metrics)} |",
-            f"| --- | --- | --- |{' --- |' * len(metrics)}",
-        ]
-        for (name, row), cells in zip(rows, words, strict=True):
-            if any(cell != MISSING for cell in cells):
-                number = self._table(name).number or escaped(name)
-                ends = f"{escaped(row.label)} | {escaped(row.against or '')} | {' | '.join(cells)}"
-                lines.append(f"| [{number}]({name}.md) | {ends} |")
-        return "\n".join(lines)
+        rows, counts = [], Counter[str]()
+        for name in names:
+            table = self._table(name)
+            for row in (row for row in table.rows if row.found and row.against):
+                cells = [
+                    self.verdict(name, row.label, mode, metric)
+                    if metric in table.measured_metrics and row.cells[mode][metric].paper_effect
+                    else MISSING
+                    for metric in metrics
+                ]
+                counts.update(cells)
+                if set(cells) != {MISSING}:
+                    link = f"[{table.number or name}]({name}.md)"
+                    rows.append([link, row.label, row.against or "", *cells])
+        verdicts = {str(verdict): counts[str(verdict)] for verdict in Verdict}
+        words = ", ".join(f"{verdict} {count}" for verdict, count in verdicts.items() if count)
+        total = f"Of {sum(verdicts.values())} effects with a sign in the paper, in {mode} mode: {words}."
+        return f"{total}\n\n{_markdown(['table', 'variant', 'compared with', *metrics], rows)}"
 
-    def _held(self, name: str, row: Row, mode: str, metric: str) -> str:
-        """Return the verdict on an effect whose sign the paper prints; a dash for any other."""
-        if metric not in self._table(name).measured_metrics:
-            return MISSING
-        printed = self._cell(name, row.label, mode, metric).paper_effect
-        return self.verdict(name, row.label, mode, metric) if printed else MISSING
+    def steps(self, name: str, mode: str = "stream") -> str:
+        """Return a table of how each step in a chain of variants changes each metric, and its share.
 
-    def way(self, name: str, mode: str = "stream") -> str:
-        """Return a table of how each step in a chain of arms changes each metric, and its share of the total.
-
-        In a chain, each arm is the control of the next, and the table's control is the last arm; without a
-        chain the text is empty. Shares are parts of the difference between the two ends of the chain, and are
-        shown if that difference's interval does not contain 0.
+        In a chain, each variant is the control of the next, and the table's control is the last one; without
+        a chain the text is empty. Shares are parts of the difference between the two ends of the chain, and
+        are shown if that difference's interval excludes 0.
         """
         table = self._table(name)
-        steps = _chain(table)
-        if not steps:
+        by_label = {row.label: row for row in table.rows}
+        chain = [by_label[table.control]]
+        while (against := chain[0].against) in by_label and against != table.control:
+            chain.insert(0, by_label[against])
+        if len(chain) < 2:
             return ""
-        first = next(row for row in table.rows if row.label == steps[0].against)
-        lines = [f"| step | {' | '.join(table.measured_metrics)} |"]
-        lines += [f"| --- |{' --- |' * len(table.measured_metrics)}"]
-        for row in steps:
-            cells = [_share(row.cells[mode][m], first.cells[mode][m], m) for m in table.measured_metrics]
-            lines.append(f"| {escaped(row.label)} | {' | '.join(map(escaped, cells))} |")
-        whole = [_whole(first.cells[mode][metric]) for metric in table.measured_metrics]
-        title = f"the whole way, from {escaped(first.label)}"
-        return "\n".join([*lines, f"| **{title}** | {' | '.join(map(escaped, whole))} |"])
+        first, *steps = chain
+        metrics = table.measured_metrics
+        rows = [
+            [row.label, *(_share(row.cells[mode][one], first.cells[mode][one], one) for one in metrics)]
+            for row in steps
+        ]
+        total = f"total, from {first.label}"
+        rows.append([total, *(_reverse(first.cells[mode][metric]) for metric in metrics)])
+        return _markdown(["step", *metrics], rows)
 
     def decided(self, name: str, *patterns: str) -> str:
         """Return how many of a table's differences are significant: `53 of 148`.
 
         Args:
             name: the name of the table's results.
-            patterns: clips that match one alike count as one group, beside the groups of the data.
+            patterns: test clips that match the same text of a pattern are one group.
         """
-        table, together = self._table(name), self.sources[name].together
+        table, regroup = self._table(name), self.sources[name].regroup
         if patterns:
-            if together is None:
-                raise InputError(f"{name}: has no coarser groups; allowed is decided without patterns")
-            table = together(patterns)
+            if regroup is None:
+                raise InputError(f"{name}: its clips cannot be regrouped; use decided without patterns")
+            table = regroup(patterns)
         cells = (cell for row in table.rows for metrics in row.cells.values() for cell in metrics.values())
         found = Counter(cell.effect.verdict for cell in cells if cell.effect and cell.effect.verdict)
         return f"{found.total() - found[Verdict.INCONCLUSIVE] - found[Verdict.EQUIVALENT]} of {found.total()}"
 
-    def _costs(self, name: str) -> str:
-        table = self._table(name)
-        heads = [with_unit(metric) for metric in table.metrics]
-        lines = [f"| variant | {' | '.join(map(escaped, heads))} |", f"| --- |{' --- |' * len(heads)}"]
-        for row in (row for row in table.rows if row.found):
-            costs = row.cells[table.modes[0]]
-            cells = [self.value(name, row.label, table.modes[0], metric) for metric in table.metrics]
-            papers = [costs[metric].paper for metric in table.metrics]
-            both = [
-                cell if paper is None else f"{cell}; paper {paper:.2f}"
-                for cell, paper in zip(cells, papers, strict=True)
-            ]
-            lines.append(f"| {escaped(row.label)} | {' | '.join(both)} |")
-        return "\n".join(lines)
-
-    def _summed(self, name: str, row: Row, mode: str, metric: str) -> str:
-        printed = row.cells[mode][metric].paper_effect
-        paper = "" if printed is None else f"; paper {self.paper(name, row.label, metric)}"
-        return escaped(f"{self.effect(name, row.label, mode, metric)}{paper}")
-
     def _table(self, name: str) -> Table:
-        _allowed("results", name, self.sources)
+        _check("results", name, self.sources)
         return self.sources[name].table
 
-    def _cell(self, name: str, arm: str, mode: str, metric: str) -> Cell:
+    def _cell(self, name: str, variant: str, mode: str, metric: str) -> Cell:
         """Return a cell of a table. Raises InputError if one of the names is wrong."""
-        table = self._table(name)
-        rows = {row.label: row for row in table.rows}
-        _allowed(f"arm of {name}", arm, rows)
-        _allowed("mode", mode, rows[arm].cells)
-        _allowed(f"metric of {name}", metric, rows[arm].cells[mode])
-        return rows[arm].cells[mode][metric]
+        rows = {row.label: row for row in self._table(name).rows}
+        _check(f"variant of {name}", variant, rows)
+        _check("mode", mode, rows[variant].cells)
+        _check(f"metric of {name}", metric, rows[variant].cells[mode])
+        return rows[variant].cells[mode][metric]
 
 
-def _chain(table: Table) -> list[Row]:
-    """Return the arms after the chain's first, up to the table's control; each is the control of the next."""
-    rows = {row.label: row for row in table.rows}
-    found: list[Row] = []
-    row = rows[table.control]
-    while row.against in rows and row.against != table.control:
-        found.insert(0, row)
-        row = rows[row.against]
-    return found
+def _markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table; cells are escaped, unless they are links."""
+    cells = [
+        [cell if cell and cell.endswith(".md)") else escaped(cell or "") for cell in row] for row in rows
+    ]
+    lines = [list(map(escaped, heads)), ["---"] * len(heads), *cells]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def _share(cell: Cell, way: Cell, metric: str) -> str:
+def _share(step: Cell, total: Cell, metric: str) -> str:
     """Return a step's difference, its share of the chain's total, and its verdict."""
-    if cell.effect is None:
+    if step.effect is None:
         return MISSING
-    words = [effect_words(cell, metric)[0].replace("*", "")]
-    if way.effect is not None and (way.effect.low or 0) * (way.effect.high or 0) > 0:
-        words.append(f"{round(100 * cell.effect.mean / -way.effect.mean)} %".replace("-", MINUS))
-    return ", ".join([*words, str(cell.effect.verdict or "no verdict")])
+    words = [effect_words(step, metric)[0].replace("*", "")]
+    if total.effect is not None and (total.effect.low or 0) * (total.effect.high or 0) > 0:
+        words.append(f"{round(100 * step.effect.mean / -total.effect.mean)} %".replace("-", MINUS))
+    return ", ".join([*words, str(step.effect.verdict or "no verdict")])
 
 
-def _whole(cell: Cell) -> str:
-    """Return the change from an arm to its control: the reversed difference, its verdict, and the paper's."""
+def _reverse(cell: Cell) -> str:
+    """Return the change from a variant to its control: its reversed difference and verdict."""
     if cell.effect is None:
         return MISSING
-    verdict = TURNED.get(cell.effect.verdict, cell.effect.verdict) if cell.effect.verdict else "no verdict"
+    verdict = REVERSED.get(cell.effect.verdict, cell.effect.verdict) if cell.effect.verdict else "no verdict"
     printed = "" if cell.paper_effect is None else f"; paper {-cell.paper_effect:+.2f}"
     digits = 2 if cell.mean is None else decimals(cell.mean)
     return f"{-cell.effect.mean:+.{digits}f}, {verdict}{printed}".replace("-", MINUS)
 
 
-def _allowed(what: str, name: str, known: Iterable[str]) -> None:
+def _check(what: str, name: str, known: Iterable[str]) -> None:
     if name not in known:
-        raise InputError(f"'{name}' is no {what}; allowed are {', '.join(known) or 'none'}")
+        raise InputError(f"'{name}': not a {what}; must be one of {', '.join(known) or 'none'}")

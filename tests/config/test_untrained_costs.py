@@ -12,7 +12,7 @@ from memmlp.common.errors import InputError
 from memmlp.config.build import untrained
 from memmlp.config.untrained_costs import with_costs
 from memmlp.report.kept_results import Kept
-from memmlp.report.result_pages import origin_words
+from memmlp.report.result_pages import describe_origin
 from memmlp.sweep.sweep_file import parse_sweep
 from memmlp.tables.build_table import make_table
 from memmlp.tables.measured_run import load
@@ -37,9 +37,9 @@ def test_networks_without_a_run_are_measured_and_said_to_be_untrained(tmp_path: 
     assert found.costs["size"] > 4 * found.costs["parameters"]
     table = make_table(SWEEP, runs)
     assert not [flag for flag in table.flags if "not evaluated" in flag or "missing" in flag]
-    said = origin_words(Kept("sizes", ("profile=tiny",), {"AvatarPoser": runs["AvatarPoser"]}, {}))
+    said = describe_origin(Kept("sizes", ("profile=tiny",), {"AvatarPoser": runs["AvatarPoser"]}, {}))
     assert said.startswith("`memmlp table sizes profile=tiny --untrained`: 1 untrained network, ")
-    said = origin_words(Kept("sizes", ("profile=tiny",), runs, {}))
+    said = describe_origin(Kept("sizes", ("profile=tiny",), runs, {}))
     assert said.startswith("`memmlp sweep sizes profile=tiny`: 1 run and 1 untrained network, ")
 
 

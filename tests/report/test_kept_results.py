@@ -12,7 +12,7 @@ import pytest
 from fake_runs import fake_run, nothing, runs_of
 
 from memmlp.common.errors import InputError
-from memmlp.report.kept_results import Kept, dumps, load_kept, overrides_of, save, without_paths
+from memmlp.report.kept_results import Kept, dumps, load_kept, overrides_of, save, shorten_paths
 from memmlp.sweep.definition import Sweep
 from memmlp.tables.build_table import make_table
 
@@ -37,16 +37,6 @@ def test_kept_results_make_the_runs_table(sweep: Sweep, kept: Kept, tmp_path: Pa
     assert [run.origin for run in read.every] == [run.origin for run in kept.every]
 
 
-def test_results_of_an_earlier_version_have_the_names_of_today(kept: Kept, tmp_path: Path):
-    label = next(iter(kept.arms))
-    arms = {**kept.arms, label: ("model=vae_hmd",)}
-    words = "data.drawn_by=clips", "loss.position_from_pelvis=1"
-    content = json.loads(dumps(replace(kept, arms=arms, overrides=words)))
-    content |= {"overrides": ["data.weighting=clips", "loss.position=1"], "digest": None}
-    (tmp_path / "kept.json").write_text(json.dumps(content))
-    assert load_kept(tmp_path / "kept.json").overrides == words
-
-
 def test_a_run_that_diverged_on_one_clip_has_no_means(sweep: Sweep, kept: Kept, tmp_path: Path):
     """Not those over the other clips; a clip that is too short for a metric does not count in that one."""
     run, other = kept.runs["2"][1], kept.runs["2"][0]
@@ -64,7 +54,7 @@ def test_a_run_that_diverged_on_one_clip_has_no_means(sweep: Sweep, kept: Kept, 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 def test_a_run_that_diverged_stays_one(sweep: Sweep, kept: Kept, tmp_path: Path, number: float):
-    """It is no run less: its arm has no mean, and no other arm's looks better for it."""
+    """It is no run less: its variant has no mean, and no other variant's looks better for it."""
     run = kept.runs["2"][1]
     for clip in run.clips:
         run.clips[clip]["stream"]["combined"]["MPJPE"] = number
@@ -79,26 +69,6 @@ def test_a_run_that_diverged_stays_one(sweep: Sweep, kept: Kept, tmp_path: Path,
     for cell in cells:
         assert sorted(cell.values) == [0, 1, 2]
         assert not np.isfinite(cell.mean)
-
-
-def test_a_run_on_a_part_of_its_list_stays_marked(kept: Kept, tmp_path: Path):
-    """And files of runs on the whole of it are as they were before there were parts."""
-    run = kept.runs["2"][1]
-    kept.runs["2"][1] = replace(run, origin=replace(run.origin, partial="3 of 5 clips", offline=True))
-    save(tmp_path / "kept.json", kept)
-    assert (tmp_path / "kept.json").read_text().count('"partial"') == 1
-    found = load_kept(tmp_path / "kept.json").runs["2"][1].origin
-    assert (found.partial, found.offline) == ("3 of 5 clips", True)
-
-
-def test_kept_results_that_were_cut_are_refused(kept: Kept, tmp_path: Path):
-    """A clip's error lost by hand or in a merge would shift the others to the wrong clips."""
-    content = json.loads(dumps(kept))
-    del content["digest"]
-    next(iter(content["runs"].values()))["errors"]["stream"]["rotation"]["MPJPE"].insert(0, 5.0)
-    (tmp_path / "kept.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match="has not as many errors as clips"):
-        load_kept(tmp_path / "kept.json")
 
 
 def test_kept_results_that_were_edited_are_refused(kept: Kept, tmp_path: Path):
@@ -123,8 +93,8 @@ def test_words_of_kept_results_stay_as_they_are(kept: Kept, tmp_path: Path):
     word = "Subject 1  take [ 2 ]\u2028"
     runs = {
         label: {seed: replace(run, clips={f"{clip}{word}": rows for clip, rows in run.clips.items()})
-                for seed, run in of_arm.items()}
-        for label, of_arm in kept.runs.items()
+                for seed, run in of_variant.items()}
+        for label, of_variant in kept.runs.items()
     }  # fmt: skip
     save(tmp_path / "kept.json", replace(kept, runs=runs, flags=(word, "two  spaces")))
     read = load_kept(tmp_path / "kept.json")
@@ -135,7 +105,7 @@ def test_words_of_kept_results_stay_as_they_are(kept: Kept, tmp_path: Path):
 
 
 def test_two_evaluations_of_one_run_are_kept_apart(sweep: Sweep, kept: Kept, tmp_path: Path):
-    """Arms may show inverse kinematics of two kinds of one training."""
+    """Variants may show inverse kinematics of two kinds of one training."""
     one, two = list(kept.runs)[:2]
     solved = {
         seed: replace(run, id=kept.runs[one][seed].id, clip_sources={})
@@ -158,7 +128,7 @@ def test_two_evaluations_of_one_run_are_kept_apart(sweep: Sweep, kept: Kept, tmp
 
 
 def test_two_deployments_of_one_run_are_kept_apart(sweep: Sweep, kept: Kept, tmp_path: Path):
-    """Arms may show what two graphs of one training cost, and one of them two evaluations, too."""
+    """Variants may show what two graphs of one training cost, and one of them two evaluations, too."""
     one, two, three = list(kept.runs)[:3]
     slower = {
         seed: replace(run, costs={**run.costs, "ms": 5.0}, clip_sources={})
@@ -184,12 +154,12 @@ def test_two_deployments_of_one_run_are_kept_apart(sweep: Sweep, kept: Kept, tmp
 
 
 def test_results_of_several_machines_add_up(sweep: Sweep, kept: Kept, tmp_path: Path):
-    """Arms and seeds of both are there. A cell that both have is the newer one's; the other run is gone."""
+    """Variants and seeds of both are present. A cell that both have is the newer one's; the other run is gone."""
     one = {label: {0: runs[0]} for label, runs in kept.runs.items()}
     newer = fake_run(tmp_path, "again", 0)
-    other = runs_of(replace(sweep, seeds=(0,)), lambda arm, seed: newer if arm.label == "2" else None)
+    other = runs_of(replace(sweep, seeds=(0,)), lambda variant, seed: newer if variant.label == "2" else None)
     rest = {label: {seed: runs[seed] for seed in (1, 2)} for label, runs in kept.runs.items()}
-    merged = replace(kept, runs=one).merged(replace(kept, runs=rest)).merged(replace(kept, runs=other))
+    merged = replace(kept, runs=one).merge(replace(kept, runs=rest)).merge(replace(kept, runs=other))
     assert {label: sorted(runs) for label, runs in merged.runs.items()} == {
         label: [0, 1, 2] for label in kept.runs
     }
@@ -197,14 +167,14 @@ def test_results_of_several_machines_add_up(sweep: Sweep, kept: Kept, tmp_path: 
     assert newer.id in ids
     assert kept.runs["2"][0].id not in ids
     with pytest.raises(InputError, match="holds the results of"):
-        kept.merged(replace(kept, overrides=("data=synthetic",)))
+        kept.merge(replace(kept, overrides=("data=synthetic",)))
 
 
 def test_kept_results_hold_no_path_of_a_machine():
     words = ("data.root=/home/me/data/cmu", "data.root=outputs/data/cmu", "+data.body=/x/model.npz")
     places = "hydra.searchpath=[file:///home/me/conf, file://near, file:///x/b]"
-    assert without_paths([places]) == ("hydra.searchpath=[file://.../conf, file://near, file://.../b]",)
-    assert without_paths(words) == (
+    assert shorten_paths([places]) == ("hydra.searchpath=[file://.../conf, file://near, file://.../b]",)
+    assert shorten_paths(words) == (
         "data.root=.../cmu",
         "data.root=outputs/data/cmu",
         "+data.body=.../model.npz",
@@ -219,22 +189,24 @@ def test_damaged_results_are_one_line(tmp_path: Path, text: str):
         load_kept(path)
 
 
-def test_results_of_an_arm_that_was_another_are_refused(sweep: Sweep, kept: Kept):
+def test_results_of_a_variant_with_other_overrides_are_rejected(sweep: Sweep, kept: Kept):
     """Otherwise its numbers would stand under a label that means something else now."""
-    arms = [replace(arm, overrides=("memory=gru",)) if arm.label == "2" else arm for arm in sweep.variants]
-    other = replace(sweep, variants=tuple(arms))
-    with pytest.raises(InputError, match="arm '2' was made with the overrides"):
+    variants = [
+        replace(one, overrides=("memory=gru",)) if one.label == "2" else one for one in sweep.variants
+    ]
+    other = replace(sweep, variants=tuple(variants))
+    with pytest.raises(InputError, match="variant '2' was made with the overrides"):
         kept.of(other)
-    with pytest.raises(InputError, match="arm '2' was made with the overrides"):
-        kept.merged(replace(kept, arms=overrides_of(other)))
+    with pytest.raises(InputError, match="variant '2' was made with the overrides"):
+        kept.merge(replace(kept, variants=overrides_of(other)))
 
 
-def test_runs_that_an_arm_would_not_have_today_are_refused(kept: Kept):
+def test_runs_that_a_variant_would_not_have_now_are_rejected(kept: Kept):
     """Its words are the same where a default has changed, and its runs are not."""
     today = {(label, seed): run.id for label, runs in kept.runs.items() for seed, run in runs.items()}
     kept.check_runs(today)
     kept.check_runs({("2", 9): "of a seed that is not kept"})
-    with pytest.raises(InputError, match=r"arm '2' has other runs than .* make \(seed 1, 2\)"):
+    with pytest.raises(InputError, match=r"variant '2' has other runs than .* make \(seed 1, 2\)"):
         kept.check_runs(today | {("2", 2): "f" * 16, ("2", 1): "e" * 16})
 
 
@@ -242,14 +214,8 @@ def test_nothing_to_keep(sweep: Sweep):
     assert Kept("table14", (), runs_of(sweep, nothing), {}).every == []
 
 
-def test_an_arm_that_was_never_run_may_become_another(sweep: Sweep, kept: Kept):
+def test_a_variant_that_was_never_run_may_become_another(sweep: Sweep, kept: Kept):
     waiting = replace(kept, runs={**kept.runs, "2": {}})
-    other = {**kept.arms, "2": ("memory=gru",)}
+    other = {**kept.variants, "2": ("memory=gru",)}
     waiting.check(other)
-    assert waiting.merged(replace(kept, arms=other)).arms["2"] == ("memory=gru",)
-
-
-def test_facts_that_a_run_has_not_leave_the_file_as_it_was(kept: Kept):
-    """Files from before they were recorded stay as they are, byte for byte."""
-    later = {"upstream_recipes", "upstream_weights", "partial", "timed_on"}
-    assert all(not later & run["origin"].keys() for run in json.loads(dumps(kept))["runs"].values())
+    assert waiting.merge(replace(kept, variants=other)).variants["2"] == ("memory=gru",)

@@ -15,7 +15,7 @@ from fake_runs import CLIPS, ORIGIN, fake_run, fake_sweep, nothing, runs_of, tab
 from fake_table import cell, printed
 
 from memmlp.report.kept_results import Kept, dumps, load_kept
-from memmlp.report.result_pages import origin_words
+from memmlp.report.result_pages import describe_origin
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import Sweep, Variant
@@ -596,7 +596,7 @@ def test_a_part_of_a_list_is_said_wherever_its_runs_are(sweep: Sweep, tmp_path: 
     path.write_text(dumps(Kept("5", (), measured, {variant.label: () for variant in variants})))
     kept = load_kept(path)
     assert {run.origin.partial for run in kept.every} == {part, None}
-    assert part in origin_words(kept).replace("\\", "")  # escaped for Markdown
+    assert part in describe_origin(kept).replace("\\", "")  # escaped for Markdown
 
 
 @pytest.mark.parametrize(
