@@ -86,7 +86,7 @@ class Kept:
         by_id: dict[str, list[Measured]] = defaultdict(list)
         for run in {id(run): run for by_seed in self.runs.values() for run in by_seed.values()}.values():
             by_id[run.id].append(run)
-        names = {}
+        names: dict[int, str] = {}
         for run_id, runs in by_id.items():
             digests = [_digest(_record(run))[:8] for run in runs] if len(runs) > 1 else [""]
             several = len(set(digests)) > 1
@@ -232,9 +232,7 @@ def load_kept(path: Path) -> Kept:
         overrides, flags = tuple(content["overrides"]), tuple(content["flags"])
         return Kept(content["sweep"], overrides, cells, variants, content["rounds"], flags)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"{path}: not a file of results ({error}); make it again with memmlp results save"
-        ) from None
+        raise InputError(f"{path}: damaged ({error}); make it again with memmlp results save") from None
 
 
 def _digest(content: Any) -> str:

@@ -154,7 +154,7 @@ def test_two_deployments_of_one_run_are_kept_apart(sweep: Sweep, kept: Kept, tmp
 
 
 def test_results_of_several_machines_add_up(sweep: Sweep, kept: Kept, tmp_path: Path):
-    """Variants and seeds of both are present. A cell that both have is the newer one's; the other run is gone."""
+    """Variants and seeds of both are present; a cell that both have is the newer one's."""
     one = {label: {0: runs[0]} for label, runs in kept.runs.items()}
     newer = fake_run(tmp_path, "again", 0)
     other = runs_of(replace(sweep, seeds=(0,)), lambda variant, seed: newer if variant.label == "2" else None)
@@ -191,9 +191,8 @@ def test_damaged_results_are_one_line(tmp_path: Path, text: str):
 
 def test_results_of_a_variant_with_other_overrides_are_rejected(sweep: Sweep, kept: Kept):
     """Otherwise its numbers would stand under a label that means something else now."""
-    variants = [
-        replace(one, overrides=("memory=gru",)) if one.label == "2" else one for one in sweep.variants
-    ]
+    other_two = {"2": ("memory=gru",)}
+    variants = [replace(one, overrides=other_two.get(one.label, one.overrides)) for one in sweep.variants]
     other = replace(sweep, variants=tuple(variants))
     with pytest.raises(InputError, match="variant '2' was made with the overrides"):
         kept.of(other)
