@@ -1,27 +1,32 @@
 """The reference pages, made from the code when the site is built: commands, config keys, Python modules.
 
-Commands come from click, keys from conf/ (values and comments) and memmlp.config.schema (types and limits).
+Commands come from click, keys from the declarations of components, memmlp.config.schema and conf/.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import importlib
+import importlib.util
 import inspect
 import pkgutil
+import re
 import typing
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 import yaml
-from omegaconf import MISSING
 
 import memmlp
 from memmlp.cli.main import COMMANDS, commands
+from memmlp.common.components import collected, find, names
+from memmlp.common.settings import MISSING
+from memmlp.config.component_source import GROUPS
 from memmlp.config.package_data import packaged
-from memmlp.config.schema import SCHEMAS
+from memmlp.config.schema import ONLY, SCHEMAS
 
 ROOT = Path(__file__).parent.parent
 MARK = "<!-- made from the code by docs/reference.py -->\n\n"
@@ -89,40 +94,39 @@ def described(
 
 
 class Key(typing.NamedTuple):
-    """A line of a config file: dotted key, value as written, comment."""
+    """A key of the config: dotted name, default, limits, meaning."""
 
     name: str
     value: str
+    limits: str
     comment: str
 
 
 def config_page() -> str:
     """All groups, their options and keys."""
     conf = packaged("conf")
+    defaults = default_options(conf / "train.yaml")
     parts = [
         "# Config keys",
-        "`memmlp train GROUP=OPTION GROUP.KEY=VALUE`; the default option stands first. Values such as "
-        "`${profile.width}` come from another key. `readings` are those of [the paper](../readings.md).",
+        "`memmlp train GROUP=OPTION GROUP.KEY=VALUE`; the default option stands first. A default such as "
+        "`16, 128, 512` has a value for each of `profile.sizes=tiny`, `small`, `paper`. `readings` are those "
+        "of [the paper](../readings.md).",
         "## Top level",
-        keys_table(file_keys(conf / "train.yaml", skip=("defaults", "hydra")), SCHEMAS["config"]),
+        keys_table(file_keys(conf / "train.yaml", "", SCHEMAS["config"], skip=("defaults", "hydra"))),
         "## profile",
         inspect.getdoc(SCHEMAS["profile"]) or "",
         profiles(conf / "profile"),
     ]
-    defaults = default_options(conf / "train.yaml")
-    for group in sorted(path.name for path in conf.iterdir() if path.is_dir()):
-        if group not in ("profile", "search"):
-            parts += group_section(conf / group, defaults.get(group))
-    empty = (name for name in defaults if "/" not in name and name != "_self_" and not (conf / name).is_dir())
-    for group in sorted(empty):
-        parts += [f"## {group}", "Empty here: [packages of your own](../guides/components.md) add options."]
+    folders = {path.name for path in conf.iterdir() if path.is_dir()}
+    for group in sorted({*folders, *GROUPS, *ONLY} - {"profile", "search"}):
+        parts += group_section(group, conf / group, defaults.get(group))
     parts += [
         "## search",
         "Of `memmlp tune`, as `search.KEY=VALUE`; [searches](../guides/searches.md) explains them.",
     ]
-    for path in sorted((conf / "search").glob("*.yaml")):
-        keys = [key._replace(name=f"search.{key.name}") for key in file_keys(path)]
-        parts.append(keys_table(keys, None))
+    parts += [
+        keys_table(file_keys(path, "search", None)) for path in sorted((conf / "search").glob("*.yaml"))
+    ]
     return "\n\n".join(parts) + "\n"
 
 
@@ -132,50 +136,104 @@ def default_options(train: Path) -> dict[str, str]:
     return {key: value for one in listed if isinstance(one, dict) for key, value in one.items()}
 
 
-def group_section(folder: Path, default: str | None) -> Iterator[str]:
+def group_section(group: str, folder: Path, default: str | None) -> Iterator[str]:
     """A group's section: its options with their keys."""
-    yield f"## {folder.name}"
-    paths = sorted(folder.glob("*.yaml"), key=lambda path: (path.stem != default, path.stem))
-    for path in paths:
-        if len(paths) > 1:
-            yield f"### {folder.name}={path.stem}"
-        yield from option_section(path)
+    yield f"## {group}"
+    sections = {path.stem: partial(file_section, path) for path in folder.glob("*.yaml")}
+    sections |= {name: partial(component_section, group, name) for name in names(group)}
+    sections |= {"default": partial(settings_section, ONLY[group], group)} if group in ONLY else {}
+    if not sections:
+        yield "Empty here: [your own packages](../guides/components.md) add options."
+    for name in sorted(sections, key=lambda name: (name != default, name)):
+        if len(sections) > 1:
+            yield f"### {group}={name}"
+        yield from sections[name]()
 
 
-def option_section(path: Path) -> Iterator[str]:
-    """An option's words, its keys, and what else it sets."""
+def component_section(group: str, name: str) -> Iterator[str]:
+    """A component's words, its keys, and what else it sets."""
+    settings = find(group, name).settings
+    yield from settings_section(
+        settings, {"generator": "data.synth", "loggers": f"loggers.{name}"}.get(group, group)
+    )
+    taken = {slot: option or "null" for slot, option in collected(settings, "defaults").items()}
+    others = taken | collected(settings, "recipe")
+    if others:
+        yield f"Sets {', '.join(f'`{key}={written(value)}`' for key, value in others.items())}."
+
+
+def settings_section(settings: type, group: str) -> Iterator[str]:
+    """The words and the keys of a dataclass of settings."""
+    words = vars(settings).get("__doc__") or ""
+    if not words.startswith(f"{settings.__name__}("):  # which dataclass writes where there is no docstring
+        yield inspect.cleandoc(words)
+    yield keys_table(list(settings_keys(settings, group)))
+
+
+def settings_keys(settings: type, prefix: str) -> Iterator[Key]:
+    """The keys of a dataclass of settings, those of its groups included."""
+    comments = comments_of(settings)
+    for spec in dataclasses.fields(settings):
+        default = spec.default_factory() if spec.default is dataclasses.MISSING else spec.default  # type: ignore[misc]
+        if dataclasses.is_dataclass(default):
+            for key in settings_keys(type(default), f"{prefix}.{spec.name}"):
+                own = getattr(default, key.name.rpartition(".")[2])
+                yield key._replace(value=written(own))
+        elif spec.name != "name":
+            yield Key(f"{prefix}.{spec.name}", written(default), allowed(spec), comments.get(spec.name, ""))
+
+
+def written(value: Any) -> str:
+    """A default as the page shows it."""
+    if isinstance(value, str) and value.startswith(("${size:", "${reading:")):
+        return ", ".join(value.partition(":")[2].rstrip("}").split(",")[:3])
+    return {MISSING: "(give one)", None: "null", True: "true", False: "false"}.get(
+        value if isinstance(value, str | bool | None) else "", str(value)
+    )
+
+
+def comments_of(settings: type) -> dict[str, str]:
+    """The comments of the keys, behind them or above them in the code, those of the bases included."""
+    found: dict[str, str] = {}
+    for kind in reversed(settings.__mro__[:-1]):
+        spec = importlib.util.find_spec(kind.__module__.partition(":")[0])
+        text = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
+        above: list[str] = []
+        for line in re.split(r"\n(?=\S)", text.partition(f"\nclass {kind.__name__}")[2])[0].splitlines():
+            own, _, comment = line.partition("  # ")
+            if line.strip().startswith("# "):
+                above.append(line.strip()[2:])
+            else:
+                if key := re.match(r"    (\w+): ", own):
+                    found[key[1]] = comment or " ".join(above)
+                above = []
+    return found
+
+
+def file_section(path: Path) -> Iterator[str]:
+    """A config file's words, its keys, and which options it takes."""
     text, group = path.read_text(encoding="utf-8"), path.parent.name
     if said := head_comment(text):
         yield said
-    keys = [key for key in file_keys(path) if not key.name.split(".")[-1].startswith("_")]
-    if "@package _global_" not in text:
-        keys = [key._replace(name=f"{package(text) or group}.{key.name}") for key in keys]
-    if own := [key for key in keys if key.name.startswith(f"{group}.")]:
-        yield keys_table(own, SCHEMAS.get(schema_name(text)), group)
-    taken = [f"`{name}={option or 'null'}`" for name, option in overridden(text)]
-    others = [f"`{key.name}={key.value}`" for key in keys if key not in own]
-    if taken or others:
-        yield f"Sets {', '.join([*taken, *others])}."
-
-
-def package(text: str) -> str | None:
-    """Where a file says that its keys stand; None where it leaves that to its folder."""
-    first = text.partition("\n")[0]
-    return first.removeprefix("# @package ").strip() if first.startswith("# @package ") else None
-
-
-def overridden(text: str) -> Iterator[tuple[str, str | None]]:
-    """The other groups' options that a config file takes."""
-    for one in yaml.safe_load(text).get("defaults", []):
-        for name, option in one.items() if isinstance(one, dict) else ():
-            if name.startswith("override "):
-                yield name.removeprefix("override /"), option
-
-
-def schema_name(text: str) -> str:
-    """The schema that a config file starts from."""
-    first = (yaml.safe_load(text).get("defaults") or [""])[0]
-    return str(first).removeprefix("/schema/").partition("@")[0]
+    defaults = yaml.safe_load(text).get("defaults", [])
+    schema = next(
+        (SCHEMAS.get(str(one).removeprefix("/schema/").partition("@")[0]) for one in defaults[:1]), None
+    )
+    whole = "@package _global_" in text
+    if keys := file_keys(path, "" if whole else group, schema):
+        yield keys_table(keys)
+    parents = [
+        f"`{group}={one}`" for one in defaults if isinstance(one, str) and not one.startswith(("/", "_"))
+    ]
+    taken = [
+        f"`{name.removeprefix('override /')}={option or 'null'}`"
+        for one in defaults
+        if isinstance(one, dict)
+        for name, option in one.items()
+        if "override" in name
+    ]
+    if parents or taken:
+        yield f"Starts from {', '.join([*parents, *taken])}."
 
 
 def head_comment(text: str) -> str:
@@ -191,24 +249,34 @@ def head_comment(text: str) -> str:
 
 def profiles(folder: Path) -> str:
     """The profiles' keys side by side."""
-    names = ["small", "paper", "tiny"]
-    values = {name: {key.name: key.value for key in file_keys(folder / f"{name}.yaml")} for name in names}
-    rows = [f"| | {' | '.join(f'`{name}`' for name in names)} | allowed |", "|---|---|---|---|---|"]
+    order, comments = ["small", "paper", "tiny"], comments_of(SCHEMAS["profile"])
+    values = {
+        name: {key.name: key.value for key in file_keys(folder / f"{name}.yaml", "", None)} for name in order
+    }
+    rows = [f"| | {' | '.join(f'`{name}`' for name in order)} | allowed | |", "|---|---|---|---|---|---|"]
     for spec in dataclasses.fields(SCHEMAS["profile"]):
-        cells = [f"`{values[name].get(spec.name, '')}`" for name in names]
-        rows.append(f"| `profile.{spec.name}` | {' | '.join(cells)} | {allowed(spec)} |")
+        cells = [f"`{values[name].get(spec.name, written(spec.default))}`" for name in order]
+        words = cell(comments.get(spec.name, ""))
+        rows.append(f"| `profile.{spec.name}` | {' | '.join(cells)} | {allowed(spec)} | {words} |")
     return "\n".join(rows)
 
 
-def file_keys(path: Path, skip: tuple[str, ...] = ("defaults",)) -> list[Key]:
+def file_keys(
+    path: Path, prefix: str, schema: type | None, skip: tuple[str, ...] = ("defaults",)
+) -> list[Key]:
     """The leaves of a config file with their comments."""
     text = path.read_text(encoding="utf-8")
     lines, node = text.splitlines(), yaml.compose(text)
-    return [key for key in leaves(node, lines, "") if key.name.split(".")[0] not in skip] if node else []
+    found = leaves(node, lines, "") if node else []
+    return [
+        Key(f"{prefix}.{name}" if prefix else name, value, allowed_at(schema, name.split(".")), comment)
+        for name, value, comment in found
+        if name.split(".")[0] not in skip
+    ]
 
 
-def leaves(node: yaml.MappingNode, lines: list[str], prefix: str) -> Iterator[Key]:
-    """The keys below a node of a file."""
+def leaves(node: yaml.MappingNode, lines: list[str], prefix: str) -> Iterator[tuple[str, str, str]]:
+    """The dotted name, the value and the comment of the keys below a node of a file."""
     for name, value in node.value:
         dotted = f"{prefix}{name.value}"
         if isinstance(value, yaml.MappingNode) and not value.flow_style:
@@ -216,40 +284,36 @@ def leaves(node: yaml.MappingNode, lines: list[str], prefix: str) -> Iterator[Ke
             continue
         line, column = value.start_mark.line, value.start_mark.column
         if isinstance(value, yaml.SequenceNode) and not value.flow_style:  # a list over several lines
-            yield Key(dotted, f"{len(value.value)} items", "")
+            yield dotted, f"{len(value.value)} items", ""
             continue
-        written, _, comment = lines[line][column:].partition(" #")
-        yield Key(dotted, written.strip(), comment.strip())
+        own, _, comment = lines[line][column:].partition(" #")
+        yield dotted, own.strip(), comment.strip()
 
 
-def keys_table(keys: list[Key], schema: type | None, group: str = "") -> str:
-    """The keys, dotted, with values, limits and comments; the schema is that of the group."""
-    rows = ["| key | default | allowed | |", "|---|---|---|---|"]
+def keys_table(keys: list[Key]) -> str:
+    """The keys, dotted, with defaults, limits and comments."""
+    rows = ["| key | default | allowed | |", "|---|---|---|---|"] if keys else []
     for key in keys:
-        below = key.name.removeprefix(f"{group}.").split(".")
-        spec = field_of(schema, below) if schema else None
-        value = "(give one)" if key.value == MISSING else f"`{key.value}`"
-        rows.append(f"| `{key.name}` | {value} | {allowed(spec) if spec else ''} | {cell(key.comment)} |")
+        value = key.value if key.value == "(give one)" else f"`{key.value}`"
+        rows.append(f"| `{key.name}` | {value} | {key.limits} | {cell(key.comment)} |")
     return "\n".join(rows)
 
 
-def field_of(schema: type, path: list[str]) -> dataclasses.Field[Any] | None:
-    """The field of a dotted key in a schema."""
-    spec = next((one for one in dataclasses.fields(schema) if one.name == path[0]), None)
+def allowed_at(schema: type | None, path: list[str]) -> str:
+    """The limits of a dotted key in a schema; nothing for a key that it does not have."""
+    spec = next((one for one in dataclasses.fields(schema) if one.name == path[0]), None) if schema else None
     if spec is None or len(path) == 1:
-        return spec
+        return allowed(spec) if spec else ""
     hint = typing.get_type_hints(schema)[path[0]]
-    inner = next((one for one in typing.get_args(hint) if dataclasses.is_dataclass(one)), hint)
-    return field_of(inner, path[1:]) if dataclasses.is_dataclass(inner) else None
+    return allowed_at(hint, path[1:]) if dataclasses.is_dataclass(hint) else ""
 
 
 def allowed(spec: dataclasses.Field[Any]) -> str:
     """A key's limits; its type where no rule says more."""
-    rule, kind = spec.metadata.get("rule"), str(spec.type)
-    own = kind.removeprefix("Optional[").removesuffix("]") if kind.startswith("Optional[") else kind
-    words = cell(str(rule)) if rule else {"bool": "true or false", "str": "text"}.get(own, "")
+    rule, own = spec.metadata.get("rule"), str(spec.type).removesuffix(" | None")
+    words = cell(rule.words) if rule else {"bool": "true or false", "str": "text"}.get(own, "")
     whole = "whole number, " if rule and own == "int" else ""
-    return " or ".join(filter(None, [whole + words, "null" if own != kind else ""]))
+    return " or ".join(filter(None, [whole + words, "null" if own != str(spec.type) else ""]))
 
 
 def cell(words: str) -> str:

@@ -19,7 +19,7 @@ from memmlp.cli.main import main
 # For a process of its own. Ctrl-C reaches it where the tests were started with SIGINT ignored (nohup, &).
 INTERRUPTIBLE = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
 MAIN = [sys.executable, "-c", f"{INTERRUPTIBLE}; from memmlp.cli.main import main; main()"]
-SIZES = ["profile.depth=2", "profile.memory_layers=[2]"]
+SIZES = ["model.depth=2"]
 SMALL = [*SIZES, "data.synth.minutes=0.05"]  # smaller than profile=tiny
 FEW = ["loggers=none", "threads=1", "optim.steps=6", "vqvae.steps=6"]
 TINY = ["profile=tiny", *SIZES, "data.synth.minutes=0.1", *FEW]

@@ -172,9 +172,9 @@ def make_placeholders(words: list[str]) -> None:
             Path(value).touch()
         elif word in OF_BOTH_SOURCES:
             make_placeholders(["data.root=outputs/data/cmu,outputs/data/bandai"])
-        elif word == "myconf":
-            Path("myconf/hand").mkdir(parents=True, exist_ok=True)
-            Path("myconf/hand/feet.yaml").write_text("{name: feet, _target_: mine.FeetPosition}")
+        elif word == "plugins=[mine]":
+            guide = (ROOT / "docs/guides/components.md").read_text(encoding="utf-8")
+            Path("mine.py").write_text(next(block for _, block in blocks(guide, "python")))
         elif word == "my_configs":
             Path("my_configs/data").mkdir(parents=True, exist_ok=True)
             guide = (ROOT / "docs/guides/motion.md").read_text(encoding="utf-8")

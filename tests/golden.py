@@ -1,7 +1,7 @@
 """The numbers that every component makes of fixed inputs, for tests/test_golden.py.
 
-`make golden` writes that file anew. It refuses where a component's numbers changed and its number in
-memmlp/runs/recipe_versions.py did not: raise that first, in the same commit.
+`make golden` writes that file. It refuses where a component's numbers changed and its version
+did not: raise that first, in its declaration or in memmlp/runs/recipe_versions.py, in the same commit.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, NoCodes
 from memmlp.networks.predictor import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
 from memmlp.networks.recurrent_memory import GRUMemory, LSTMMemory
 from memmlp.networks.recurrent_poser import CELLS
-from memmlp.networks.still_pose import StillPose
-from memmlp.runs.recipe_versions import RECIPES
+from memmlp.networks.still_pose import StillPose, StillPoseSettings
+from memmlp.runs.recipe_versions import version_of
 from memmlp.training.loop import seed_step
 from memmlp.training.losses import (
     AGRoLLoss,
@@ -225,7 +225,7 @@ def ik(solver: IK) -> Numbers:
 
 
 CASES: dict[str, Callable[[], Numbers]] = {
-    "synthetic": synthetic,
+    "generator.puppet": synthetic,
     "features": features,
     **{
         f"coordinates.{name}": partial(coordinates, kind)
@@ -236,7 +236,7 @@ CASES: dict[str, Callable[[], Numbers]] = {
         f"model.{name}": partial(lambda name: network(tiny.baseline(name)), name)
         for name in tiny.BASELINES
     },
-    "model.still_pose": lambda: network(StillPose(tiny.normalizer(Heading()), frames=7)),
+    "model.still_pose": lambda: network(StillPose(tiny.normalizer(Heading()), StillPoseSettings(frames=7))),
     "model.recurrent_poser": lambda: {
         f"{cell}{' ' + output if output != 'local' else ''} {name}": value
         for cell, output in [*((cell, "local") for cell in CELLS), ("gru", "global"), ("gru", "reaching")]
@@ -334,12 +334,14 @@ def record() -> None:
     """
     before, now = stored(), {case: numbers(case) for case in CASES}
     known = {
-        case: before[case]["numbers"] for case in CASES if before.get(case, {}).get("recipe") == RECIPES[case]
+        case: before[case]["numbers"]
+        for case in CASES
+        if before.get(case, {}).get("recipe") == version_of(case)
     }
     wrong = [case for case, old in known.items() if old.keys() & changed(now[case], old, tolerance(case))]
     if wrong:
-        sys.exit(f"raise the number of {', '.join(wrong)} in memmlp/runs/recipe_versions.py: they changed")
-    kept = {case: {"recipe": RECIPES[case], "numbers": now[case] | known.get(case, {})} for case in CASES}
+        sys.exit(f"raise the version of {', '.join(wrong)}: their numbers changed")
+    kept = {case: {"recipe": version_of(case), "numbers": now[case] | known.get(case, {})} for case in CASES}
     PATH.write_text(json.dumps(kept, indent=1) + "\n")
 
 

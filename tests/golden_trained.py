@@ -14,7 +14,7 @@ from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.network_coordinates import World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import MotionModel, State, TrainingOutputs
-from memmlp.networks.refiner import SAGERefiner
+from memmlp.networks.refiner import SAGERefinerSettings
 from memmlp.networks.sage_parts import LATENT, ProductQuantiser
 from memmlp.networks.vqvae import VQVAE
 from memmlp.training.loop import seed_step, train_step
@@ -110,7 +110,7 @@ def refiner() -> Numbers:
     found = {}
     for kind, loss in LOSSES.items():
         model, split, optim = tiny.refined(), frames(), Optim(steps=3, batch=4, lr=1e-2)
-        pieces = RefinerTraining(0, SAGERefiner(6, 2, 20, 6), optim, "frames").draw_pieces(split)
+        pieces = RefinerTraining(0, SAGERefinerSettings(6, 2, 20, 6), optim, "frames").draw_pieces(split)
         task = RefinerTask(model, loss(), split, pieces, optim, validate=lambda: {})
         numbers = _trained(task, optim)
         numbers |= summary("stream", evaluation.stream(model.eval(), [tiny.clip(25)])[0])

@@ -9,9 +9,8 @@ from pathlib import Path
 
 from command_line import SMALL
 
-from memmlp.common.plugin import METRICS
+from memmlp.common import components
 from memmlp.config import plugins
-from memmlp.config.schema import SCHEMAS
 from memmlp.evaluation.metric_facts import HIGHER, SMALLEST, UNITS
 from memmlp.runs.recipe_versions import RECIPES
 
@@ -20,7 +19,7 @@ PACKAGE = "memmlp_feet"
 TINY = ["profile=tiny", *SMALL, "loggers=none", "threads=1", "optim.validate_every=20"]
 KILLED = [*TINY, "optim.steps=40", "optim.checkpoint_every=5"]
 """Words of a run that takes long enough to be killed at a checkpoint."""
-REGISTERS = (METRICS, SCHEMAS, SMALLEST, UNITS, RECIPES, HIGHER, plugins._active, plugins._folders)
+REGISTERS = (SMALLEST, UNITS, RECIPES, HIGHER, plugins._active, components._roots)
 
 
 @contextmanager
@@ -34,6 +33,7 @@ def registers_kept() -> Iterator[None]:
         for one, content in zip(REGISTERS, before, strict=True):
             one.clear()
             one.update(content)  # type: ignore[arg-type]
+        components.declared.cache_clear()
         for name in set(sys.modules) - modules:
-            if name.split(".")[0] in (PACKAGE, "mine", "other", "helper", "lab"):
+            if name.split(".")[0] in (PACKAGE, "mine", "other", "helper", "lab") and ":" not in name:
                 del sys.modules[name]

@@ -248,15 +248,28 @@ def test_unknown_clips_and_modes_are_one_line(run: memmlp.TrainedRun):
         run.predict(run.clips[0], "live")  # type: ignore[arg-type]
 
 
+STILL = """
+from memmlp.common.components import component
+from memmlp.common.settings import Settings, setting
+from memmlp.training.losses import Term
+
+@component("term", "still", builds="Still")
+class StillSettings(Settings):
+    weight: float = setting(None, 1.0)
+
+class Still(Term): pass
+"""
+
+
 def test_code_of_ones_own_runs_only_where_the_script_names_its_package(
     three: memmlp.Runs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Whatever a run's record names, and be it a module that lies here."""
-    (tmp_path / "mine.py").write_text("from memmlp.training.losses import Term\nclass Still(Term): pass\n")
+    (tmp_path / "mine.py").write_text(STILL)
     monkeypatch.syspath_prepend(tmp_path)
     folder = three[0].folder
     config = yaml.safe_load((folder / "config.yaml").read_text())
-    term = {"name": "still", "_target_": "mine.Still", "weight": 1.0}
+    term = {"name": "still", "weight": 1.0}
     (folder / "config.yaml").write_text(yaml.safe_dump({**config, "plugins": ["mine"], "term": term}))
     with registers_kept():
         with pytest.raises(memmlp.InputError, match=r"trust it, .* in Python plugins=\['mine'\]"):
@@ -268,7 +281,7 @@ def test_code_of_ones_own_runs_only_where_the_script_names_its_package(
         assert found.clips
     with pytest.raises(memmlp.InputError, match=r"plugins 'mine': allowed is a list of names, \['mine'\]"):
         memmlp.load_run(folder, plugins="mine")
-    with pytest.raises(memmlp.InputError, match=r"plugin nowhere: there is no such package here"):
+    with pytest.raises(memmlp.InputError, match=r"plugin nowhere: not found"):
         memmlp.load_run(folder, plugins=["nowhere"])
 
 

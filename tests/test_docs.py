@@ -6,9 +6,11 @@ import importlib
 import re
 import runpy
 import shlex
+import sys
 import tomllib
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import yaml
@@ -17,7 +19,7 @@ from omegaconf import OmegaConf
 from own_package import PACKAGE, registers_kept
 
 from memmlp.cli.main import COMMANDS
-from memmlp.config.build import build_loss
+from memmlp.config.build import untrained
 from memmlp.config.compose import composed
 from memmlp.config.plugins import activate
 from memmlp.evaluation.metric_facts import SMALLEST, UNITS
@@ -50,9 +52,11 @@ def ids(lines: list[Line]) -> list[str]:
 @pytest.mark.parametrize("line", LINES, ids=ids(LINES))
 def test_a_command_line_is_taken(line: Line, on_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
-    if PACKAGE in line.text:
-        activate([PACKAGE])
-    checks(line.text)
+    monkeypatch.syspath_prepend(tmp_path)
+    with registers_kept():
+        if PACKAGE in line.text:
+            activate([PACKAGE])
+        checks(line.text)
 
 
 def checks(text: str) -> None:
@@ -192,7 +196,7 @@ def test_the_reference_has_every_key(reference: ModuleType):
         keys = {key for key, value in values if f"## {key}\n" not in page or value not in (None, {})}
         for key in keys:
             last = key.rsplit(".", 1)[-1]
-            assert last in ("name", "_target_", "_partial_") or f"| `{key}` |" in page, f"{word}: {key}"
+            assert last in ("name", "_target_") or f"| `{key}` |" in page, f"{word}: {key}"
 
 
 def test_the_reference_has_every_option(reference: ModuleType):
@@ -207,15 +211,23 @@ def examples(name: str, language: str) -> list[str]:
     return [block for _, block in blocks((DOCS / f"guides/{name}.md").read_text(encoding="utf-8"), language)]
 
 
-def test_the_component_of_the_guide_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    (tmp_path / "myconf/hand").mkdir(parents=True)
-    (tmp_path / "mine.py").write_text(examples("components", "python")[0])
-    (tmp_path / "myconf/hand/feet.yaml").write_text(examples("components", "yaml")[0])
+def test_the_network_of_the_guide_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Its file is a plugin, its test passes, and its variant is a config file."""
+    network, test, *_ = examples("components", "python")
+    (tmp_path / "mine.py").write_text(network)
+    (tmp_path / "myconf/model").mkdir(parents=True)
+    (tmp_path / "myconf/model/wide_conv.yaml").write_text(examples("components", "yaml")[0])
     monkeypatch.syspath_prepend(tmp_path)
     with registers_kept():  # other tests have modules of that name
-        cfg = composed(["--config-dir", str(tmp_path / "myconf"), "hand=feet"])
-        loss = build_loss(cfg)(frozenset({"rotation", "position"}))
-    assert type(loss.hand).__name__ == "FeetPosition"
+        words = ["plugins=[mine]", "profile=tiny", "--config-dir", str(tmp_path / "myconf")]
+        cfg = composed([*words, "model=wide_conv"])
+        assert (cfg.model.name, cfg.model.width, cfg.loss.name) == ("causal_conv", 512, "terms")
+        assert "mine" not in sys.modules
+        names: dict[str, Any] = {}
+        exec(test, names)
+        names["test_the_stream_is_the_network"]()
+        model = untrained([*words, "model=causal_conv"])
+        assert model.count_parameters() > 0
 
 
 @pytest.mark.slow

@@ -68,6 +68,6 @@ def test_components_of_ones_own_go_through_everything(
     ran = finished([*MAIN, "eval", made.id], cwd=home)
     assert ran.returncode == 2
     assert ran.stderr == (
-        f"memmlp: run {made.id}: made with the package {PACKAGE} 0.1.0, which is not here; install it, or "
+        f"memmlp: run {made.id}: made with the package {PACKAGE} 0.1.0, which is not found; install it, or "
         "put its folder on PYTHONPATH\n"
     )

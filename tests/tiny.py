@@ -5,33 +5,25 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 
+from memmlp.common.components import find
 from memmlp.motion.body import FRAME_DIM, builtin_rest_joints
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.geometry import motion_frames
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.agrol import AGRoLDiffusion, AGRoLMLP
-from memmlp.networks.avatar_jlm import AvatarJLM
-from memmlp.networks.avatar_poser import AvatarPoser
-from memmlp.networks.bodiffusion import BoDiffusion
-from memmlp.networks.ego_poser import EgoPoser
-from memmlp.networks.hmd_poser import HMDPoser
-from memmlp.networks.manikin import ManikinL, ManikinS
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import Memory, NoMemory
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory
 from memmlp.networks.predictor import Predictor, TwoBranch
 from memmlp.networks.recurrent_memory import RecurrentMemory
-from memmlp.networks.recurrent_poser import RecurrentPoser
+from memmlp.networks.recurrent_poser import RecurrentPoser, RecurrentPoserSettings
 from memmlp.networks.refiner import Refined
-from memmlp.networks.rpm import RPM
-from memmlp.networks.sage_net import SAGENet
-from memmlp.networks.vae_hmd import VAEHMD
 from memmlp.networks.vqvae import VQVAE
 from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, Loss, LossOfNetwork, RPMLoss, TermsLoss
 
@@ -105,38 +97,32 @@ def model(
     return MemMLP(normalizer(coordinates), slot, head, depth=DEPTH, **SIZES).eval()
 
 
-BASELINES: dict[str, Callable[..., MotionModel]] = {
-    "agrol_mlp": partial(AGRoLMLP, frames=7, width=16, depth=2),
-    "agrol_diffusion": partial(
-        AGRoLDiffusion, frames=7, width=16, depth=2, diffusion_steps=50, sampling_steps=3, noise_seed=0
+BASELINES: dict[str, dict[str, Any]] = {
+    "agrol_mlp": dict(frames=7, width=16, depth=2),
+    "agrol_diffusion": dict(
+        frames=7, width=16, depth=2, diffusion_steps=50, sampling_steps=3, noise_seed=0
     ),
-    "bodiffusion": partial(
-        BoDiffusion, frames=7, width=48, depth=2, heads=3, diffusion_steps=50, sampling_steps=3, noise_seed=0,
+    "bodiffusion": dict(
+        frames=7, width=48, depth=2, heads=3, diffusion_steps=50, sampling_steps=3, noise_seed=0,
         noise_weight=1.0, bound_weight=1.0, offline=False,
     ),
-    "avatar_poser": partial(AvatarPoser, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1),
-    "ego_poser": partial(EgoPoser, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1),
-    "hmd_poser": partial(
-        HMDPoser, frames=7, width=16, depth=2, encoder_layers=1, heads=4, feedforward=32, dropout=0.1,
+    "avatar_poser": dict(frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1),
+    "ego_poser": dict(frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1),
+    "hmd_poser": dict(frames=7, width=16, depth=2, encoder_layers=1, heads=4, feedforward=32, dropout=0.1,
         shape_weight=0.1,
     ),
-    "vae_hmd": partial(VAEHMD, frames=7, width=16, depth=2, latent=6, dropout=0.2, divergence_weight=0.01),
-    "avatar_jlm": partial(
-        AvatarJLM, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, coarse_weight=1.0
+    "vae_hmd": dict(frames=7, width=16, depth=2, latent=6, dropout=0.2, divergence_weight=0.01),
+    "avatar_jlm": dict(frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, coarse_weight=1.0
     ),
-    "rpm": partial(
-        RPM, frames=9, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, context=3, horizon=4
+    "rpm": dict(frames=9, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, context=3, horizon=4
     ),
-    "manikin_s": partial(
-        ManikinS, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.0, parts_weight=1.0,
+    "manikin_s": dict(frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.0, parts_weight=1.0,
         turned=True,
     ),
-    "manikin_l": partial(
-        ManikinL, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, coarse_weight=1.0,
+    "manikin_l": dict(frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, coarse_weight=1.0,
         parts_weight=1.0, turned=True, offline=False,
     ),
-    "sage": partial(
-        SAGENet, frames=8, width=16, depth=1, heads=2, code_width=16, code_depth=1, code_heads=2, dropout=0.1,
+    "sage": dict(frames=8, width=16, depth=1, heads=2, code_width=16, code_depth=1, code_heads=2, dropout=0.1,
         diffusion_steps=50, sampling_steps=2, noise=0.01, noise_seed=0,
     ),
 }  # fmt: skip
@@ -162,10 +148,16 @@ BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
 }
 
 
+def build_baseline(name: str, normalizer: Normalizer, **changes) -> MotionModel:
+    """Make a tiny baseline."""
+    network = find("model", name)
+    return network.kind(normalizer, network.make_settings(BASELINES[name] | changes))
+
+
 def baseline(name: str, coordinates: World | None = None, seed: int = 0, **changes) -> MotionModel:
     """Make a tiny baseline with random weights, in evaluation mode."""
     torch.manual_seed(seed)
-    return BASELINES[name](normalizer(coordinates), **changes).eval()
+    return build_baseline(name, normalizer(coordinates), **changes).eval()
 
 
 def recurrent_poser(coordinates: World | None = None, seed: int = 0, **changes) -> RecurrentPoser:
@@ -174,7 +166,7 @@ def recurrent_poser(coordinates: World | None = None, seed: int = 0, **changes) 
     settings = {
         "frames": 7, "width": 16, "depth": 2, "cell": "gru", "expansion": 2, "output": "local", "members": 1,
     }  # fmt: skip
-    return RecurrentPoser(normalizer(coordinates), **settings | changes).eval()
+    return RecurrentPoser(normalizer(coordinates), RecurrentPoserSettings(**settings | changes)).eval()
 
 
 def refined(network: MotionModel | None = None) -> Refined:

@@ -33,10 +33,10 @@ class Device(click.ParamType):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         """Return the name; whether the device exists is checked when it is used."""
-        from memmlp.config.schema.value_rules import DEVICE
+        from memmlp.common.settings import DEVICE
 
         if not DEVICE.allows(value):
-            self.fail(f"{value}: allowed is {DEVICE}")
+            self.fail(f"{value}: must be {DEVICE.words}")
         return value
 
 

@@ -215,7 +215,7 @@ def executor(workers: Workers, folder: Path, shared: list[Share], gpus: bool) ->
 
         return Dask(workers.settings(), gpus)
     if "." in workers.executor:
-        from memmlp.config.instantiate import located
+        from memmlp.config.plugins import located
 
         return located(workers.executor, "executor")(logs(folder), workers.words)
     from memmlp.sweep.executors.local import Debug, Local

@@ -11,25 +11,23 @@ from typing import Any
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from memmlp.common.components import Component, chosen, find
 from memmlp.common.errors import InputError
-from memmlp.common.plugin import METRICS
 from memmlp.config import plugins
 from memmlp.config.build_motion import shares
 from memmlp.config.build_request import build_request
+from memmlp.config.check import check
 from memmlp.config.compose import composed
-from memmlp.config.instantiate import built, located
 from memmlp.config.name_from_config import readable_name
-from memmlp.config.schema import check, restored
+from memmlp.config.schema import restored
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import IK, LBFGS, Arms, NoIK
 from memmlp.evaluation.metrics import UserMetric
 from memmlp.motion.body import builtin_rest_joints
-from memmlp.motion.network_coordinates import Coordinates, Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.architectures import (
     Architecture,
@@ -38,7 +36,6 @@ from memmlp.networks.architectures import (
     PlainArchitecture,
     RefinedArchitecture,
 )
-from memmlp.networks.memory import Memory
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.vqvae import VQVAE
 from memmlp.runs.identity import VQVAE_SHAPE
@@ -53,12 +50,6 @@ from memmlp.training.train_network import NetworkTraining
 from memmlp.training.train_refiner import RefinerTraining
 from memmlp.training.train_vqvae import VQVAETraining
 
-COORDINATES: dict[str, type[Coordinates]] = {
-    "head_relative": HeadRelative,
-    "world": World,
-    "heading": Heading,
-}
-
 
 def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
     """Build the experiment of a checked config.
@@ -71,7 +62,11 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
     Raises:
         InputError: if the config's device, or the code of a custom component, does not exist here.
     """
-    unrefined = build_experiment(_unrefined(cfg), elsewhere) if cfg.refiner is not None else None
+    unrefined = None
+    if cfg.refiner is not None:
+        bare = cfg.copy()
+        bare.refiner, bare.force, bare.save_predictions = None, False, None
+        unrefined = build_experiment(bare, elsewhere)
     request = build_request(cfg)
     metrics = build_metrics(cfg.evaluation.metrics)
     return Experiment(
@@ -95,15 +90,8 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
     )
 
 
-def _unrefined(cfg: DictConfig) -> DictConfig:
-    """Return the config of the same network without its refiner, not forced and without saved predictions."""
-    bare = cfg.copy()
-    bare.refiner, bare.force, bare.save_predictions = None, False, None
-    return bare
-
-
 def build_prerequisites(cfg: DictConfig, config: dict[str, Any]) -> tuple[PrerequisiteTraining, ...]:
-    """Build the trainings of the runs that a checked config's network builds upon, in order.
+    """Build the trainings of the prerequisite runs of a checked config's network, in order.
 
     The only prerequisite of a refiner is its network's run.
 
@@ -116,8 +104,8 @@ def build_prerequisites(cfg: DictConfig, config: dict[str, Any]) -> tuple[Prereq
     if cfg.upstream is not None:
         training = build_training(cfg, {})
         assert isinstance(training, NetworkTraining)
-        return tuple(built(cfg.upstream).trainings(config, training))
-    if cfg.memory is None or not memory_class(cfg).uses_codes:
+        return tuple(build(cfg, "upstream").trainings(config, training))
+    if getattr(chosen(cfg, "memory"), "codes", "") != "frozen":
         return ()
     optim = partial(build_vqvae_optim, cfg)
     return (VQVAETraining(seed=cfg.vqvae.seed, optim=optim, mirror=cfg.data.mirror),)
@@ -125,12 +113,12 @@ def build_prerequisites(cfg: DictConfig, config: dict[str, Any]) -> tuple[Prereq
 
 def build_training(cfg: DictConfig, metrics: dict[str, UserMetric]) -> NetworkTraining | RefinerTraining:
     """Build the training of a checked config's network, or of the refiner behind it."""
-    common = {"seed": cfg.seed, "optim": built(cfg.optim), "drawn_by": cfg.data.drawn_by}
+    common = {"seed": cfg.seed, "optim": build(cfg, "optim"), "drawn_by": cfg.data.drawn_by}
     common |= {"shares": shares(cfg.data), "mirror": cfg.data.mirror, "metrics": metrics}
     if cfg.refiner is not None:
-        refiner = built(cfg.refiner)
+        refiner = _settings(cfg, "refiner")
         return RefinerTraining(refiner=refiner, **common | {"optim": common["optim"].at(refiner.lr)})
-    return NetworkTraining(loss=build_loss(cfg), rollout=built(cfg.rollout), **common)
+    return NetworkTraining(loss=build_loss(cfg), rollout=build(cfg, "rollout"), **common)
 
 
 def untrained(overrides: Sequence[str]) -> MotionModel:
@@ -143,9 +131,39 @@ def untrained(overrides: Sequence[str]) -> MotionModel:
 
 
 def build_loggers(cfg: DictConfig) -> Loggers:
-    """Build the loggers of a config, in which its runs are shown."""
+    """Build the loggers of a config, which show its runs elsewhere."""
     outputs = Path(cfg.paths.outputs)
-    return Loggers(tuple(built(node, outputs=outputs) for node in cfg.loggers.values()), outputs)
+    nodes = _plain(cfg.loggers)
+    return Loggers(
+        tuple(find("loggers", name).build(nodes[name], outputs=outputs) for name in nodes), outputs
+    )
+
+
+def build(cfg: DictConfig, slot: str) -> Any:
+    """Build the component in a slot of a checked config.
+
+    Raises:
+        InputError: if its class does not accept the keys.
+    """
+    component, keys = _chosen(cfg, slot)
+    try:
+        return component.build(keys)
+    except TypeError as error:
+        raise InputError(f"{slot}={component.name}: cannot be built: {error}") from error
+
+
+def _chosen(cfg: DictConfig, slot: str) -> tuple[Component, dict[str, Any]]:
+    keys = _plain(cfg[slot])
+    return find(slot, keys["name"]), keys
+
+
+def _settings(cfg: DictConfig, slot: str) -> Any:
+    component, keys = _chosen(cfg, slot)
+    return component.make_settings(keys)
+
+
+def _plain(node: DictConfig) -> dict[str, Any]:
+    return OmegaConf.to_container(node, resolve=True)  # type: ignore[return-value]
 
 
 def build_architecture(cfg: DictConfig) -> Architecture:
@@ -154,76 +172,65 @@ def build_architecture(cfg: DictConfig) -> Architecture:
     if cfg.refiner is None:
         return network
     common = {name: getattr(network, name) for name in ("coordinates", "normalize", "vqvae")}
-    return RefinedArchitecture(**common, network=network, refiner=built(cfg.refiner))
+    return RefinedArchitecture(**common, network=network, refiner=_settings(cfg, "refiner"))
 
 
 def build_unrefined_architecture(cfg: DictConfig) -> Architecture:
     """Build the architecture of a checked config's network, without a refiner."""
     vqvae = partial(VQVAE, **{name: cfg.vqvae[name] for name in VQVAE_SHAPE})
-    coordinates = build_coordinates(cfg.normalizer.coordinates)
+    coordinates = find("coordinates", cfg.normalizer.coordinates).kind()
     common = {"coordinates": coordinates, "normalize": cfg.normalizer.z_scores, "vqvae": vqvae}
-    if "_target_" in cfg.model:
+    network, keys = _chosen(cfg, "model")
+    if cfg.memory is None:
         family = PlainArchitecture if cfg.upstream is None else PartedArchitecture
-        return family(**common, network=built(cfg.model))
-    memory, kind = built(cfg.memory), memory_class(cfg)
+        return family(**common, network=partial(_network, network, keys))
+    memory, memory_keys = _chosen(cfg, "memory")
+    predictor, predictor_keys = _chosen(cfg, "predictor")
+    codes = getattr(memory.settings, "codes", "")
+    joint = {"vqvae": vqvae} if codes == "joint" else {}
     return MemMLPArchitecture(
         **common,
         frames=cfg.model.frames,
         hidden=cfg.model.width,
         depth=cfg.model.depth,
-        memory=partial(memory, vqvae=vqvae) if kind.trains_codes else memory,
-        memory_kind=kind,
-        predictor=built(cfg.predictor),
+        memory=partial(memory.build, memory_keys, **joint),
+        predictor=partial(predictor.build, predictor_keys),
+        codes=codes,
     )
 
 
-def build_coordinates(name: str) -> Coordinates:
-    """Build the coordinates with that name, or those of a custom class with that path."""
-    if name in COORDINATES:
-        return COORDINATES[name]()
-    found = located(name, "normalizer.coordinates")
-    if not (isinstance(found, type) and issubclass(found, Coordinates)):
-        allowed = f"a class that extends {Coordinates.__module__}.Coordinates"
-        raise InputError(f"normalizer.coordinates={name}: allowed is {allowed}")
-    return found()
+def _network(network: Component, keys: dict[str, Any], normalizer: Normalizer) -> MotionModel:
+    return network.kind(normalizer, network.make_settings(keys))
 
 
 def build_metrics(names: Iterable[str]) -> dict[str, UserMetric]:
     """Return the custom metrics with these names."""
-    own = {name: METRICS[name] for name in names}
-    return {
-        name: UserMetric(located(metric.function, f"metric {name}"), metric.of)
-        for name, metric in own.items()
-    }
-
-
-def memory_class(cfg: DictConfig) -> type[Memory]:
-    """Return the class in the memory slot."""
-    return get_class(cfg.memory._target_)
+    own: dict[str, Any] = {name: find("metric", name) for name in names}
+    return {name: UserMetric(metric.kind, metric.settings.of) for name, metric in own.items()}
 
 
 def build_loss(cfg: DictConfig) -> Callable[[frozenset[str]], Loss]:
     """Return a function that makes the loss for a network's branches.
 
-    Mem-MLP's loss is put together from the weighting, the hand term, a custom term and the branches. A
-    baseline's loss is complete and ignores the branches.
+    Mem-MLP's loss consists of the weighting, the hand term, a custom term and the branches. A complete loss
+    ignores the branches.
 
     Raises:
         InputError: for a custom term beside a complete loss, or for a branch that the predictor lacks.
     """
-    loss = built(cfg.loss)
+    loss = build(cfg, "loss")
     if isinstance(loss, Loss):
         if cfg.term is not None:
-            raise InputError(
-                f"term={cfg.term.name}: loss={cfg.loss.name} is a whole loss; allowed is term=null"
-            )
+            raise InputError(f"term={cfg.term.name}: must be null with loss={cfg.loss.name}, a complete loss")
         return lambda branches: loss
-    term = built(cfg.term) if cfg.term is not None else Term()
-    branches: frozenset[str] = get_class(cfg.predictor._target_).branches  # type: ignore[attr-defined]
+    term = build(cfg, "term") if cfg.term is not None else Term()
+    branches = find("predictor", cfg.predictor.name).kind.branches  # type: ignore[attr-defined]
     if cfg.term is not None and term.branch not in branches:
-        lacking = f"looks at the {term.branch} branch, which predictor={cfg.predictor.name} lacks"
-        raise InputError(f"term={cfg.term.name}: {lacking}; allowed is a term of {' or '.join(branches)}")
-    return partial(MotionLoss, loss, built(cfg.hand), term=term)
+        raise InputError(
+            f"term={cfg.term.name}: must compare a branch of predictor={cfg.predictor.name}: "
+            f"{' or '.join(branches)}, not {term.branch}"
+        )
+    return partial(MotionLoss, loss, build(cfg, "hand"), term=term)
 
 
 def build_deployment(cfg: DictConfig) -> Deployment | None:
@@ -238,10 +245,7 @@ def build_ik(cfg: DictConfig) -> IK:
 
 
 def build_vqvae_optim(cfg: DictConfig, frames: int) -> Optim:
-    """Build the optimisation of the VQ-VAE, whose length may be given in epochs.
-
-    An epoch has as many frames as the training part (`frames`).
-    """
+    """Build the optimisation of the VQ-VAE, whose length may be given in epochs of `frames` frames each."""
     own, often = cfg.vqvae, {name: cfg.optim[name] for name in ("checkpoint_every", "log_every")}
     steps = own.steps or math.ceil(own.epochs * frames / own.batch)
     return vqvae_optim(steps, own.batch, own.lr, own.weight_decay, **often)
@@ -256,7 +260,7 @@ def config_of(run: Run, overrides: Sequence[str] = ()) -> DictConfig:
 
     Raises:
         InputError: if the run is not finished, its config does not fit this version, an override is wrong, or
-            custom code is not here or was not allowed to be imported.
+            a package with custom components is not in use.
     """
     check_trained(run)
     plugins.activate(plugins.named(overrides))
@@ -276,11 +280,11 @@ def _override(cfg: DictConfig, word: str) -> None:
     """Set a key of a typed config as given by a word KEY=VALUE."""
     key, equals, _ = word.partition("=")
     if not equals:
-        raise InputError(f"{word}: allowed is KEY=VALUE")
+        raise InputError(f"{word}: must be KEY=VALUE")
     try:
         override = OverridesParser.create().parse_override(word)  # a bare off is text, not false
         if override.is_sweep_override():
-            raise InputError(f"{word}: allowed is one value; a list is [in,brackets]")
+            raise InputError(f"{word}: must be one value; a list is [in,brackets]")
         OmegaConf.update(cfg, key, override.value(), merge=True)
     except (OmegaConfBaseException, HydraException) as error:
         raise InputError(f"{key}: {str(error).splitlines()[0]}") from None

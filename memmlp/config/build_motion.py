@@ -3,29 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
+from memmlp.common.components import Component, component, find
 from memmlp.common.errors import InputError
-from memmlp.config.instantiate import built, located
+from memmlp.common.settings import Settings, at_least, positive, setting
 from memmlp.motion.clip import LINES
 from memmlp.motion.motion_source import MotionSource
 from memmlp.motion.preparing.cache import ClipFolder
 from memmlp.motion.preparing.find_clips import Folders, Root
-from memmlp.motion.preparing.splits import MixedSplit, SeededSplit, Split
-from memmlp.runs.recipe_versions import RECIPES
+from memmlp.motion.preparing.splits import ListSplit, MixedSplit, SeededSplit, Split, SubsetSplit
+
+SPLITS = {"seeded": SeededSplit, "lists": ListSplit, "subsets": SubsetSplit}
 
 
 def build_motion(cfg: DictConfig) -> MotionSource:
     """Build the source of an experiment's motion.
 
-    A synthetic folder's name contains its length and seed, or the path and settings of a custom generator,
-    and the generator's recipe version after the first, so that other settings and generators never find
-    stale files. A custom generator's recipe has the name of its option, such as "data.walks".
+    A synthetic folder's name contains its length and seed, or the name and settings of a custom generator,
+    and the generator's component version after the first, so that other settings and generators never find
+    stale files.
 
     Raises:
         InputError: if a list of groups can't be read, two folders of a list have the same name, or the
@@ -34,16 +36,14 @@ def build_motion(cfg: DictConfig) -> MotionSource:
     data = cfg.data
     root, split = _clips(data)
     generate: Callable[[Path], object] | None = None
-    if data.synth is not None and "_target_" in data.synth:
-        path = str(data.synth._target_)
-        settings = {str(key): value for key, value in data.synth.items() if key != "_target_"}
-        made = "-".join([path, *(f"{key}{value}" for key, value in settings.items())])
-        root = Path(data.root) / f"{made}{_version(f'data.{data.name}')}"
-        generate = partial(located(path, "data.synth"), **settings)
-    elif data.synth is not None:
-        made = f"{data.synth.minutes:g}min-seed{data.synth.seed}"
-        root = Path(data.root) / f"{made}{_version('synthetic')}"
-        generate = partial(_synthesize, minutes=data.synth.minutes, seed=data.synth.seed)
+    if data.synth is not None:
+        settings = {str(key): value for key, value in data.synth.items() if key != "name"}
+        generator = find("generator", data.synth.name)
+        made = "-".join([generator.name, *(f"{key}{value}" for key, value in settings.items())])
+        if generator.name == "puppet":
+            made = f"{data.synth.minutes:g}min-seed{data.synth.seed}"
+        version = f"-v{generator.version}" if generator.version > 1 else ""
+        root, generate = Path(data.root) / f"{made}{version}", partial(_generate, generator, settings)
 
     interpolation = data.get("interpolation", LINES)  # recorded configs from before the key mean lines
     clips = ClipFolder(root, split, str(data.body), data.min_frames, data.strict, interpolation)
@@ -51,14 +51,21 @@ def build_motion(cfg: DictConfig) -> MotionSource:
     return MotionSource(clips, generate, caches, partial=data.get("partial", False))
 
 
-def _version(recipe: str) -> str:
-    """Return what a folder's name says of a generator's recipe version: nothing of the first, else "-v2"."""
-    version = RECIPES.get(recipe, 1)
-    return f"-v{version}" if version > 1 else ""
+def _generate(generator: Component, settings: Mapping[str, Any], folder: Path) -> None:
+    generator.kind(folder, **settings)
 
 
-def _synthesize(folder: Path, minutes: float, seed: int) -> None:
-    """Make synthetic motion; imported here, since that needs torch."""
+@component("generator", "puppet", builds="synthesize")
+@dataclass
+class PuppetSettings(Settings):
+    """Procedural motion of a puppet."""
+
+    minutes: float = setting(positive(), "${profile.synth_minutes}")
+    seed: int = setting(at_least(0), 0)
+
+
+def synthesize(folder: Path, minutes: float, seed: int) -> None:
+    """Write synthetic clips of this many minutes to a folder; torch is imported first here."""
     from memmlp.motion.synthetic import synthesize
 
     synthesize(folder, minutes=minutes, seed=seed)
@@ -79,7 +86,8 @@ class _Clips(NamedTuple):
 
 def _clips(data: DictConfig) -> _Clips:
     """Return the folder or folders of the clips, and their split; each source is split separately."""
-    split = built(data.split)
+    keys: dict[str, Any] = OmegaConf.to_container(data.split, resolve=True)  # type: ignore[assignment]
+    split: Any = SPLITS[keys.pop("name")](**keys)
     if sources := data.get("sources"):
         folders = Folders({name: Path(source.root) for name, source in sources.items()})
         own = {name: _own_split(split, name, source) for name, source in sources.items()}

@@ -25,12 +25,15 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from memmlp.common.components import names
 from memmlp.common.errors import InputError
 from memmlp.common.overrides import Override, parse_overrides
 from memmlp.config import plugins
+from memmlp.config.check import check, unknown_key
+from memmlp.config.component_source import GROUPS, ONLY, SCHEME, is_group, register
 from memmlp.config.config_errors import explain
 from memmlp.config.package_data import packaged
-from memmlp.config.schema import Config, check, register, unknown_key
+from memmlp.config.schema import Config
 from memmlp.runs.identity import flatten
 
 VERSION_BASE = "1.3"
@@ -93,6 +96,7 @@ class UserConfigs(SearchPathPlugin):
         """Add the folders."""
         for provider, folder in plugins.folders():
             search_path.append(provider, f"file://{folder}")
+        search_path.append(SCHEME, f"{SCHEME}://")
 
 
 def composed(overrides: Sequence[str]) -> DictConfig:
@@ -199,7 +203,11 @@ def _compose(args: argparse.Namespace, overrides: list[str]) -> DictConfig:
 
 def _chooses_option(override: HydraOverride) -> bool:
     """Return whether an override chooses an option of a group; the others set values."""
-    return not isinstance(override.value(), dict) and (packaged("conf") / override.key_or_group).is_dir()
+    return not isinstance(override.value(), dict) and _is_group(override.key_or_group)
+
+
+def _is_group(name: str) -> bool:
+    return is_group(name) or (packaged("conf") / name).is_dir()
 
 
 def _sets_value(override: HydraOverride) -> bool:
@@ -277,8 +285,12 @@ def help_text(args: argparse.Namespace) -> str:
     for folder in folders:
         for path in sorted(folder.rglob("*.yaml")):
             options.setdefault(path.parent.relative_to(folder).as_posix(), []).append(path.stem)
+    for group in (*GROUPS, *ONLY):
+        options.setdefault(group, []).extend(["default"] if group in ONLY else names(group))
     groups = [
-        f"{name}: {', '.join(sorted(options[name]))}" for name in sorted(options.keys() - {".", "search"})
+        f"{name}: {', '.join(sorted(options[name]))}"
+        for name in sorted(options.keys() - {".", "search"})
+        if options[name]
     ]
     with _hydra(args), _explained(args.overrides):
         config = OmegaConf.to_yaml(compose(args.config_name or CONFIG, args.overrides), resolve=args.resolve)
@@ -305,6 +317,9 @@ def _check_hidden(args: argparse.Namespace) -> None:
     own_folders = [_folder(args.config_dir, "--config-dir")] if args.config_dir else []
     own_folders += [folder for provider, folder in plugins.folders() if provider == plugins.OWN]
     for folder in [*own_folders, *_search_path(args.overrides)]:
+        for path in sorted(folder.rglob("*.yaml")):
+            if plugins.is_component(path.relative_to(folder)):
+                raise InputError(f"{path}: memmlp has an option of that name; give it another name")
         for other in before:
             for path in sorted(other.rglob("*.yaml")):
                 own = folder / path.relative_to(other)

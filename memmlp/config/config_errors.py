@@ -19,7 +19,7 @@ from omegaconf.errors import (
     ValidationError,
 )
 
-from memmlp.config.schema import unknown_key
+from memmlp.config.check import unknown_key
 from memmlp.runs.former_keys import present_key, present_option
 
 SOURCES = "data.sources"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Iterator, Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,11 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from memmlp.common.components import declared
+from memmlp.config.component_source import register
 from memmlp.config.compose import VERSION_BASE
 from memmlp.config.package_data import packaged
-from memmlp.config.schema import register
+from memmlp.config.schema import ProfileConfig
 from memmlp.runs.identity import NETWORK, SLOTS, flatten, option_in_slot, training_config
 from memmlp.runs.shown_name import kind_words
 
@@ -86,7 +89,8 @@ def _option(config: Mapping[str, Any], slot: str) -> str | None:
 
 
 def _shipped(slot: str, option: str | None) -> bool:
-    return (packaged("conf") / slot / f"{option}.yaml").is_file()
+    found = declared().get((slot, str(option)))
+    return found is not None and found.package == "memmlp"
 
 
 def _word(value: Any) -> str:
@@ -138,4 +142,5 @@ def _profile(config: Mapping[str, Any]) -> Iterator[str]:
 
 @functools.cache
 def _values(path: Path) -> dict[str, Any]:
-    return {key: value for key, value in yaml.safe_load(path.read_text()).items() if key != "defaults"}
+    defaults = {spec.name: spec.default for spec in fields(ProfileConfig)}
+    return defaults | yaml.safe_load(path.read_text())

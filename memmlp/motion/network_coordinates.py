@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from memmlp.common.components import component
 from memmlp.motion.body import (
     N_JOINTS,
     POSITION,
@@ -47,10 +48,12 @@ class Coordinates:
         return rotations
 
 
+@component("coordinates", "world")
 class World(Coordinates):
     """The world's own coordinates: the most literal reading of the paper."""
 
 
+@component("coordinates", "head_relative")
 class HeadRelative(Coordinates):
     """Coordinates with the head of the same frame as horizontal origin and unchanged heights (reading 20)."""
 
@@ -60,6 +63,7 @@ class HeadRelative(Coordinates):
         return head * head.new_tensor([1.0, 1.0, 0.0])
 
 
+@component("coordinates", "heading")
 class Heading(HeadRelative):
     """Coordinates relative to the head on the floor, turned so that the head of the same frame faces ahead.
 

@@ -7,13 +7,16 @@ The paper's sizes are T = 196, d = 512 and 12 blocks, each the pre-norm pair of
 
 from __future__ import annotations
 
-from typing import Any, cast
+from dataclasses import dataclass
+from typing import Any, ClassVar, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common import distributed
+from memmlp.common.components import component
+from memmlp.common.settings import at_least, setting
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.diffusion import Diffusion, TimeEmbedding
@@ -23,6 +26,7 @@ from memmlp.networks.motion_model import (
     TrainingOutputs,
     WholeWindow,
 )
+from memmlp.networks.settings import NetworkSettings
 from memmlp.networks.streaming import AGRoLGraph
 
 
@@ -49,25 +53,37 @@ class AGRoLMLPGraph(AGRoLGraph):
         return self.model.head(last.newest(window, 1))
 
 
+@component("model", "agrol_mlp", builds="AGRoLMLP")
+@dataclass
+class AGRoLMLPSettings(NetworkSettings):
+    """AGRoL's MLP (Du et al. 2023), which predicts whole windows; a stream keeps the last frame.
+
+    Loss, depth and features are those of its released code. Training is this project's: AdamW in place of
+    Adam, final_lr 1e-5 in place of 3e-5, and what the profile sets (profile=paper has its authors' batch and
+    rates).
+    """
+
+    frames: int = setting(at_least(2), tiny=11, small=196, paper=196)  # T, the frames of a window
+    # d, the width of the hidden state
+    width: int = setting(at_least(1), tiny=16, small=128, paper=512, width_fraction=1)
+    depth: int = setting(at_least(1), 12)  # blocks
+
+    defaults: ClassVar = {"loss": "agrol"}
+
+
 class AGRoLMLP(WholeWindow):
     """AGRoL's MLP: stem, MLP blocks, head.
 
     It has 3,735,668 parameters at the paper's sizes (3.74 M in Table 16).
-
-    Args:
-        normalizer: converts between the world and network space.
-        frames: T, the window's length.
-        width: d, the width of the hidden state.
-        depth: number of blocks.
     """
 
     graph = AGRoLMLPGraph
 
-    def __init__(self, normalizer: Normalizer, *, frames: int, width: int, depth: int):
-        super().__init__(normalizer, frames)
-        self.stem = nn.Linear(SPARSE_DIM, width)
-        self.blocks = nn.ModuleList(MLPBlock(width, frames) for _ in range(depth))
-        self.head = nn.Linear(width, ROTATION.stop)
+    def __init__(self, normalizer: Normalizer, settings: AGRoLMLPSettings):
+        super().__init__(normalizer, settings.frames)
+        self.stem = nn.Linear(SPARSE_DIM, settings.width)
+        self.blocks = nn.ModuleList(MLPBlock(settings.width, settings.frames) for _ in range(settings.depth))
+        self.head = nn.Linear(settings.width, ROTATION.stop)
 
     def rotations(self, encoded: Tensor) -> Tensor:
         """Map inputs (B, T, 54) to rotations (B, T, 132), both in network space."""
@@ -138,6 +154,25 @@ class AGRoLDiffusionGraph(AGRoLGraph):
         return self.model.head(block.newest(h + shift, count))
 
 
+@component("model", "agrol_diffusion", builds="AGRoLDiffusion")
+@dataclass
+class AGRoLDiffusionSettings(AGRoLMLPSettings):
+    """AGRoL's diffusion model (Du et al. 2023), which makes the rotations of a window from noise, by DDIM.
+
+    Loss, depth, noise schedule and features are those of its released code, which normalises the motion but
+    not the inputs. Training is this project's: AdamW in place of Adam, final_lr, and what the profile sets.
+    """
+
+    # d, the width of the hidden state
+    width: int = setting(at_least(2), tiny=16, small=128, paper=512, width_fraction=1)
+    diffusion_steps: int = setting(at_least(1), 1000)  # steps of the noise schedule (cosine)
+    sampling_steps: int = setting(at_least(1), 5)  # calls of the denoiser for each window (DDIM)
+    # the seed of the noise that sampling starts from, the same for every window
+    noise_seed: int = setting(at_least(0), 0)
+
+    recipe: ClassVar = {"normalizer.z_scores": True}
+
+
 class AGRoLDiffusion(WholeWindow):
     """A denoiser of rotations, conditioned on the window's inputs, that predicts the clean rotations.
 
@@ -150,39 +185,22 @@ class AGRoLDiffusion(WholeWindow):
     The noise that sampling starts from is always the same, drawn from `noise_seed`: sampling is then a
     function of the inputs alone, in torch as in ONNX, and consecutive windows of a stream do not differ by
     their noise.
-
-    Args:
-        normalizer: converts between the world and network space.
-        frames: T, the window's length.
-        width: d, the width of the hidden state.
-        depth: number of blocks.
-        diffusion_steps: number of steps of the training's noise schedule.
-        sampling_steps: number of denoiser calls at inference.
-        noise_seed: seed of the noise that sampling starts from.
     """
 
     graph = AGRoLDiffusionGraph
     noise: Tensor
 
-    def __init__(
-        self,
-        normalizer: Normalizer,
-        *,
-        frames: int,
-        width: int,
-        depth: int,
-        diffusion_steps: int,
-        sampling_steps: int,
-        noise_seed: int,
-    ):
-        super().__init__(normalizer, frames)
-        self.diffusion = Diffusion(diffusion_steps, sampling_steps)
-        self.time = TimeEmbedding(width)
-        self.stem = nn.Linear(ROTATION.stop + SPARSE_DIM, width)
-        self.blocks = nn.ModuleList(TimedBlock(width, frames) for _ in range(depth))
-        self.head = nn.Linear(width, ROTATION.stop)
-        draw = torch.Generator().manual_seed(noise_seed)
-        self.register_buffer("noise", torch.randn(frames, ROTATION.stop, generator=draw))
+    def __init__(self, normalizer: Normalizer, settings: AGRoLDiffusionSettings):
+        super().__init__(normalizer, settings.frames)
+        self.diffusion = Diffusion(settings.diffusion_steps, settings.sampling_steps)
+        self.time = TimeEmbedding(settings.width)
+        self.stem = nn.Linear(ROTATION.stop + SPARSE_DIM, settings.width)
+        self.blocks = nn.ModuleList(
+            TimedBlock(settings.width, settings.frames) for _ in range(settings.depth)
+        )
+        self.head = nn.Linear(settings.width, ROTATION.stop)
+        draw = torch.Generator().manual_seed(settings.noise_seed)
+        self.register_buffer("noise", torch.randn(settings.frames, ROTATION.stop, generator=draw))
 
     def denoise(self, noisy: Tensor, time: Tensor, encoded: Tensor) -> Tensor:
         """Predict the clean rotations (B, T, 132).

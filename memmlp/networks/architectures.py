@@ -18,7 +18,7 @@ from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import Memory
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.predictor import Predictor
-from memmlp.networks.refiner import Refined, SAGERefiner
+from memmlp.networks.refiner import Refined, SAGERefinerSettings
 from memmlp.networks.vqvae import VQVAE
 
 
@@ -107,26 +107,26 @@ class MemMLPArchitecture(Architecture):
         hidden: d, the width of the hidden state.
         depth: L, the number of the backbone's blocks.
         memory: makes the memory, given `codes`, `depth`, `hidden` and `frames`.
-        memory_kind: the class of that memory.
         predictor: makes the predictor, given `memory_block`, `hidden` and `frames`.
+        codes: "frozen" if the memory needs a VQ-VAE that is trained before, "joint" if it has one of its own.
     """
 
     frames: int
     hidden: int
     depth: int
     memory: Callable[..., Memory]
-    memory_kind: type[Memory]
     predictor: Callable[..., Predictor]
+    codes: str = ""
 
     @property
     def uses_codes(self) -> bool:
         """Whether the memory needs a frozen VQ-VAE."""
-        return self.memory_kind.uses_codes
+        return self.codes == "frozen"
 
     @property
     def trains_codes(self) -> bool:
         """Whether the memory has a VQ-VAE of its own that is trained with the network."""
-        return self.memory_kind.trains_codes
+        return self.codes == "joint"
 
     def build(self, normalizer: Normalizer, codes: VQVAE | None) -> MemMLP:
         """Build the network with fresh weights."""
@@ -183,7 +183,7 @@ class RefinedArchitecture(Architecture):
     """
 
     network: Architecture
-    refiner: SAGERefiner
+    refiner: SAGERefinerSettings
 
     @property
     def uses_codes(self) -> bool:

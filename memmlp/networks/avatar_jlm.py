@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
 import torch
 from torch import Tensor, nn
 
+from memmlp.common.components import component
 from memmlp.common.float32_regions import in_float32
+from memmlp.common.settings import at_least, fraction, setting
 from memmlp.motion.body import (
     HEAD,
     N_JOINTS,
@@ -29,6 +33,7 @@ from memmlp.networks.motion_model import (
     WholeWindow,
     fill_past,
 )
+from memmlp.networks.settings import NetworkSettings
 from memmlp.networks.transformer import EncoderLayer, draw_weights
 
 JOINT_DIM = 18  # features of a joint: rotation, angular velocity, position, velocity
@@ -109,21 +114,42 @@ class AvatarJLMGraph(StreamingGraph):
         return self.model.regressor(features)
 
 
+@component("model", "avatar_jlm", version=2, builds="AvatarJLM")
+@dataclass
+class AvatarJLMSettings(NetworkSettings):
+    """AvatarJLM (Zheng et al. 2023): attention over the joints of a coarse pose, and over time.
+
+    Loss and features are those of its released code; the floor is each window's lowest true joint, which that
+    code finds by clustering. Training is this project's: AdamW with its schedule, in place of Adam at 1e-4, a
+    tenth at 60 K steps.
+    """
+
+    frames: int = setting(at_least(2), tiny=11, small=41, paper=41)  # T, the frames of a window
+    # d, the width of a token; the layers of the coarse pose have 2 d
+    width: int = setting(at_least(4), tiny=16, small=32, paper=512)
+    # blocks: an encoder layer over the tokens of a frame, and one over the frames of a token
+    depth: int = setting(at_least(1), tiny=1, small=1, paper=6)
+    heads: int = setting(at_least(1), tiny=4, small=2, paper=8)  # heads of attention
+    # the hidden width of the encoders' feed-forward layers
+    feedforward: int = setting(at_least(1), tiny=64, small=128, paper=2048)
+    dropout: float = setting(fraction(), 0.1)  # in the encoders, while training
+    coarse_weight: float = setting(at_least(0), 1.0)  # the weight of the loss of the coarse pose's joints
+
+    defaults: ClassVar = {"loss": "avatar_jlm"}
+
+    @classmethod
+    def problems(cls, config: Any) -> Iterator[str]:
+        """Yield why the network cannot be used; see Settings."""
+        yield from super().problems(config)
+        if config["model"]["width"] % 4:
+            yield f"model.width={config['model']['width']}: must be a multiple of 4 with this model"
+
+
 class AvatarJLM(WholeWindow):
     """A coarse pose of each frame, tokens of its joints, encoder layers, and a head on all tokens of a frame.
 
     It has 63,807,240 parameters at the paper's sizes (T = 41, d = 512, 6 blocks). It predicts all frames of a
     window; a live stream keeps the last one.
-
-    Args:
-        normalizer: converts between the world and network space.
-        frames: T, the window's length.
-        width: d, the width of a token; the layers of the coarse pose have 2 d.
-        depth: number of blocks: an encoder layer over a frame's tokens, and one over each token's frames.
-        heads: number of attention heads; it divides d.
-        feedforward: width of the encoders' hidden layers.
-        dropout: dropout rate of the encoders, while training.
-        coarse_weight: weight of the loss of the coarse pose's joints.
 
     Attributes:
         outputs: how many numbers are read from the tokens of a frame.
@@ -132,35 +158,25 @@ class AvatarJLM(WholeWindow):
     graph = AvatarJLMGraph
     outputs: ClassVar[int] = ROTATION.stop
 
-    def __init__(
-        self,
-        normalizer: Normalizer,
-        *,
-        frames: int,
-        width: int,
-        depth: int,
-        heads: int,
-        feedforward: int,
-        dropout: float,
-        coarse_weight: float,
-    ):
-        super().__init__(normalizer, frames)
-        self.coarse_weight, hidden = coarse_weight, 2 * width
+    def __init__(self, normalizer: Normalizer, settings: AvatarJLMSettings):
+        super().__init__(normalizer, settings.frames)
+        self.coarse_weight, hidden = settings.coarse_weight, 2 * settings.width
         self.embedding = nn.Linear(N_JOINTS * JOINT_DIM, hidden)
         self.coarse = nn.Sequential(
             nn.Linear(hidden, hidden), nn.LeakyReLU(0.1), nn.Linear(hidden, ROTATION.stop)
         )
-        self.position_token, self.rotation_token = nn.Linear(3, width), nn.Linear(6, width)
-        self.input_token = nn.Linear(hidden, width)
-        self.joint_places = nn.Parameter(torch.empty(TOKENS, width))
-        self.time_places = nn.Parameter(torch.empty(max(LONGEST, frames), 1, width))
+        self.position_token, self.rotation_token = nn.Linear(3, settings.width), nn.Linear(6, settings.width)
+        self.input_token = nn.Linear(hidden, settings.width)
+        self.joint_places = nn.Parameter(torch.empty(TOKENS, settings.width))
+        self.time_places = nn.Parameter(torch.empty(max(LONGEST, settings.frames), 1, settings.width))
         for places in (self.joint_places, self.time_places):
             nn.init.trunc_normal_(places, std=0.02)
         self.layers = nn.ModuleList(
-            EncoderLayer(width, heads, feedforward, dropout) for _ in range(2 * depth)
+            EncoderLayer(settings.width, settings.heads, settings.feedforward, settings.dropout)
+            for _ in range(2 * settings.depth)
         )
         self.regressor = nn.Sequential(
-            nn.Linear(TOKENS * width, hidden),
+            nn.Linear(TOKENS * settings.width, hidden),
             nn.GroupNorm(GROUPS, hidden),
             nn.LeakyReLU(0.1),
             nn.Linear(hidden, self.outputs),

@@ -5,14 +5,18 @@ Its final step, inverse kinematics of the arms, is not part of the network and i
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
 import torch
 from torch import Tensor, nn
 
+from memmlp.common.components import component
+from memmlp.common.settings import at_least, fraction, setting
 from memmlp.motion.body import N_JOINTS, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import OwnWindows, State, StreamingGraph, slide_window
+from memmlp.networks.settings import NetworkSettings
 from memmlp.networks.transformer import EncoderLayer, draw_weights
 
 ROOT = 6  # components of the root's orientation, the first of the rotations
@@ -62,21 +66,34 @@ class AvatarPoserGraph(StreamingGraph):
         return self.model.read(newest)
 
 
+@component("model", "avatar_poser", version=2, builds="AvatarPoser")
+@dataclass
+class AvatarPoserSettings(NetworkSettings):
+    """AvatarPoser (Jiang et al. 2022): a transformer encoder that predicts the newest frame's rotations.
+
+    Loss, features and initial weights (Kaiming's normal ones, gain 0.2; biases 0) are those of its released
+    code. Training is this project's: AdamW with its schedule, in place of Adam at 1e-4, halved every 60 K
+    steps.
+    """
+
+    frames: int = setting(at_least(2), tiny=10, small=40, paper=40)  # T, the frames of a window
+    width: int = setting(at_least(1), tiny=16, small=64, paper=256)  # d, the width of the hidden state
+    depth: int = setting(at_least(1), 3)  # encoder layers
+    heads: int = setting(at_least(1), 8)  # heads of attention
+    # the hidden width of the encoder's feed-forward layers
+    feedforward: int = setting(at_least(1), tiny=64, small=512, paper=2048)
+    dropout: float = setting(fraction(), 0.1)  # in the encoder, while training
+
+    learns_newest_frame: ClassVar[bool] = True
+    defaults: ClassVar = {"loss": "avatar_poser"}
+
+
 class AvatarPoser(OwnWindows):
     """An embedding, an encoder, and two heads on the newest frame, for the root's orientation and the rest.
 
     It has 4,124,804 parameters at the paper's sizes (T = 40, d = 256, 8 heads, 3 layers, feed-forward 2048),
     4.12 M in Table 16. Post-norm, ReLU, dropout 0.1 and the lack of a positional encoding are our readings:
     the paper names none of them, and its parameter count leaves no room for learned positions.
-
-    Args:
-        normalizer: converts between the world and network space.
-        frames: T, the window's length.
-        width: d, the width of the features.
-        depth: number of encoder layers.
-        heads: number of attention heads; it divides d.
-        feedforward: width of the feed-forward's hidden layers.
-        dropout: dropout rate in the encoder, while training.
 
     Attributes:
         inputs: how many features of a frame are embedded.
@@ -87,22 +104,15 @@ class AvatarPoser(OwnWindows):
     inputs: ClassVar[int] = SPARSE_DIM
     rotated: ClassVar[int] = N_JOINTS - 1
 
-    def __init__(
-        self,
-        normalizer: Normalizer,
-        *,
-        frames: int,
-        width: int,
-        depth: int,
-        heads: int,
-        feedforward: int,
-        dropout: float,
-    ):
-        super().__init__(normalizer, frames)
-        self.embedding = nn.Linear(self.inputs, width)
-        self.layers = nn.ModuleList(EncoderLayer(width, heads, feedforward, dropout) for _ in range(depth))
-        self.orientation = head(width, ROOT)
-        self.rotation = head(width, 6 * self.rotated)
+    def __init__(self, normalizer: Normalizer, settings: AvatarPoserSettings):
+        super().__init__(normalizer, settings.frames)
+        self.embedding = nn.Linear(self.inputs, settings.width)
+        self.layers = nn.ModuleList(
+            EncoderLayer(settings.width, settings.heads, settings.feedforward, settings.dropout)
+            for _ in range(settings.depth)
+        )
+        self.orientation = head(settings.width, ROOT)
+        self.rotation = head(settings.width, 6 * self.rotated)
         draw_weights(self)
 
     def rotations(self, encoded: Tensor) -> Tensor:

@@ -5,17 +5,22 @@ As published it is offline: windows that overlap by half are denoised together, 
 
 from __future__ import annotations
 
-from typing import Any, cast
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common import distributed
+from memmlp.common.components import component
+from memmlp.common.settings import at_least, positive, setting
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM, TRACKED
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.diffusion import AncestralDiffusion, Denoised, TimeEmbedding
 from memmlp.networks.motion_model import State, TrainingOutputs, WholeWindow
+from memmlp.networks.settings import NetworkSettings
 from memmlp.networks.streaming import AGRoLGraph, linear
 from memmlp.networks.transformer import DiTBlock
 
@@ -85,6 +90,46 @@ class BoDiffusionGraph(AGRoLGraph):
         return Denoised(*self.made(block.newest(h, modulation.chunk(6), count)).split(ROTATION.stop, -1))
 
 
+@component("model", "bodiffusion", version=2, builds="BoDiffusion")
+@dataclass
+class BoDiffusionSettings(NetworkSettings):
+    """BoDiffusion (Castillo et al. 2023): a transformer that makes a window's rotations from noise.
+
+    As published it is model.offline=true evaluation.modes=[window] export.graph=off: a clip's windows overlap
+    and are denoised together. Loss (noise, variational bound), noise schedule, features and averaged weights
+    are those of its released code; its number of sampling steps is not published. Training is this project's:
+    AdamW with its schedule, in place of 1e-5 without decay.
+    """
+
+    frames: int = setting(at_least(2), tiny=11, small=41, paper=41)  # T, the frames of a window
+    # d, the width of the hidden state; below 132 it cannot pass on the noise of all rotations
+    width: int = setting(at_least(2), tiny=16, small=192, paper=384)
+    depth: int = setting(at_least(1), tiny=2, small=4, paper=12)  # blocks
+    heads: int = setting(at_least(1), tiny=4, small=3, paper=6)  # heads of attention
+    diffusion_steps: int = setting(at_least(1), 1000)  # steps of the noise schedule (linear)
+    # calls of the denoiser for each window; all but the last, and those in the last 50 of diffusion_steps,
+    # add noise
+    sampling_steps: int = setting(at_least(1), tiny=2, small=10, paper=25)
+    noise_seed: int = setting(at_least(0), 0)  # the seed of the samples' noise, the same for every window
+    noise_weight: float = setting(at_least(0), 1.0)  # the weight of the loss of the predicted noise
+    # the weight of the variational bound, from which the variances learn
+    bound_weight: float = setting(positive(), 1.0)
+    offline: bool = setting(default=False)  # true: as published, with future frames; never a stream
+
+    trains_by_itself: ClassVar[bool] = True
+    defaults: ClassVar = {"loss": "of_network"}
+    recipe: ClassVar = {
+        "profile.ema": 0.9999
+    }  # the default of optim.ema: the averaged weights that its authors train
+
+    @classmethod
+    def problems(cls, config: Any) -> Iterator[str]:
+        """Yield why the network cannot be used; see Settings."""
+        yield from super().problems(config)
+        if config["loss"]["name"] == "of_network" and not config["model"]["noise_weight"]:
+            yield "model.noise_weight=0: must be above 0 with loss=of_network"
+
+
 class BoDiffusion(WholeWindow):
     """A denoiser of rotations that predicts their noise, conditioned on the window's inputs.
 
@@ -93,51 +138,26 @@ class BoDiffusion(WholeWindow):
 
     The noise of a sample is always the same, drawn from `noise_seed`, as AGRoLDiffusion's is. A live stream
     samples a window at each frame and keeps its last one.
-
-    Args:
-        normalizer: converts between the world and network space.
-        frames: T, the window's length.
-        width: d, the width of the features.
-        depth: number of blocks.
-        heads: number of attention heads; it divides d.
-        diffusion_steps: number of steps of the training's noise schedule.
-        sampling_steps: number of denoiser calls at inference.
-        noise_seed: seed of the noise of samples.
-        noise_weight: weight of the loss of the predicted noise.
-        bound_weight: weight of the variational bound, from which the variances learn.
-        offline: whether window mode denoises the windows of a clip together, as published.
     """
 
     graph = BoDiffusionGraph
     noises: Tensor
 
-    def __init__(
-        self,
-        normalizer: Normalizer,
-        *,
-        frames: int,
-        width: int,
-        depth: int,
-        heads: int,
-        diffusion_steps: int,
-        sampling_steps: int,
-        noise_seed: int,
-        noise_weight: float,
-        bound_weight: float,
-        offline: bool,
-    ):
-        super().__init__(normalizer, frames)
-        self.noise_weight, self.bound_weight = noise_weight, bound_weight
-        self.noise_seed, self.offline = noise_seed, offline
-        self.diffusion = AncestralDiffusion(diffusion_steps, sampling_steps)
-        self.time = TimeEmbedding(width, SINES)
+    def __init__(self, normalizer: Normalizer, settings: BoDiffusionSettings):
+        super().__init__(normalizer, settings.frames)
+        self.noise_weight, self.bound_weight = settings.noise_weight, settings.bound_weight
+        self.noise_seed, self.offline = settings.noise_seed, settings.offline
+        self.diffusion = AncestralDiffusion(settings.diffusion_steps, settings.sampling_steps)
+        self.time = TimeEmbedding(settings.width, SINES)
         self.spread = nn.Linear(len(TRACKED), N_JOINTS, bias=False)
-        self.stem = nn.Linear(N_JOINTS * (NOISY + CHANNELS), width)
-        self.places = nn.Parameter(torch.zeros(frames, width), requires_grad=False)
-        self.blocks = nn.ModuleList(DiTBlock(width, heads) for _ in range(depth))
-        self.head = nn.Linear(width, N_JOINTS * (NOISY + CHANNELS))
+        self.stem = nn.Linear(N_JOINTS * (NOISY + CHANNELS), settings.width)
+        self.places = nn.Parameter(torch.zeros(settings.frames, settings.width), requires_grad=False)
+        self.blocks = nn.ModuleList(DiTBlock(settings.width, settings.heads) for _ in range(settings.depth))
+        self.head = nn.Linear(settings.width, N_JOINTS * (NOISY + CHANNELS))
         self.joint_head = nn.Linear(NOISY + CHANNELS, 2 * NOISY)
-        self.register_buffer("noises", self.drawn(frames), persistent=False)  # more with more sampling steps
+        self.register_buffer(
+            "noises", self.drawn(settings.frames), persistent=False
+        )  # more with more sampling steps
 
     @property
     def is_stream(self) -> bool:

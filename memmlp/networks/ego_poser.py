@@ -6,15 +6,19 @@ body's shape, since all bodies here have the mean one.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from memmlp.common.components import component
+from memmlp.common.settings import at_least, setting
 from memmlp.motion.body import SPARSE_DIM, SPARSE_POSITION, TRACKED
 from memmlp.motion.network_coordinates import HeadRelative
-from memmlp.networks.avatar_poser import AvatarPoser
+from memmlp.networks.avatar_poser import AvatarPoser, AvatarPoserSettings
 from memmlp.networks.motion_model import State, StreamingGraph, fill_past
 from memmlp.networks.transformer import EncoderLayer, encode_newest_frame
 
@@ -65,6 +69,32 @@ class EgoPoserGraph(StreamingGraph):
         newest = encode_newest_frame(self.layers, slow + fast - 2 * first)
         kept = {name: frames[1:] for name, frames in window.items()}
         return self.normalizer.posed(self.model.read(newest), sparse), kept
+
+
+@component("model", "ego_poser", version=2, builds="EgoPoser")
+@dataclass
+class EgoPoserSettings(AvatarPoserSettings):
+    """EgoPoser (Jiang et al. 2024): AvatarPoser's encoder over a fast and a slow view of a longer window.
+
+    Loss and features are those of its released code, except for the hands' positions, which are its paper's
+    (docs/readings.md). Training is this project's, as AvatarPoser's is.
+    """
+
+    # T, the frames of a window; the encoder sees half as many
+    frames: int = setting(at_least(2), tiny=20, small=80, paper=80)
+
+    defaults: ClassVar = {"loss": "ego_poser"}
+
+    @classmethod
+    def problems(cls, config: Any) -> Iterator[str]:
+        """Yield why the network cannot be used; see Settings."""
+        yield from super().problems(config)
+        normalizer = config["normalizer"]
+        if normalizer["z_scores"] and normalizer["coordinates"] == "world":
+            yield (
+                "normalizer.z_scores=true: must be false with normalizer.coordinates=world, since "
+                "model=ego_poser subtracts the head position"
+            )
 
 
 class EgoPoser(AvatarPoser):

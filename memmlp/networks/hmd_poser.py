@@ -8,13 +8,17 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from memmlp.common.components import component
 from memmlp.common.float32_regions import in_float32
+from memmlp.common.settings import at_least, fraction, setting
 from memmlp.motion.body import (
     ROTATION,
     SPARSE_ANGULAR_VELOCITY,
@@ -26,6 +30,7 @@ from memmlp.motion.body import (
 from memmlp.motion.geometry import matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel
+from memmlp.networks.settings import NetworkSettings
 from memmlp.networks.transformer import EncoderLayer
 
 HANDS, OTHERS = 2, 3  # tokens of hands in the head's frame, and of the sensors that there are none of
@@ -170,54 +175,63 @@ class HMDPoserGraph(FrameGraph):
         return self.normalizer.posed(self.model.pose(features[0]), sparse), kept
 
 
+@component("model", "hmd_poser", builds="HMDPoser")
+@dataclass
+class HMDPoserSettings(NetworkSettings):
+    """HMD-Poser (Dai et al. 2024) with three trackers: LSTMs, and a transformer over a frame's tokens.
+
+    It is a stream without a window. Loss and features are those of its released code, on the mean body.
+    Training is this project's: AdamW with its schedule, in place of Adam at 1e-3 with a warm-up and a fall
+    after 300 of 400 epochs.
+    """
+
+    # T, the frames of a training window, from zero states; live there is no window
+    frames: int = setting(at_least(2), tiny=10, small=40, paper=40)
+    width: int = setting(at_least(4), tiny=16, small=48, paper=256)  # d, the width of a token
+    depth: int = setting(at_least(1), 2)  # blocks: an LSTM for each token, then a transformer over the tokens
+    encoder_layers: int = setting(at_least(1), tiny=1, small=1, paper=3)  # encoder layers of a block
+    heads: int = setting(at_least(1), 8)  # heads of attention
+    # the hidden width of the encoders' feed-forward layers
+    feedforward: int = setting(at_least(1), tiny=64, small=256, paper=2048)
+    dropout: float = setting(fraction(), 0.1)  # in the encoders, while training
+    # the weight of the loss that keeps the body's predicted shape the same within a window; 0: no head for
+    # the shape
+    shape_weight: float = setting(at_least(0), 0.1)
+
+    defaults: ClassVar = {"loss": "hmd_poser"}
+
+
 class HMDPoser(WindowlessModel):
     """Tokens of trackers, blocks of LSTMs and encoder layers, and a head on all tokens of a frame.
 
     It has 17,444,484 parameters at the paper's sizes, of which 528,656 belong to the head for the body's
     shape, and carries two states of d for each LSTM: 8,192 numbers. Evaluation runs over whole clips,
     training over windows of T frames, both from zero states.
-
-    Args:
-        normalizer: converts between the world and network space.
-        frames: T, the frames of a training window.
-        width: d, the width of a token.
-        depth: number of blocks.
-        encoder_layers: number of encoder layers of a block.
-        heads: number of attention heads; it divides d.
-        feedforward: width of the encoders' hidden layers.
-        dropout: dropout rate of the encoders, while training.
-        shape_weight: weight of the loss that keeps the predicted shape the same in a window; 0 leaves out the
-            head for the shape, which no prediction needs.
     """
 
     graph = HMDPoserGraph
 
-    def __init__(
-        self,
-        normalizer: Normalizer,
-        *,
-        frames: int,
-        width: int,
-        depth: int,
-        encoder_layers: int,
-        heads: int,
-        feedforward: int,
-        dropout: float,
-        shape_weight: float,
-    ):
-        super().__init__(normalizer, frames)
-        self.width, self.depth, self.shape_weight = width, depth, shape_weight
-        tracked, turns = ((6, 6, 3, 3), shares(width)), 15 * width // 32
+    def __init__(self, normalizer: Normalizer, settings: HMDPoserSettings):
+        super().__init__(normalizer, settings.frames)
+        self.width, self.depth, self.shape_weight = settings.width, settings.depth, settings.shape_weight
+        tracked, turns = ((6, 6, 3, 3), shares(settings.width)), 15 * settings.width // 32
         self.trackers = nn.ModuleList(TokenEmbedding(*tracked) for _ in TRACKED)
         self.hands = nn.ModuleList(TokenEmbedding(*tracked) for _ in range(HANDS))
-        unseen = (6, 6, 3), (turns, turns, width - 2 * turns)
+        unseen = (6, 6, 3), (turns, turns, settings.width - 2 * turns)
         self.others = nn.ModuleList(TokenEmbedding(*unseen) for _ in range(OTHERS))
-        self.norm = nn.LayerNorm(width, eps=1e-6)
+        self.norm = nn.LayerNorm(settings.width, eps=1e-6)
         self.blocks = nn.ModuleList(
-            TimeAndTokenBlock(width, encoder_layers, heads, feedforward, dropout) for _ in range(depth)
+            TimeAndTokenBlock(
+                settings.width,
+                settings.encoder_layers,
+                settings.heads,
+                settings.feedforward,
+                settings.dropout,
+            )
+            for _ in range(settings.depth)
         )
         self.pose = self._head(ROTATION.stop)
-        self.shape = self._head(SHAPE) if shape_weight else None
+        self.shape = self._head(SHAPE) if settings.shape_weight else None
 
     def _head(self, size: int) -> nn.Module:
         return nn.Sequential(

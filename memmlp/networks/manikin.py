@@ -9,6 +9,7 @@ rotation; and a straight limb does not keep the swivel of the frame before.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -16,7 +17,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from memmlp.common import distributed
+from memmlp.common.components import component
 from memmlp.common.float32_regions import in_float32
+from memmlp.common.settings import at_least, fraction, setting
 from memmlp.motion.body import (
     HEAD,
     N_JOINTS,
@@ -32,8 +35,8 @@ from memmlp.motion.body import (
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.network_coordinates import Heading
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.avatar_jlm import AvatarJLM, AvatarJLMGraph
-from memmlp.networks.avatar_poser import AvatarPoser, AvatarPoserGraph, head
+from memmlp.networks.avatar_jlm import AvatarJLM, AvatarJLMGraph, AvatarJLMSettings
+from memmlp.networks.avatar_poser import AvatarPoser, AvatarPoserGraph, AvatarPoserSettings, head
 from memmlp.networks.limb_solver import (
     ANKLES,
     BASES,
@@ -224,50 +227,38 @@ class ManikinSGraph(AvatarPoserGraph):
         return self.model.posed(self.model.read(newest), encoded)
 
 
+@component("model", "manikin_s", version=3, builds="ManikinS")
+@dataclass
+class ManikinSSettings(AvatarPoserSettings):
+    """MANIKIN-S (Jiang et al. 2024): AvatarPoser's encoder predicts trunk, swivels, ankles and toes.
+
+    Arms and legs are solved in closed form, so that hands are on their trackers. Losses are those of its
+    released code, without dropout as there; heights are the world's, where that code subtracts the clip's
+    lowest foot. Training is this project's: AdamW with its schedule.
+    """
+
+    dropout: float = setting(fraction(), 0.0)  # in the encoder, while training
+    # the weight of the losses of what the limbs are solved from: the trunk, swivels, elbows and knees,
+    # ankles, toes
+    parts_weight: float = setting(at_least(0), 1.0)
+    turned: bool = setting(default=True)  # whether training windows are turned by random headings
+
+    defaults: ClassVar = {"loss": "manikin_s"}
+
+
 class ManikinS(Manikin, AvatarPoser):
     """AvatarPoser's embedding and encoder, with heads for root, rotations, swivels, and ankles and toes.
 
     It has 4,244,566 parameters at the paper's sizes (AvatarPoser's).
-
-    Args:
-        normalizer: converts between the world and network space.
-        frames: T, the window's length.
-        width: d, the width of the features.
-        depth: number of encoder layers.
-        heads: number of attention heads; it divides d.
-        feedforward: width of the feed-forward's hidden layers.
-        dropout: dropout rate in the encoder, while training.
-        parts_weight: weight of the losses of what the limbs are solved from.
-        turned: whether training windows are turned by headings drawn at random.
     """
 
     graph = ManikinSGraph
     rotated: ClassVar[int] = len(KEPT)
 
-    def __init__(
-        self,
-        normalizer: Normalizer,
-        *,
-        frames: int,
-        width: int,
-        depth: int,
-        heads: int,
-        feedforward: int,
-        dropout: float,
-        parts_weight: float,
-        turned: bool,
-    ):
-        super().__init__(
-            normalizer,
-            frames=frames,
-            width=width,
-            depth=depth,
-            heads=heads,
-            feedforward=feedforward,
-            dropout=dropout,
-        )
-        self.parts_weight, self.turned = parts_weight, turned
-        self.swivel, self.places = head(width, SWIVELS), head(width, PLACES)
+    def __init__(self, normalizer: Normalizer, settings: ManikinSSettings):
+        super().__init__(normalizer, settings)
+        self.parts_weight, self.turned = settings.parts_weight, settings.turned
+        self.swivel, self.places = head(settings.width, SWIVELS), head(settings.width, PLACES)
         for added in (self.swivel, self.places):
             draw_weights(added)
 
@@ -317,56 +308,43 @@ class ManikinLGraph(AvatarJLMGraph):
         return self.model.posed(self.model.regressor(features), encoded)
 
 
+@component("model", "manikin_l", version=2, builds="ManikinL")
+@dataclass
+class ManikinLSettings(AvatarJLMSettings):
+    """MANIKIN-L (Jiang et al. 2024): AvatarJLM's network predicts trunk, swivels, ankles and toes.
+
+    Arms and legs are solved in closed form. MANIKIN-LN are the same weights with model.offline=true
+    evaluation.modes=[window] export.graph=off. Losses are those of its released code. Training is this
+    project's: AdamW with its schedule.
+    """
+
+    # the weight of the losses of what the limbs are solved from: rotations, swivels, ankles, toes
+    parts_weight: float = setting(at_least(0), 1.0)
+    turned: bool = setting(default=True)  # whether training windows are turned by random headings
+    # true: as MANIKIN-LN, whose windows do not overlap; never a stream
+    offline: bool = setting(default=False)
+
+    defaults: ClassVar = {"loss": "manikin_l"}
+
+
 class ManikinL(Manikin, AvatarJLM):
     """AvatarJLM's network, whose regressor predicts the parts and, for training only, all rotations as well.
 
     It has 63,889,240 parameters at the paper's sizes (AvatarJLM's). Its authors' MANIKIN-LN uses the same
     weights on windows that do not overlap and takes all frames of each: it can't run as a live stream. (They
     also raise ankles to the true floor, which is left out here.)
-
-    Args:
-        normalizer: converts between the world and network space.
-        frames: T, the window's length.
-        width: d, the width of a token; the layers of the coarse pose have 2 d.
-        depth: number of blocks: an encoder layer over a frame's tokens, and one over each token's frames.
-        heads: number of attention heads; it divides d.
-        feedforward: width of the encoders' hidden layers.
-        dropout: dropout rate of the encoders, while training.
-        coarse_weight: weight of the loss of the coarse pose's joints.
-        parts_weight: weight of the losses of what the limbs are solved from.
-        turned: whether training windows are turned by headings drawn at random.
-        offline: whether it is used as MANIKIN-LN.
     """
 
     graph = ManikinLGraph
     outputs: ClassVar[int] = PREDICTED + AUXILIARY
 
-    def __init__(
-        self,
-        normalizer: Normalizer,
-        *,
-        frames: int,
-        width: int,
-        depth: int,
-        heads: int,
-        feedforward: int,
-        dropout: float,
-        coarse_weight: float,
-        parts_weight: float,
-        turned: bool,
-        offline: bool,
-    ):
-        super().__init__(
-            normalizer,
-            frames=frames,
-            width=width,
-            depth=depth,
-            heads=heads,
-            feedforward=feedforward,
-            dropout=dropout,
-            coarse_weight=coarse_weight,
+    def __init__(self, normalizer: Normalizer, settings: ManikinLSettings):
+        super().__init__(normalizer, settings)
+        self.parts_weight, self.turned, self.offline = (
+            settings.parts_weight,
+            settings.turned,
+            settings.offline,
         )
-        self.parts_weight, self.turned, self.offline = parts_weight, turned, offline
 
     @property
     def is_stream(self) -> bool:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from memmlp.common.components import chosen, component
+from memmlp.common.settings import Settings, at_least, setting
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.layers import MLPBlock, PlainFusion, ResidualFusion
@@ -238,6 +241,54 @@ class MemMLPGraph(StreamingGraph):
         motion = self.predictor(h, contributions, sparse, self.normalizer, 1)
         kept |= memory.remember(motion[None], past, state, 1) | {"sparse": queue[:, 1:]}
         return self.conversions.decode_motion(motion, origin), kept
+
+
+@component("model", "mem_mlp", builds="MemMLP")
+@dataclass
+class MemMLPSettings(Settings):
+    """Mem-MLP's backbone (Sec. 3.2, readings 1 and 2), with slots for memory, predictor and hand term."""
+
+    frames: int = setting(at_least(2), tiny=11, small=41, paper=41)  # T, the frames of a window
+    # d, the width of the hidden state
+    width: int = setting(at_least(1), tiny=16, small=128, paper=512, width_fraction=1)
+    depth: int = setting(at_least(1), 8)  # L, the number of blocks
+
+    @classmethod
+    def problems(cls, config: Any) -> Iterator[str]:
+        """Yield why the network cannot be used; see Settings."""
+        for slot, words in (
+            ("memory", ", or none for no memory"),
+            ("predictor", ""),
+            ("hand", ", or off for no term"),
+        ):
+            if config[slot] is None:
+                yield f"{slot}: must be one of its options{words}, since model=mem_mlp has this slot"
+                return
+        if config["upstream"] is not None:
+            yield f"upstream={config['upstream']['name']}: must be null with model=mem_mlp"
+        memory, model, rollout = config["memory"], config["model"], config["rollout"]
+        layers = list(memory.get("layers", []))
+        if layers and max(layers) > model["depth"]:
+            yield f"memory.layers={layers}: must be at most model.depth={model['depth']}"
+        loss, predictor = chosen(config, "loss"), chosen(config, "predictor")
+        if getattr(loss, "complete", False):
+            name, alone = config["loss"]["name"], "predictor=rotation_only hand=off"
+            if not getattr(loss, "rotations_alone", False):
+                yield f"loss={name}: must be uncertainty or manual, or a loss of rotations alone with {alone}"
+            elif getattr(predictor, "positions", True) or config["hand"]["name"] != "off":
+                yield f"loss={name}: must be uncertainty or manual, since it needs {alone}"
+        if getattr(predictor, "memory_blocks", False) and not layers:
+            yield f"predictor={config['predictor']['name']}: must have no memory blocks with memory=none"
+        if memory["name"] == "none" and rollout["name"] == "own_predictions":
+            yield "rollout=own_predictions: must be teacher_forcing or streams with memory=none"
+        passes, frames = rollout.get("max_passes", model["frames"]), model["frames"]
+        if memory.get("shift") == "frame" and passes < frames:
+            yield (
+                f"rollout.max_passes={passes}: must be at least model.frames={frames} with "
+                "memory.shift=frame, since a call fills one frame; or set memory.shift=window"
+            )
+        if config["evaluation"]["ik"] == "lbfgs" and not getattr(predictor, "positions", True):
+            yield "evaluation.ik=lbfgs: must be off or arms, since the predictor has no positions"
 
 
 class MemMLP(MotionModel):

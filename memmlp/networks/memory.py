@@ -13,6 +13,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from torch import Tensor, nn
 
+from memmlp.common.components import component
 from memmlp.common.errors import InputError
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.layers import MLPBlock, PlainFusion, ResidualFusion
@@ -116,8 +117,6 @@ class Memory(nn.Module):
     """The memory slot's interface; in this base class nothing is kept and nothing is recalled.
 
     Attributes:
-        uses_codes: whether the memory needs a frozen VQ-VAE.
-        trains_codes: whether it has a VQ-VAE of its own that is trained with the network.
         shift: how many frames before the newest one the recalled past ends, which is also how many frames a
             training step moves on; 0 without a past.
         past_frames: how many past frames of inputs the buffer holds; the last one directly precedes the new.
@@ -129,8 +128,6 @@ class Memory(nn.Module):
 
     streaming_recall: ClassVar[type[Recall]] = Recall
 
-    uses_codes: ClassVar[bool] = False
-    trains_codes: ClassVar[bool] = False
     shift: int
     past_frames: int
     frames: int
@@ -182,6 +179,7 @@ class Memory(nn.Module):
         return {}
 
 
+@component("memory", "none")
 class NoMemory(Memory):
     """The empty memory: plain blocks, no past, no state.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -11,6 +12,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common import distributed
+from memmlp.common.components import component
+from memmlp.common.settings import Settings, at_least, each, one_of, setting, within
 from memmlp.motion.body import MOTION_DIM, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import FeatureMemory, Past, Recall, RecurrentPast
@@ -171,6 +174,58 @@ class CodeRecall(OwnPastRecall):
         return CodeTable(parts, self.vectors) if name == "codes" else super().projections(name, parts)
 
 
+@dataclass
+class OwnPastMemorySettings(Settings):
+    """The keys of the memories of the network's own past.
+
+    Attributes:
+        codes: "frozen" for a memory that needs a VQ-VAE that is trained before, "joint" for one with a VQ-VAE
+        of
+            its own, "" without.
+    """
+
+    # which blocks of the backbone have it: the even ones (Sec. 4.1)
+    layers: list[int] = setting(each(at_least(1)), "${even_layers:${model.depth}}")
+    # k, the width of the memory feature (reading 3)
+    width: int = setting(at_least(1), tiny=8, small=48, paper=192, width_fraction=0.375)
+    # window: the past window ends T frames ago; frame: it ends one frame ago (reading 6)
+    shift: str = setting(one_of("frame", "window"), "window", literal="frame")
+    # first: a past frame's estimate from when it was the newest; latest: its latest estimate (reading 6)
+    history: str = setting(one_of("first", "latest"), "first", literal="latest")
+    # residual: x + f([x; z]); plain: f([x; z]) (reading 3)
+    fusion: str = setting(one_of("residual", "plain"), "residual")
+    # m at inference: a number in [0, 1], or sampled as in training, for which ONNX has 0.5 (reading 7)
+    blend: int | float | str = setting(within(0, 1, "sampled"), 0.5)
+
+    codes: ClassVar[str] = ""
+
+
+@component("memory", "no_codes", builds="NoCodesMemory")
+@dataclass
+class NoCodesMemorySettings(OwnPastMemorySettings):
+    """A memory of the network's own past alone, without code-vectors (Table 11)."""
+
+
+@component("memory", "vq", builds="CodeMemory")
+@dataclass
+class CodeMemorySettings(OwnPastMemorySettings):
+    """The paper's memory: code-vectors beside the network's own past (Sec. 3.2.1)."""
+
+    codes: ClassVar[str] = "frozen"
+
+
+@component("memory", "vq_joint", builds="JointCodeMemory")
+@dataclass
+class JointCodeMemorySettings(OwnPastMemorySettings):
+    """As vq, but the VQ-VAE is trained from scratch with the network (App. A), by a loss without a weight.
+
+    The VQ-VAE has no stage of its own, so that vqvae.steps, epochs, batch, lr and weight_decay have no
+    effect.
+    """
+
+    codes: ClassVar[str] = "joint"
+
+
 class OwnPastMemory(FeatureMemory):
     """A memory of the network's own past; the base of those with and without code-vectors.
 
@@ -292,8 +347,6 @@ class VQMemory(OwnPastMemory):
 class CodeMemory(VQMemory):
     """The paper's memory, whose VQ-VAE is trained beforehand and frozen."""
 
-    uses_codes: ClassVar[bool] = True
-
     def __init__(self, *args, codes: VQVAE | None = None, **kwargs):
         super().__init__(*args, **kwargs)
         assert codes is not None
@@ -317,8 +370,6 @@ class JointCodeMemory(VQMemory):
         vqvae: makes the VQ-VAE.
         codes: ignored; there is no frozen VQ-VAE.
     """
-
-    trains_codes: ClassVar[bool] = True
 
     def __init__(self, *args, vqvae: Callable[[], VQVAE], codes: VQVAE | None = None, **kwargs):
         super().__init__(*args, **kwargs)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
+from memmlp.common.components import component
+from memmlp.common.settings import Settings, at_least, setting
 from memmlp.motion.body import MOTION_DIM, ROTATION
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.layers import MLPBlock
@@ -58,6 +61,46 @@ class MemoryBranch(Branch):
         for block in self.blocks:
             h = block(h, past)
         return self.linear(h[..., -newest:, :])
+
+
+@component("predictor", "two_branch", builds="TwoBranch")
+@dataclass
+class TwoBranchSettings(Settings):
+    """Rotations and positions, with a branch for each (Sec. 3.2.2)."""
+
+    depth: int = setting(at_least(0), 2)  # MLP blocks in each branch (Sec. 4.1)
+
+    positions: ClassVar[bool] = True
+    memory_blocks: ClassVar[bool] = False
+
+
+@component("predictor", "two_branch_memory", builds="TwoBranchMemory")
+@dataclass
+class TwoBranchMemorySettings(TwoBranchSettings):
+    """Rotations and positions, with a branch of memory blocks for each (Table 8, "MHP w/ MB").
+
+    It needs a memory.
+    """
+
+    depth: int = setting(at_least(1), 2)  # memory blocks in each branch
+
+    memory_blocks: ClassVar[bool] = True
+
+
+@component("predictor", "rotation_only", builds="RotationOnly")
+@dataclass
+class RotationOnlySettings(TwoBranchSettings):
+    """Rotations alone (Table 4); positions follow by forward kinematics. It needs hand=fk or hand=off."""
+
+    positions: ClassVar[bool] = False
+
+
+@component("predictor", "rotation_only_memory", builds="RotationOnlyMemory")
+@dataclass
+class RotationOnlyMemorySettings(TwoBranchMemorySettings):
+    """Rotations alone, by a branch of memory blocks. It needs a memory, and hand=fk or hand=off."""
+
+    positions: ClassVar[bool] = False
 
 
 class TwoBranch(nn.Module):

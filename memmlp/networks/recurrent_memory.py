@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from memmlp.common.components import component
 from memmlp.common.float32_regions import in_float32
+from memmlp.common.settings import Settings, at_least, each, one_of, setting
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.networks.memory import FeatureMemory, Past, Recall, RecurrentPast
 from memmlp.networks.motion_model import State
@@ -189,6 +192,27 @@ class RecurrentMemory(FeatureMemory):
 
     def _layers(self) -> list[Recurrence]:
         return [layer for layer in self.recurrences if isinstance(layer, Recurrence)]
+
+
+@component("memory", "lstm", builds="LSTMMemory")
+@dataclass
+class LSTMMemorySettings(Settings):
+    """An LSTM for each memory block (Table 15, reading 19): LayerNorm of the sparse features, LSTM, SiLU.
+
+    Teacher forcing starts its states from the input before the window; evaluation carries them on.
+    """
+
+    # which blocks of the backbone have it: the even ones (Sec. 4.1)
+    layers: list[int] = setting(each(at_least(1)), "${even_layers:${model.depth}}")
+    width: int = setting(at_least(1), tiny=8, small=48, paper=192, width_fraction=0.375)  # the hidden size
+    # residual: x + f([x; z]); plain: f([x; z]) (reading 3)
+    fusion: str = setting(one_of("residual", "plain"), "residual")
+
+
+@component("memory", "gru", builds="GRUMemory")
+@dataclass
+class GRUMemorySettings(LSTMMemorySettings):
+    """A GRU for each memory block (Table 15, reading 19), in place of the LSTM of memory=lstm."""
 
 
 class LSTMMemory(RecurrentMemory):

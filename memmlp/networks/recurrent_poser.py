@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from memmlp.common.components import component
 from memmlp.common.float32_regions import in_float32
+from memmlp.common.settings import at_least, one_of, setting, sized
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.layers import gru_step, products
 from memmlp.networks.limb_solver import reach_hands, use_tracker_rotations
 from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel
+from memmlp.networks.settings import NetworkSettings
 from memmlp.networks.streaming import OneFrameNormalizer
 
 SHORTEST, LONGEST = 0.9, 0.999
@@ -368,6 +372,52 @@ class RecurrentPoserGraph(FrameGraph):
         return self.model.step(sparse, state)
 
 
+@component("model", "recurrent_poser", version=3, builds="RecurrentPoser")
+@dataclass
+class RecurrentPoserSettings(NetworkSettings):
+    """RecurrentPoser, this project's network: residual blocks of a recurrent cell and an MLP.
+
+    It is a recurrent stream without a window. It predicts rotations; positions follow by forward kinematics,
+    with the head on its tracker. The learning rate is the best of four at profile=small. Weight decays from
+    0.05 to 0.5 are alike in MPJRE, and Jitter falls with them (docs/guides/recurrent-poser-search.md).
+    """
+
+    # T, the frames of a training window, from a zero state; live there is no window
+    frames: int = setting(at_least(2), tiny=11, small=21, paper=120)
+    # recurrences side by side, each trained by itself; their rotations are averaged
+    members: int = setting(at_least(1), tiny=2, small=3, paper=2)
+    # d, the width of a member's hidden state and of each cell
+    width: int = setting(at_least(1), tiny=16, small=128, paper=160)
+    depth: int = setting(at_least(1), tiny=2, small=4, paper=2)  # blocks of a member
+    # mingru and lru: their states enter linearly, so that training computes all frames at once
+    cell: str = setting(one_of("gru", "lstm", "mingru", "lru"), "gru")
+    # global: rotations in the network's space; reaching: these, with arms that reach to the hands' trackers;
+    # local: relative to the parents
+    output: str = setting(one_of("local", "global", "reaching"), "reaching")
+    expansion: int = setting(at_least(1), 1)  # the hidden width of the blocks' MLPs, in d
+
+    carries_state: ClassVar[bool] = True
+    defaults: ClassVar = {"loss": "calm", "optim": "muon"}
+    recipe: ClassVar = {
+        "optim.batch": sized(8, 64, 256),
+        "optim.lr": 8.0e-3,
+        "optim.warmup": sized(0, 100, 1000),
+        "optim.weight_decay": sized(0.3, 0.3, 2.0e-3),
+        "normalizer.coordinates": "heading",
+        "normalizer.z_scores": True,
+    }
+
+    @classmethod
+    def problems(cls, config: Any) -> Iterator[str]:
+        """Yield why the network cannot be used; see Settings."""
+        yield from super().problems(config)
+        reaching = (
+            config["model"]["output"] == "reaching" and config["refiner"] is None
+        )  # a refiner moves arms again
+        if config["evaluation"]["ik"] == "arms" and reaching:
+            yield "evaluation.ik=arms: must be off, since the arms of model.output=reaching reach already"
+
+
 class RecurrentPoser(WindowlessModel):
     """A recurrent stream of rotations, averaged over several members.
 
@@ -375,36 +425,18 @@ class RecurrentPoser(WindowlessModel):
     follow from the rotations by forward kinematics, the head on its tracker. All it knows of the past is the
     state of its cells; it does not see its own outputs. Training unrolls it over T frames from a zero state,
     as a live stream starts.
-
-    Args:
-        normalizer: converts between the world and network space.
-        frames: T, the frames of a training window.
-        width: d, the width of a member's hidden state.
-        depth: number of a member's blocks.
-        cell: the recurrent cell, by its name in CELLS.
-        expansion: the hidden width of the blocks' MLPs, as a multiple of d.
-        output: what the rotations stand for, by its name in OUTPUTS.
-        members: number of members.
     """
 
     graph = RecurrentPoserGraph
 
-    def __init__(
-        self,
-        normalizer: Normalizer,
-        *,
-        frames: int,
-        width: int,
-        depth: int,
-        cell: str,
-        expansion: int,
-        output: str,
-        members: int,
-    ):
-        super().__init__(normalizer, frames)
-        self.output = OUTPUTS[output]()
+    def __init__(self, normalizer: Normalizer, settings: RecurrentPoserSettings):
+        super().__init__(normalizer, settings.frames)
+        self.output = OUTPUTS[settings.output]()
         self.members = nn.ModuleDict(
-            {f"member{i}": Member(CELLS[cell], width, depth, expansion) for i in range(1, members + 1)}
+            {
+                f"member{i}": Member(CELLS[settings.cell], settings.width, settings.depth, settings.expansion)
+                for i in range(1, settings.members + 1)
+            }
         )
         for _, member in self.named_members():
             self.output.begin(member.head, normalizer)

@@ -13,7 +13,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from memmlp.common.components import component
 from memmlp.common.float32_regions import in_float32
+from memmlp.common.settings import Settings, at_least, one_of, positive, setting
 from memmlp.motion.body import POSITION, ROTATION
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import MotionModel, State, StreamingGraph
@@ -22,26 +24,24 @@ from memmlp.networks.streaming import FrameGRU, has_stream, streaming
 HIDDEN = "refiner"  # the name of the refiner's own state
 
 
-@dataclass(frozen=True)
-class SAGERefiner:
-    """How SAGE-Net's refiner is made, and what it is trained on.
+@component("refiner", "sage")
+@dataclass
+class SAGERefinerSettings(Settings):
+    """SAGE-Net's refiner (Feng et al. 2024): recurrent layers that correct a stream of rotations.
 
-    Attributes:
-        width: the width of its recurrent layers.
-        depth: number of recurrent layers.
-        frames: number of frames of a training piece, over which the network runs as a stream from a fresh
-            start.
-        pieces: how many pieces are drawn from the training clips.
-        lr: learning rate at the start; None for the network's learning rate.
-        velocities: whose movement its loss compares, "rotations" as in the released code, or "joints".
+    It is trained behind the finished network, whose run is the same as without it, on poses that the network
+    streams; its loss is its released code's. Arms that reach to the hands' trackers are corrected,
+    too; evaluation.ik=arms makes them reach again. Steps, batch (of pieces) and schedule are those of optim.
     """
 
-    width: int
-    depth: int
-    frames: int
-    pieces: int
-    lr: float | None = None
-    velocities: str = "rotations"
+    width: int = setting(at_least(1), tiny=8, small=96, paper=512)  # the width of the recurrent layers
+    depth: int = setting(at_least(1), 2)  # the number of recurrent layers
+    frames: int = setting(at_least(4), tiny=20, small=120, paper=500)  # frames of a training piece
+    # how many are drawn from the training clips, as windows are (data.drawn_by); shorter clips begin with
+    # their first frame until one is full
+    pieces: int = setting(at_least(1), tiny=8, small=512, paper=2048)
+    velocities: str = setting(one_of("rotations", "joints"), "rotations")  # whose movement its loss compares
+    lr: float | None = setting(positive(), None)  # learning rate at the start; null: that of optim
 
     def around(self, network: MotionModel) -> Refined:
         """Return a network with a refiner of fresh weights behind it."""

@@ -6,15 +6,21 @@ The nearer a predicted frame is, the less a new prediction may change it; the ne
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common import distributed
+from memmlp.common.components import component
+from memmlp.common.settings import at_least, fraction, setting
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel
+from memmlp.networks.settings import NetworkSettings
 from memmlp.networks.transformer import Attention, EncoderLayer
 
 FRESH = 0.25  # of the training windows begin as a live stream does, without a past
@@ -40,6 +46,43 @@ class RPMGraph(FrameGraph):
     model: RPM
 
 
+@component("model", "rpm", builds="RPM")
+@dataclass
+class RPMSettings(NetworkSettings):
+    """RPM (CVPR 2025): a stream that predicts the next frames at every step, and refines them later.
+
+    Loss and features are its released code's, except that its inputs are z-scores, too; hands are always
+    visible. Training is this project's: AdamW with its schedule.
+    """
+
+    # T, the frames of a training window: context, up to T - context - horizon of free running, horizon
+    frames: int = setting(at_least(2), tiny=24, small=80, paper=80)
+    width: int = setting(at_least(1), tiny=16, small=96, paper=512)  # d, the width of the hidden state
+    depth: int = setting(at_least(1), tiny=2, small=2, paper=4)  # encoder layers
+    heads: int = setting(at_least(1), 4)  # heads of attention
+    # the hidden width of the encoder's feed-forward layers
+    feedforward: int = setting(at_least(1), tiny=32, small=192, paper=1024)
+    dropout: float = setting(fraction(), 0.1)  # in the encoder, while training
+    # frames of its own past motion that it sees; of inputs it sees one more
+    context: int = setting(at_least(1), 10)
+    # true: the past that it makes itself in training has dropout, too; its released code has none there
+    own_dropout: bool = setting(default=False)
+    # frames that it predicts: 10 in its paper's reactive setting, 20 in the smooth one
+    horizon: int = setting(at_least(1), 10)
+
+    defaults: ClassVar = {"loss": "rpm"}
+    recipe: ClassVar = {"normalizer.z_scores": True}
+
+    @classmethod
+    def problems(cls, config: Any) -> Iterator[str]:
+        """Yield why the network cannot be used; see Settings."""
+        yield from super().problems(config)
+        model = config["model"]
+        least = model["context"] + model["horizon"]
+        if model["frames"] < least:
+            yield f"model.frames={model['frames']}: must be at least model.context + model.horizon = {least}"
+
+
 class RPM(WindowlessModel):
     """Cross-attention from past and future motion to the newest inputs, then encoder layers.
 
@@ -47,52 +90,32 @@ class RPM(WindowlessModel):
     nothing uses (9,889,412). Readings: a frame that is predicted for the first time takes the prediction
     unchanged; a live stream begins with zeros as its past motion, as a quarter of the training windows do,
     and with its first frame's inputs in place of earlier ones.
-
-    Args:
-        normalizer: converts between the world and network space.
-        frames: T, the frames of a training window: past motion, frames of free running, and predicted frames.
-        width: d, the width of the features.
-        depth: number of encoder layers.
-        heads: number of attention heads; it divides d.
-        feedforward: width of the encoder's hidden layers.
-        dropout: dropout rate of the encoder, while training.
-        context: how many frames of its own past motion the network sees; it sees the inputs of one frame
-            more.
-        horizon: W, how many frames the network predicts.
-        own_dropout: whether the past that it makes itself in training has dropout, too; as published it has
-            none.
     """
 
     graph = RPMGraph
     places: Tensor
     freedom: Tensor
 
-    def __init__(
-        self,
-        normalizer: Normalizer,
-        *,
-        frames: int,
-        width: int,
-        depth: int,
-        heads: int,
-        feedforward: int,
-        dropout: float,
-        context: int,
-        horizon: int,
-        own_dropout: bool = False,
-    ):
-        super().__init__(normalizer, frames)
-        self.context, self.horizon, self.own_dropout = context, horizon, own_dropout
-        self.motion = nn.Linear(ROTATION.stop, width)
-        self.sparse = nn.Linear(SPARSE_DIM, width)
-        self.attention = Attention(width, heads)
-        self.norm = nn.LayerNorm(width)
-        self.layers = nn.ModuleList(
-            EncoderLayer(width, heads, feedforward, dropout, F.gelu) for _ in range(depth)
+    def __init__(self, normalizer: Normalizer, settings: RPMSettings):
+        super().__init__(normalizer, settings.frames)
+        self.context, self.horizon, self.own_dropout = (
+            settings.context,
+            settings.horizon,
+            settings.own_dropout,
         )
-        self.head = nn.Linear(width, ROTATION.stop)
-        self.register_buffer("places", sines(context + horizon, width), persistent=False)
-        self.register_buffer("freedom", freedom(horizon), persistent=False)
+        self.motion = nn.Linear(ROTATION.stop, settings.width)
+        self.sparse = nn.Linear(SPARSE_DIM, settings.width)
+        self.attention = Attention(settings.width, settings.heads)
+        self.norm = nn.LayerNorm(settings.width)
+        self.layers = nn.ModuleList(
+            EncoderLayer(settings.width, settings.heads, settings.feedforward, settings.dropout, F.gelu)
+            for _ in range(settings.depth)
+        )
+        self.head = nn.Linear(settings.width, ROTATION.stop)
+        self.register_buffer(
+            "places", sines(settings.context + settings.horizon, settings.width), persistent=False
+        )
+        self.register_buffer("freedom", freedom(settings.horizon), persistent=False)
 
     def initial_state(self, batch: int = 1) -> State:
         """Return the state of a fresh start, zeros.

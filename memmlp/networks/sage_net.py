@@ -5,18 +5,22 @@ Its parts are trained one after the other (memmlp.training.train_sage), and then
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, cast
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from memmlp.common.components import component
+from memmlp.common.settings import at_least, fraction, setting, sized
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.diffusion import Diffusion
 from memmlp.networks.motion_model import OwnWindows, State, StreamingGraph, TrainingOutputs, slide_window
 from memmlp.networks.sage_parts import LATENT, Decoder, HalfVQVAE, LowerDenoiser, UpperDenoiser, places
+from memmlp.networks.settings import NetworkSettings
 from memmlp.networks.streaming import linear
 from memmlp.networks.transformer import DiTBlock
 
@@ -122,6 +126,44 @@ class SAGENetGraph(StreamingGraph):
         return clean
 
 
+@component("model", "sage", builds="SAGENet")
+@dataclass
+class SAGESettings(NetworkSettings):
+    """SAGE-Net (Feng et al. 2024): two diffusion models of the body halves' latents, and a decoder.
+
+    Its parts are trained before it, in runs of their own (upstream); then optim trains both diffusion models
+    and the decoder together, through the sampler. Its refiner is refiner=sage, which can stand behind any
+    network. Losses, learning rates and features are those of its released code.
+    """
+
+    frames: int = setting(at_least(2), tiny=8, small=20, paper=20)  # T, the frames of a window
+    width: int = setting(at_least(1), tiny=16, small=128, paper=512)  # d, the width of the diffusion models
+    depth: int = setting(at_least(1), tiny=1, small=3, paper=12)  # their blocks
+    heads: int = setting(at_least(1), tiny=2, small=4, paper=8)  # their heads of attention
+    # the width of the VQ-VAEs and the decoder, even
+    code_width: int = setting(at_least(2), tiny=16, small=64, paper=256)
+    # blocks of the decoder, and of each VQ-VAE's encoder and decoder
+    code_depth: int = setting(at_least(1), tiny=1, small=2, paper=4)
+    code_heads: int = setting(at_least(1), tiny=2, small=4, paper=4)  # their heads of attention
+    dropout: float = setting(fraction(), 0.1)  # in their blocks, while training
+    diffusion_steps: int = setting(at_least(1), 1000)  # steps of the noise schedule
+    sampling_steps: int = setting(at_least(1), 5)  # calls of each diffusion model for each pose
+    noise: float = setting(at_least(0), 0.01)  # the standard deviation of the noise that sampling starts from
+    noise_seed: int = setting(at_least(0), 0)  # its seed, the same noise for every window
+
+    learns_newest_frame: ClassVar[bool] = True
+    defaults: ClassVar = {"loss": "sage", "upstream": "sage"}
+    recipe: ClassVar = {"optim.steps": sized(20, 1000, 56000), "optim.lr": sized(5.0e-4, 5.0e-4, 8.0e-5)}
+
+    @classmethod
+    def problems(cls, config: Any) -> Iterator[str]:
+        """Yield why the network cannot be used; see Settings."""
+        yield from super().problems(config)
+        for key in ("frames", "code_width"):  # its codes are of two frames each
+            if config["model"][key] % 2:
+                yield f"model.{key}={config['model'][key]}: must be even with model=sage"
+
+
 class SAGENet(OwnWindows):
     """Samples the upper half's latents, then the lower half's given these, and decodes both to a pose.
 
@@ -130,52 +172,31 @@ class SAGENet(OwnWindows):
     frame has losses.
 
     The noise that sampling starts from is always the same, drawn from `noise_seed`, as AGRoLDiffusion's is.
-
-    Args:
-        normalizer: converts between the world and network space.
-        frames: T, the window's length.
-        width: d, the width of the denoisers' features.
-        depth: number of the denoisers' blocks.
-        heads: number of the denoisers' attention heads; it divides d.
-        code_width: the width of the decoder's and the VQ-VAEs' features, even.
-        code_depth: number of blocks of the decoder, and of each VQ-VAE's encoder and decoder.
-        code_heads: number of attention heads of the decoder and the VQ-VAEs; it divides `code_width`.
-        dropout: dropout rate in the blocks of the decoder and the VQ-VAEs, while training.
-        diffusion_steps: number of steps of the training's noise schedule.
-        sampling_steps: number of calls of each denoiser at inference.
-        noise: standard deviation of the noise that sampling starts from.
-        noise_seed: the seed of that noise.
     """
 
     graph = SAGENetGraph
     noises: Tensor
 
-    def __init__(
-        self,
-        normalizer: Normalizer,
-        *,
-        frames: int,
-        width: int,
-        depth: int,
-        heads: int,
-        code_width: int,
-        code_depth: int,
-        code_heads: int,
-        dropout: float,
-        diffusion_steps: int,
-        sampling_steps: int,
-        noise: float,
-        noise_seed: int,
-    ):
-        super().__init__(normalizer, frames)
-        self._codes = {"width": code_width, "depth": code_depth, "heads": code_heads}
-        self._dropout = dropout
-        self.diffusion = Diffusion(diffusion_steps, sampling_steps)
-        self.upper = UpperDenoiser(frames, width=width, depth=depth, heads=heads)
-        self.lower = LowerDenoiser(frames, width=width, depth=depth, heads=heads)
-        self.decoder = Decoder(frames, **self._codes, dropout=dropout)
-        draw = torch.Generator().manual_seed(noise_seed)
-        self.register_buffer("noises", noise * torch.randn(2, frames // 2, LATENT, generator=draw))
+    def __init__(self, normalizer: Normalizer, settings: SAGESettings):
+        super().__init__(normalizer, settings.frames)
+        self._codes = {
+            "width": settings.code_width,
+            "depth": settings.code_depth,
+            "heads": settings.code_heads,
+        }
+        self._dropout = settings.dropout
+        self.diffusion = Diffusion(settings.diffusion_steps, settings.sampling_steps)
+        self.upper = UpperDenoiser(
+            settings.frames, width=settings.width, depth=settings.depth, heads=settings.heads
+        )
+        self.lower = LowerDenoiser(
+            settings.frames, width=settings.width, depth=settings.depth, heads=settings.heads
+        )
+        self.decoder = Decoder(settings.frames, **self._codes, dropout=settings.dropout)
+        draw = torch.Generator().manual_seed(settings.noise_seed)
+        self.register_buffer(
+            "noises", settings.noise * torch.randn(2, settings.frames // 2, LATENT, generator=draw)
+        )
 
     def codes(self, joints: tuple[int, ...]) -> HalfVQVAE:
         """Make a VQ-VAE with fresh weights for the half of the body that has the given joints."""

@@ -6,9 +6,14 @@ predicted (a zero-velocity baseline: Martinez et al., CVPR 2017); the papers of 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import torch
 from torch import Tensor, nn
 
+from memmlp.common.components import component
+from memmlp.common.settings import at_least, setting
 from memmlp.motion.body import N_JOINTS, ROTATION
 from memmlp.motion.geometry import matrix_to_sixd
 from memmlp.motion.normalizer import Normalizer
@@ -17,6 +22,7 @@ from memmlp.networks.motion_model import (
     State,
     WindowlessModel,
 )
+from memmlp.networks.settings import NetworkSettings
 
 
 class StillPoseGraph(FrameGraph):
@@ -26,21 +32,28 @@ class StillPoseGraph(FrameGraph):
     model: StillPose
 
 
+@component("model", "still_pose", builds="StillPose")
+@dataclass
+class StillPoseSettings(NetworkSettings):
+    """One pose that turns and moves with the head: a floor for tables, which knows only the average pose."""
+
+    frames: int = setting(at_least(2), tiny=10, small=40, paper=40)  # T, the frames of a training window
+
+    defaults: ClassVar = {"loss": "avatar_poser"}
+    recipe: ClassVar = {"normalizer.coordinates": "heading", "normalizer.z_scores": True}
+
+
 class StillPose(WindowlessModel):
     """A learned pose, which the coordinates alone turn and carry along: by default with the head.
 
     It has 132 parameters: the joints' local rotations, at first those of the normalizer's mean, or none where
     it has no mean (`normalizer.z_scores=false`).
-
-    Args:
-        normalizer: converts between the world and network space.
-        frames: T, the frames of a training window; each is a pose of its own.
     """
 
     graph = StillPoseGraph
 
-    def __init__(self, normalizer: Normalizer, *, frames: int):
-        super().__init__(normalizer, frames)
+    def __init__(self, normalizer: Normalizer, settings: StillPoseSettings):
+        super().__init__(normalizer, settings.frames)
         self.pose = nn.Parameter(torch.zeros(ROTATION.stop))
         if not normalizer.mean.any():  # zeros would be no rotations then, and their gradient has no bound
             self.pose.data.copy_(matrix_to_sixd(torch.eye(3)).repeat(N_JOINTS))

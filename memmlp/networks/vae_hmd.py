@@ -9,15 +9,21 @@ not change.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
 from memmlp.common import distributed
+from memmlp.common.components import component
+from memmlp.common.settings import at_least, fraction, setting
 from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM, SPARSE_POSITION, SPARSE_ROTATION
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.layers import Dropout
 from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel
+from memmlp.networks.settings import NetworkSettings
 
 POSES = (SPARSE_ROTATION, SPARSE_POSITION)
 TRACKERS = sum(part.stop - part.start for part in POSES)  # no velocities
@@ -96,40 +102,49 @@ class VAEHMDGraph(FrameGraph):
         return self.normalizer.posed(self.model.decoder(mean), sparse), {}
 
 
+@component("model", "vae_hmd", builds="VAEHMD")
+@dataclass
+class VAEHMDSettings(NetworkSettings):
+    """VAE-HMD (Dittadi et al. 2021): a frame's trackers to the latent of a variational autoencoder of poses.
+
+    No code of its authors is public: sizes are a re-implementation's. Its two stages are trained side by side
+    (reading).
+    """
+
+    # T, the frames of a training window, each a pose of its own; live there is no window
+    frames: int = setting(at_least(2), tiny=10, small=40, paper=40)
+    width: int = setting(at_least(1), tiny=16, small=128, paper=256)  # d, the width of the hidden layers
+    depth: int = setting(at_least(1), 3)  # residual blocks of each encoder and of the decoder
+    latent: int = setting(at_least(1), 30)  # components of the latent
+    dropout: float = setting(fraction(), 0.2)  # in the blocks, while training
+    # the weight of the KL divergence beside its authors' loss, which is in the hundreds; beside
+    # loss=kinematic 0.01 is best, and latents collapse with 1
+    divergence_weight: float = setting(at_least(0), 1.0)
+
+    defaults: ClassVar = {"loss": "vae_hmd"}
+
+
 class VAEHMD(WindowlessModel):
     """An encoder of a frame's trackers to a latent, whose mean is decoded to the rotations of that frame.
 
     It has 853,958 parameters at the sizes of its re-implementation. The encoder of whole poses, which
     training alone uses, is not counted.
-
-    Args:
-        normalizer: converts between the world and network space.
-        frames: T, the frames of a training window; each is a pose of its own.
-        width: d, the width of the hidden layers.
-        depth: number of residual blocks of each part.
-        latent: z, the number of the latent's components.
-        dropout: dropout rate of the blocks, while training.
-        divergence_weight: weight of the KL divergence.
     """
 
     graph = VAEHMDGraph
 
-    def __init__(
-        self,
-        normalizer: Normalizer,
-        *,
-        frames: int,
-        width: int,
-        depth: int,
-        latent: int,
-        dropout: float,
-        divergence_weight: float,
-    ):
-        super().__init__(normalizer, frames)
-        self.divergence_weight = divergence_weight
-        self.encoder = Perceptron(TRACKERS, 2 * latent, width, depth, dropout)
-        self.decoder = Perceptron(latent, ROTATION.stop, width, depth, dropout)
-        self.pose_encoder = Perceptron(MOTION_DIM, 2 * latent, width, depth, dropout)
+    def __init__(self, normalizer: Normalizer, settings: VAEHMDSettings):
+        super().__init__(normalizer, settings.frames)
+        self.divergence_weight = settings.divergence_weight
+        self.encoder = Perceptron(
+            TRACKERS, 2 * settings.latent, settings.width, settings.depth, settings.dropout
+        )
+        self.decoder = Perceptron(
+            settings.latent, ROTATION.stop, settings.width, settings.depth, settings.dropout
+        )
+        self.pose_encoder = Perceptron(
+            MOTION_DIM, 2 * settings.latent, settings.width, settings.depth, settings.dropout
+        )
 
     def count_parameters(self) -> int:
         """Count the trainable parameters of the network in use, without the encoder of whole poses."""

@@ -10,7 +10,6 @@ import os
 import platform
 import re
 import subprocess
-import sys
 from collections.abc import Iterable, Mapping
 from importlib import metadata
 from pathlib import Path
@@ -30,7 +29,7 @@ NOT_NUMBERS = (
     "tables",
 )
 """Folders of the package on whose code no result depends; `live` alone measures one, whole poses' times."""
-WIRING = ("config/build.py", "config/build_motion.py", "config/instantiate.py")
+WIRING = ("config/build.py", "config/build_motion.py")
 """Files of these folders that count all the same, since they decide what reaches the constructors."""
 PATCH = 1_000_000  # at most so many characters of changes are kept with a run
 
@@ -211,8 +210,10 @@ def computed_imports(plugins: Mapping[str, Mapping[str, str | None]]) -> str | N
 
 def _own_version(name: str) -> str | None:
     """Return a package's own version, or that of the distribution that contains it."""
-    if version := getattr(sys.modules.get(name), "__version__", None):
-        return str(version)
+    spec = module_spec(name)
+    text = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
+    if version := re.search(r'^__version__ = "(.+)"$', text, re.MULTILINE):
+        return version[1]
     distributions = _distributions().get(name.split(".")[0], [])
     return _version(distributions[0]) if distributions else None
 

@@ -12,7 +12,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import now, plain, read_json, write_json
 from memmlp.runs.environment import environment
 from memmlp.runs.identity import belongs, evaluation_id_of, solver_of
-from memmlp.runs.recipe_versions import RECIPES, outdated
+from memmlp.runs.recipe_versions import outdated, version_of
 
 COMBINED = "combined"
 """The branch of the rotations after inverse kinematics; whose, the settings of the evaluation say."""
@@ -59,7 +59,7 @@ def outdated_by(path: Path, report: Mapping[str, Any]) -> str | None:
     """
     if "recipes" not in report:  # a report from before they were recorded
         return None if current(path, report) else "of an earlier version"
-    known = {name: number for name, number in report["recipes"].items() if name in RECIPES}
+    known = {name: number for name, number in report["recipes"].items() if version_of(name)}
     return ", ".join(outdated(known)) or None
 
 

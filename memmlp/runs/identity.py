@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from memmlp.common.components import declared
 from memmlp.common.files import plain
-from memmlp.common.plugin import METRICS
 from memmlp.runs.former_keys import former_option, with_former_names
 from memmlp.runs.recipe_versions import recipes
 
@@ -39,9 +39,6 @@ NEUTRAL = (
     "hydra",
 )
 """Config keys that change no result of any stage."""
-
-PATHS = ("_target_", "_partial_")
-"""Where a component's class lies; the `name` of one of this package says what it is."""
 
 EVALUATION = ("evaluation",)
 DEPLOYMENT = ("export",)
@@ -175,7 +172,8 @@ def solver_of(settings: Mapping[str, Any]) -> str | None:
 
 def _own_metrics(names: Iterable[str]) -> dict[str, str]:
     """Return the paths of custom metrics' functions, by name."""
-    return {name: METRICS[name].function if name in METRICS else "" for name in sorted(names)}
+    found = {name: declared().get(("metric", name)) for name in sorted(names)}
+    return {name: f"{one.module}.{one.builds}" if one else "" for name, one in found.items()}
 
 
 def _groups(data: Mapping[str, Any]) -> dict[str, Any]:
@@ -250,7 +248,7 @@ def training_config(config: Mapping[str, Any]) -> dict[str, Any]:
     later = (*EVALUATION, *DEPLOYMENT, *(() if _rolls_out(config) else INFERENCE))
     out = (*NEUTRAL, *later, *_unused(config))
     flat = {key: _canonical(value) for key, value in flatten(config).items() if value is not None}
-    counting = {key: flat[key] for key in flat if not _below(key, out) and not _is_path(key, flat)}
+    counting = {key: flat[key] for key in flat if not _below(key, out)}
     inert = {key: value for key, value in _inert(config).items() if key in counting}
     return counting | inert | _draws(config)
 
@@ -369,17 +367,6 @@ def _inert(config: Mapping[str, Any]) -> dict[str, float]:
 def _below(key: str, names: Iterable[str]) -> bool:
     """Return whether a dotted key is one of the names, or below one."""
     return any(key == name or key.startswith(f"{name}.") for name in names)
-
-
-def _is_path(key: str, flat: Mapping[str, Any]) -> bool:
-    """Return whether a key holds the import path of a class that the config also names in another way.
-
-    That is the class of a slot, or of a component below one, if it is of this package: `name` says which it
-    is. Of classes of users' packages, the path is the only name.
-    """
-    node, _, last = key.rpartition(".")
-    named = "." not in node or f"{node}.name" in flat
-    return last in PATHS and named and (flat[key] is True or str(flat[key]).startswith("memmlp."))
 
 
 def _digest(what: Mapping[str, Any]) -> str:

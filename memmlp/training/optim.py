@@ -6,15 +6,17 @@ The classes of the slot `optim` are Optim (AdamW), Muon and ScheduleFree.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import nn
 
+from memmlp.common.components import component
 from memmlp.common.errors import InputError
+from memmlp.common.settings import Settings, at_least, fraction, one_of, positive, setting, within
 from memmlp.training.averaging import EMA, Average, ScheduleFreeAverage
 from memmlp.training.muon import ComposedOptimiser
 
@@ -24,6 +26,70 @@ SCHEDULES: dict[str, Callable[[float, float, float], float]] = {
     "cosine": lambda done, final, drop_at: final + (1 - final) * 0.5 * (1 + math.cos(math.pi * done)),
     "milestones": lambda done, final, drop_at: 0.2 ** sum(done >= at for at in (0.2, 0.5, 0.7)),
 }
+
+
+@dataclass
+class OptimSettings(Settings):
+    """The keys that all optimisers have."""
+
+    steps: int = setting(at_least(1), "${profile.steps}")
+    batch: int = setting(at_least(1), "${profile.batch}")  # windows a step
+    lr: float = setting(positive(), "${profile.lr}")
+    weight_decay: float = setting(at_least(0), 1.0e-4)
+    warmup: int = setting(at_least(0), 0)  # steps over which the learning rate first grows; 0 for none
+    clip_norm: float = setting(at_least(0), 0.0)  # the largest norm of the gradient; 0 for no limit
+    precision: str = setting(one_of("fp32", "bf16"), "fp32")
+    compile: bool = setting(default=False)  # true: torch.compile the network
+    checkpoint_every: int = setting(at_least(1), "${profile.checkpoint_every}")  # steps between checkpoints
+    validate_every: int = setting(at_least(1), "${profile.validate_every}")  # steps between validations
+    log_every: int = setting(at_least(1), "${profile.log_every}")  # steps between entries of the metrics log
+
+    @classmethod
+    def problems(cls, config: Any) -> Iterator[str]:
+        """Yield which values cannot be combined; see Settings."""
+        own = config["optim"]
+        if own.get("final_lr", 0) > own["lr"]:
+            yield f"optim.final_lr={own['final_lr']}: must be at most optim.lr={own['lr']}"
+        if own["warmup"] > own["steps"]:
+            yield f"optim.warmup={own['warmup']}: must be at most optim.steps={own['steps']}"
+
+
+@component("optim", "adamw", builds="Optim")
+@dataclass
+class AdamWSettings(OptimSettings):
+    """Training by AdamW (Sec. 4.1). Batch and weight decay are AGRoL's (reading 12)."""
+
+    final_lr: float = setting(at_least(0), "${profile.final_lr}")  # the learning rate at the end
+    # step: falls to final_lr at drop_at; cosine: falls to it along a half cosine
+    schedule: str = setting(one_of("step", "cosine"), "${profile.schedule}")
+    drop_at: float = setting(within(0, 1, strict=True), 0.75)  # a fraction of the steps: 225 K of 300 K
+    # decay of an exponential moving average of the weights, such as 0.999, which is what counts; null for
+    # none
+    ema: float | None = setting(within(0, 1, strict=True), "${profile.ema}")
+
+
+@component("optim", "muon", builds="Muon")
+@dataclass
+class MuonSettings(AdamWSettings):
+    """Training by Muon for matrices and AdamW for all else (torch.optim.Muon).
+
+    Its steps are as long as AdamW's at the same learning rate.
+    """
+
+    momentum: float = setting(fraction(), 0.95)  # Muon's
+    other_lr: float | None = setting(positive(), None)  # learning rate of all but matrices; null: lr
+    # which optimises parameters with one column or row, such as the biases of time mixes
+    vectors: str = setting(one_of("adamw", "muon"), "adamw")
+
+
+@component("optim", "schedule_free", builds="ScheduleFree")
+@dataclass
+class ScheduleFreeSettings(OptimSettings):
+    """Training by schedule-free AdamW, which averages the weights itself.
+
+    It needs pip install 'memmlp[schedulefree]'.
+    The learning rate does not fall after the warm-up.
+    """
 
 
 @dataclass(frozen=True)

@@ -5,23 +5,20 @@ This module needs no torch, so that planning a sweep, listing, and finding a fin
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from memmlp.common.components import chosen
 from memmlp.common.progress import announce, notify
 from memmlp.motion.motion_source import MotionSource, Prepared
 from memmlp.runs.environment import packages_of_ones_own
 from memmlp.runs.evaluation_file import read_report
-from memmlp.runs.identity import NETWORK, VQVAE_SHAPE, Identity, deployment_id, evaluation_id, option_in_slot
+from memmlp.runs.identity import NETWORK, VQVAE_SHAPE, Identity, deployment_id, evaluation_id
 from memmlp.runs.run import Run
 from memmlp.training.data_remarks import data_remarks, tested_clips_remark
-
-CODES = {"vq": "frozen", "vq_joint": "joint"}
-"""By memory: whether its VQ-VAE is trained before the network, or with it."""
 
 
 @dataclass(frozen=True)
@@ -95,13 +92,7 @@ class RunRequest:
 
 def codes_of(config: Mapping[str, Any]) -> str | None:
     """Return how the VQ-VAE of a config's memory is trained, "frozen" or "joint"; None without one."""
-    memory = config.get("memory") or {}
-    path = str(memory.get("_target_", "memmlp."))
-    if path.startswith("memmlp."):
-        return CODES.get(str(option_in_slot(config, "memory")))
-    module, _, name = path.rpartition(".")
-    kind = getattr(importlib.import_module(module), name)
-    return "joint" if kind.trains_codes else "frozen" if kind.uses_codes else None
+    return getattr(chosen(config, "memory"), "codes", None) or None
 
 
 def without_refiner(config: Mapping[str, Any]) -> dict[str, Any]:

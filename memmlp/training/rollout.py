@@ -6,12 +6,15 @@ So the history may be made by the network itself, as it will be in a live stream
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from memmlp.common import distributed
+from memmlp.common.components import component
+from memmlp.common.settings import Settings, at_least, setting
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.networks.motion_model import MotionModel, State
@@ -52,6 +55,7 @@ class Rollout(nn.Module):
         """Keep what is needed of the state after the training call; by default nothing is kept."""
 
 
+@component("rollout", "teacher_forcing")
 class TeacherForcing(Rollout):
     """A rollout with the true motion as history: the paper's training (Sec. 3.2.1)."""
 
@@ -64,6 +68,19 @@ class TeacherForcing(Rollout):
         stretch = dataset.stretches(clips, end, past + stride)
         state = model.true_state(stretch[:, :past])
         return TrainingCall(stretch[:, past:, :SPARSE_DIM], state, stretch[:, -model.frames :], clips)
+
+
+@component("rollout", "own_predictions", builds="OwnPredictions")
+@dataclass
+class OwnPredictionsSettings(Settings):
+    """Training on the network's own predictions for the frames before the window (reading 6).
+
+    With memory.shift=frame a call makes one of them, so that max_passes has to be model.frames at least.
+    """
+
+    # a step makes 0 to this many calls without gradient before the trained one; the number is drawn for each
+    # step
+    max_passes: int = setting(at_least(1), 3)
 
 
 class OwnPredictions(Rollout):
@@ -95,6 +112,15 @@ class OwnPredictions(Rollout):
         torch.clear_autocast_cache()  # weights that were cast without a gradient would have none below
         model.train()
         return TrainingCall(sparse[:, -stride:], state, stretch[:, -model.frames :], clips)
+
+
+@component("rollout", "streams", version=2, builds="PersistentStreams")
+@dataclass
+class StreamsSettings(Settings):
+    """Training on persistent streams (reading 6)."""
+
+    # streams side by side, each of which goes through whole clips on its own history
+    streams: int = setting(at_least(1), tiny=16, small=1024, paper=1024)
 
 
 class PersistentStreams(Rollout):

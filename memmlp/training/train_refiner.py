@@ -19,7 +19,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import checkpoint
 from memmlp.networks.architectures import Architecture, RefinedArchitecture
 from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.refiner import HIDDEN, Refined, SAGERefiner
+from memmlp.networks.refiner import HIDDEN, Refined, SAGERefinerSettings
 from memmlp.runs.run import Run
 from memmlp.training.loop import StepResult, TrainingTask, ValidationCallback, train
 from memmlp.training.losses import Fixed, Loss, Terms, TermsLoss
@@ -94,7 +94,7 @@ class RefinerTraining:
     """
 
     seed: int
-    refiner: SAGERefiner
+    refiner: SAGERefinerSettings
     optim: Optim
     drawn_by: str
     shares: Mapping[str, float] | None = None

@@ -19,7 +19,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common import distributed
+from memmlp.common.components import component
 from memmlp.common.float32_regions import in_float32
+from memmlp.common.settings import Settings, at_least, each, fraction, group, positive, setting, sized
 from memmlp.motion.body import HANDS, HEAD, N_JOINTS, ROOT, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.dataset import MirroredDataset, MotionDataset, WindowSampler
 from memmlp.motion.motion_source import Prepared
@@ -73,15 +75,48 @@ class DroppingOptim(Optim):
         return self.lr_drop ** sum(step >= at * self.steps for at in self.lr_drops_at)
 
 
-@dataclass(frozen=True)
-class SAGEUpstream:
-    """The steps, batch, lr and its drops with which each part is trained."""
+@dataclass
+class PartSettings:
+    """How a part is trained: by AdamW with a weight decay of 1e-4."""
 
-    upper_codes: Mapping[str, Any]
-    lower_codes: Mapping[str, Any]
-    upper_diffusion: Mapping[str, Any]
-    lower_diffusion: Mapping[str, Any]
-    decoder: Mapping[str, Any]
+    steps: int = setting(at_least(1), sized(20, 2000, 188000))
+    batch: int = setting(at_least(1), sized(8, 32, 512))  # windows a step
+    lr: float = setting(positive(), sized(1.0e-3, 1.0e-3, 1.0e-4))
+    lr_drops_at: list[float] = setting(each(fraction(), empty=True), [0.75])  # fractions of the steps
+    lr_drop: float = setting(positive(), 0.25)  # by which the learning rate is multiplied at each of these
+
+
+@component("upstream", "sage", version=3)
+@dataclass
+class SAGEUpstreamSettings(Settings):
+    """The training of SAGE-Net's parts before the whole network (Feng et al. 2024), each in a run of its own.
+
+    Learning rates and their falls are its authors'; at profile=paper steps draw as many windows as epochs.
+    Of optim, precision and the intervals act here; its optimiser, warmup, ema, clip_norm, weight_decay and
+    compile only act in the training of the whole.
+    """
+
+    upper_codes: PartSettings = group(PartSettings)  # the VQ-VAE of the upper half of the body
+    lower_codes: PartSettings = group(PartSettings)  # the VQ-VAE of the lower half
+    # the diffusion model of the upper half's latents
+    upper_diffusion: PartSettings = group(
+        PartSettings,
+        steps=sized(20, 2000, 240000),
+        lr=sized(1.0e-3, 1.0e-3, 2.0e-4),
+        lr_drops_at=[0.392, 0.588],
+    )
+    # the diffusion model of the lower half's latents, given the upper ones that the first predicts
+    lower_diffusion: PartSettings = group(
+        PartSettings,
+        steps=sized(20, 2000, 193000),
+        lr=sized(1.0e-3, 1.0e-3, 2.0e-4),
+        lr_drops_at=[0.366, 0.488],
+        lr_drop=0.2,
+    )
+    # the decoder of what both predict
+    decoder: PartSettings = group(
+        PartSettings, steps=sized(20, 1000, 56000), batch="${profile.batch}", lr_drops_at=[], lr_drop=1.0
+    )
 
     def trainings(self, config: Mapping[str, Any], network: NetworkTraining) -> Iterator[PartTraining]:
         """Yield the training of each part, in order.
@@ -110,7 +145,7 @@ def list_unused(name: str, whole: Optim, part: Optim) -> tuple[str, ...]:
 
 def select_config(kind: str, config: Mapping[str, Any]) -> dict[str, Any]:
     """Return those keys of a network's config that determine the result of training one of its parts."""
-    upstream = {key: config["upstream"][key] for key in ("name", "_target_", kind)}
+    upstream = {key: config["upstream"][key] for key in ("name", kind)}
     own = {key: config[key] for key in ("profile", "data", "normalizer", "seed")}
     own |= {"loss": config["loss"]} if kind == "decoder" else {}
     return {

@@ -226,7 +226,7 @@ def test_train_gives_the_job_its_config(memmlp: Memmlp, jobs: list[DictConfig], 
     ran = memmlp("train", "profile=tiny", "memory=none", "seed=3")
     assert (ran.code, ran.out, ran.err) == (0, "", "")
     (cfg,) = jobs
-    assert (cfg.seed, cfg.model.width, cfg.memory._target_) == (3, 16, "memmlp.networks.memory.NoMemory")
+    assert (cfg.seed, cfg.model.width, cfg.memory.name) == (3, 16, "none")
     assert "hydra" not in cfg
     assert list(tmp_path.iterdir()) == []
 
@@ -271,7 +271,7 @@ def test_a_failed_job_does_not_stop_the_others(memmlp: Memmlp, monkeypatch: pyte
 def test_cfg_job_prints_the_config(memmlp: Memmlp, jobs: list[DictConfig]):
     ran = memmlp("train", "--cfg", "job", "--resolve", "seed=7")
     assert "seed: 7\n" in ran.out
-    assert "_target_: memmlp.networks.own_past_memory.CodeMemory" in ran.out
+    assert "name: vq" in ran.out
     assert jobs == []
 
 

@@ -24,7 +24,7 @@ from memmlp.common.errors import InputError
 from memmlp.config.compose_plan import find_sweep, kept_or_new_plan, orphans, plan_anew
 from memmlp.config.worker_process import perform
 from memmlp.runs.lookup import list_runs
-from memmlp.runs.recipe_versions import RECIPES
+from memmlp.runs.recipe_versions import RECIPES, version_of
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan
 from memmlp.sweep.progress_table import name
@@ -365,7 +365,7 @@ def test_a_worker_of_other_code_or_data_leaves_the_run_alone(home: Path, monkeyp
 
 
 def test_runs_of_an_older_recipe_are_said_and_made_again(home: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(RECIPES, "memory.none", RECIPES["memory.none"] + 1)
+    monkeypatch.setitem(RECIPES, "memory.none", version_of("memory.none") + 1)
     words = (
         "table",
         "trial.yaml",
@@ -377,7 +377,7 @@ def test_runs_of_an_older_recipe_are_said_and_made_again(home: Path, monkeypatch
     known = next(
         one for one in list_runs(home / "outputs") if "memory.none" in one.manifest.get("recipes", {})
     )
-    before = RECIPES["memory.none"] - 1
+    before = version_of("memory.none") - 1
     assert (
         f"made again by the sweep: 'none' seed 0 (run {known.id}: memory.none {before} -> {before + 1})"
         in said

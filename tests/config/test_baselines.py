@@ -170,51 +170,54 @@ REFUSED = [
     (["model=avatar_poser", "model.heads=7"], "model.heads"),
     (["model=agrol_diffusion", "model.sampling_steps=2000"], "model.sampling_steps"),
     (["model=agrol_diffusion", "model.diffusion_steps=0"], "model.diffusion_steps"),
-    (["loss=agrol"], "predictor=rotation_only with hand=off"),
-    (["loss=agrol", "predictor=rotation_only", "hand=fk"], "predictor=rotation_only with hand=off"),
+    (["loss=agrol"], "predictor=rotation_only hand=off"),
+    (["loss=agrol", "predictor=rotation_only", "hand=fk"], "predictor=rotation_only hand=off"),
     (
         ["loss=avatar_poser", "predictor=rotation_only", "hand=off"],
-        "loss=avatar_poser: a baseline's, of other outputs than Mem-MLP's; allowed are loss=uncertainty",
+        "loss=avatar_poser",
     ),
     (["model=agrol_mlp", "loss.error=cube"], "loss.error=cube"),
     (["model=avatar_poser", "loss.anchor=foot"], "loss.anchor=foot"),
     (
         ["model=ego_poser", "normalizer.z_scores=true"],
-        "normalizer.z_scores=true: EgoPoser takes the head's place off the hands'",
+        "normalizer.z_scores=true",
     ),
     (["model=rpm", "model.frames=19"], "model.context + model.horizon = 20"),
-    (["model=manikin_l", "model.offline=true"], "allowed is evaluation.modes=[window] with export.graph=off"),
+    (["model=manikin_l", "model.offline=true"], "evaluation.modes=[window] and export.graph=off"),
     (
         [*OFFLINE, "refiner=sage"],
-        "refiner: corrects a stream",
+        "refiner: must be null",
     ),
     (["model=bodiffusion", "model.noise_weight=0"], "model.noise_weight=0"),
     (["model=sage", "upstream=null"], "upstream=null"),
-    (["upstream=sage"], "allowed with this model is upstream=null"),
-    (["model=sage", "model.frames=21"], "model.frames=21: allowed for SAGENet is an even number"),
+    (["upstream=sage"], "upstream=sage: must be null"),
+    (["model=sage", "model.frames=21"], "model.frames=21: must be even"),
     (["model=sage", "model.code_heads=3"], "model.code_heads=3"),
     (["model=sage", "model.code_width=21", "model.code_heads=1"], "model.code_width=21"),
     (["model=sage", "upstream.decoder.lr_drop=0"], "upstream.decoder.lr_drop=0"),
-    (["model=avatar_poser", "loss=of_network"], "loss=of_network: AvatarPoser"),
-    (["loss=terms"], "loss=terms is of rotations alone"),
+    (["model=avatar_poser", "loss=of_network"], "loss=of_network"),
+    (["loss=terms"], "loss=terms"),
     (["model=agrol_mlp", "loss=terms", "loss.jerk=-1"], "loss.jerk=-1"),
     (["model=agrol_mlp", "loss=terms", "loss.jerks=1"], "loss.jerks"),
-    (["model=avatar_poser", "loss=kinematic"], "loss.velocity: needs 2 frames of each window"),
-    (["model=manikin_s", "loss=terms", "loss.contact=1"], "loss.contact: needs 2 frames"),
-    (["model=sage", "loss=terms", "loss.jerk=1"], "loss.jerk: needs 4 frames"),
-    (["model=hmd_poser", "model.frames=3", "loss=calm"], "allowed is loss.velocity_3=null"),
-    (["model=agrol_mlp", "export.precision=int8", "export.graph=naive"], "allowed is auto or streaming"),
-    (["model=recurrent_poser", "evaluation.ik=arms"], "model.output=reaching has such arms already"),
+    (["model=avatar_poser", "loss=kinematic"], "loss.velocity: must be null"),
+    (["model=manikin_s", "loss=terms", "loss.contact=1"], "loss.contact: must be null"),
+    (["model=sage", "loss=terms", "loss.jerk=1"], "loss.jerk: must be null"),
+    (["model=hmd_poser", "model.frames=3", "loss=calm"], "loss.velocity_3: must be null"),
+    (
+        ["model=agrol_mlp", "export.precision=int8", "export.graph=naive"],
+        "export.precision=int8: must be fp32",
+    ),
+    (["model=recurrent_poser", "evaluation.ik=arms"], "evaluation.ik=arms: must be off"),
 ]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("overrides", "word"), REFUSED, ids=[" ".join(options) for options, _ in REFUSED])
-def test_what_makes_no_sense_is_refused_in_one_line(overrides, word):
-    with pytest.raises(InputError) as refusal:
-        composed(overrides)
-    assert word in str(refusal.value)
-    assert "\n" not in str(refusal.value)
+def test_an_impossible_combination_is_one_line():
+    for overrides, word in REFUSED:
+        with pytest.raises(InputError) as refusal:
+            composed(overrides)
+        assert word in str(refusal.value), overrides
+        assert "\n" not in str(refusal.value)
 
 
 @pytest.mark.slow
@@ -224,10 +227,10 @@ def test_arms_that_a_refiner_has_moved_may_reach_again():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("profile", ["tiny", "small", "paper"])
-def test_profiles_and_the_papers_experiment_fit(name, profile):
-    cfg = composed([f"model={name}", "experiment=paper", f"profile={profile}", "model.frames=22"])
-    assert cfg.model.frames == 22
-    assert (cfg.memory, cfg.predictor, cfg.hand) == (None, None, None)
-    assert build_experiment(cfg).config["model"]["_target_"].startswith("memmlp.networks.")
+def test_profiles_and_the_papers_experiment_fit(profile):
+    for name in NAMES:
+        cfg = composed([f"model={name}", "experiment=paper", f"profile={profile}", "model.frames=22"])
+        assert cfg.model.frames == 22
+        assert (cfg.memory, cfg.predictor, cfg.hand) == (None, None, None)
+        assert build_experiment(cfg).config["model"]["name"] == name

@@ -321,27 +321,24 @@ REFUSED += [(["predictor=two_branch_memory", "predictor.depth=0"], "predictor.de
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("overrides", "word"), REFUSED, ids=[" ".join(options) for options, _ in REFUSED])
-def test_what_cannot_go_together_is_refused_in_one_line(overrides, word):
-    rotation_only = any(option.startswith("predictor=rotation_only") for option in overrides)
-    hand = (
-        ["hand=fk"] if rotation_only and not any(option.startswith("hand=") for option in overrides) else []
-    )
-    with pytest.raises(InputError) as stop:
-        composed(["profile=tiny", *overrides, *hand])
-    assert word in str(stop.value)
-    assert "allowed" in str(stop.value)
-    assert "\n" not in str(stop.value)
+def test_what_cannot_go_together_is_refused_in_one_line():
+    for overrides, word in REFUSED:
+        rotation_only = any(option.startswith("predictor=rotation_only") for option in overrides)
+        hand = ["hand=fk"] if rotation_only and not any(o.startswith("hand=") for o in overrides) else []
+        with pytest.raises(InputError) as stop:
+            composed(["profile=tiny", *overrides, *hand])
+        assert word in str(stop.value), overrides
+        assert "\n" not in str(stop.value)
 
 
-@pytest.mark.parametrize("name", ["s1", "s2", "s3"])
-def test_every_protocol_builds(name, tmp_path):
+def test_every_protocol_builds(tmp_path):
     (tmp_path / "CMU").mkdir()
     for part in ("train", "test"):
         (tmp_path / "CMU" / f"{part}_split.txt").write_text(f"CMU/{part}.npz\n")
-    lists = [f"data.split.folder={tmp_path}"] if name == "s1" else []
-    cfg = composed([f"data=amass_{name}", f"data.root={tmp_path}", *lists])
-    assert build_experiment(cfg).config["data"]["name"] == f"amass_{name}"
+    for name in ("s1", "s2", "s3"):
+        lists = [f"data.split.folder={tmp_path}"] if name == "s1" else []
+        cfg = composed([f"data=amass_{name}", f"data.root={tmp_path}", *lists])
+        assert build_experiment(cfg).config["data"]["name"] == f"amass_{name}"
 
 
 @pytest.mark.slow

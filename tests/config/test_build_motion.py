@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import yaml
 from omegaconf import OmegaConf
 
+from memmlp.common.components import declared, find
 from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment
 from memmlp.config.build_motion import build_motion
@@ -15,7 +17,6 @@ from memmlp.config.compose import composed
 from memmlp.config.schema import restored
 from memmlp.motion.preparing.find_clips import Folders
 from memmlp.motion.preparing.splits import MixedSplit, SeededSplit
-from memmlp.runs.recipe_versions import RECIPES
 
 MIX = {
     "defaults": ["mocap", {"grouping@sources.bandai": "bandai_namco"}, "_self_"],
@@ -97,7 +98,7 @@ def test_named_sources_have_groups_of_their_own():
         ({"sources": {}}, [], "data.sources.bandai.root: has no value"),
         ({"root": "a"}, [], "data.root=a"),
         ({"sources": {**MIX["sources"], "c/d": {"root": "a"}}}, [], "data.sources.c/d"),
-        ({"sources": {**MIX["sources"], "other": {"root": "a"}}}, [], "a weight for each source or for none"),
+        ({"sources": {**MIX["sources"], "other": {"root": "a"}}}, [], "data.sources: must have a weight"),
         (with_source(root="nowhere"), [], "data.sources.cmu.root=nowhere"),
         (with_source(weight=0), [], "data.sources.cmu.weight=0"),
         (with_source(test=2), [], "data.sources.cmu.test=2"),
@@ -111,7 +112,7 @@ def test_what_does_not_go_together_is_one_line(changes, words, said):
         mix(changes, *words)
     assert said in str(error.value)
     assert "\n" not in str(error.value)
-    with pytest.raises(InputError, match=r"data.root=None: allowed is a folder or a list"):
+    with pytest.raises(InputError, match=r"data.root=None: must be a folder or a list"):
         composed(["data=mocap", "data.root=null"])
 
 
@@ -156,7 +157,8 @@ def test_a_run_on_a_mix_is_restored():
     assert build_motion(restored(record)) == build_motion(cfg)
 
 
-def test_another_generator_never_finds_the_motion_of_an_older_one(monkeypatch: pytest.MonkeyPatch):
+def test_another_version_of_a_generator_makes_other_motion(monkeypatch: pytest.MonkeyPatch):
     before = build_motion(composed(["profile=tiny"])).clips.root
-    monkeypatch.setitem(RECIPES, "synthetic", 7)
+    newer = replace(find("generator", "puppet"), version=7)
+    monkeypatch.setitem(declared(), ("generator", "puppet"), newer)
     assert build_motion(composed(["profile=tiny"])).clips.root == before.with_name(f"{before.name}-v7")

@@ -48,12 +48,13 @@ def test_a_vqvae_and_a_component_of_ones_own():
     whole = config()
     codes = {"normalizer": whole["normalizer"], "vqvae": whole["vqvae"] | {"codes": 9, "seed": 4}}
     assert readable_name("vqvae", codes) == "VQ-VAE · vqvae.codes=9 · seed 4"
-    mine = whole | {"memory": {"name": "mine", "_target_": "mine.Memory", "knob": 3}}
+    mine = whole | {"memory": {"name": "mine", "knob": 3}}
     assert readable_name("memmlp", mine) == "memory=mine · seed 0"
 
 
 def test_hydra_is_as_busy_afterwards_as_before():
-    busy, whole = GlobalHydra.instance(), config("optim.lr=0.5")
+    whole = config("optim.lr=0.5")
+    busy = GlobalHydra.instance()
     busy.hydra = "a job's"  # type: ignore[assignment]
     try:
         assert readable_name("memmlp", whole) == "optim.lr=0.5 · seed 0"

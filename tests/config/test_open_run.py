@@ -27,27 +27,19 @@ def trained(tmp_path: Path) -> Run:
     return run
 
 
-@pytest.mark.parametrize(
-    ("word", "key", "value"),
-    [
-        ("evaluation.ik=arms", "evaluation", "arms"),
-        ("export.precision=int8", "export", "int8"),
-        ("data.strict=true", "data", True),
-    ],
-)
-def test_keys_of_what_follows_a_training_may_have_other_values(trained: Run, word: str, key: str, value):
-    assert value in experiment_of(trained, "cpu", [word]).config[key].values()
+def test_keys_of_later_stages_may_have_other_values(trained: Run):
+    words = ["evaluation.ik=arms", "export.precision=int8", "data.strict=true"]
+    config = experiment_of(trained, "cpu", words).config
+    values = config["evaluation"]["ik"], config["export"]["precision"], config["data"]["strict"]
+    assert values == ("arms", "int8", True)
 
 
-@pytest.mark.parametrize(
-    "word",
-    ["force=true", "device=cuda", "threads=2", "save_predictions=a", "profile.ik=arms", "optim.log_every=7"],
-)
-def test_a_key_that_would_do_nothing_is_refused(trained: Run, word: str):
-    with pytest.raises(InputError, match=f"{word}: .*allowed are keys of evaluation and export"):
-        experiment_of(trained, "cpu", ["evaluation.ik=arms", word])
+def test_a_key_without_effect_is_refused(trained: Run):
+    for word in ("force=true", "device=cuda", "save_predictions=a", "profile.steps=3", "optim.log_every=7"):
+        with pytest.raises(InputError, match=word):
+            experiment_of(trained, "cpu", ["evaluation.ik=arms", word])
 
 
 def test_several_values_of_a_key_are_refused(trained: Run):
-    with pytest.raises(InputError, match=r"^evaluation\.ik=off,arms: allowed is one value"):
+    with pytest.raises(InputError, match=r"^evaluation\.ik=off,arms"):
         experiment_of(trained, "cpu", ["evaluation.ik=off,arms"])

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +16,7 @@ import yaml
 from own_package import EXAMPLE, PACKAGE, registers_kept
 
 from memmlp.cli.workers import split_executor
+from memmlp.common import components
 from memmlp.common.errors import InputError
 from memmlp.config import plugins
 from memmlp.config.build import build_experiment, config_of
@@ -67,26 +68,30 @@ def test_nothing_is_there_of_a_package_that_nobody_names(on_path: Path):
     with pytest.raises(InputError, match=r"memory=mean: no such option"):
         composed(["memory=mean"])
     assert PACKAGE not in sys.modules
-    with pytest.raises(InputError, match=r"evaluation.metrics=.*allowed is .*package of one's own"):
+    with pytest.raises(InputError, match=r"evaluation.metrics="):
         composed(["evaluation.metrics=[FootSkate]"])
 
 
-def test_keys_of_a_schema_of_ones_own_are_checked(on_path: Path):
-    with pytest.raises(InputError, match=r"memory.width=0: allowed is at least 1"):
+def test_keys_of_a_custom_component_are_checked(on_path: Path):
+    with pytest.raises(InputError, match=r"memory.width=0: must be at least 1"):
         composed([*OWN, "memory.width=0"])
     with pytest.raises(InputError, match=r"memory.depth: no such key"):
         composed([*OWN, "memory.depth=2"])
-    with pytest.raises(InputError, match=r"term.weight=-1.0: allowed is at least 0"):
+    with pytest.raises(InputError, match=r"term.weight=-1.0: must be at least 0"):
         composed([*OWN, "term.weight=-1"])
 
 
-def test_an_experiment_knows_packages_and_recipes(on_path: Path):
+def raise_version(monkeypatch: pytest.MonkeyPatch, slot: str, name: str) -> None:
+    monkeypatch.setitem(components.declared(), (slot, name), replace(components.find(slot, name), version=2))
+
+
+def test_an_experiment_knows_packages_and_versions(on_path: Path, monkeypatch: pytest.MonkeyPatch):
     experiment = build_experiment(composed(OWN))
     assert experiment.config["plugins"] == [PACKAGE]
     recipes = experiment.identity("d").recipes
     assert (recipes["memory.mean"], recipes["term.skate"]) == (1, 1)
     before = experiment.identity("d").id
-    plugins.RECIPES["memory.mean"] = 2
+    raise_version(monkeypatch, "memory", "mean")
     assert experiment.identity("d").id != before
     assert build_experiment(composed([])).config["plugins"] == []
 
@@ -96,14 +101,14 @@ def test_naming_a_package_changes_no_run(on_path: Path):
     assert build_experiment(composed([f"plugins=[{PACKAGE}]"])).identity("d").id == plain
 
 
-def test_metrics_of_ones_own_make_another_evaluation(on_path: Path):
+def test_custom_metrics_make_another_evaluation(on_path: Path, monkeypatch: pytest.MonkeyPatch):
     config = build_experiment(composed(OWN)).config
     without = {**config, "evaluation": {**config["evaluation"], "metrics": []}}
     assert evaluation_settings(config, "stream")["metrics"] == {"FootSkate": f"{PACKAGE}.metrics.foot_skate"}
     assert "metrics" not in evaluation_settings(without, "stream")
     before = evaluation_id(config, "stream")
     assert before != evaluation_id(without, "stream")
-    plugins.RECIPES["metric.FootSkate"] = 2
+    raise_version(monkeypatch, "metric", "FootSkate")
     assert evaluation_id(config, "stream") != before
 
 
@@ -124,11 +129,11 @@ def test_a_loss_has_the_term_with_its_weight(on_path: Path):
     assert learned.weighting.weights()["skate"] == 1.0
     assert len(learned.weighting.parameter_groups()[0]["params"]) == 6
     whole = composed([*OWN, "predictor=rotation_only", "hand=off", "loss=agrol", "evaluation.ik=off"])
-    with pytest.raises(InputError, match=r"term=skate: loss=agrol is"):
+    with pytest.raises(InputError, match=r"term=skate: .*loss=agrol"):
         build_experiment(whole)
-    with pytest.raises(InputError, match=r"term=skate: looks at the position branch, which predictor=rot"):
+    with pytest.raises(InputError, match=r"term=skate: .*predictor=rot"):
         build_experiment(composed([*OWN, "predictor=rotation_only", "hand=off"]))
-    with pytest.raises(InputError, match=r"term: AGRoLMLP has none"):
+    with pytest.raises(InputError, match=r"term: .*model=agrol_mlp"):
         composed([f"plugins=[{PACKAGE}]", "model=agrol_mlp", "term=skate"])
 
 
@@ -139,7 +144,7 @@ def test_a_memory_that_cannot_be_streamed_is_exported_as_it_was_trained(on_path:
     architecture = build_experiment(composed(OWN)).architecture
     model = architecture.build(Normalizer.raw(architecture.coordinates, torch.zeros(22, 3)), None).eval()
     assert GRAPHS["auto"](model) is model
-    with pytest.raises(InputError, match=r"export.graph=streaming: parts of one's own have none|own"):
+    with pytest.raises(InputError, match=r"export.graph=streaming"):
         GRAPHS["streaming"](model)
 
 
@@ -176,38 +181,43 @@ def test_a_metric_is_measured_in_both_branches(on_path: Path):
         evaluate(model(), frames(), ["stream"], 4, own={"Mean": UserMetric(lambda p, t: p, "positions")})
 
 
+HEAD = """
+from memmlp.common.components import component
+from memmlp.common.settings import MetricSettings, Settings, setting
+"""
+
+
 @pytest.mark.parametrize(
     ("text", "line"),
     [
-        ("raise RuntimeError('no')", "plugin mine: cannot be imported: RuntimeError: no"),
-        ("import nothing_here", "plugin mine: cannot be imported: No module named 'nothing_here'"),
+        ('@component("memory", "gru")\nclass Mine: pass\n', "memory=gru: "),
+        ('@component("metric", "MPJPE")\nclass S(MetricSettings): smallest = 1\n', "metric MPJPE: "),
+        ('@component("metric", "A")\nclass ASettings(MetricSettings): smallest = 0\n', "metric A: "),
         (
-            "P(metrics={'MPJPE': M('mine.f', 'cm', 1)})",
-            "plugin mine: metric MPJPE: there is one of that name",
+            '@component("metric", "A")\nclass ASettings(MetricSettings): smallest, better = 1, "more"\n',
+            "metric A: better",
         ),
-        ("P(metrics={'a b': M('mine.f', 'cm', 1)})", "plugin mine: metric 'a b': allowed is a word"),
-        ("P(metrics={'A': M('mine.f', 'cm', 0)})", "plugin mine: metric A: smallest=0; allowed"),
-        ("P(metrics={'A': M('mine.f', '', 1, 'more')})", "metric A: better=more; allowed is lower or higher"),
-        ("P(recipes={'memory.gru': 2})", "plugin mine: recipe of memory.gru: there is a component"),
-        ("P(recipes={'memory.a': 0})", "plugin mine: recipe of memory.a: 0; allowed"),
-        ("P(schemas={'memory_gru': 'mine.X'})", "plugin mine: schema of memory_gru: mine.X"),
-        ("P(schemas={'memory_a': 'mine.M'})", "allowed is a dataclass that extends MemoryConfig"),
+        (
+            '@component("metric", "A")\nclass ASettings(torch.nn.Module): pass\n',
+            "name 'torch' is not defined",
+        ),
     ],
 )
-def test_what_a_package_tells_is_checked(folder: Path, text: str, line: str):
-    head = "from memmlp.common.plugin import Metric as M, Plugin as P\n"
-    write(folder, {"mine.py": f"{head}{'plugin = ' if text.startswith('P') else ''}{text}\n"})
+def test_wrong_declarations_are_one_line(folder: Path, text: str, line: str):
+    write(folder, {"mine.py": HEAD + text})
     with pytest.raises(InputError) as error:
         composed(["plugins=[mine]"])
     assert line in str(error.value)
+    assert str(error.value).startswith("plugin mine: ")
     assert "mine" not in plugins.active()
+    assert composed(["memory=gru"]).memory.name == "gru"
 
 
 def test_names_that_are_no_packages(folder: Path):
     for name, line in (
-        ("nowhere_at_all", "there is no such package here"),
-        ("memmlp.cli", "allowed is"),
-        ("os", "allowed is"),
+        ("nowhere_at_all", "not found"),
+        ("memmlp.cli", "plugins: 'memmlp.cli'"),
+        ("os", "plugins: 'os'"),
     ):
         with pytest.raises(InputError, match=line):
             composed([f"plugins=[{name}]"])
@@ -215,7 +225,7 @@ def test_names_that_are_no_packages(folder: Path):
 
 def test_an_option_hides_no_other(folder: Path):
     write(folder, {"mine/__init__.py": "", "mine/conf/memory/gru.yaml": "name: gru"})
-    with pytest.raises(InputError, match=r"gru.yaml: there is an option of that name"):
+    with pytest.raises(InputError, match=r"gru.yaml: must have another name"):
         composed(["plugins=[mine]"])
 
 
@@ -235,75 +245,64 @@ def test_a_folder_of_configs_is_searched_while_a_command_runs(folder: Path):
         composed(["experiment=own"])
 
 
-def test_coordinates_of_ones_own(folder: Path):
-    write(
-        folder, {"mine.py": "from memmlp.motion.network_coordinates import World\nclass Floor(World): pass\n"}
-    )
-    experiment = build_experiment(composed(["normalizer.coordinates=mine.Floor"]))
+COORDINATES = """
+import torch
+from memmlp.common.components import component
+from memmlp.motion.network_coordinates import World
+
+@component("coordinates", "floor")
+class Floor(World): pass
+"""
+
+
+def test_custom_coordinates(folder: Path):
+    write(folder, {"mine.py": COORDINATES})
+    experiment = build_experiment(composed(["plugins=[mine]", "normalizer.coordinates=floor"]))
     assert type(experiment.architecture.coordinates).__name__ == "Floor"
     assert experiment.config["plugins"] == ["mine"]
     assert experiment.identity("d").id != build_experiment(composed([])).identity("d").id
-    for word, line in (
-        ("mine.Gone", "mine.Gone"),
-        ("yaml.Loader", "extends"),
-        ("pathlib.Path", "plugins: 'pathlib'; allowed is the name of a package of your own"),
-        ("sideways", "allowed is"),
-    ):
-        with pytest.raises(InputError, match=line):
-            build_experiment(composed([f"normalizer.coordinates={word}"]))
 
 
 WALKS = """
-from dataclasses import dataclass, field
-from memmlp.common.plugin import Plugin
-from memmlp.config.schema.data import SynthConfig, SynthDataConfig
-from memmlp.config.schema.value_rules import target
+from dataclasses import dataclass
+from memmlp.common.components import component
+from memmlp.common.settings import Settings, setting
+
+@component("generator", "walks", version=VERSION, builds="walks")
+@dataclass
+class WalksSettings(Settings):
+    minutes: float = setting(None, 1)
+    seed: int = setting(None, 0)
 
 def walks(folder, minutes, seed):
     (folder / f"{minutes} {seed}").touch()
-
-def runs(folder, minutes, seed):
-    pass
-
-@dataclass
-class Walks(SynthConfig):
-    _target_: str = target("mine.walks")
-
-@dataclass
-class WalksConfig(SynthDataConfig):
-    synth: Walks = field(default_factory=Walks)
-
-plugin = Plugin(schemas={"data_walks": "mine.WalksConfig"})
 """
 WALKS_YAML = """
-defaults: [synth, /schema/data_walks@_here_, _self_]
+defaults: [synth, override /generator@synth: walks, _self_]
 name: walks
 root: made
-synth: {_target_: mine.walks, minutes: 1, seed: 0}
 """
 
 
-def test_a_data_source_of_ones_own(folder: Path):
-    write(folder, {"mine/__init__.py": WALKS, "mine/conf/data/walks.yaml": WALKS_YAML})
+def test_a_custom_data_source(folder: Path):
+    files = {"mine/__init__.py": "", "mine/walks.py": WALKS.replace("VERSION", "1")}
+    write(folder, {**files, "mine/conf/data/walks.yaml": WALKS_YAML})
     cfg = composed(["plugins=[mine]", "data=walks", "data.synth.minutes=2", "data.synth.seed=3"])
     source = build_motion(cfg)
-    assert source.clips.root == Path("made/mine.walks-minutes2.0-seed3")
+    assert source.clips.root == Path("made/walks-minutes2.0-seed3")
     source.generate(folder)
     assert (folder / "2.0 3").exists()
     config = build_experiment(cfg).config
     assert config["plugins"] == ["mine"]
     assert restored(config).data == cfg.data
-    cfg.data.synth._target_ = "mine.runs"  # the same settings, but other motion
-    other = build_motion(cfg)
-    assert other.clips.root == Path("made/mine.runs-minutes2.0-seed3")
-    assert other.cache != source.cache
 
 
-def test_a_new_recipe_of_a_data_source_makes_its_clips_anew(folder: Path):
-    newer = WALKS.replace("Plugin(", 'Plugin(recipes={"data.walks": 2}, ')
-    write(folder, {"mine/__init__.py": newer, "mine/conf/data/walks.yaml": WALKS_YAML})
+def test_a_new_version_of_a_data_source_makes_its_clips_again(folder: Path):
+    write(
+        folder, {"mine/__init__.py": WALKS.replace("VERSION", "2"), "mine/conf/data/walks.yaml": WALKS_YAML}
+    )
     source = build_motion(composed(["plugins=[mine]", "data=walks"]))
-    assert source.clips.root == Path("made/mine.walks-minutes1.0-seed0-v2")
+    assert source.clips.root == Path("made/walks-minutes1.0-seed0-v2")
 
 
 def test_an_executor_of_ones_own(folder: Path):
@@ -330,13 +329,11 @@ def test_reading_a_run_imports_nothing_by_itself(on_path: Path, monkeypatch: pyt
     assert PACKAGE not in sys.modules
     with pytest.raises(InputError) as error:
         config_of(recorded(config, "0.1.0"))
-    assert str(error.value) == (
-        f"run abc: names code of the package {PACKAGE} 0.1.0; to trust it, say --plugins {PACKAGE} or "
-        f"MEMMLP_PLUGINS={PACKAGE}, in Python plugins=['{PACKAGE}']"
-    )
+    assert f"{PACKAGE} 0.1.0" in str(error.value)
+    assert f"--plugins {PACKAGE} or MEMMLP_PLUGINS={PACKAGE}" in str(error.value)
     assert PACKAGE not in sys.modules
     monkeypatch.setattr(sys, "path", [one for one in sys.path if one != str(on_path)])
-    with pytest.raises(InputError, match=rf"made with the package {PACKAGE} 0.1.0, which is not here"):
+    with pytest.raises(InputError, match=rf"{PACKAGE} 0.1.0, which is not found"):
         config_of(recorded(config, "0.1.0"))
 
 
@@ -347,20 +344,15 @@ def test_a_run_is_read_again_once_its_package_is_named(on_path: Path):
     assert build_experiment(read).identity("d").id == build_experiment(composed(OWN)).identity("d").id
 
 
-@pytest.mark.parametrize(
-    ("path", "line"),
-    [
-        ("os.system", "run abc: os.system: allowed is what memmlp or a package of your own defines"),
-        ("other.Mean", "run abc: made with the package other, which is not here"),
-        ("memmlp_feet.memory.nn.Linear", "nn.Linear: allowed is what memmlp_feet defines itself"),
-        ("memmlp_feet.losses.Gone", "memmlp_feet.losses.Gone"),
-    ],
-)
-def test_a_record_cannot_reach_beyond_the_package(on_path: Path, path: str, line: str):
+def test_a_record_cannot_reach_beyond_the_package(on_path: Path):
     config = build_experiment(composed(OWN)).config
-    forged = {**config, "term": {**config["term"], "_target_": path}}  # of a slot without a schema
-    with pytest.raises(InputError, match=line):
-        config_of(recorded(forged))
+    for change, line in (
+        ({"term": {**config["term"], "name": "os.system"}}, "term=os.system"),
+        ({"term": {**config["term"], "_target_": "os.system"}}, "_target_"),
+        ({"plugins": ["os"]}, "os"),
+    ):
+        with pytest.raises(InputError, match=line):
+            config_of(recorded({**config, **change}))
 
 
 def test_code_that_changed_since_is_told(folder: Path):
@@ -422,32 +414,12 @@ def test_imports_by_computed_names_are_recorded_unless_their_package_is_named(fo
     ]
 
 
-def test_records_without_what_a_package_imports_are_of_no_other_code(folder: Path):
-    """Those of earlier versions, which have the digest of the package alone."""
-    write(folder, IMPORTING)
-    plugins.activate(["mine"])
-    run = Run(folder / "run")
-    files = {"mine.py": code_digest(IMPORTING["mine.py"])}
-    digest = hashlib.sha256(repr(files).encode()).hexdigest()[:12]
-    assert packages_of_ones_own(["mine"])["mine"] == {"version": None, "digest": digest}
-    run.begin("memmlp", {}, data="d", upstream=None, plugins={"mine": {"version": None, "digest": digest}})
-    own = {name: code for name, code in run.manifest["sources"].items() if ":" not in name}
-    run.write_manifest({"sources": own | {"mine:mine.py": files["mine.py"]}})
-    assert run.changed_sources == []
-    run.checkpoint.touch()
-    run.begin("memmlp", {}, data="d", upstream=None, plugins=packages_of_ones_own(["mine"]))
-    assert "mixed" not in run.manifest["sources"].values()
-    write(folder, {"mine.py": "from helper import W\n"})
-    assert run.changed_sources == ["mine:mine.py"]
-
-
 def test_code_that_changed_since_is_told_where_nothing_imports_it(folder: Path):
     """As in tables of a sweep that was planned before."""
     write(folder, {"mine.py": "A = 1\n"})
     plugins.activate(["mine"])
     run = Run(folder / "run")
     run.begin("memmlp", {}, data="d", upstream=None, plugins=packages_of_ones_own(["mine"]))
-    del sys.modules["mine"]
     write(folder, {"mine.py": "A = 22\n"})
     assert run.changed_sources == ["mine:mine.py"]
     assert "mine" not in sys.modules

@@ -17,7 +17,7 @@ from memmlp.motion.body import HEAD, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSI
 from memmlp.motion.geometry import sixd_to_matrix
 from memmlp.motion.network_coordinates import Heading
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.still_pose import StillPose
+from memmlp.networks.still_pose import StillPose, StillPoseSettings
 from memmlp.networks.streaming import streaming
 
 CLIP = tiny.clip(40)
@@ -26,7 +26,7 @@ CLIP = tiny.clip(40)
 @pytest.fixture
 def model() -> StillPose:
     """One that was fitted to a clip and then moved off its average."""
-    model = StillPose(Normalizer.fit(Heading(), tiny.REST, CLIP), frames=7)
+    model = StillPose(Normalizer.fit(Heading(), tiny.REST, CLIP), StillPoseSettings(frames=7))
     torch.nn.init.normal_(model.pose, generator=torch.Generator().manual_seed(0))
     return model.eval()
 
@@ -49,7 +49,7 @@ def test_the_pose_is_the_same_and_the_head_where_its_tracker_is(model: StillPose
 def test_its_first_gradient_is_that_of_rotations(normalize: bool):
     """Zeros are no rotation, and the gradient of one made of them is 1e12 times that of another."""
     made = Normalizer.fit(Heading(), tiny.REST, CLIP) if normalize else Normalizer.raw(Heading(), tiny.REST)
-    model = StillPose(made, frames=7)
+    model = StillPose(made, StillPoseSettings(frames=7))
     motion = model.training_call(CLIP[None, :7, :SPARSE_DIM], {}, CLIP[None, :7]).motion
     (rotations(motion) * torch.rand(22, 3, 3)).sum().backward()
     assert 1e-3 < float(model.pose.grad.norm()) < 1e3
@@ -72,7 +72,7 @@ def test_it_turns_with_the_head_and_with_nothing_else(model: StillPose):
 @torch.no_grad()
 def test_at_first_it_is_the_average():
     normalizer = Normalizer.fit(Heading(), tiny.REST, CLIP)
-    (motion,) = modes.stream(StillPose(normalizer, frames=7).eval(), [CLIP])
+    (motion,) = modes.stream(StillPose(normalizer, StillPoseSettings(frames=7)).eval(), [CLIP])
     mean = CLIP[:, SPARSE_DIM:][:, 6 : ROTATION.stop].mean(0)
     torch.testing.assert_close(motion[:, 6 : ROTATION.stop], mean.expand(len(CLIP), -1), atol=1e-5, rtol=0)
 

@@ -10,12 +10,8 @@ import yaml
 
 from memmlp.common.errors import InputError
 from memmlp.config.compose import composed
-from memmlp.config.schema.config import SCHEMAS
-from memmlp.config.schema.network import PartConfig
 from memmlp.runs.former_keys import (
-    GROUPS,
     KINDS,
-    OPTIONS,
     RENAMED,
     present_key,
     with_former_keys,
@@ -78,29 +74,6 @@ def test_an_id_is_that_of_the_former_names():
     """What version 0.2 made of this config, computed with its code (commit ae007ecb)."""
     made = run_id("memmlp", NOW | {"data": {"drawn_by": "clips"}}, data="d", upstream=None)
     assert made == "30bd7460c64ebd85"
-
-
-@pytest.mark.parametrize("one", RENAMED, ids=lambda one: f"{one.former} of {one.option}")
-def test_every_renamed_key_is_one_of_the_config_and_its_former_name_is_none(one):
-    group, _, key = one.now.partition(".")
-    if group == "upstream":  # of a part of its own
-        assert one.now.split(".")[1] in SCHEMAS["upstream_sage"].__dataclass_fields__
-        fields = PartConfig.__dataclass_fields__
-        assert one.now.split(".")[2] in fields
-        assert one.former.split(".")[2] not in fields
-        return
-    option = one.option.partition("=")[2] if one.option else {"data": "synth"}.get(group)
-    schema = SCHEMAS.get(f"{group}_{option}") or SCHEMAS[group]
-    fields = schema.__dataclass_fields__
-    assert key in fields
-    assert one.former.partition(".")[2] not in fields
-
-
-def test_every_renamed_group_and_option_is_there():
-    fields = SCHEMAS["config"].__dataclass_fields__
-    assert fields.keys() >= set(GROUPS.values())
-    assert fields.keys().isdisjoint(GROUPS)
-    assert {f"{group}_{now}" for group, now in OPTIONS} <= SCHEMAS.keys()
 
 
 def test_recorded_overrides_have_the_names_of_today():

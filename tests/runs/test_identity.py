@@ -54,25 +54,6 @@ def test_what_a_run_is_does_not_move_with_recipes(monkeypatch: pytest.MonkeyPatc
     assert Identity("memmlp", config, "e", codes).what != what
 
 
-def test_where_a_class_lies_does_not_count():
-    def of(path: str) -> str:
-        return identity({**CONFIG, "memory": {"name": "gru", "_target_": path}})
-
-    assert of("memmlp.a.B") == of("memmlp.c.d.B")
-    assert len({of("memmlp.a.B"), of("mine.B"), of("theirs.B")}) == 3  # a name alone tells no foreign class
-
-
-def test_what_a_slot_s_class_is_made_of_counts_unless_it_is_named():
-    """Such as the loss that a loss of one's own wraps."""
-
-    def of(inner: dict) -> str:
-        return identity({**CONFIG, "loss": {"name": "mine", "_target_": "mine.Loss", "inner": inner}})
-
-    assert of({"_target_": "memmlp.a.B"}) != of({"_target_": "memmlp.a.C"})
-    named = [of({"_target_": f"memmlp.{path}", "name": "b"}) for path in ("a.B", "c.d.B")]
-    assert named[0] == named[1]
-
-
 def test_stages_have_identities_of_what_changes_them_alone():
     def of(**changes: object) -> tuple[str, str, str]:
         config = {**CONFIG, "evaluation": {"ik": "off", "ik_iterations": 15, "batch": 4}, "export": {"a": 1}}
@@ -130,7 +111,7 @@ def test_keys_that_older_runs_lack_count_only_where_they_change_something():
         return Identity("memmlp", config, "d").what  # recipe versions, which move as well, do not count
 
     assert of(loss={"weighting": "fixed", "lr": 0.01}, data={"mirror": False}) == of()
-    names = {"name": "adamw", "_target_": "memmlp.training.optim.Optim"}
+    names = {"name": "adamw"}
     assert of(optim={**names, "warmup": 0, "ema": None}) == of()
     others = [{"warmup": 2}, {"ema": 0.9}, {**names, "name": "muon"}]
     assert len({of(), *(of(optim=other) for other in others)}) == 4

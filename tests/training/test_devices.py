@@ -7,7 +7,7 @@ import torch
 
 from memmlp.common import distributed
 from memmlp.common.errors import InputError
-from memmlp.config.schema.value_rules import DEVICE
+from memmlp.common.settings import DEVICE
 from memmlp.training.devices import described, device, missing_gpu, overlooked_gpu, use_threads
 
 

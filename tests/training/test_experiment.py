@@ -16,11 +16,10 @@ from omegaconf import OmegaConf
 
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
-from memmlp.config.schema import restored
 from memmlp.deploy.deployment import GRAPHS
 from memmlp.evaluation import modes as evaluation
 from memmlp.motion.dataset import MotionDataset
-from memmlp.runs.identity import NEUTRAL, Identity, deployment_id, evaluation_id, flatten
+from memmlp.runs.identity import NEUTRAL, flatten
 from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.run import Run
 from memmlp.training.experiment import Experiment
@@ -191,7 +190,7 @@ def digest(value: Any) -> str:
 def test_every_key_is_changed_or_said_not_to_be():
     """The profile's sizes are not changed here, since they act through the groups' keys, which are."""
     config = flatten(OmegaConf.to_container(composed(BASE), resolve=True))  # type: ignore[arg-type]
-    own = {key for key in config if key.rsplit(".", 1)[-1] not in ("name", "_target_", "_partial_")}
+    own = {key for key in config if key.rsplit(".", 1)[-1] != "name"}
     own |= {"data.name"}  # a slot's own name is fixed
     assert {key for key in own if not key.startswith("profile.")} == CHANGES.keys() | UNTRIED.keys()
 
@@ -240,23 +239,3 @@ def test_a_compiled_training_is_another():
         return build_experiment(composed([*BASE, *overrides])).identity("data").id
 
     assert identity("optim.compile=true") != identity()
-
-
-def test_a_class_that_moves_changes_no_identity_and_is_found_where_it_is_now():
-    """For every slot, the run's record names the class where it lay when the run was made."""
-
-    def moved(tree: dict[str, Any]) -> dict[str, Any]:
-        found = {key: moved(value) if isinstance(value, dict) else value for key, value in tree.items()}
-        return {
-            key: f"memmlp.elsewhere.{key}" if key == "_target_" else value for key, value in found.items()
-        }
-
-    cfg = composed(BASE)
-    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-    before = moved(config)
-    assert before != config
-    assert Identity("memmlp", before, "d").id == Identity("memmlp", config, "d").id
-    assert (evaluation_id(before, "stream"), deployment_id(before)) == (
-        evaluation_id(config, "stream"), deployment_id(config)
-    )  # fmt: skip
-    assert OmegaConf.to_container(restored(before)) == config

@@ -257,7 +257,7 @@ def test_foreign_targets_in_a_runs_config_are_refused(home, tmp_path):
     for name in ("manifest.json", "DONE"):
         (copy / name).write_bytes((run.folder / name).read_bytes())
     config = run.config
-    config["memory"]["_target_"] = "os.system"
+    config["memory"]["name"] = "os.system"
     (copy / "config.yaml").write_text(yaml.safe_dump(config))
     assert "os.system" in command(home, "eval", str(copy), code=2)
 

@@ -10,12 +10,12 @@ import torch
 
 from memmlp.evaluation import modes
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.networks.refiner import SAGERefiner
+from memmlp.networks.refiner import SAGERefinerSettings
 from memmlp.training.optim import Optim
 from memmlp.training.train_refiner import RefinerTask, RefinerTraining, SAGERefinerLoss
 
 OPTIM = Optim(steps=12, batch=4, lr=1e-2, final_lr=1e-3, schedule="cosine", checkpoint_every=5, log_every=4)
-REFINER = SAGERefiner(width=6, depth=2, frames=20, pieces=6)
+REFINER = SAGERefinerSettings(width=6, depth=2, frames=20, pieces=6)
 
 
 def task(optim: Optim = OPTIM) -> RefinerTask:

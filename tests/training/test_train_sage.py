@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -141,7 +142,7 @@ def test_the_whole_is_trained_through_both_samplers():
 def test_it_begins_with_the_weights_of_its_parts(tmp_path: Path):
     kept = tiny.baseline("sage", seed=1)
     checkpoint.write(tmp_path / "model", checkpoint.module_tensors("model", kept), {})
-    network = tiny.BASELINES["sage"]
+    network = partial(tiny.build_baseline, "sage")
     architecture = PartedArchitecture(World(), normalize=False, vqvae=tiny.vqvae, network=network)
     for finished in ((), ("upper", "lower")):
         net = replace(architecture, finished=finished).build_for_training(

@@ -13,7 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from memmlp.common.components import component
 from memmlp.common.errors import check_installed
+from memmlp.common.settings import Settings, setting
 from memmlp.runs.loggers.facts import CurvePoint, RunFacts, SweepFacts
 
 if TYPE_CHECKING:
@@ -32,6 +34,17 @@ STATUS = {
     "running": "RUNNING", "done": "FINISHED", "failed": "FAILED", "killed": "KILLED", "stopped": "KILLED",
 }  # fmt: skip
 PARAM_LENGTH, TAG_LENGTH, PARAMS, METRICS = 6000, 5000, 100, 1000  # MLflow's limits
+
+
+@component("loggers", "mlflow", builds="MLflow")
+@dataclass
+class MLflowSettings(Settings):
+    """Shows runs in MLflow while they happen; `memmlp mlflow` opens its page.
+
+    It needs pip install 'memmlp[mlflow]'.
+    """
+
+    uri: str | None = setting(default=None)  # null: MLFLOW_TRACKING_URI, or else sqlite under paths.outputs
 
 
 @dataclass(frozen=True)

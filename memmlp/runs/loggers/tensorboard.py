@@ -9,11 +9,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from memmlp.common.components import component
 from memmlp.common.errors import check_installed
+from memmlp.common.settings import Settings
 from memmlp.runs.loggers.facts import CurvePoint, RunFacts, SweepFacts
 
 MAX_NAME = 120  # characters of a folder's name
 FINGERPRINT = "memmlp-fingerprint"
+
+
+@component("loggers", "tensorboard", builds="TensorBoard")
+@dataclass
+class TensorBoardSettings(Settings):
+    """Writes runs as event files below outputs/tensorboard (needs pip install 'memmlp[tensorboard]')."""
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,21 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from memmlp.common.components import component
 from memmlp.common.errors import check_installed
+from memmlp.common.settings import Settings, setting, text
 from memmlp.runs.loggers.facts import CurvePoint, RunFacts, SweepFacts
 
 OFFLINE = {"WANDB_MODE": "offline", "WANDB_SILENT": "true", "WANDB_ERROR_REPORTING": "false"}
 FINGERPRINT = "memmlp-fingerprint"
+
+
+@component("loggers", "wandb", builds="WandB")
+@dataclass
+class WandBSettings(Settings):
+    """Writes runs as W&B's offline runs below outputs/wandb (needs pip install 'memmlp[wandb]')."""
+
+    project: str = setting(text(), "memmlp")  # to which `wandb sync` uploads
 
 
 @dataclass(frozen=True)

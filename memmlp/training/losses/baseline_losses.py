@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
 
 from torch import Tensor
 
+from memmlp.common.components import component
+from memmlp.common.settings import at_least, one_of, setting
 from memmlp.motion.body import N_JOINTS, ROOT, ROTATION
 from memmlp.motion.normalizer import Normalizer
-from memmlp.training.losses.loss import Fixed, Loss, Terms, joints
+from memmlp.training.losses.loss import CompleteLossSettings, Fixed, Loss, Terms, joints
 from memmlp.training.losses.terms import Comparison
 
 
@@ -23,6 +27,18 @@ def mean_square(error: Tensor) -> Tensor:
 
 
 ERRORS: dict[str, Callable[[Tensor], Tensor]] = {"norm": joint_norms, "square": mean_square}
+
+
+@component("loss", "agrol", builds="AGRoLLoss")
+@dataclass
+class AGRoLLossSettings(CompleteLossSettings):
+    """AGRoL's loss (Du et al. 2023); Mem-MLP can have it with predictor=rotation_only and hand=off."""
+
+    # norm: the mean over frames and joints of the 6D error's norm, as in the released code; square: the mean
+    # squared error
+    error: str = setting(one_of("norm", "square"), "norm")
+
+    rotations_alone: ClassVar[bool] = True
 
 
 class AGRoLLoss(Loss):
@@ -56,6 +72,20 @@ def from_origin(positions: Tensor) -> Tensor:
 
 
 ANCHORS: dict[str, Callable[[Tensor], Tensor]] = {"pelvis": from_pelvis, "head": from_origin}
+
+
+@component("loss", "avatar_poser", builds="AvatarPoserLoss")
+@dataclass
+class AvatarPoserLossSettings(CompleteLossSettings):
+    """AvatarPoser's loss, of mean absolute errors (Jiang et al. 2022)."""
+
+    # weight of the root's orientation: the released code's; its paper has 0.05
+    orientation: float = setting(at_least(0), 0.02)
+    rotation: float = setting(at_least(0), 1.0)  # weight of the local rotations
+    position: float = setting(at_least(0), 1.0)  # weight of the positions by forward kinematics
+    # where both bodies coincide: pelvis, as in the released code, or head, with the predicted head on its
+    # tracker
+    anchor: str = setting(one_of("pelvis", "head"), "pelvis")
 
 
 class AvatarPoserLoss(Loss):
@@ -101,6 +131,20 @@ def joint_sums_of_steps(error: Tensor) -> Tensor:
     return joint_sums(error.diff(dim=1)) * (frames - 1) / frames
 
 
+@component("loss", "rpm", builds="RPMLoss")
+@dataclass
+class RPMLossSettings(CompleteLossSettings):
+    """RPM's loss (CVPR 2025, released code): L1 norms of the joints' errors, and of their steps.
+
+    Rotations are as the network sees them, positions by forward kinematics with the head on its tracker.
+    """
+
+    rotation_all: float = setting(at_least(0), 1.0)
+    rotation_velocity: float = setting(at_least(0), 1.0)
+    world_position: float = setting(at_least(0), 1.0)
+    velocity: float = setting(at_least(0), 1.0)
+
+
 class RPMLoss(Loss):
     """L1 norms of joints' errors in rotations and positions, and in how both move (CVPR 2025, released code).
 
@@ -137,6 +181,12 @@ class RPMLoss(Loss):
             "world_position": joint_sums(positions),
             "velocity": joint_sums_of_steps(positions),
         }
+
+
+@component("loss", "of_network", builds="LossOfNetwork")
+@dataclass
+class LossOfNetworkSettings(CompleteLossSettings):
+    """No loss beside the network's own, for networks that can train with it alone: BoDiffusion."""
 
 
 class LossOfNetwork(Loss):

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
+from memmlp.common.components import component
 from memmlp.common.errors import InputError
 from memmlp.common.float32_regions import in_float32
+from memmlp.common.settings import Settings, at_least, positive, setting
 from memmlp.motion.body import N_JOINTS, POSITION
 from memmlp.motion.normalizer import Normalizer
 
@@ -18,6 +22,44 @@ Terms = dict[str, Tensor]
 def joints(motion: Tensor) -> Tensor:
     """Return the joint positions (B, T, 22, 3) of motion (B, T, 198)."""
     return motion[..., POSITION].unflatten(-1, (N_JOINTS, 3))
+
+
+@component("loss", "manual", builds="Manual")
+@dataclass
+class ManualSettings(Settings):
+    """Mem-MLP's loss terms with fixed weights, which the paper found by grid search (Sec. 4.4, reading 8)."""
+
+    rotation_all: float = setting(at_least(0), 1.0)
+    rotation_velocity: float = setting(at_least(0), 30.0)
+    position_branch: float = setting(at_least(0), 0.5)
+    velocity_lower_body: float = setting(at_least(0), 0.1)
+    hand: float = setting(at_least(0), 0.1)
+
+
+@component("loss", "uncertainty", builds="Uncertainty")
+@dataclass
+class UncertaintySettings(Settings):
+    """Mem-MLP's loss terms weighted by homoscedastic uncertainty (Eq. 5, reading 8).
+
+    A term counts as e^-s L + s, with one learned s for each term.
+    """
+
+    # the learning rate of every s; with the network's own they would not settle
+    lr: float = setting(positive(), 1.0e-2)
+
+
+@dataclass
+class CompleteLossSettings(Settings):
+    """The settings of a complete loss, which networks without slots need; others only weight Mem-MLP's terms.
+
+    Attributes:
+        complete: whether the loss is complete.
+        rotations_alone: whether it only compares rotations, so that Mem-MLP with a rotation branch can have
+        it.
+    """
+
+    complete: ClassVar[bool] = True
+    rotations_alone: ClassVar[bool] = False
 
 
 class Fixed(nn.Module):

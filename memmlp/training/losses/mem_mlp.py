@@ -7,10 +7,16 @@ either per frame.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
 import torch
 from torch import Tensor
 
+from memmlp.common.components import chosen, component
 from memmlp.common.errors import InputError
+from memmlp.common.settings import Settings
 from memmlp.motion.body import FRAME_DIM, HANDS, LOWER, N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.network_coordinates import World
 from memmlp.motion.normalizer import Normalizer
@@ -22,6 +28,7 @@ def l1(error: Tensor) -> Tensor:
     return error.abs().flatten(2).sum(-1).mean()
 
 
+@component("hand", "off")
 class NoHand:
     """The choice to have no hand term."""
 
@@ -30,6 +37,18 @@ class NoHand:
     def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         """Return no term."""
         return {}
+
+
+@component("hand", "position", builds="HandPosition")
+@dataclass
+class HandPositionSettings(Settings):
+    """The hand term compares the wrists' positions of the position branch (reading 9)."""
+
+    @classmethod
+    def problems(cls, config: Any) -> Iterator[str]:
+        """Yield whether the predictor has no positions; see Settings."""
+        if not getattr(chosen(config, "predictor"), "positions", True):
+            yield f"hand=position: must be fk or off with predictor={config['predictor']['name']}"
 
 
 class HandPosition:
@@ -43,6 +62,7 @@ class HandPosition:
         return {"hand": l1((joints(motion) - joints(truth))[:, :, hands])}
 
 
+@component("hand", "fk")
 class HandFK:
     """The hand term as L1 on both wrists' positions by forward kinematics of the rotation branch.
 

@@ -6,18 +6,30 @@ velocities.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from memmlp.common.components import chosen, component
 from memmlp.common.errors import InputError
+from memmlp.common.settings import at_least, one_of, positive, setting
 from memmlp.motion.body import HANDS, HEAD, N_JOINTS, ROOT, ROTATION, SPARSE_POSITION
 from memmlp.motion.geometry import forward_kinematics, geodesic_angle, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
-from memmlp.training.losses.loss import Fixed, LearnedWeights, Loss, Terms, Weighting, joints
+from memmlp.training.losses.loss import (
+    CompleteLossSettings,
+    Fixed,
+    LearnedWeights,
+    Loss,
+    Terms,
+    Weighting,
+    joints,
+)
 
 FEET = (7, 8, 10, 11)  # both ankles, both toes
 TOES = (10, 11)
@@ -181,32 +193,95 @@ def foot_height(pair: Comparison, error: Error) -> Tensor:
     return ((pair.positions[:, 1:, list(TOES), 2] - pair.floor[..., None]).abs() * standing).mean()
 
 
-TERMS: dict[str, tuple[Callable[[Comparison, Error], Tensor], int]] = {
-    "orientation": (orientation, 1),
-    "rotation": (rotation, 1),
-    "global_rotation": (global_rotation, 1),
-    "angle": (angle, 1),
-    "sixd_velocity": (sixd_velocity, 2),
-    "turn": (turn, 2),
-    "position_from_pelvis": (position_from_pelvis, 1),
-    "world_position": (world_position, 1),
-    "hand": (hand, 1),
-    "velocity": (partial(velocity, step=1), 2),
-    "velocity_3": (partial(velocity, step=3), 4),
-    "velocity_5": (partial(velocity, step=5), 6),
-    "acceleration": (acceleration, 3),
-    "jerk": (jerk, 4),
-    "contact": (contact, 2),
-    "penetration": (penetration, 1),
-    "foot_height": (foot_height, 2),
+TERM_FRAMES = {
+    "sixd_velocity": 2, "turn": 2, "velocity": 2, "velocity_3": 4, "velocity_5": 6, "acceleration": 3,
+    "jerk": 4, "contact": 2, "foot_height": 2,
+}  # fmt: skip
+"""How many frames the terms need that need several."""
+
+TERMS: dict[str, Callable[[Comparison, Error], Tensor]] = {
+    "orientation": orientation,
+    "rotation": rotation,
+    "global_rotation": global_rotation,
+    "angle": angle,
+    "sixd_velocity": sixd_velocity,
+    "turn": turn,
+    "position_from_pelvis": position_from_pelvis,
+    "world_position": world_position,
+    "hand": hand,
+    "velocity": partial(velocity, step=1),
+    "velocity_3": partial(velocity, step=3),
+    "velocity_5": partial(velocity, step=5),
+    "acceleration": acceleration,
+    "jerk": jerk,
+    "contact": contact,
+    "penetration": penetration,
+    "foot_height": foot_height,
 }
-"""Each term, and how many frames it needs."""
+"""The terms by name."""
 
 
 WEIGHTINGS: dict[str, Callable[[dict[str, float], float], Weighting]] = {
     "fixed": lambda weights, lr: Fixed(weights),
     "learned": LearnedWeights,
 }
+
+
+@component("loss", "terms", builds="TermsLoss")
+@dataclass
+class TermsLossSettings(CompleteLossSettings):
+    """Terms of a library, each with a weight; null leaves a term out.
+
+    Options such as loss=ego_poser and loss=hmd_poser are choices of them.
+
+    A network that learns one frame of a window (AvatarPoser, EgoPoser, MANIKIN) cannot have the terms over
+    several.
+    """
+
+    # of differences: absolute components, square, norm (of joints), smooth (Huber's, as torch's smooth L1)
+    error: str = setting(one_of("absolute", "square", "norm", "smooth"), "absolute")
+    # learned: by uncertainty (Eq. 5), as e^-s L + s with one s for each term; the weights are those that e^-s
+    # begins at
+    weighting: str = setting(one_of("fixed", "learned"), "fixed")
+    lr: float = setting(positive(), 1.0e-2)  # the learning rate of every s, where weights are learned
+    orientation: float | None = setting(at_least(0), None)  # the root's 6D orientation
+    rotation: float | None = setting(at_least(0), 1.0)  # the other joints' local 6D rotations
+    global_rotation: float | None = setting(at_least(0), None)  # all joints' global 6D rotations
+    # the angle between global rotations, radians, whatever `error` is
+    angle: float | None = setting(at_least(0), None)
+    # all local 6D rotations' differences from frame to frame
+    sixd_velocity: float | None = setting(at_least(0), None)
+    # velocity on SO(3): the rotations from frame to frame, as 6D
+    turn: float | None = setting(at_least(0), None)
+    # joints by forward kinematics relative to the pelvis: without translation
+    position_from_pelvis: float | None = setting(at_least(0), None)
+    # joints by forward kinematics with the head on its tracker
+    world_position: float | None = setting(at_least(0), None)
+    hand: float | None = setting(at_least(0), None)  # both wrists, with the head on its tracker
+    # the joints' movement from frame to frame, with the head on its tracker
+    velocity: float | None = setting(at_least(0), None)
+    velocity_3: float | None = setting(at_least(0), None)  # the same between every third frame
+    velocity_5: float | None = setting(at_least(0), None)  # the same between every fifth frame
+    acceleration: float | None = setting(at_least(0), None)  # the joints' second differences
+    # the norm of the predicted joints' third differences, whatever the true ones are
+    jerk: float | None = setting(at_least(0), None)
+    # the movement of predicted feet while the true ones move at most 1 cm a frame
+    contact: float | None = setting(at_least(0), None)
+    # how far the lowest joint is below the lowest true joint of the window
+    penetration: float | None = setting(at_least(0), None)
+    # the distance of predicted toes from that height while the true ones stand
+    foot_height: float | None = setting(at_least(0), None)
+
+    rotations_alone: ClassVar[bool] = True
+
+    @classmethod
+    def problems(cls, config: Any) -> Iterator[str]:
+        """Yield which terms need more frames than the network learns of a window; see Settings."""
+        newest = getattr(chosen(config, "model"), "learns_newest_frame", False)
+        frames = 1 if newest else config["model"]["frames"]
+        for name, needed in TERM_FRAMES.items():
+            if config["loss"].get(name) is not None and frames < needed:
+                yield f"loss.{name}: must be null, since it needs {needed} frames and there are {frames}"
 
 
 class TermsLoss(Loss):
@@ -244,11 +319,9 @@ class TermsLoss(Loss):
         pair, frames = Comparison(motion, truth, sparse, normalizer), motion.shape[1]
         found = {}
         for name in self.weighting.weights():
-            term, needed = TERMS[name]
-            if frames < needed:
+            if frames < (needed := TERM_FRAMES.get(name, 1)):
                 raise InputError(
-                    f"loss.{name}: needs {needed} frames of each window, and this network learns {frames}; "
-                    f"allowed is loss.{name}=null"
+                    f"loss.{name}: must be null, since it needs {needed} frames; the network learns {frames}"
                 )
-            found[name] = term(pair, self.error)
+            found[name] = TERMS[name](pair, self.error)
         return found

@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from torch import Tensor
 
+from memmlp.common.components import component
+from memmlp.common.settings import Settings, at_least, setting
 from memmlp.motion.body import JOINTS
 from memmlp.motion.normalizer import Normalizer
 from memmlp.training.losses import Term, Terms, joints, l1
 
 FEET = [JOINTS.index("left_foot"), JOINTS.index("right_foot")]
+
+
+@component("term", "skate", builds="FootSkate")
+@dataclass
+class FootSkateSettings(Settings):
+    """term=skate: the velocity of both feet."""
+
+    weight: float = setting(at_least(0), 0.1)  # with loss=manual; loss=uncertainty learns one
 
 
 class FootSkate(Term):

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from torch import Tensor, nn
 
+from memmlp.common.components import component
+from memmlp.common.settings import Settings, at_least, each, one_of, setting
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.networks.memory import FeatureMemory
 from memmlp.networks.motion_model import State
@@ -26,6 +29,18 @@ class MeanFeature(nn.Module):
     def forward(self, mean: Tensor) -> Tensor:
         """Map the mean inputs of each frame's past (B, T, 54) to features (B, T, k)."""
         return self.projection(mean)
+
+
+@component("memory", "mean", builds="MeanMemory")
+@dataclass
+class MeanMemorySettings(Settings):
+    """memory=mean: the mean of the inputs over the window, for each memory block."""
+
+    # which blocks of the backbone have it
+    layers: list[int] = setting(each(at_least(1)), "${even_layers:${model.depth}}")
+    width: int = setting(at_least(1), tiny=8, small=48, paper=192)  # the width of the feature
+    # residual: x + f([x; z]); plain: f([x; z])
+    fusion: str = setting(one_of("residual", "plain"), "residual")
 
 
 class MeanMemory(FeatureMemory):

@@ -1,0 +1,234 @@
+"""The keys of the config of `memmlp train` with their types and limits; components declare their own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from memmlp.common.components import SLOTS, find, names
+from memmlp.common.settings import (
+    DEVICE,
+    SIZES,
+    Rule,
+    Settings,
+    at_least,
+    each,
+    group,
+    one_of,
+    positive,
+    seed,
+    setting,
+    text,
+    within,
+)
+from memmlp.config.data_schema import (
+    DataConfig,
+    ListDataConfig,
+    SeededDataConfig,
+    SubsetDataConfig,
+    SynthDataConfig,
+)
+from memmlp.runs.deployment_folder import ONNX_FILES
+
+
+@dataclass
+class PathsConfig:
+    """Where runs, caches and sweeps are kept."""
+
+    outputs: str = setting(text())
+
+
+@dataclass
+class ProfileConfig:
+    """A scale of work (tests, a CPU, a GPU), from which all other groups take their defaults.
+
+    Components declare their sizes for it; any of them can be overridden in its own group.
+    """
+
+    sizes: str = setting(one_of(*SIZES))  # which of their sizes components have
+    reading: str = setting(one_of("default", "literal"), "default")  # literal: the paper's text word by word
+    # the width of Mem-MLP's and AGRoL's hidden states, to which the memory's is proportional; null: that of
+    # `sizes`
+    width: int | None = setting(at_least(1), None)
+    synth_minutes: float | None = setting(positive(), None)
+    steps: int = setting(at_least(1))
+    batch: int = setting(at_least(1))
+    lr: float = setting(positive())
+    final_lr: float = setting(at_least(0))
+    schedule: str = setting(one_of("step", "cosine"))
+    ema: float | None = setting(within(0, 1, strict=True), None)
+    checkpoint_every: int = setting(at_least(1))
+    validate_every: int = setting(at_least(1))
+    log_every: int = setting(at_least(1))
+    evaluation_batch: int = setting(at_least(1))
+    latency_steps: int = setting(at_least(1))
+
+
+def _coordinates() -> Rule:
+    words = "heading or head_relative or world, or coordinates that a plugin declares"
+    return Rule(words, lambda value: value in names("coordinates"))
+
+
+@dataclass
+class NormalizerConfig:
+    """The space in which the network sees the motion.
+
+    The paper mentions neither coordinates nor normalisation; the network measured better with both.
+    """
+
+    # heading: seen as the head looks; head_relative: horizontal positions relative to the head; world
+    # (reading 20)
+    coordinates: str = setting(_coordinates(), "heading", literal="world")
+    # by mean and deviation of the training part (reading 20)
+    z_scores: bool = setting(None, True, literal=False)
+
+
+@dataclass
+class VQVAEConfig:
+    """The VQ-VAE whose code-vectors the memory uses (App. A, reading 5).
+
+    Exactly one of `epochs` and `steps` is set. A stage of its own trains it, then it is frozen. An epoch has
+    all frames of the training part alike: data.drawn_by and the sources' weights are for windows.
+    """
+
+    codes: int = setting(at_least(1), tiny=8, small=64, paper=64)  # K, the number of code-vectors (reading 4)
+    width: int = setting(at_least(1), tiny=16, small=128, paper=256)  # the width of latents and code-vectors
+    encoder_depth: int = setting(at_least(0), 4)  # L_enc, the encoder's blocks
+    decoder_depth: int = setting(at_least(0), 1)  # L_dec, the decoder's blocks
+    commitment: float = setting(at_least(0), 0.25)  # the weight of the commitment loss
+    # the decay of the codes' running means (codebook: ema)
+    decay: float = setting(within(0, 1, strict=True), 0.99)
+    # ema: running means; gradient: learned by the loss, as printed, which tends to collapse
+    codebook: str = setting(one_of("ema", "gradient"), "ema")
+    seed: int = setting(seed(), "${seed}")  # the run's own; one number for all seeds gives them one VQ-VAE
+    # the length in epochs of training frames
+    epochs: float | None = setting(positive(), tiny=None, small=None, paper=100)
+    steps: int | None = setting(at_least(1), tiny=20, small=2000, paper=None)  # the length in steps
+    batch: int = setting(at_least(1), tiny=32, small=256, paper=256)  # frames a step
+    # the learning rate, which is multiplied by 0.2 at 20, 50 and 70 % of the steps
+    lr: float = setting(positive(), tiny=1e-3, small=1e-3, paper=1e-4)
+    weight_decay: float = setting(at_least(0), 1e-4)
+
+
+def _metrics() -> Rule:
+    words = "one of the metrics that plugins=[NAME] declare"
+    return Rule(words, lambda value: value in names("metric"))
+
+
+@dataclass
+class EvaluationConfig:
+    """How a trained network is evaluated on the test clips."""
+
+    # window: windows that do not overlap; stream: one frame at a time on the network's own history (reading
+    # 21)
+    modes: list[str] = setting(each(one_of("window", "stream")), ["window", "stream"])
+    batch: int = setting(at_least(1), "${profile.evaluation_batch}")  # clips that are evaluated side by side
+    # lbfgs adds a result, "combined": rotations fitted to the position branch (Table 6, reading 11); arms:
+    # hands at their trackers
+    ik: str = setting(one_of("off", "lbfgs", "arms"), "off", literal="lbfgs")
+    ik_iterations: int = setting(at_least(1), 15)  # of lbfgs, the most for each frame (App. A)
+    # custom metrics (docs/guides/components.md)
+    metrics: list[str] = setting(each(_metrics(), empty=True), [])
+
+
+@dataclass
+class ExportConfig:
+    """How a trained network is deployed: exported as ONNX and timed."""
+
+    # how many steps are timed, after a warm-up
+    latency_steps: int = setting(at_least(1), "${profile.latency_steps}")
+    # streaming: computes each frame's part once; naive: the network as trained; auto: streaming where it
+    # exists; off: no export
+    graph: str = setting(one_of("auto", "streaming", "naive", "off"), "auto")
+    # int8, int8_blocks (for networks without a window) or fp16 add such a file beside the float32 one; live
+    # use takes integers where MPJPE grows by at most 1 % and Jitter by at most 10 %
+    precision: str = setting(one_of(*ONNX_FILES), "fp32")
+    alone: bool = setting(default=False)  # true: time the network alone, too, as papers do (Table 17)
+    # the ONNX files' operator set; engines that read only older files need 15
+    opset: int = setting(within(15, 26), 18)
+
+
+@dataclass
+class Config:
+    """The whole config of `memmlp train`."""
+
+    seed: int = setting(seed())
+    device: str = setting(DEVICE)
+    threads: int = setting(at_least(0))
+    force: bool = setting()
+    plugins: list[str] = setting(each(empty=True), [])
+    save_predictions: str | None = setting()
+    paths: PathsConfig = group(PathsConfig)
+    profile: ProfileConfig = group(ProfileConfig)
+    data: DataConfig = group(DataConfig)
+    normalizer: NormalizerConfig = group(NormalizerConfig)
+    model: Settings = group(Settings)
+    memory: Settings | None = None
+    predictor: Settings | None = None
+    vqvae: VQVAEConfig = group(VQVAEConfig)
+    rollout: Settings = group(Settings)
+    loss: Settings = group(Settings)
+    hand: Settings | None = None
+    term: Settings | None = None
+    refiner: Settings | None = None
+    upstream: Settings | None = None
+    optim: Settings = group(Settings)
+    evaluation: EvaluationConfig = group(EvaluationConfig)
+    export: ExportConfig = group(ExportConfig)
+    loggers: dict[str, Settings] = field(default_factory=dict)
+
+
+SCHEMAS: dict[str, type] = {
+    "config": Config,
+    "profile": ProfileConfig,
+    "data_synth": SynthDataConfig,
+    "data_seeded": SeededDataConfig,
+    "data_lists": ListDataConfig,
+    "data_subsets": SubsetDataConfig,
+}
+"""What a config file in conf/ may start from, as /schema/NAME."""
+
+ONLY = {
+    "normalizer": NormalizerConfig,
+    "vqvae": VQVAEConfig,
+    "evaluation": EvaluationConfig,
+    "export": ExportConfig,
+}
+"""The groups that have one option, `default`."""
+
+
+def restored(config: Mapping[str, Any]) -> DictConfig:
+    """Turn the config that a run recorded back into a typed one.
+
+    Raises:
+        InputError: if it names a component that no package in use has.
+        OmegaConfBaseException, KeyError: if the record does not fit this version's schema. (A value of the
+            wrong kind may also raise TypeError or ValueError.)
+    """
+    cfg = OmegaConf.structured(Config)
+    for key, content in config.items():
+        if not isinstance(content, Mapping):
+            cfg[key] = content
+        elif key == "loggers":
+            cfg.loggers = {name: _typed(find(key, name).settings, node) for name, node in content.items()}
+        elif key == "data":
+            synth = content.get("synth")
+            cfg.data = _typed(_data_schema(content), {**content, "synth": None})
+            cfg.data.synth = _typed(find("generator", synth["name"]).settings, synth) if synth else None
+        elif key in SLOTS:
+            cfg[key] = _typed(find(key, content["name"]).settings, content)
+        else:
+            cfg[key] = OmegaConf.merge(cfg[key], content)
+    return cfg
+
+
+def _typed(kind: Any, content: Mapping[str, Any]) -> Any:
+    return OmegaConf.merge(OmegaConf.structured(kind), content)
+
+
+def _data_schema(content: Mapping[str, Any]) -> type:
+    kinds = {"seeded": SeededDataConfig, "lists": ListDataConfig, "subsets": SubsetDataConfig}
+    return SynthDataConfig if content.get("synth") else kinds[content["split"]["name"]]

@@ -1,0 +1,78 @@
+"""The settings that all networks without slots have in common. Imports no torch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from memmlp.common.components import chosen
+from memmlp.common.settings import Settings, at_least, setting
+
+
+@dataclass
+class NetworkSettings(Settings):
+    """The settings of a network that has no slots: memory, predictor, hand and term are null with it.
+
+    Attributes:
+        learns_newest_frame: whether training learns only the newest frame of each window.
+        carries_state: whether training can carry the network's state from step to step (`rollout=streams`).
+        trains_by_itself: whether the network's own loss is enough to train it (`loss=of_network`).
+    """
+
+    frames: int = setting(at_least(2))  # T, the frames of a training window
+
+    learns_newest_frame: ClassVar[bool] = False
+    carries_state: ClassVar[bool] = False
+    trains_by_itself: ClassVar[bool] = False
+    defaults: ClassVar = {"memory": None, "predictor": None, "hand": None}
+    recipe: ClassVar = {
+        "normalizer.coordinates": "world",
+        "normalizer.z_scores": False,
+        "evaluation.ik": "off",  # there is no position branch
+    }
+
+    @classmethod
+    def problems(cls, config: Any) -> Iterator[str]:
+        """Yield which keys of a config need another network; see Settings."""
+        model, name = config["model"], config["model"]["name"]
+        for slot in ("memory", "predictor", "hand", "term"):
+            if config[slot] is not None:
+                yield f"{slot}: must be null with model={name}, which does not have this slot"
+        loss, rollout = config["loss"]["name"], config["rollout"]["name"]
+        if loss == "of_network" and not cls.trains_by_itself:
+            yield f"loss=of_network: must be another loss, since model={name} has no loss of its own"
+        if not getattr(chosen(config, "loss"), "complete", False):
+            yield f"loss={loss}: must be a complete loss, such as the default of model={name}"
+        if rollout not in ("teacher_forcing", *(["streams"] if cls.carries_state else [])):
+            yield f"rollout={rollout}: must be teacher_forcing with model={name}"
+        if config["evaluation"]["ik"] == "lbfgs":
+            yield f"evaluation.ik=lbfgs: must be off or arms, since model={name} predicts no positions"
+        for heads, width in (("heads", "width"), ("code_heads", "code_width")):
+            if heads in model and model[width] % model[heads]:
+                yield f"model.{heads}={model[heads]}: must be a divisor of model.{width}={model[width]}"
+        if model.get("offline"):
+            yield from _offline_problems(config)
+        calls, steps = model.get("sampling_steps", 1), model.get("diffusion_steps", 1)
+        if calls > steps:
+            yield f"model.sampling_steps={calls}: must be at most model.diffusion_steps={steps}"
+        needed = cls.upstream_option()
+        if needed is None and config["upstream"] is not None:
+            yield f"upstream={config['upstream']['name']}: must be null with model={name}"
+        if needed and (config["upstream"] is None or config["upstream"]["name"] != needed):
+            yield f"upstream: must be {needed} with model={name}"
+
+    @classmethod
+    def upstream_option(cls) -> str | None:
+        """Return the option of `upstream` that trains the network's parts before it; None for no parts."""
+        return cls.defaults.get("upstream")
+
+
+def _offline_problems(config: Any) -> Iterator[str]:
+    if list(config["evaluation"]["modes"]) != ["window"] or config["export"]["graph"] != "off":
+        yield (
+            "model.offline=true: needs evaluation.modes=[window] and export.graph=off, since it uses future "
+            "frames"
+        )
+    if config["refiner"] is not None:
+        yield "refiner: must be null with model.offline=true, since a refiner corrects a stream"
