@@ -42,9 +42,17 @@ def synthesize(out: Path, *, minutes: float = 10.0, seed: int = 0, fps: float = 
     Raises:
         InputError: for bad arguments.
     """
-    _check(minutes, seed, fps)
-    rng = np.random.default_rng(seed)
-    lengths = _lengths(rng, minutes * 60.0, fps)
+    low, high = FRAME_RATE_RANGE
+    if not (math.isfinite(minutes) and minutes > 0):
+        raise InputError(f"minutes={minutes:g}: must be a positive number")
+    if seed < 0:
+        raise InputError(f"seed={seed}: must be 0 or more")
+    if not low <= fps <= high:
+        raise InputError(f"fps={fps:g}: must be {low:g} to {high:g}")
+    rng, seconds = np.random.default_rng(seed), minutes * 60.0
+    share = rng.uniform(0.6, 1.4, max(MIN_CLIPS, round(seconds / CLIP_SECONDS)))
+    ends = np.round(np.cumsum(share) / share.sum() * seconds * fps).astype(int)
+    lengths = [max(2, int(frames)) for frames in np.diff(ends, prepend=0)]
     rounds = math.ceil(len(lengths) / len(ACTIVITIES))
     names = np.concatenate([rng.permutation(list(ACTIVITIES)) for _ in range(rounds)])
     paths = []
@@ -63,7 +71,7 @@ def synthesize_clip(activity: str, seed: int, *, seconds: float = 14.0, fps: flo
         InputError: for an unknown activity.
     """
     if activity not in ACTIVITIES:
-        raise InputError(f"activity: {activity!r}; allowed: {', '.join(ACTIVITIES)}")
+        raise InputError(f"activity={activity}: must be one of {', '.join(ACTIVITIES)}")
     rng = np.random.default_rng([list(ACTIVITIES).index(activity), seed])
     frames = max(2, round(seconds * fps))
     t = np.arange(frames + round(MARGIN * fps)) / fps
@@ -71,21 +79,3 @@ def synthesize_clip(activity: str, seed: int, *, seconds: float = 14.0, fps: flo
     poses, trans = solve(ACTIVITIES[activity](rng, t))
     cut = slice(first, first + frames)
     return Clip(f"{activity}/{seed}", poses[cut].astype(np.float32), trans[cut].astype(np.float32), fps)
-
-
-def _lengths(rng: np.random.Generator, seconds: float, fps: float) -> list[int]:
-    """Draw the lengths of the clips in frames, at least 2 each."""
-    share = rng.uniform(0.6, 1.4, max(MIN_CLIPS, round(seconds / CLIP_SECONDS)))
-    ends = np.round(np.cumsum(share) / share.sum() * seconds * fps).astype(int)
-    return [max(2, int(n)) for n in np.diff(ends, prepend=0)]
-
-
-def _check(minutes: float, seed: int, fps: float) -> None:
-    """Raise InputError for bad arguments, naming the argument."""
-    if not (math.isfinite(minutes) and minutes > 0):
-        raise InputError(f"minutes: {minutes:g}; allowed: a positive number")
-    if seed < 0:
-        raise InputError(f"seed: {seed}; allowed: 0 or more")
-    low, high = FRAME_RATE_RANGE
-    if not low <= fps <= high:
-        raise InputError(f"fps: {fps:g}; allowed: {low:g} to {high:g}")

@@ -1,19 +1,17 @@
-"""What people do on the spot: squat, sit, reach, wave, box, jump, step sideways, look around.
+"""Actions on the spot: squat, sit, reach, wave, box, jump, step sideways, look around.
 
 Each public function draws a performance at the times t (N,), in seconds.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from memmlp.motion.synthetic.curves import Array, arc, ease, pulse, wander
-from memmlp.motion.synthetic.gait import GRAVITY
-from memmlp.motion.synthetic.puppet import Puppet
-from memmlp.motion.synthetic.standing import (
+from memmlp.motion.synthetic.gait import (
+    GRAVITY,
     LEFT_RIGHT,
     FootPlacement,
     Footwork,
@@ -24,6 +22,7 @@ from memmlp.motion.synthetic.standing import (
     occasions,
     stand,
 )
+from memmlp.motion.synthetic.puppet import Array, Puppet, arc, ease, pulse, wander
 
 ARM = 0.53  # metres, shoulder to wrist
 # Where the hands are from the shoulders (outward, up, forward, metres): ahead, before the chest, hanging.
@@ -187,29 +186,6 @@ def _aimed(puppet: Puppet, side: int, target: Array) -> Array:
     return np.stack([out * cosine - forward * sine, np.full_like(yaw, up), forward * cosine + out * sine], -1)
 
 
-@dataclass(frozen=True)
-class Leap:
-    """One jump.
-
-    Attributes:
-        start: seconds at which the crouch begins.
-        off: seconds of the take-off.
-        on: seconds of the landing.
-        depth: metres by which the pelvis is lowered in the crouch.
-        swing: factor on the arms' swing.
-    """
-
-    start: float
-    off: float
-    on: float
-    depth: float
-    swing: float
-
-    @property
-    def end(self) -> float:
-        return self.on + 0.9
-
-
 def jumping(rng: np.random.Generator, t: Array) -> Puppet:
     """Jump on the spot, ahead, aside and with a turn: crouch, take-off, flight, landing."""
     style = Style.draw(rng)
@@ -220,30 +196,38 @@ def jumping(rng: np.random.Generator, t: Array) -> Puppet:
         flight = np.sqrt(8 * rise / GRAVITY)
         shift, turn = rng.uniform(-0.3, 0.3, 2) * rng.integers(2), rng.uniform(-0.9, 0.9) * rng.integers(2)
         work.change(off, flight, 0.0, shift, turn, lift=rise + 0.08, heel=0.9, toe=0.0, push=0.2)
-        leaps.append(Leap(start, off, off + flight, rng.uniform(0.18, 0.3), style.swing))
+        leaps.append((start, off, off + flight, rng.uniform(0.18, 0.3)))
     puppet = stand(rng, t, style, work)
     puppet.settle = 0.03
     for leap in leaps:
-        _leap(puppet, t, leap)
+        _leap(puppet, t, style.swing, *leap)
     return puppet
 
 
-def _leap(puppet: Puppet, t: Array, leap: Leap) -> None:
-    """Move the pelvis through one jump, the trunk with it, and the arms to help."""
-    start, off, on, end, depth = leap.start, leap.off, leap.on, leap.end, leap.depth
-    low, deep, speed = off - 0.28, on + 0.22, GRAVITY * (on - off) / 2
+def _leap(puppet: Puppet, t: Array, swing: float, start: float, off: float, on: float, depth: float) -> None:
+    """Move the pelvis through one jump, the trunk with it, and the arms to help.
+
+    Args:
+        puppet: the person, who is changed in place.
+        t: times (N,), seconds.
+        swing: factor on the arms' swing.
+        start: seconds at which the crouch begins.
+        off: seconds of the take-off.
+        on: seconds of the landing.
+        depth: metres by which the pelvis is lowered in the crouch.
+    """
+    low, deep, end, speed = off - 0.28, on + 0.22, on + 0.9, GRAVITY * (on - off) / 2
     heights, speeds = [0, -depth, -0.04, -0.08, -0.7 * depth, 0], [0, 0, speed, -speed, 0, 0]
     inside = (t > start) & (t < end)
-    puppet.pelvis[inside, 2] += CubicHermiteSpline([start, low, off, on, deep, end], heights, speeds)(
-        t[inside]
-    )
+    path = CubicHermiteSpline([start, low, off, on, deep, end], heights, speeds)
+    puppet.pelvis[inside, 2] += path(t[inside])
     crouch = pulse(t, start, low, low, off) + 0.7 * pulse(t, on, deep, deep, end)
     puppet.pelvis[:, :2] -= 0.3 * depth * crouch[:, None] * direction(puppet.heading)
     puppet.tilt[:, 0] += 1.8 * depth * crouch
     puppet.spine[:, 0] += 1.0 * depth * crouch
-    back, ahead = np.array([0.12, -0.44, -0.25]), np.array([0.1, 0.15 * leap.swing, 0.4])
+    back, ahead = np.array([0.12, -0.44, -0.25]), np.array([0.1, 0.15 * swing, 0.4])
     for side in (0, 1):
-        move_hand(puppet, side, back, leap.swing / 1.5 * pulse(t, start, low - 0.05, low, off - 0.02))
+        move_hand(puppet, side, back, swing / 1.5 * pulse(t, start, low - 0.05, low, off - 0.02))
         move_hand(puppet, side, ahead, pulse(t, low, off + 0.05, off + 0.1, deep + 0.2))
 
 

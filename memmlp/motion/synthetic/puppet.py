@@ -1,21 +1,22 @@
 """A person driven by feet, pelvis, trunk, gaze and hands, whose joints follow by inverse kinematics.
 
 Directions of the body are SMPL's: x left, y up, z forward. Angles about them are (pitch, yaw, roll): positive
-leans forward, turns left, leans to the right.
+leans forward, turns left, leans to the right. Curves are arrays over times of N frames, in seconds.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
+from scipy.ndimage import convolve1d, maximum_filter1d, minimum_filter1d
 from scipy.spatial.transform import Rotation
 
 from memmlp.motion.body import JOINTS, N_JOINTS, builtin_rest_joints
-from memmlp.motion.synthetic.curves import Array, smooth, smooth_below, soft_minimum
-from memmlp.motion.synthetic.steps import Feet
+
+Array = np.ndarray
 
 REST = builtin_rest_joints()
 INDEX = {name: joint for joint, name in enumerate(JOINTS)}
@@ -27,9 +28,156 @@ SPINE_SHARES = {"spine1": 0.3, "spine2": 0.3, "spine3": 0.4}
 LEG_POLE, ARM_POLE = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])  # knee and elbow in T-pose
 
 
+# Smooth functions of time
+
+
+def ease(t: Array, start: float, end: float) -> Array:
+    """Return (N,): 0 before `start`, 1 after `end`, minimum jerk between."""
+    s = np.clip((t - start) / (end - start), 0.0, 1.0)
+    return s * s * s * (10.0 - s * (15.0 - 6.0 * s))
+
+
+def pulse(t: Array, start: float, top: float, leave: float, end: float) -> Array:
+    """Return (N,): 0, rising from `start` to 1 at `top`, falling from `leave` to 0 at `end`."""
+    return ease(t, start, top) - ease(t, leave, end)
+
+
+def glide(t: Array, start: float, end: float, ramp: float = 0.3) -> Array:
+    """Return (N,): as `ease`, but at an even speed between two ramps that take `ramp` of the time each."""
+
+    def ramped(x: Array) -> Array:  # the integral of an ease from 0 to 1
+        c = np.clip(x, 0.0, 1.0)
+        return c**4 * (2.5 - c * (3.0 - c)) + np.maximum(x - 1.0, 0.0)
+
+    s = np.clip((t - start) / (end - start), 0.0, 1.0)
+    return (ramped(s / ramp) - ramped((s - 1.0) / ramp + 1.0)) * ramp / (1.0 - ramp)
+
+
+def arc(t: Array, start: float, end: float) -> Array:
+    """Return (N,): 0 outside [start, end], 1 in the middle, velocity and acceleration 0 at both ends."""
+    s = glide(t, start, end)
+    return 4.0 * s * (1.0 - s)
+
+
+def wander(
+    rng: np.random.Generator, t: Array, shape: tuple[int, ...] = (), low: float = 0.1, high: float = 1.0
+) -> Array:
+    """Return natural variation (N, *shape) of RMS 1: independent sums of six sines of `low` to `high` Hz."""
+    size = (6, *shape)
+    frequency = np.exp(rng.uniform(np.log(low), np.log(high), size))
+    amplitude = rng.uniform(0.5, 1.0, size) / np.sqrt(frequency)
+    amplitude *= np.sqrt(2.0 / (amplitude**2).sum(0))
+    start = rng.uniform(0.0, 2 * np.pi, size)
+    time = t.reshape(-1, *([1] * len(shape)))
+    result = np.zeros((len(t), *shape))
+    for wave in range(6):
+        result += amplitude[wave] * np.sin(2 * np.pi * frequency[wave] * time + start[wave])
+    return result
+
+
+def smooth(x: Array, frames: int) -> Array:
+    """Return the moving average (N, ...) under a bell of 2 * `frames` + 1 frames."""
+    kernel = np.hanning(2 * frames + 3)[1:-1] ** 2
+    return convolve1d(x, kernel / kernel.sum(), axis=0, mode="nearest")
+
+
+def smooth_below(x: Array, frames: int) -> Array:
+    """Return a smooth curve (N,) that is nowhere above `x`: the running minimum's average under the bell."""
+    return smooth(minimum_filter1d(x, 2 * frames + 1, mode="nearest"), frames)
+
+
+def soft_minimum(a: Array, b: Array, width: float) -> Array:
+    """Return a smooth curve below both `a` and `b`.
+
+    It is within `width` / 2 of their minimum, and nearer where they differ more.
+    """
+    return 0.5 * (a + b - np.sqrt((a - b) ** 2 + width**2))
+
+
+# Feet
+
+
+@dataclass(frozen=True)
+class FootStep:
+    """One step of one foot; seconds, metres, radians.
+
+    Attributes:
+        foot: 0 left, 1 right.
+        off: when the toes leave the floor.
+        on: when the heel touches the floor again.
+        to: position (2,) on the floor below the ankle, world.
+        yaw: direction of the foot after the step, world.
+        lift: how high the foot is lifted on the way.
+        heel: angle by which the heel is up when the toes leave.
+        toe: angle by which the toes are up when the heel arrives.
+        push: how long before `off` the heel rises.
+        roll: how long after `on` the toes come down.
+    """
+
+    foot: int
+    off: float
+    on: float
+    to: Array
+    yaw: float
+    lift: float = 0.05
+    heel: float = 0.4
+    toe: float = 0.1
+    push: float = 0.15
+    roll: float = 0.1
+
+
+@dataclass
+class Feet:
+    """Both feet over N frames, left and right.
+
+    Attributes:
+        ground: position (N, 2, 3) of the flat foot, below the ankle, metres, world; z is 0 on the floor.
+        yaw: direction (N, 2), radians, world.
+        heel: angle (N, 2), radians, at least 0, by which the foot is turned about its ball.
+        toe: angle (N, 2), radians, at least 0, by which it is turned about its heel.
+        planted: whether (N, 2) ball or heel are on the floor.
+    """
+
+    ground: Array
+    yaw: Array
+    heel: Array
+    toe: Array
+    planted: Array
+
+
+def tread(t: Array, places: Array, yaws: Array, steps: Iterable[FootStep]) -> Feet:
+    """Return feet that make steps in order of time.
+
+    Args:
+        t: times (N,), seconds.
+        places: where (2, 2) the feet start, metres, world.
+        yaws: their directions (2,) there, radians, world.
+        steps: the steps, in order of time.
+    """
+    n = len(t)
+    ground = np.zeros((n, 2, 3))
+    ground[:, :, :2] = places
+    feet = Feet(ground, np.tile(yaws, (n, 1)), np.zeros((n, 2)), np.zeros((n, 2)), np.ones((n, 2), bool))
+    place, yaw = np.array(places, float), np.array(yaws, float)
+    for step in steps:
+        foot, off, on = step.foot, step.off, step.on
+        part = glide(t, off, on)
+        ground[:, foot, :2] += part[:, None] * (step.to - place[foot])
+        ground[:, foot, 2] += step.lift * arc(t, off, on)
+        feet.yaw[:, foot] += part * (step.yaw - yaw[foot])
+        feet.heel[:, foot] += step.heel * pulse(t, off - step.push, off, off, off + 0.7 * (on - off))
+        feet.toe[:, foot] += step.toe * pulse(t, on - 0.5 * (on - off), on, on, on + step.roll)
+        feet.planted[:, foot] &= (t <= off) | (t >= on)
+        place[foot], yaw[foot] = step.to, step.yaw
+    return feet
+
+
+# The person
+
+
 @dataclass
 class Puppet:
-    """What the person does, over N frames; metres, radians.
+    """The controls of a person over N frames; metres, radians.
 
     Attributes:
         fps: frames per second.
@@ -63,8 +211,13 @@ def solve(puppet: Puppet) -> tuple[Array, Array]:
     local = {"pelvis": pelvis}
     for side in (0, 1):
         local |= _leg(puppet, side, pelvis, root)
-    chest, spine = _spine(puppet, pelvis)
-    local |= spine | _head(puppet, chest)
+    chest = pelvis
+    for name, share in SPINE_SHARES.items():
+        local[name] = Rotation.from_rotvec(share * puppet.spine)
+        chest = chest * local[name]
+    gaze = facing(puppet.heading + puppet.gaze[:, 1]) * _pitch(puppet.gaze[:, 0])
+    half = Rotation.from_rotvec(0.5 * (chest.inv() * gaze).as_rotvec())
+    local |= {"neck": half, "head": half}  # which share the turn from the chest to the gaze
     for side in (0, 1):
         local |= _arm(puppet, side, chest)
     poses = np.zeros((len(root), N_JOINTS, 3))
@@ -83,8 +236,7 @@ def two_bone(
     start: Array,
     target: Array,
     pole: Array,
-    upper: Array,
-    lower: Array,
+    bones: tuple[Array, Array],
     rest_pole: Array,
     free: Array | float,
 ) -> tuple[Rotation, Rotation]:
@@ -94,17 +246,18 @@ def two_bone(
         start: positions (N, 3).
         target: positions (N, 3); a position out of reach is approached as far as the bones go.
         pole: directions (N, 3) to which the joint between the bones points.
-        upper: first bone (3,) in the rest pose.
-        lower: second bone (3,) in the rest pose.
+        bones: the two bones (3,) in the rest pose.
         rest_pole: direction (3,) to which the joint between the bones points in the rest pose.
         free: in [0, 1] (N,): how early a limb that is being stretched slows down; with 0 it reaches exactly,
             up to nearly its full length.
     """
+    upper, lower = bones
     a, b = float(np.linalg.norm(upper)), float(np.linalg.norm(lower))
     span = np.linalg.norm(target - start, axis=-1, keepdims=True)
     along = (target - start) / span
     reach = np.maximum(_within(span, a + b, free), 0.28 * (a + b))
-    across = _unit(pole - (pole * along).sum(-1, keepdims=True) * along)
+    across = pole - (pole * along).sum(-1, keepdims=True) * along
+    across = across / np.linalg.norm(across, axis=-1, keepdims=True)
     cosine = (a * a + reach * reach - b * b) / (2 * a * reach)
     middle = a * (cosine * along + np.sqrt(1 - cosine * cosine) * across)
     hinge = np.cross(across, along)
@@ -126,19 +279,19 @@ def ankles(feet: Feet, side: int) -> tuple[Array, Rotation]:
 
 def _root(puppet: Puppet, pelvis: Rotation) -> Array:
     """Return the root (N, 3), lowered if a leg that carries, or is about to, would be stretched out."""
-    wanted = puppet.pelvis[:, 2]
-    ceiling = wanted + 0.3
+    height = puppet.pelvis[:, 2]
+    ceiling = height + 0.3
     frames = round(puppet.settle * puppet.fps)
     for side, (name, _) in enumerate(SIDES):
         hip = pelvis.apply(_bone("pelvis", f"{name}_hip"))
         away = ankles(puppet.feet, side)[0] - puppet.pelvis - hip
         length = STRETCH * _length(f"{name}_hip", f"{name}_knee", f"{name}_ankle")
-        height = np.sqrt(np.maximum(length**2 - (away[:, :2] ** 2).sum(-1), 0.0))
-        limit = wanted + away[:, 2] + height
+        reach = np.sqrt(np.maximum(length**2 - (away[:, :2] ** 2).sum(-1), 0.0))
+        limit = height + away[:, 2] + reach
         carries = _near(puppet.feet.planted[:, side], frames // 2)
         ceiling = np.where(carries, np.minimum(ceiling, limit), ceiling)
     root = puppet.pelvis.copy()
-    root[:, 2] = soft_minimum(wanted, smooth_below(ceiling, frames), 0.01)
+    root[:, 2] = soft_minimum(height, smooth_below(ceiling, frames), 0.01)
     return root
 
 
@@ -152,8 +305,7 @@ def _leg(puppet: Puppet, side: int, pelvis: Rotation, root: Array) -> dict[str, 
         root + pelvis.apply(_bone("pelvis", f"{name}_hip")),
         ankle,
         pole,
-        _bone(f"{name}_hip", f"{name}_knee"),
-        _bone(f"{name}_knee", f"{name}_ankle"),
+        (_bone(f"{name}_hip", f"{name}_knee"), _bone(f"{name}_knee", f"{name}_ankle")),
         LEG_POLE,
         smooth(1.0 - _near(puppet.feet.planted[:, side], frames), frames),
     )
@@ -163,22 +315,6 @@ def _leg(puppet: Puppet, side: int, pelvis: Rotation, root: Array) -> dict[str, 
         f"{name}_ankle": shin.inv() * foot,
         f"{name}_foot": _pitch(-0.5 * puppet.feet.heel[:, side]),
     }
-
-
-def _spine(puppet: Puppet, pelvis: Rotation) -> tuple[Rotation, dict[str, Rotation]]:
-    """Return the chest's global rotation, and the local rotations that share the spine's bend."""
-    local = {name: Rotation.from_rotvec(share * puppet.spine) for name, share in SPINE_SHARES.items()}
-    chest = pelvis
-    for rotation in local.values():
-        chest = chest * rotation
-    return chest, local
-
-
-def _head(puppet: Puppet, chest: Rotation) -> dict[str, Rotation]:
-    """Return the rotations of neck and head, which share the turn from the chest to the gaze."""
-    gaze = facing(puppet.heading + puppet.gaze[:, 1]) * _pitch(puppet.gaze[:, 0])
-    half = Rotation.from_rotvec(0.5 * (chest.inv() * gaze).as_rotvec())
-    return {"neck": half, "head": half}
 
 
 def _arm(puppet: Puppet, side: int, chest: Rotation) -> dict[str, Rotation]:
@@ -193,8 +329,10 @@ def _arm(puppet: Puppet, side: int, chest: Rotation) -> dict[str, Rotation]:
     mirror = np.array([sign, 1.0, 1.0])
     start = chest.apply(shoulder[0]) + collar.apply(shoulder[1])
     target = chest.apply(sum(shoulder)) + trunk.apply(puppet.hands[:, side] * mirror)
-    pole = trunk.apply(_elbow(hand) * mirror)
-    upper, lower = two_bone(start, target, pole, *bones, ARM_POLE, 0.0)
+    ahead = 0.5 + 0.5 * np.tanh(2.0 * (hand[:, 2] - 0.35))
+    # The elbow points back while the hand hangs, and down when it is ahead.
+    pole = trunk.apply(np.stack([np.full_like(ahead, 0.35), -0.9 * ahead, -0.9 * (1.0 - ahead)], -1) * mirror)
+    upper, lower = two_bone(start, target, pole, bones, ARM_POLE, 0.0)
     return {
         f"{name}_collar": chest.inv() * collar,
         f"{name}_shoulder": collar.inv() * upper,
@@ -203,26 +341,20 @@ def _arm(puppet: Puppet, side: int, chest: Rotation) -> dict[str, Rotation]:
     }
 
 
-def _elbow(hand: Array) -> Array:
-    """Return where the elbow points (N, 3): back while the hand (N, 3) hangs, down when it is ahead."""
-    ahead = 0.5 + 0.5 * np.tanh(2.0 * (hand[:, 2] - 0.35))
-    return np.stack([np.full_like(ahead, 0.35), -0.9 * ahead, -0.9 * (1.0 - ahead)], -1)
-
-
 def _near(flags: Array, frames: int) -> Array:
-    """Return whether (N,) a flag is set within `frames` frames."""
+    """Return whether (N,) a flag is set within a number of frames."""
     return maximum_filter1d(flags, 2 * frames + 1, mode="nearest")
 
 
 def _within(span: Array, full: float, free: Array | float) -> Array:
     """Limit a limb's reach (N, 1) so that the limb never quite straightens.
 
-    Up to about STRETCH of the full length the reach stays as it is; beyond, it comes smoothly near 99.9 % of
-    it. The limit begins earlier the larger `free` is.
+    Up to about STRETCH of the full length the reach stays unchanged; beyond, it smoothly approaches 99.9 % of
+    it. The limit begins earlier if `free` is larger.
     """
     start = (STRETCH - 0.05 * np.reshape(free, (-1, 1))) * full
-    room = 0.999 * full - start
-    return np.where(span < start, span, start + room * np.tanh((span - start) / room))
+    margin = 0.999 * full - start
+    return np.where(span < start, span, start + margin * np.tanh((span - start) / margin))
 
 
 def _carry(rest: Array, rest_hinge: Array, bone: Array, hinge: Array) -> Rotation:
@@ -232,12 +364,8 @@ def _carry(rest: Array, rest_hinge: Array, bone: Array, hinge: Array) -> Rotatio
 
 def _frame(bone: Array, hinge: Array) -> Array:
     """Return orthonormal axes (..., 3, 3) in columns: the bone, the hinge, and their cross product."""
-    first, second = _unit(bone), _unit(hinge)
+    first, second = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (bone, hinge))
     return np.stack([first, second, np.cross(first, second)], -1)
-
-
-def _unit(v: Array) -> Array:
-    return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
 def _pitch(angle: Array) -> Rotation:
