@@ -18,7 +18,7 @@ from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset
 from memmlp.networks.motion_model import MotionModel
 
-SAME = 0.1  # cm: MPJPE of two branches up to this apart is that of the same joints
+SAME = 0.1  # cm: largest difference of the MPJPE of two branches with the same joints
 PICTURE_FRAMES = 600  # the first 10 s
 
 
@@ -68,13 +68,13 @@ def check_positions(network: str, rows: Sequence[dict[str, Any]]) -> None:
         InputError: if they don't; then the network, or the way it was loaded, is broken.
     """
     for row in rows:
-        own, followed = row["position"]["MPJPE"], row["rotation"]["MPJPE"]
-        diverged = math.isnan(own) and math.isnan(followed)  # the results tell it
-        if not diverged and not math.isclose(own, followed, rel_tol=0, abs_tol=SAME):
+        learned, followed = row["position"]["MPJPE"], row["rotation"]["MPJPE"]
+        diverged = math.isnan(learned) and math.isnan(followed)  # the results show it
+        if not diverged and not math.isclose(learned, followed, rel_tol=0, abs_tol=SAME):
             raise InputError(
-                f"{network}: its positions have an MPJPE of {own:.2f} cm in clip {row['name']}, those of its "
-                f"rotations {followed:.2f} cm; allowed without a position branch (branches) is forward "
-                "kinematics of the rotations"
+                f"{network}: its positions have an MPJPE of {learned:.2f} cm in clip {row['name']}, those of "
+                f"its rotations {followed:.2f} cm; without a position branch, positions must follow from the "
+                "rotations by forward kinematics"
             )
 
 

@@ -28,10 +28,10 @@ Objective = Callable[[Tensor, Tensor], Tensor]
 
 
 class NoIK:
-    """No inverse kinematics: there is no third result besides the two branches."""
+    """No inverse kinematics: there is no third result beside the two branches."""
 
     def solutions(self, normalizer: Normalizer, motion: Tensor, sparse: Tensor) -> dict[str, Tensor]:
-        """Return an empty dict: there is no branch `combined`."""
+        """Return an empty dict."""
         return {}
 
 
@@ -41,15 +41,12 @@ class LBFGS:
 
     The variables are an axis-angle increment for each joint, applied on the right of its predicted rotation:
     the increment is smooth around the start, and lacks the redundant scale of 6D. The head stays on its
-    tracker as in `Normalizer.pose`, so that the minimised distance is the one that is measured. A rotation
-    that moves no joint (those of the leaves) stays as predicted. Everything is computed in float64, so that a
-    frame's result does not depend on its neighbours.
+    tracker as in `Normalizer.pose`, so that the minimised distance is the measured one. A rotation that moves
+    no joint (at the leaves) stays as predicted. Everything is computed in float64, so that a frame's result
+    does not depend on its neighbours.
 
-    torch.optim.LBFGS (strong Wolfe) is not used: over a batch it has one step length and one curvature for
-    all frames, so that a frame's result depends on the other frames of the batch. Measured on 3000 streamed
-    frames of CMU salsa, one thread, 15 iterations: the distance between the branches falls from 3.13 cm to
-    0.98 cm in 2 s and Jitter rises from 16.4 to 17.9; torch's L-BFGS reaches 1.02 cm in 5 s with a Jitter of
-    16.6.
+    torch.optim.LBFGS is not used, since over a batch it has one step length and one curvature for all frames,
+    so that a frame's result depends on the other frames of the batch.
 
     Attributes:
         iterations: largest number of iterations.
@@ -74,7 +71,7 @@ class LBFGS:
     def solve(self, normalizer: Normalizer, motion: Tensor, sparse: Tensor) -> Tensor:
         """Return rotations (N, 132) in 6D that bring each frame's joints nearest to the position branch's.
 
-        A frame whose joints are no numbers has no numbers either: its rotations are fitted to nothing.
+        A frame with NaN or infinite joints gets NaN rotations.
         """
         start = sixd_to_matrix(motion[:, ROTATION].double().unflatten(-1, (N_JOINTS, 6)))
         head = sparse[:, SPARSE_POSITION][:, :3].double()
@@ -157,8 +154,7 @@ def _units(rest: tuple[float, ...], dtype: torch.dtype, device: torch.device) ->
     """Return each joint's unit of rotation (22, 1) for 66 coordinates of a rest pose; cached per rest pose.
 
     Turning a hip moves more joints than turning a wrist. With these units, the objective's curvature is about
-    the same for each variable, so that few iterations get far and neighbouring frames get similar solutions
-    (without them: 1.19 cm, Jitter 24).
+    the same for each variable, so that few iterations suffice and neighbouring frames get similar solutions.
     """
     still = torch.eye(3, dtype=dtype, device=device).expand(1, N_JOINTS, 3, 3)
     pose = torch.tensor(rest, dtype=dtype, device=device).unflatten(0, (N_JOINTS, 3))

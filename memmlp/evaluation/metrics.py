@@ -88,18 +88,18 @@ class UserMetric:
 UserMetrics = Mapping[str, UserMetric]
 
 
-def own_report(own: UserMetrics, of: str, predicted: Tensor, truth: Tensor) -> dict[str, float]:
-    """Return one clip's values of those custom metrics that take positions, or of those that take rotations.
+def custom_report(custom: UserMetrics, of: str, predicted: Tensor, truth: Tensor) -> dict[str, float]:
+    """Return one clip's values of the custom metrics that take positions, or of those that take rotations.
 
     Raises:
         InputError: if a metric does not return a number; the message names the metric.
     """
-    return {name: _number(name, one, predicted, truth) for name, one in own.items() if one.of == of}
-
-
-def _number(name: str, metric: UserMetric, predicted: Tensor, truth: Tensor) -> float:
-    value = metric.function(predicted, truth)
-    try:
-        return float(value)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise InputError(f"metric {name}: returned no number: {error}") from error
+    report = {}
+    for name, metric in custom.items():
+        if metric.of == of:
+            value = metric.function(predicted, truth)
+            try:
+                report[name] = float(value)
+            except (TypeError, ValueError, RuntimeError) as error:
+                raise InputError(f"metric {name}: must return a number: {error}") from error
+    return report

@@ -25,7 +25,7 @@ from memmlp.motion.preparing.cache import frame_blocks
 from memmlp.networks.motion_model import MotionModel
 
 KINDS_OF_POSES = {"rotation": "predicted", "combined": "combined", "truth": "true"}
-"""Names of what can be made a clip -> the beginnings of its arrays' names (`prediction_arrays`)."""
+"""Branches that can be written as clips -> the beginnings of their arrays' names (`prediction_arrays`)."""
 
 
 def save_predictions(evaluation: Evaluation, model: MotionModel, test: MotionDataset, folder: Path) -> None:
@@ -48,7 +48,7 @@ def predict_clip(model: MotionModel, clip: Tensor, mode: str) -> dict[str, np.nd
     A network that draws random numbers draws the same ones for a clip each time.
 
     Raises:
-        InputError: for the stream of a network that has none.
+        InputError: for the stream of a network that can't run as a stream.
     """
     check_mode(model, mode)
     with torch.random.fork_rng():
@@ -58,9 +58,9 @@ def predict_clip(model: MotionModel, clip: Tensor, mode: str) -> dict[str, np.nd
 
 
 def check_mode(model: MotionModel, mode: str) -> None:
-    """Raise InputError for the stream of a network that makes frames with later ones."""
+    """Raise InputError for the stream of a network that uses future frames."""
     if mode == "stream" and not model.is_stream:
-        raise InputError("mode stream: this network makes a frame with later ones; allowed is mode window")
+        raise InputError("mode=stream: must be window for this network, which uses future frames")
 
 
 def prediction_arrays(normalizer: Normalizer, clip: Tensor, motion: Tensor, ik: IK) -> dict[str, np.ndarray]:
@@ -115,7 +115,7 @@ class ClipPredictor:
         interpolation: how clips of other rates are brought to 60 Hz, as those of the network's training were.
 
     Raises:
-        InputError: for the stream of a network that has none.
+        InputError: for the stream of a network that can't run as a stream.
     """
 
     model: MotionModel
@@ -137,7 +137,7 @@ class ClipPredictor:
         torch.manual_seed(self.evaluation.seed)
         clips = [clip.to(self.model.normalizer.rest.device) for clip in clips]
         ik = self.evaluation.ik if self.branch == "combined" else NoIK()
-        if self.branch == "truth":  # which needs no network, and takes no time
+        if self.branch == "truth":  # without the network
             motions = [clip[:, SPARSE_DIM:] for clip in clips]
         else:
             motions = modes.predict(self.model, clips, self.mode, self.evaluation.batch)
@@ -155,7 +155,7 @@ class ClipPredictor:
         """Write the network's predictions for a plan's clips.
 
         Args:
-            plan: what to write.
+            plan: the clips.
             strict: whether a bad file raises InputError; otherwise it is skipped and reported, if other files
                 can be read.
 
@@ -179,14 +179,13 @@ class ClipPredictor:
         """Read a clip's frames (N, 252), computed on the network's body as in a cache.
 
         Args:
-            target: what is to be read.
-            odd: gets what is unusual of the clip, by its name.
+            target: the clip.
+            odd: gets a remark on a clip that is unusual, by its name.
 
         Raises:
             InputError: if the file can't be read, or has fewer than two frames at 60 Hz.
         """
         clip, _ = resample(read_motion(target, odd), interpolation=self.interpolation)
         if len(clip) < 2:
-            few = f"{target.source}: one frame at {FPS} Hz"
-            raise InputError(f"{few}; allowed: two or more, as a velocity needs them")
+            raise InputError(f"{target.source}: one frame at {FPS} Hz; must be two or more for a velocity")
         return torch.from_numpy(np.concatenate(list(frame_blocks(clip, self.rest))))

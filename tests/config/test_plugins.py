@@ -172,13 +172,13 @@ def test_a_metric_is_measured_in_both_branches(on_path: Path):
         return predicted.mean()
 
     own = {"Mean": UserMetric(mean, "positions"), "Turn": UserMetric(mean, "rotations")}
-    report = evaluate(model(), frames(), ["stream"], 4, own=own)["mean"]["stream"]
+    report = evaluate(model(), frames(), ["stream"], 4, custom=own)["mean"]["stream"]
     assert {"Mean", "Turn"} <= report["rotation"].keys()
     assert "Mean" in report["position"]
     assert "Turn" not in report["position"]
     assert {"rotation Mean", "position Mean"} <= quick_stream(model(), frames().clips(), own).keys()
-    with pytest.raises(InputError, match=r"metric Mean: returned no number"):
-        evaluate(model(), frames(), ["stream"], 4, own={"Mean": UserMetric(lambda p, t: p, "positions")})
+    with pytest.raises(InputError, match=r"metric Mean"):
+        evaluate(model(), frames(), ["stream"], 4, custom={"Mean": UserMetric(lambda p, t: p, "positions")})
 
 
 HEAD = """

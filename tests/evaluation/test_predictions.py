@@ -123,7 +123,7 @@ def test_a_folder_is_predicted_as_its_clips_are(tmp_path: Path):
         "d.npz",
     ]
     assert [each.file for each in report.skipped] == ["bad.npz", "short.npz"]
-    assert report.skipped[1].reason.startswith("one frame at 60 Hz; allowed: ")
+    assert report.skipped[1].reason.startswith("one frame at 60 Hz")
     for name, stride in (("a", 1), ("b/c", 2), ("d", 1)):
         before = read_clip(tmp_path / "in" / f"{name}.npz", name)
         at_60 = Clip(name, before.poses[::stride], before.trans[::stride], 60.0)
@@ -155,9 +155,9 @@ def test_strict_stops_at_a_bad_clip(tmp_path: Path):
 def test_an_offline_network_has_no_stream_to_predict_or_to_draw(tmp_path: Path):
     offline = baseline("bodiffusion", offline=True, sampling_steps=2, depth=1)
     settings = {"modes": ["window"], "batch": 2, "ik": NoIK(), "seed": 0}
-    with pytest.raises(InputError, match="mode stream: this network makes a frame with later ones"):
+    with pytest.raises(InputError, match="mode=stream"):
         predict_clip(offline, frames(source(30)), "stream")
-    with pytest.raises(InputError, match="mode stream: this network makes a frame with later ones"):
+    with pytest.raises(InputError, match="mode=stream"):
         ClipPredictor(offline, "stream", "rotation", Evaluation(**settings))
     assert predict_clip(offline, frames(source(30)), "window")["predicted_positions"].shape == (29, 22, 3)
     truth, predicted = evaluation.predict_first_clip(offline, tiny_frames())
