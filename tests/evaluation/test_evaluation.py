@@ -51,12 +51,11 @@ def test_positions_that_are_not_those_of_the_rotations_are_refused():
         STREAM.report(model, TEST, "stream")
 
 
-@pytest.mark.parametrize("lost", [math.nan, math.inf])
-def test_a_network_that_diverged_is_evaluated_as_any_other(lost: float):
+def test_a_network_that_diverged_is_evaluated_like_any_other():
     """Its rotations and the positions that follow from them are no numbers, which is no broken network."""
     model = tiny.recurrent_poser(Heading())
     with torch.no_grad():
-        next(model.parameters()).fill_(lost)
+        next(model.parameters()).fill_(math.nan)
     found = STREAM.report(model, TEST, "stream")
     means = [found["mean"][branch]["MPJPE"] for branch in ("rotation", "position")]
     assert not any(map(math.isfinite, means))

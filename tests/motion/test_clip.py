@@ -26,9 +26,8 @@ def analytic(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize(
     ("fps", "how"),
-    [(60, "kept"), (120, "every 2. frame"), (240, "every 4. frame"), (100, "interpolated"),
-     (59.94, "interpolated"),
-     (250, "interpolated"), (150, "interpolated"), (30, "interpolated"), (50, "interpolated")],
+    [(60, "kept"), (240, "every 4. frame"), (100, "interpolated"), (59.94, "interpolated"),
+     (30, "interpolated")],
 )  # fmt: skip
 @pytest.mark.parametrize("interpolation", INTERPOLATIONS)
 def test_resampling_is_exact(fps, how, interpolation):
@@ -105,12 +104,12 @@ def test_pieces_are_the_clip(frames: int, lengths: list[int]):
 # Rates of recordings: which are known, and which known one is nearest
 
 
-@pytest.mark.parametrize("rate", [*USUAL_RATES, *RARE_RATES, 23.976, 29.97, 59.94, 119.88, 1 / 0.0083333])
-def test_rates_of_cameras_and_of_video_are_known(rate: float):
-    assert is_known_rate(rate)
+def test_rates_of_cameras_and_of_video_are_known():
+    rates = [*USUAL_RATES, *RARE_RATES, 23.976, 29.97, 59.94, 119.88, 1 / 0.0083333]
+    assert all(map(is_known_rate, rates))
 
 
-@pytest.mark.parametrize(("time", "usual"), [(0.016, 60), (0.017, 60), (0.008, 120), (0.03, 30), (0.011, 90)])
-def test_the_rate_of_a_frame_time_that_was_cut_off_is_none(time: float, usual: float):
+@pytest.mark.parametrize(("time", "usual"), [(0.016, 60), (0.008, 120), (0.03, 30)])
+def test_the_rate_of_a_frame_time_that_was_cut_off_is_not_known(time: float, usual: float):
     assert not is_known_rate(1 / time)
     assert nearest_rate(1 / time) == usual

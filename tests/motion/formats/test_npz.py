@@ -33,12 +33,11 @@ def npz(**values: object) -> bytes:
     return buffer.getvalue()
 
 
-@pytest.mark.parametrize("width", [156, 165, 72, 66])
 @pytest.mark.parametrize(
-    ("key", "rate"),
-    [("mocap_framerate", np.array(120.0)), ("mocap_framerate", np.array([120.0])), ("mocap_framerate", 120),
-     ("mocap_framerate", np.array(b"120")), ("mocap_framerate", np.array("120.0")),
-     ("mocap_frame_rate", 120.0), ("fps", 120)],
+    ("key", "rate", "width"),
+    [("mocap_framerate", np.array(120.0), 156), ("mocap_framerate", np.array([120.0]), 165),
+     ("mocap_framerate", 120, 72), ("mocap_framerate", np.array(b"120"), 66),
+     ("mocap_framerate", np.array("120.0"), 156), ("mocap_frame_rate", 120.0, 156), ("fps", 120, 156)],
 )  # fmt: skip
 def test_every_spelling_is_read(key, rate, width, tmp_path):
     values = arrays(width=width)
@@ -67,10 +66,9 @@ def parted(root: str, body: str, trans: str, width: int) -> dict[str, np.ndarray
      arrays() | {"poses": arrays()["poses"].astype(">f8")},
      arrays() | {"poses": arrays()["poses"].astype("g")}],
 )  # fmt: skip
-@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
-def test_every_layout_gives_the_same_clip(values, save, tmp_path, monkeypatch):
+def test_every_layout_gives_the_same_clip(values, tmp_path, monkeypatch):
     monkeypatch.setattr(bounded_npz, "BLOCK", 15_000)  # several blocks an array
-    save(tmp_path / "a.npz", **values)
+    np.savez_compressed(tmp_path / "a.npz", **values)
     clip = read_clip(tmp_path / "a.npz", "a")
     np.testing.assert_array_equal(clip.poses.reshape(20, 66), arrays()["poses"][:, :66])
     np.testing.assert_array_equal(clip.trans, arrays()["trans"])
@@ -173,9 +171,8 @@ def mutants(count: int = 130) -> list[bytes]:
 
 def test_damage_raises_one_line_or_reads_as_finite(tmp_path):
     path, refused = tmp_path / "bad.npz", 0
-    damaged = [*structural(), huge_header(), *mutants()]
-    assert len(damaged) >= 150
-    for content in damaged:
+    certain = [*structural(), huge_header()]
+    for number, content in enumerate([*certain, *mutants()]):
         path.write_bytes(content)
         message = ""
         try:
@@ -187,17 +184,10 @@ def test_damage_raises_one_line_or_reads_as_finite(tmp_path):
             assert str(path) in message
             assert "\n" not in message
         else:
+            assert number >= len(certain)
             assert np.isfinite(clip.poses).all()
             assert np.isfinite(clip.trans).all()
     assert refused >= 120
-
-
-def test_all_structural_damage_is_refused(tmp_path):
-    for i, content in enumerate([*structural(), huge_header()]):
-        path = tmp_path / f"{i}.npz"
-        path.write_bytes(content)
-        with pytest.raises(InputError, match=path.name):
-            read_clip(path, "bad")
 
 
 def repacked(data: bytes, **entries: bytes) -> bytes:
@@ -258,7 +248,7 @@ def test_a_small_file_that_unpacks_to_much_is_refused_before_it_does(shape, allo
     assert peak_of_refusal(path, f"poses is float64 .*{allowed}") < 500_000
 
 
-@pytest.mark.parametrize("width", [88, 132, 176, 198])
+@pytest.mark.parametrize("width", [88, 198])
 def test_rotations_in_another_form_are_refused(width, tmp_path):
     """Quaternions, 6D, and matrices of 22 joints would be read as rotation vectors of another motion."""
     np.savez(tmp_path / "a.npz", **(arrays() | {"poses": np.zeros((50, width))}))
@@ -308,22 +298,6 @@ def test_a_huge_directory_is_not_read(tmp_path, monkeypatch):
     path = tmp_path / "a.npz"
     path.write_bytes(npz(**arrays(), **{f"x{i}": np.zeros(1) for i in range(200)}))
     assert peak_of_refusal(path, "a part of more than") < 500_000
-
-
-def test_what_is_no_zip_is_said_without_advice_to_unpickle(tmp_path):
-    (tmp_path / "a.npz").write_text("not an npz\n")
-    with pytest.raises(InputError, match=r"a\.npz: not a zip") as caught:
-        read_clip(tmp_path / "a.npz", "a")
-    assert "unsafe" not in str(caught.value)
-    assert "pickle" not in str(caught.value)
-
-
-def test_the_message_is_one_line_whatever_the_file_is_called(tmp_path):
-    path = tmp_path / "a\nb\x1b[2J.npz"
-    path.write_bytes(b"")
-    with pytest.raises(InputError) as caught:
-        read_clip(path, "a")
-    assert str(caught.value).isprintable()
 
 
 def test_an_npz_without_motion_is_known(tmp_path):

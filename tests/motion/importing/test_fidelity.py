@@ -55,7 +55,7 @@ def test_a_right_import_has_no_fault(walk: Converted) -> None:
     assert again == walk.fidelity
 
 
-@pytest.mark.parametrize("place", [(60, 0, 0), (-60, 0, 0), (0, 60, 0), (0, -60, 0)], ids=str)
+@pytest.mark.parametrize("place", [(60, 0, 0), (0, -60, 0)], ids=str)
 def test_feet_point_forward_wherever_the_walk_is(walk: Converted, place: tuple[float, float, float]) -> None:
     elsewhere = replace(walk.clip, trans=walk.clip.trans + np.array(place))
     faults = compare(elsewhere, walk.motion, REST, "cmu_daz").faults
@@ -72,11 +72,8 @@ def bent(clip: Clip, joint: str, frame: int | slice, vector: list[float]) -> Cli
     ("joint", "segment"),
     [
         ("spine2", "spine2 to neck"),
-        ("neck", "neck to head"),
         ("left_elbow", "left_elbow to left_wrist"),
         ("right_hip", "right_hip to right_knee"),
-        ("left_ankle", "left_ankle to left_foot"),
-        ("right_collar", "right_collar to right_shoulder"),
     ],
 )
 def test_a_joint_that_is_off_in_one_frame_is_named(walk: Converted, joint: str, segment: str) -> None:
@@ -186,7 +183,7 @@ def test_a_wrong_rest_is_said(tmp_path: Path, joint: str, turn: list[float], sai
     assert any(said in fault for fault in faults(tmp_path, BANDAI, chosen, turns=turns))
 
 
-@pytest.mark.parametrize("degrees", [90.0, -90.0, 180.0])
+@pytest.mark.parametrize("degrees", [90.0, 180.0])
 def test_palms_that_face_elsewhere_are_said(tmp_path: Path, degrees: float) -> None:
     """A T-pose whose arms are turned about themselves, which only the axes of the elbows show."""
     sample = own_tree(DAZ)

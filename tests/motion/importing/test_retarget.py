@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from bvh_samples import (
-    FOLDED,
     POSITIONS,
     TREES,
     Sample,
@@ -83,27 +82,6 @@ def test_segments_point_as_in_the_file(tmp_path: Path, skeleton: str) -> None:
             continue
         expected = unit(positions[:, end] - positions[:, start])
         np.testing.assert_allclose(unit(body[:, child] - body[:, joint]), expected, atol=1e-9)
-
-
-@pytest.mark.parametrize("skeleton", TREES)
-def test_unmapped_rotations_are_folded_in(tmp_path: Path, skeleton: str) -> None:
-    """Head and torso turn in the world as in the file from frame to frame, whatever joints lie between."""
-    bvh, chosen = read(tmp_path, skeleton, folded=True), load_skeleton(skeleton)
-    assert any(name in FOLDED for name in bvh.nodes)
-    source = bvh.kinematics()[0][1:]
-    body = on_body(imported(bvh, chosen))[0]
-    for joint in ("spine1", "spine2", "head", "left_collar"):
-        node = source[:, bvh.nodes.index(chosen.joints[joint])]
-        turn = to_z_up((node @ node[0].T).swapaxes(-1, -2)).swapaxes(-1, -2)
-        expected = to_z_up(turn)
-        own = body[:, JOINT[joint]] @ body[0, JOINT[joint]].T
-        np.testing.assert_allclose(own, expected, atol=1e-9)
-
-
-def test_joints_without_counterpart_do_not_turn(tmp_path: Path) -> None:
-    clip = imported(read(tmp_path, "cmu_daz"), load_skeleton("cmu_daz"))
-    np.testing.assert_allclose(clip.poses[:, JOINT["spine3"]], 0, atol=1e-9)
-    assert np.abs(clip.poses[:, JOINT["spine2"]]).max() > 0.1
 
 
 def test_another_body_keeps_limbs_too(tmp_path: Path) -> None:
@@ -214,15 +192,6 @@ def test_lengths_are_those_of_the_motion(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.trans, expected.trans, atol=1e-3)
 
 
-def test_hip_joints_lie_where_the_scaled_source_has_them(tmp_path: Path) -> None:
-    """So legs of the same direction end where the source's do, although DAZ' hip lies lower."""
-    bvh, chosen = read(tmp_path, "cmu_daz"), load_skeleton("cmu_daz")
-    hips = [bvh.nodes.index("lThigh"), bvh.nodes.index("rThigh")]
-    source = to_z_up(bvh.kinematics()[1][1:, hips].mean(1)) * 0.01 * fitted(bvh, chosen).scale
-    body = on_body(imported(bvh, chosen))[1][:, [1, 2]].mean(1)
-    np.testing.assert_allclose(body, source, atol=1e-9)
-
-
 def test_calibration_frame_is_dropped(tmp_path: Path) -> None:
     bvh, chosen = read(tmp_path, "cmu_daz", frames=6), load_skeleton("cmu_daz")
     dropped, kept = imported(bvh, chosen), imported(bvh, replace(chosen, calibration_frame=False))
@@ -239,10 +208,13 @@ def test_calibration_frame_is_dropped(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("skeleton", TREES)
-@pytest.mark.parametrize("activity", ["walking", "reaching"])
-def test_a_performance_comes_back_from_its_file(tmp_path: Path, skeleton: str, activity: str) -> None:
+def test_a_performance_comes_back_from_its_file(tmp_path: Path, skeleton: str) -> None:
     """The embedded motion, written as a file of the skeleton: all joints that it has are where they were."""
-    clip, chosen, sample = synthesize_clip(activity, 0, seconds=2.0), load_skeleton(skeleton), tree(skeleton)
+    clip, chosen, sample = (
+        synthesize_clip("reaching", 0, seconds=2.0),
+        load_skeleton(skeleton),
+        tree(skeleton),
+    )
     corrections = fitted(zero_pose(sample), chosen).corrections
     file = performed(chosen, clip, sample=sample, corrections=corrections)
     bvh = read_bvh(write(tmp_path, file.text("\r\n")))
@@ -297,7 +269,7 @@ def whole(turn: Rotation) -> np.ndarray:
     return np.tile(turn.as_matrix(), (len(own_tree(DAZ).names), 1, 1))
 
 
-@pytest.mark.parametrize("degrees", [0, 90, 180, -37])
+@pytest.mark.parametrize("degrees", [180, -37])
 def test_a_zero_pose_that_stands_serves(tmp_path: Path, walk: Clip, degrees: float) -> None:
     """Whichever way it faces, it is turned to face +Z."""
     stance = found(tmp_path, walk, DAZ, turns=whole(Rotation.from_euler("y", degrees, degrees=True)))
@@ -307,8 +279,7 @@ def test_a_zero_pose_that_stands_serves(tmp_path: Path, walk: Clip, degrees: flo
     assert (stance.positions[10] - stance.positions[7])[2] > 0
 
 
-@pytest.mark.parametrize("axis", ["x", "z"])
-@pytest.mark.parametrize("degrees", [90, 180, -90])
+@pytest.mark.parametrize(("axis", "degrees"), [("x", 90), ("z", 180)])
 def test_a_zero_pose_that_lies_does_not_serve(tmp_path: Path, walk: Clip, axis: str, degrees: float) -> None:
     stance = found(tmp_path, walk, DAZ, turns=whole(Rotation.from_euler(axis, degrees, degrees=True)))
     assert stance.source.endswith("the straightest")
@@ -412,13 +383,6 @@ def test_joints_of_a_leg_that_stand_for_others_are_refused(tmp_path: Path, walk:
         found(tmp_path, walk, replace(DAZ, joints=joints))
 
 
-def test_mirrored_bones_are_refused(tmp_path: Path) -> None:
-    bvh, chosen = read(tmp_path, "cmu_daz"), load_skeleton("cmu_daz")
-    behind = replace(bvh, offsets=bvh.offsets * [-1, 1, 1])
-    with refuse(bvh.path, "the feet point backward, so left and right may be swapped"):
-        find_stance(behind, chosen, pick_joints(behind, chosen))
-
-
 # A map's rest
 
 
@@ -440,10 +404,7 @@ def leaning(degrees: float) -> list[float]:
     ("change", "said"),
     [
         ({"Spine": leaning(80.0)}, "pelvis to head is 7"),
-        ({"Spine": [0.0, 0.0, 0.0]}, "the left shoulder is on the side of the right hip"),
         ({"Hips": [0.0, 0.0, 0.0]}, "rest of skeleton bandai_namco"),
-        ({"Chest": [-0.1, 180.0, 0.0]}, "the left shoulder is on the side of the right hip"),
-        ({"UpperLeg_L": [0.0, 0.0, 0.0]}, "left_hip to left_knee is"),
         ({"Foot_R": [-0.6, 186.9, -65.9], "Foot_L": [-0.6, 186.9, -65.9]}, "the feet point backward"),
         ({"Spine": [90.0, 86.2]}, "rest.Spine has 2 values"),
     ],

@@ -145,13 +145,6 @@ def test_joints_are_those_of_the_map(tmp_path: Path, skeleton: str) -> None:
             np.testing.assert_array_equal(mapped_motion.positions[:, joint], positions[:, node])
 
 
-def test_a_joint_without_counterpart_is_its_parent(tmp_path: Path) -> None:
-    mapped_motion = pick_joints(read(tmp_path, "cmu_daz"), load_skeleton("cmu_daz"))
-    spine2, spine3 = JOINTS.index("spine2"), JOINTS.index("spine3")
-    assert mapped_motion.nodes[spine3] == mapped_motion.nodes[spine2]
-    np.testing.assert_array_equal(mapped_motion.positions[:, spine3], mapped_motion.positions[:, spine2])
-
-
 def test_a_map_of_other_joints_is_refused(tmp_path: Path) -> None:
     bvh, chosen = read(tmp_path, "cmu_daz"), load_skeleton("cmu_daz")
     with refuse(bvh.path, "Hips"):
@@ -168,13 +161,10 @@ def test_a_map_of_other_joints_is_refused(tmp_path: Path) -> None:
     ("nodes", "plain"),
     [
         (["mixamorig:Hips", "mixamorig:LeftArm"], ["Hips", "LeftArm"]),
-        (["mixamorig1:Hips", "mixamorig1:Hips.end"], ["Hips", "Hips.end"]),
         (["mixamorigHips", "mixamorigLeftArm"], ["Hips", "LeftArm"]),
         (["Character1_Hips", "Character1_LeftArm"], ["Hips", "LeftArm"]),
         (["m_avg_root", "m_avg_L_Hip", "m_avg_R_Hip"], ["root", "L_Hip", "R_Hip"]),
         (["Armature", "a:b:Hips", "a:b:Head"], ["Armature", "Hips", "Head"]),
-        (["LeftArm", "LeftForeArm"], ["Arm", "ForeArm"]),
-        (["Hips", "Head"], ["Hips", "Head"]),
         (["Spine", "Spine1", "Spine2"], ["Spine", "Spine1", "Spine2"]),
         (["a:Hips", "b:Hips"], ["a:Hips", "b:Hips"]),
         (["joint_1", "joint_2", "joint_2.end"], ["1", "2", "2.end"]),
@@ -193,7 +183,7 @@ def test_nodes_are_found_by_their_very_name_first():
 
 
 @pytest.mark.parametrize("name", FAMILIES)
-@pytest.mark.parametrize("prefix", ["", "mixamorig:", "Character1_"])
+@pytest.mark.parametrize("prefix", ["", "mixamorig:"])
 def test_each_familys_file_is_known_by_its_own_map(name: str, prefix: str):
     bvh = family(name).hierarchy()
     bvh = renamed(bvh, {joint: prefix + joint for joint in joints(bvh)})
@@ -204,10 +194,6 @@ def test_each_familys_file_is_known_by_its_own_map(name: str, prefix: str):
     assert {node.removeprefix(prefix) for node in found.joints.values()} == set(
         load_skeleton(name).joints.values()
     )
-
-
-def test_there_is_a_family_for_every_map():
-    assert sorted(FAMILIES) == list(shipped_skeletons())
 
 
 def test_spellings_of_smpl():
