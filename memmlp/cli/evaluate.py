@@ -1,4 +1,4 @@
-"""`memmlp eval`: the metrics of a finished run, read if they were measured before, else measured now."""
+"""`memmlp eval`: the metrics of a finished run, measured if necessary."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from memmlp.common.errors import InputError
     type=click.Path(path_type=Path),
     help="File to write the metrics into, means and one row for each clip, as JSON.",
 )
-@click.option("--again", is_flag=True, help="Measure again what was measured before.")
+@click.option("--again", is_flag=True, help="Repeat measurements that exist already.")
 @device_option
 @plugins_option
 @outputs_option
@@ -41,9 +41,13 @@ def evaluate(
     """Show the metrics of a finished run (id, its beginning, or folder) on its test clips.
 
     OVERRIDES are keys of the evaluation or the export, such as evaluation.ik=lbfgs, evaluation.modes=[stream]
-    or export.precision=int8. What was not measured so before is measured now; nothing is trained.
+    or export.precision=int8. Missing measurements are made; nothing is trained.
     """
     check_runs(outputs, run)
+    if json_path is not None and not json_path.absolute().parent.is_dir():
+        raise InputError(f"--json {json_path}: must be a file in an existing folder")
+    if save_predictions is not None and save_predictions.exists() and not save_predictions.is_dir():
+        raise InputError(f"--save-predictions {save_predictions}: must be a folder, not a file")
     from rich.console import Console
 
     from memmlp.cli.train_summary import metrics_table, older_code, source_tables
@@ -53,12 +57,11 @@ def evaluate(
     from memmlp.training.request import clip_rows
     from memmlp.training.run_stages import complete_stages
 
-    _check_places(json_path, save_predictions)
     found = open_run(outputs, run, device, overrides)
     experiment = found.experiment
     results, made = complete_stages(experiment, found.run, found.data, again=again)
-    said = f"{' and '.join(made)} done" if made else "measured before"
-    click.echo(f"run {found.run.id}: {said}")
+    outcome = f"{' and '.join(made)} done" if made else "measured before"
+    click.echo(f"run {found.run.id}: {outcome}")
     if partial := found.run.manifest.get("partial"):
         click.echo(f"on a part of the data: {partial}")
     for fact in ("resampled", "unusual"):
@@ -74,11 +77,3 @@ def evaluate(
     if save_predictions is not None:
         write_predictions(experiment.evaluation, found.network(), found.test, save_predictions)
         click.echo(f"predictions of {len(found.test.names)} clips under {save_predictions}")
-
-
-def _check_places(json_path: Path | None, predictions: Path | None) -> None:
-    """Raise InputError, before anything is measured, for a place where the results can't be written."""
-    if json_path is not None and not json_path.absolute().parent.is_dir():
-        raise InputError(f"--json {json_path}: allowed is a file in a folder that exists")
-    if predictions is not None and predictions.exists() and not predictions.is_dir():
-        raise InputError(f"--save-predictions {predictions}: is a file; allowed is a folder")

@@ -17,7 +17,7 @@ from memmlp.motion.preparing.manifest import Manifest
 from memmlp.motion.preparing.splits import PARTS
 
 DRAWN_BY = ("frames", "clips")
-SHARE_STEPS = 2**52  # how finely sources' shares are kept
+SHARE_STEPS = 2**52  # resolution of the sources' shares
 
 
 class MotionDataset:
@@ -53,7 +53,7 @@ class MotionDataset:
             InputError: if the cache is unfinished or damaged, or the part has no clip.
         """
         if part not in PARTS:
-            raise InputError(f"data: no part {part!r}; allowed: {', '.join(PARTS)}")
+            raise InputError(f"part={part}: must be one of {', '.join(PARTS)}")
         manifest = Manifest.load(cache)
         clips = manifest.part(part)
         if not clips:
@@ -105,7 +105,7 @@ class MotionDataset:
 
 
 class WindowSampler:
-    """Draws random windows; a draw depends on seed and step alone, so a sampler needs no state but the step.
+    """Draws random windows; a draw depends only on seed and step, so the step is the sampler's only state.
 
     A window of a clip is named by its last frame. Every window can be drawn, including the clip's last one; a
     clip shorter than the window has one window, which ends at its last frame.
@@ -118,10 +118,10 @@ class WindowSampler:
         drawn_by: "frames" if every window of the part is equally likely (reading 23), "clips" if every clip
             is equally likely.
         shares: how often a window is drawn from each source, relative to the others; within a source,
-            `drawn_by` decides. None draws from all clips alike.
+            `drawn_by` decides. None draws from all clips.
 
     Raises:
-        InputError: for another `drawn_by`.
+        InputError: for any other `drawn_by`.
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class WindowSampler:
         shares: Mapping[str, float] | None = None,
     ):
         if drawn_by not in DRAWN_BY:
-            raise InputError(f"data.drawn_by: {drawn_by!r}; allowed: {', '.join(DRAWN_BY)}")
+            raise InputError(f"data.drawn_by={drawn_by}: must be one of {', '.join(DRAWN_BY)}")
         self.batch, self.seed, self.device = batch, seed, dataset.frames.device
         lengths = dataset.lengths.cpu().numpy()
         self.first_end = np.minimum(window, lengths) - 1
@@ -151,10 +151,10 @@ class WindowSampler:
         return torch.from_numpy(clip).to(self.device), torch.from_numpy(end).to(self.device)
 
     def draw_beginnings(self, step: int, stride: int) -> tuple[Tensor, Tensor]:
-        """Draw where streams begin that run through a clip to its end, `stride` frames per step.
+        """Draw the starts of streams that run through a clip to its end, `stride` frames per step.
 
-        They begin at one of the clip's first windows. The longer a stream stays in a clip, the more rarely
-        the clip is drawn, so that streams see each window as often as `draw` draws it.
+        They begin at one of the clip's first windows. A clip in which a stream stays longer is drawn more
+        rarely, so that streams see each window as often as `draw` draws it.
 
         Returns:
             Clips (B,) and the last frames (B,) of the windows, as from `draw`, but independent of its draws.
@@ -216,7 +216,7 @@ SOURCES, SIGNS = _layout()
 def mirror_frames(frames: Tensor) -> Tensor:
     """Mirror world frames [X | Theta] (..., 252) at the plane X = 0, with left and right exchanged.
 
-    If the body's rest pose is not symmetric, the mirrored motion is that of the mirrored body.
+    If the body's rest pose is not symmetric, the mirrored motion belongs to the mirrored body.
     """
     return frames[..., SOURCES.to(frames.device)] * SIGNS.to(frames)
 

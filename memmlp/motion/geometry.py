@@ -119,7 +119,7 @@ def forward_kinematics(local: Tensor, root: Tensor, rest: Tensor) -> tuple[Tenso
 def bone_chains() -> Tensor:
     """Return the matrix (22, 21) that adds turned bones up to joint positions relative to the head.
 
-    A bone leads from a joint's parent to the joint; the root has none.
+    A bone leads from a joint's parent to the joint; the root does not have one.
     """
     chains = torch.zeros(N_JOINTS, N_JOINTS - 1)
     for joint in range(1, N_JOINTS):

@@ -21,7 +21,7 @@ HEAT = ("#2b5fd9", "#27a9e1", "#3fc380", "#f2d43d", "#f28c28", "#c4161c")
 
 
 class Limb(NamedTuple):
-    """A round limb between two joints, or from a joint to a tip that is no joint.
+    """A round limb between two joints, or from a joint to a tip.
 
     Attributes:
         start, end: the joints whose errors colour its two ends.

@@ -38,17 +38,17 @@ class Prepared(NamedTuple):
         """Open a part of the cache, memory-mapped (`MotionDataset.open`).
 
         Raises:
-            InputError: if the cache is unfinished, or was made anew of other clips since this was prepared.
+            InputError: if the cache is unfinished, or was replaced by a cache of other clips.
         """
         # Imported here, since it imports torch, which finding finished work does not need.
         from memmlp.motion.dataset import MotionDataset
 
         part_of_cache = MotionDataset.open(self.cache, part)
-        # Looked at last: arrays are replaced after the old manifest went, and before the new one comes.
+        # Checked last: arrays are replaced after the old manifest was removed, before the new one is written.
         if Manifest.load(self.cache).digest != self.digest:
             raise InputError(
-                f"{self.cache}: was made anew of other clips while this ran with those of before; "
-                "start it again, or put the clips back"
+                f"{self.cache}: was prepared again from other clips while this ran; start it again, or "
+                "restore the clips"
             )
         return part_of_cache
 
@@ -61,7 +61,7 @@ class MotionSource:
         clips: the folder of clips, or several, with its split and body.
         generate: makes a synthetic folder; None for the user's own.
         caches: folder of all caches.
-        partial: whether it is allowed that only a part of the split's entries have clips.
+        partial: whether entries of the split may lack clips.
     """
 
     clips: ClipFolder

@@ -22,7 +22,7 @@ from memmlp.motion.body import (
 class Coordinates:
     """The slot's interface; methods that are not overridden use the world's own coordinates.
 
-    `origin` says, from a frame's inputs alone, the origin of its local coordinates; `sparse_in`, `motion_in`
+    `origin` computes the origin of a frame's local coordinates from its inputs; `sparse_in`, `motion_in`
     and `motion_out` convert inputs and motion to and from them.
     """
 

@@ -54,7 +54,7 @@ class Normalizer(nn.Module):
 
     @classmethod
     def raw(cls, coordinates: Coordinates, rest: Tensor) -> Normalizer:
-        """Make a normalizer that changes the coordinates alone, without z-scores."""
+        """Make a normalizer that only changes the coordinates, without z-scores."""
         return cls(coordinates, rest, torch.zeros(FRAME_DIM), torch.ones(FRAME_DIM))
 
     @classmethod

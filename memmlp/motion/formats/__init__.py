@@ -1,1 +1,1 @@
-"""Files of motion: what reads and writes each format."""
+"""Readers and writers of motion files."""

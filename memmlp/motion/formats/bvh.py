@@ -218,7 +218,7 @@ def _hierarchy(words: _Words) -> tuple[list[str], list[int], list[list[float]], 
     offsets: list[list[float]] = []
     channels: list[tuple[str, ...]] = []
     ends: list[tuple[str, int, list[float]]] = []
-    open_joints: list[int] = []  # whose closing } is still to come
+    open_joints: list[int] = []  # without their closing }
 
     def check(name: str) -> str:
         if name in ("{", "}") or name in names or any(name == end for end, _, _ in ends):

@@ -24,7 +24,7 @@ from memmlp.motion.clip import Clip, y_up_motion
 from memmlp.motion.limb_shapes import LIMBS, ends
 
 COMPONENTS = {"<f4": 5126, "<u2": 5123, "|u1": 5121}  # glTF's numbers for types of components
-VERTICES, INDICES = 34962, 34963  # what a buffer view is for
+VERTICES, INDICES = 34962, 34963  # kinds of buffer views
 COLOUR = (0.38, 0.44, 0.50, 1.0)  # of the mannequin, linear RGB and opacity
 AROUND, CAP = 16, 4  # vertices around a limb; rings of the half sphere at each of its ends
 

@@ -60,6 +60,6 @@ def check_imported_body(clips: Iterable[Path], rest: np.ndarray, user: str) -> N
         # Networks have their joints in float32.
         if joints.shape != rest.shape or not np.allclose(joints, rest, rtol=0, atol=1e-4):
             raise InputError(
-                f"{path.parent}: imported onto the body {body}, which is not that of {user}; "
+                f"{path.parent}: imported onto the body {body}, but {user} has another one; "
                 "use the same body, or import again with --body"
             )

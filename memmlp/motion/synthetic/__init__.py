@@ -36,8 +36,8 @@ MARGIN = 4.0  # seconds; a clip is a random excerpt of a performance that is lon
 def synthesize(out: Path, *, minutes: float = 10.0, seed: int = 0, fps: float = 60.0) -> list[Path]:
     """Write clips of 8 to 20 s, `minutes` in all, as `out`/<activity>/<activity>_<nnn>.npz.
 
-    If that would make fewer than three clips, three shorter ones are written. The clips depend on the
-    arguments alone.
+    If that would make fewer than three clips, three shorter ones are written. The clips depend only
+    on the arguments.
 
     Raises:
         InputError: for bad arguments.
