@@ -143,19 +143,6 @@ export function forest(rows, { label, smallest }) {
     () => [['variant', 'difference', 'low', 'high', 'paper', 'verdict'], ...rows.map(row => [row.variant, row.mean, row.low, row.high, row.paper, row.verdict ?? ''])]);
 }
 
-export function bars(rows, { label, digits = 2 }) {
-  const domain = rows.map(row => row.name);
-  const draw = width => Plot.plot(base(width, 46 + 26 * rows.length, {
-    marginLeft: Math.min(nameWidth(domain), width * 0.45), marginRight: 46, marginTop: 8,
-    x: { label, grid: true, ticks: Math.min(width / 80, 6) }, y: { domain, label: null, tickSize: 0 },
-    marks: [
-      Plot.barX(rows, { x: 'value', y: 'name', fill: 'var(--series0)', rx: 2, insetTop: 3, insetBottom: 3 }),
-      Plot.text(rows, { x: 'value', y: 'name', text: row => number(row.value, digits), dx: 6, textAnchor: 'start', fill: 'var(--ink)' }),
-    ],
-  }));
-  return figure(`${label}. ${rows.map(row => `${row.name}: ${number(row.value, digits)}`).join('; ')}.`, draw);
-}
-
 // Trials' values by number, and the best so far.
 export function history(trials, { label, open }) {
   let best = Infinity;
@@ -203,46 +190,6 @@ export function profiles({ thresholds, rows }, { label }) {
   }));
   const legend = h('div', { class: 'keys' }, rows.map(row => h('span', { class: 'key still' }, h('i', { style: `background:${colours.get(row.variant)}` }), row.variant)));
   return h('div', {}, legend, figure(`Performance profiles of ${label}.`, draw));
-}
-
-// A line for each trial across an axis for each key; the better the darker.
-export function parallel(trials, axes, { label }) {
-  const scales = axes.map(axis => {
-    const values = trials.map(trial => trial.cells[axis.key]).filter(value => value !== undefined && value !== null);
-    const numeric = values.every(value => typeof value === 'number');
-    if (!numeric) {
-      const words = [...new Set(values.map(String))].sort();
-      return { ...axis, at: value => (words.length > 1 ? words.indexOf(String(value)) / (words.length - 1) : 0.5), ends: [words[0], words.at(-1)] };
-    }
-    const turn = axis.log && Math.min(...values) > 0 ? Math.log : value => value;
-    const [low, high] = [Math.min(...values), Math.max(...values)];
-    const span = turn(high) - turn(low);
-    return { ...axis, at: value => (span ? (turn(value) - turn(low)) / span : 0.5), ends: [number(low), number(high)] };
-  });
-  const order = [...trials].sort((a, b) => b.value - a.value);
-  const lines = order.flatMap((trial, rank) => scales.filter(scale => trial.cells[scale.key] !== undefined && trial.cells[scale.key] !== null)
-    .map(scale => ({ id: trial.id, axis: scale.name, y: scale.at(trial.cells[scale.key]), rank: (rank + 1) / order.length, best: rank === order.length - 1, text: trial.text })));
-  const names = scales.map(scale => scale.name);
-  const draw = width => {
-    const across = Math.max(width, 124 * axes.length);
-    const plot = Plot.plot(base(across, 300, {
-    marginLeft: 60, marginRight: 60, marginTop: 40, marginBottom: 30,
-    x: { domain: names, type: 'point', axis: null }, y: { axis: null, domain: [0, 1] },
-    marks: [
-      Plot.ruleX(names, { stroke: 'var(--line)', strokeWidth: 1.5 }),
-      Plot.line(lines.filter(point => !point.best), { x: 'axis', y: 'y', z: 'id', stroke: 'var(--series0)', strokeOpacity: point => 0.12 + 0.6 * point.rank ** 2, strokeWidth: 1.4 }),
-      Plot.line(lines.filter(point => point.best), { x: 'axis', y: 'y', z: 'id', stroke: 'var(--series1)', strokeWidth: 2.5 }),
-      Plot.text(names, { x: name => name, y: 1, dy: -26, text: name => name, fontWeight: 600, fill: 'var(--ink)' }),
-      Plot.text(scales, { x: 'name', y: 1, dy: -10, text: scale => scale.ends[1], fill: 'var(--faint)' }),
-      Plot.text(scales, { x: 'name', y: 0, dy: 14, text: scale => scale.ends[0], fill: 'var(--faint)' }),
-      tip(lines, { x: 'axis', y: 'y', title: 'text' }),
-    ],
-    }));
-    if (width < across) plot.setAttribute('data-wide', ''); // it scrolls
-    return plot;
-  };
-  return figure(`${label}: ${trials.length} trials across ${names.join(', ')}.`, draw,
-    () => [['trial', ...names], ...trials.map(trial => [trial.id, ...scales.map(scale => trial.cells[scale.key])])]);
 }
 
 // Errors over time; a click goes to a moment.

@@ -1,8 +1,8 @@
-// Searches: their history, what mattered, the Pareto front, and all trials across parallel axes.
+// Searches: their history, the importance of their keys, the Pareto front, and all trials.
 
 import { h, replace, link, section, empty, select, table } from './dom.js';
 import { address, ask, place, remember, runs } from './store.js';
-import { bars, history, parallel, scatter } from './charts.js';
+import { history, scatter } from './charts.js';
 import { number, shortKeys, word } from './format.js';
 import { state } from './runs.js';
 
@@ -47,20 +47,18 @@ function body(search, update) {
   const text = trial => [`trial ${trial.number}: ${values(trial)}`, ...search.keys.map(key => `${short.get(key)} ${word(trial.params[key])}`)].join('\n');
   const listed = complete.map(trial => ({
     ...trial, id: trial.number, value: trial.values[search.objectives.indexOf(objective)], text: text(trial),
-    cells: { ...trial.params, ...Object.fromEntries(trial.values.map((value, i) => [`objective ${i}`, value])) },
   }));
   const open = trial => { if (runs.has(trial.runs[0])) location.hash = address('run', trial.runs[0]); };
   const front = new Set(search.front);
-  const axes = [...search.keys.map(key => ({ key, name: short.get(key), log: search.log.includes(key) })), ...search.objectives.map((name, i) => ({ key: `objective ${i}`, name, log: false }))];
   const best = listed.filter(trial => front.has(trial.id));
-  const importance = search.too_few ? h('p', { class: 'faint' }, search.too_few)
-    : search.importance.length ? bars(search.importance.map(([key, value]) => ({ name: short.get(key), value })), { label: `${search.importance_is}, by ${search.objectives[0]}` }) : null;
+  const meter = share => h('td', { class: 'meter' }, h('i', { style: `width:${100 * share}%` }));
+  const importance = search.too_few ? h('p', { class: 'faint' }, search.too_few) : search.importance.length
+    ? [h('p', { class: 'faint' }, `${search.importance_is}, by ${search.objectives[0]}`), table(null, search.importance.map(([key, share]) => [short.get(key), meter(share), number(share, 2)]))] : null;
   return [
     h('div', { class: 'sum' }, h('p', {}, counts(search)), h('p', { class: 'best' }, best.length === 1 ? 'Best: ' : 'On the Pareto front: ', best.slice(0, 8).map((trial, i) => [i ? ', ' : '', runLink(trial), ' ', h('b', { class: 'n' }, values(trial))])), search.ends.map(line => h('p', { class: 'faint' }, line))),
     search.objectives.length > 1 ? h('div', { class: 'tools' }, select('Objective', search.objectives.map(one => [one, one]), objective, value => { remember({ objective: value }); update(); })) : null,
     search.objectives.length === 2 ? section('Pareto front', scatter(listed.map(trial => ({ ...trial, x: trial.values[0], y: trial.values[1] })), { x: search.objectives[0], y: search.objectives[1], front })) : null,
     h('div', { class: 'pair' }, section('History', history(listed, { label: objective, open })), importance && section('Importance', importance)),
-    section('All trials', h('p', { class: 'faint' }, `A line for each trial, darker where ${objective} is lower; the best stands out.`), parallel(listed, axes, { label: 'Parallel axes' })),
     trials(search, short),
   ];
 }
