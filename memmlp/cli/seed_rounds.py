@@ -48,6 +48,8 @@ def current_rounds(sweep: Sweep, outputs: Path, most: int | None) -> Rounds:
 
 def check(overrides: Sequence[str], wanted: bool, most: int | None) -> None:
     """Raise InputError for options of the command line that don't go together."""
+    if most is None and not wanted:
+        return
     from memmlp.tables.seed_rounds import MOST
     from memmlp.tables.statistics import looks
 

@@ -26,12 +26,10 @@ from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS, FRAME_DIM, load_rest_joints
 from memmlp.motion.clip import INTERPOLATED, LINES, SPLINES, Clip, resample
 from memmlp.motion.formats.npz import read_clip
-from memmlp.motion.preparing.duplicates import assign_parts
 from memmlp.motion.preparing.find_clips import Folders, Root, clip_name, find_clips
 from memmlp.motion.preparing.imported_body import body_name, check_imported_body
 from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manifest
 from memmlp.motion.preparing.splits import PARTS, Split
-from memmlp.motion.preparing.survey import survey
 from memmlp.runs.recipe_versions import RECIPES
 
 FRAMES_VERSION = 1  # number of a frame's content; a new one changes every digest, and so repeats every run
@@ -98,6 +96,9 @@ def finished_cache(source: ClipFolder, out: Path) -> Manifest | None:
 
 def _plan(source: ClipFolder, rest: np.ndarray, request: str) -> Manifest:
     """Read the sources and split them; return the manifest of the cache to be written."""
+    from memmlp.motion.preparing.duplicates import assign_parts  # scipy takes 0.4 s to import
+    from memmlp.motion.preparing.survey import survey
+
     found, split = survey(source.root, source.min_frames, source.strict), source.split
     if not found.clips:
         first = f"; the first: {found.skipped[0].file}: {found.skipped[0].reason}" if found.skipped else ""
