@@ -32,7 +32,7 @@ def demo(overrides: tuple[str, ...]) -> None:
     have, only the first network is trained.
     """
     from memmlp.cli.train_summary import show_side_by_side
-    from memmlp.runs.motion_seen import frames_seen, hardly_trained
+    from memmlp.runs.lookup import frames_seen, hardly_trained
 
     started = time.monotonic()
     both = fit_recurrent_poser(overrides)  # before the minutes of the first network

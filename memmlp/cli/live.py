@@ -269,8 +269,7 @@ def serve(given: LiveOptions) -> None:
     from memmlp.live.session import page_server
     from memmlp.live.session.loop import Fitting, make_greeting, run_loop
     from memmlp.live.stream import Stream
-    from memmlp.runs.lookup import find_run
-    from memmlp.runs.motion_seen import frames_seen, hardly_trained
+    from memmlp.runs.lookup import find_run, frames_seen, hardly_trained
 
     with contextlib.closing(make_source(given)) as source:
         file, name = network_file(given)

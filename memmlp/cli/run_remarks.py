@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 def remark_on(runs: Iterable[Run]) -> None:
     """Say on standard error which of the runs' networks hardly saw motion in training."""
-    from memmlp.runs.motion_seen import frames_seen, hardly_trained
+    from memmlp.runs.lookup import frames_seen, hardly_trained
 
     for run in runs:
         if said := hardly_trained(frames_seen(run)):

@@ -20,7 +20,7 @@ from memmlp.runs.deployment_folder import (
     as_deployed,
     deployed_precision,
 )
-from memmlp.runs.motion_seen import frames_seen, hardly_trained
+from memmlp.runs.lookup import frames_seen, hardly_trained
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import BRANCHES
 from memmlp.tables.measured_run import CORE_SHARES, SAME, SHARED, Errors, load

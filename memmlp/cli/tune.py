@@ -242,14 +242,13 @@ def write_results(setup: Setup, study: Study) -> None:
     """Write the results of the search into its folder."""
     from memmlp.config.package_data import packaged
     from memmlp.runs.identity import option_in_slot
-    from memmlp.runs.shown_name import USUAL
     from memmlp.sweep.search import results
 
     results.write_trials(study, setup.folder / "trials.csv")
     groups = [path.name for path in packaged("conf").iterdir() if path.is_dir()]
     results.write_experiments(study, setup.folder, groups)
     model = option_in_slot(_requests(setup, {})[0].config, "model")
-    if model == USUAL["model"]:  # Table 5 is of no other network
+    if model in (None, "mem_mlp"):  # Table 5 is about this network
         table = f"table{results.TABLE:02d}.yaml"
         results.write_table(study, packaged("sweeps") / table, setup.folder / table, setup.words)
     results.write_plots(study, setup.folder)

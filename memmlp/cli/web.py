@@ -94,8 +94,7 @@ def describe_network(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:
     from memmlp.live.web.networks import SiteNetwork
     from memmlp.networks.streaming import check_streams
     from memmlp.runs.identity import flatten
-    from memmlp.runs.motion_seen import frames_seen, hardly_trained
-    from memmlp.runs.shown_name import run_name
+    from memmlp.runs.lookup import frames_seen, hardly_trained, run_name
 
     network = opened.network()
     check_streams(network)

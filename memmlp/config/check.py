@@ -14,7 +14,6 @@ from omegaconf.errors import OmegaConfBaseException
 from memmlp.common.components import SLOTS, chosen
 from memmlp.common.errors import InputError
 from memmlp.config.schema import Config
-from memmlp.runs.former_keys import present_key
 
 
 def check(cfg: DictConfig) -> None:
@@ -65,8 +64,6 @@ def unknown_key(name: str, keys: Sequence[str]) -> str:
     own = re.split(r"[./@]", name)[-1]
     near = difflib.get_close_matches(own, keys, n=1)
     hint = f"did you mean {near[0]}? " if near else ""
-    if (now := present_key(name.replace("@", "."), keys)) is not None:
-        hint = f"it is now {now}; "
     listed = ", ".join(keys) or "none"
     return f"{name}: no such key; {hint}allowed here: {listed}"
 

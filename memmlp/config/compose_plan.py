@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import digest, read_json, write_json
+from memmlp.common.overrides import Override
 from memmlp.config.package_data import packaged
 from memmlp.config.plugins import activate, named, texts_outside_memmlp
-from memmlp.runs.former_keys import with_former_keys
 from memmlp.sweep.definition import Sweep, Variant, key_of
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
 from memmlp.sweep.sweep_file import load_sweep
@@ -67,23 +67,15 @@ def check_preset(sweep: Sweep, arm: Variant) -> None:
     others = arm.own_overrides if chosen in arm.cell else ()
     around = {key_of(word): word for word in (*sweep.base, *sweep.command_line)}
     around = {key: word for key, word in around.items() if key not in own or key == EXPERIMENT}
-    before, options = _options(around.pop(EXPERIMENT, "")), _options(chosen)
+    before, options = Override.parse(around.pop(EXPERIMENT, "")).options, Override.parse(chosen).options
     where = f"sweep {sweep.name}, variant '{arm.label}': {chosen}"
     if options and (lost := [option for option in before if option not in options]):
         both = ",".join(dict.fromkeys([*before, *options]))
-        raise InputError(f"{where} would replace {EXPERIMENT}={lost[0]}; allowed is {EXPERIMENT}=[{both}]")
+        raise InputError(f"{where} would replace {EXPERIMENT}={lost[0]}; use {EXPERIMENT}=[{both}]")
     known = set_by_experiments(options, sweep.all_overrides(arm))
     for key, word in (around | {key_of(word): word for word in others}).items():
         if key in known:
-            raise InputError(
-                f"{where} sets {key}, and {word} beside it would win; allowed are keys that it does not set"
-            )
-
-
-def _options(word: str) -> list[str]:
-    """Return the options that an override of a group names: one, a list of them, or none."""
-    value = word.partition("=")[2].strip("[] ")
-    return [option.strip() for option in value.split(",") if option.strip() not in ("", "null")]
+            raise InputError(f"{where} sets {key}, and {word} would override it; remove it or the experiment")
 
 
 def _path(name: str) -> Path:
@@ -98,9 +90,7 @@ def _path(name: str) -> Path:
         tables = [int(known.removeprefix("table")) for known in shipped if known.startswith("table")]
         others = ", ".join(known for known in shipped if not known.startswith("table"))
         numbers = f"the number of a table of the paper, {min(tables)} to {max(tables)}"
-        raise InputError(
-            f"sweep '{name}': no such sweep; allowed are {numbers}, a path ending in .yaml, or {others}"
-        )
+        raise InputError(f"sweep '{name}': no such sweep; use {numbers}, a path ending in .yaml, or {others}")
     return path
 
 
@@ -112,18 +102,12 @@ def is_path(name: str) -> bool:
 def sweep_folder(sweep: Sweep, outputs: Path) -> Path:
     """Return the folder of a sweep with its overrides: its plan, its rounds and its workers' logs.
 
-    It is the same in whatever order the overrides are written, and with the former names of renamed keys.
-    Earlier versions had a folder for each order; one that is there is used.
+    The order of overrides does not matter.
     """
     if not sweep.command_line:
         return outputs / "sweeps" / sweep.name
-    of_arms = [word for arm in sweep.runnable() for word in sweep.all_overrides(arm)]
-    words = with_former_keys(sweep.command_line, beside=of_arms)
-    ordered = tuple(sorted(words, key=lambda word: word.partition("=")[0]))
-    as_written, same_for_all = (
-        outputs / "sweeps" / f"{sweep.name}-{digest(order)[:8]}" for order in (words, ordered)
-    )
-    return as_written if as_written.is_dir() else same_for_all
+    ordered = sorted(sweep.command_line, key=key_of)
+    return outputs / "sweeps" / f"{sweep.name}-{digest(ordered)[:8]}"
 
 
 def kept_or_new_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:

@@ -1,4 +1,4 @@
-"""Explains errors of Hydra and OmegaConf in one line that names the key and says what is allowed."""
+"""Explains errors of Hydra and OmegaConf in one line that names the key and what was expected."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from omegaconf.errors import (
 )
 
 from memmlp.config.check import unknown_key
-from memmlp.runs.former_keys import present_key, present_option
 
 SOURCES = "data.sources"
 WORDS = {int: "an integer", float: "a number", bool: "true or false", str: "text", NoneType: "null"}
@@ -29,16 +28,12 @@ WORDS = {int: "an integer", float: "a number", bool: "true or false", str: "text
 def explain(error: Exception, overrides: Sequence[str]) -> str:
     """Return the line for an error that was raised while composing these overrides."""
     if isinstance(error, OverrideParseException):
-        return f"{error.override}: cannot be read; allowed is KEY=VALUE, +KEY=VALUE or ~KEY"
+        return f"{error.override}: cannot be parsed; expected KEY=VALUE, +KEY=VALUE or ~KEY"
     if isinstance(error, MissingConfigException):
         return _missing_option(error)
-    if isinstance(error, ConfigCompositionException) and (said := _former_group(overrides)):
-        return said
     if isinstance(error, RecursionError):
-        said = (
-            "a defaults list leads back to itself; allowed is '- NAME' for another option of the same group"
-        )
-        return f"{' '.join(overrides)}: {said}"
+        reason = "a defaults list includes itself; write '- NAME' for another option of the same group"
+        return f"{' '.join(overrides)}: {reason}"
     below = error.__cause__ or error.__context__
     if isinstance(below, OmegaConfBaseException):
         return _typed(below, _offender(error))
@@ -57,18 +52,7 @@ def _missing_option(error: MissingConfigException) -> str:
         return _first_line(error)
     near = difflib.get_close_matches(option, error.options, n=1)
     hint = f"did you mean {near[0]}? " if near else ""
-    if (now := present_option(group, option)) is not None:
-        hint = f"it is now {now}; "
-    return f"{group}={option}: no such option; {hint}allowed are {', '.join(error.options)}"
-
-
-def _former_group(overrides: Sequence[str]) -> str | None:
-    """Answer an override that names a group by a former name; None if there is none."""
-    for word in overrides:
-        group = re.split("[.=@]", word.lstrip("+~"))[0]
-        if (now := present_key(group, ())) is not None:
-            return f"{word}: no such group; it is now {now}"
-    return None
+    return f"{group}={option}: no such option; {hint}must be one of {', '.join(error.options)}"
 
 
 def _offender(error: Exception) -> str | None:
@@ -82,7 +66,7 @@ def _typed(error: OmegaConfBaseException, override: str | None) -> str:
     name = str(error.full_key or override)
     schema = error.object_type
     if not dataclasses.is_dataclass(schema) and ("SourceConfig" in str(error) or name.startswith(SOURCES)):
-        return f"{SOURCES}: allowed are sources in a config file of your own (docs/guides/motion.md)"
+        return f"{SOURCES}: must be set in your own config file (docs/guides/motion.md)"
     if isinstance(error, ConfigAttributeError | ConfigKeyError) and not isinstance(
         error, InterpolationKeyError
     ):
@@ -92,9 +76,9 @@ def _typed(error: OmegaConfBaseException, override: str | None) -> str:
         return unknown_key(name, keys)
     if isinstance(error, ValidationError):
         shown = override if override and override.lstrip("+").startswith(f"{name}=") else name
-        return f"{shown}: allowed is {_expected(name, schema, error)}"
+        return f"{shown}: expected {_expected(name, schema, error)}"
     if isinstance(error, ConfigTypeError):
-        return f"{name}: cannot be removed; allowed is a value, {name}=..."
+        return f"{name}: cannot be removed; set a value, {name}=..."
     return f"{override or name}: {_first_line(error)}"
 
 
@@ -126,7 +110,7 @@ def _composition(text: str) -> str:
     """Return Hydra's own message without its advice on other ways to write the command."""
     ambiguous = re.match(r"Ambiguous value for argument '(.*)'", text)
     if ambiguous:
-        return f"{ambiguous[1]}: more than one value; allowed is one, a list [a,b], or several with -m"
+        return f"{ambiguous[1]}: expected one value, a list [a,b], or several values with -m"
     return "; ".join(line.strip() for line in text.splitlines() if line.strip())
 
 

@@ -22,7 +22,7 @@ from memmlp.config.compose import VERSION_BASE
 from memmlp.config.package_data import packaged
 from memmlp.config.schema import ProfileConfig
 from memmlp.runs.identity import NETWORK, SLOTS, flatten, option_in_slot, training_config
-from memmlp.runs.shown_name import kind_words
+from memmlp.runs.lookup import kind_words
 
 MOST = 6  # words
 BETWEEN = " · "

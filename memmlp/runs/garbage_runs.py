@@ -10,12 +10,11 @@ from typing import Any, NamedTuple
 from memmlp.common.files import read_json
 from memmlp.common.lease import is_alive
 from memmlp.runs.identity import NETWORK
-from memmlp.runs.lookup import list_runs
+from memmlp.runs.lookup import kind_words, list_runs
 from memmlp.runs.notes import read_notes
+from memmlp.runs.origin import upstream_recipes
 from memmlp.runs.recipe_versions import outdated
 from memmlp.runs.run import Run
-from memmlp.runs.shown_name import kind_words
-from memmlp.runs.upstream_origin import upstream_recipes
 
 REASONS = ("failed", "old", "orphaned")
 

@@ -16,11 +16,10 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import to_number
 from memmlp.runs.deployment_folder import with_times_as_deployed
 from memmlp.runs.evaluation_file import with_solvers
-from memmlp.runs.former_keys import present_key
 from memmlp.runs.identity import SLOTS, flatten, option_in_slot, training_config
+from memmlp.runs.lookup import run_name
 from memmlp.runs.notes import read_notes
 from memmlp.runs.run import STATUSES, Run
-from memmlp.runs.shown_name import run_name
 
 Record = Mapping[str, Any]
 Condition = Callable[[Record], bool]
@@ -38,7 +37,7 @@ DEEPEST = 50  # parentheses and "not"s in one another
 def record(run: Run) -> dict[str, Any]:
     """Return the values that conditions can use for a run, by key.
 
-    These are its id, kind, status, name, started, upstream, user, tag and note; its data by name (`data`) and
+    They are its id, kind, status, name, started, upstream, user, tag and note; its data by name (`data`) and
     by digest (`data_digest`); the keys of its config, with slots also under their name alone (`memory` for
     `memory.name`); and its results, with those of the rotation branch also without the branch (`stream.MPJPE`
     for `stream.rotation.MPJPE`), and after inverse kinematics with its name (`stream.combined-arms.MPJPE`).
@@ -138,11 +137,9 @@ def check_key(key: str, records: Iterable[Record], option: str) -> None:
     if key not in keys:
         near = difflib.get_close_matches(key, keys, n=1)
         hint = f"did you mean {near[0]}? " if near else ""
-        if (now := present_key(key, [name.rpartition(".")[2] for name in keys])) is not None:
-            hint = f"it is now {now}; "
         raise InputError(
-            f"{option}: no run has the key '{key}'; {hint}allowed are keys of the config (memory, optim.lr), "
-            "results (stream.MPJPE), id, kind, status, name, data, started, tag and note"
+            f"{option}: no run has the key '{key}'; {hint}use keys of the config (memory, optim.lr), results "
+            "(stream.MPJPE), id, kind, status, name, data, started, tag or note"
         )
 
 
@@ -165,7 +162,7 @@ class Query(NamedTuple):
             values = [one[key] for one in records if key in one]
             if values and all(isinstance(value, str | list | tuple) for value in values):
                 raise InputError(
-                    f"{option}: {key} is no number in any run ({as_typed(values[0])}); allowed are = and !="
+                    f"{option}: {key} is not a number in any run ({as_typed(values[0])}); use = or !="
                 )
         return [self.condition(one) for one in records]
 
@@ -189,7 +186,7 @@ class _Parser:
         while place < len(text):
             found = TOKEN.match(text, place)
             if found is None:
-                raise self._refusal(f"'{text[place:].strip()[:20]}' is not understood")
+                raise self._refusal(f"'{text[place:].strip()[:20]}' cannot be parsed")
             yield found.lastgroup or "", found[found.lastgroup or 0]
             place = found.end()
 
@@ -214,7 +211,7 @@ class _Parser:
     def _not(self) -> Condition:
         self.depth += 1
         if self.depth > DEEPEST:
-            raise self._refusal("it is too deep")
+            raise self._refusal("too many nested parentheses")
         try:
             if self._take("word", "not"):
                 inner = self._not()
@@ -242,7 +239,7 @@ class _Parser:
             raise self._refusal(f"{key}{sign}{value}: {sign} compares with a number")
         if key == "status" and value not in (*STATUSES, "damaged"):
             known = ", ".join([*STATUSES, "damaged"])
-            raise InputError(f"--where '{self.text}': status={value}; allowed are {known}")
+            raise InputError(f"--where '{self.text}': status={value}: must be one of {known}")
         self.keys.append(key)
         if key == "started" and sign in ORDER:  # times in ISO 8601, as much of them as is typed
             return lambda one: bool(one.get(key)) and ORDER[sign](str(one[key]), value)
@@ -266,7 +263,7 @@ class _Parser:
 
     def _refusal(self, reason: str) -> InputError:
         return InputError(
-            f"--where '{self.text}': {reason}; allowed are comparisons (= != < <= > >=), and, or, not, ( )"
+            f"--where '{self.text}': {reason}; use comparisons (= != < <= > >=), and, or, not, ( )"
         )
 
 

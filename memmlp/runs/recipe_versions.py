@@ -65,17 +65,3 @@ def outdated(known: Mapping[str, int]) -> list[str]:
 def recipes(components: list[str]) -> dict[str, int]:
     """Return the recipe versions of components by name; 0 for a component that is not in use."""
     return {name: version_of(name) for name in sorted(components)}
-
-
-def first_of_vqvae(known: Mapping[str, int], codebook: str | None = None) -> dict[str, int]:
-    """Return the recipe versions of a VQ-VAE from before these were kept with the networks upon it.
-
-    Args:
-        known: the recipe versions that are known of a network and its upstream runs, by component.
-        codebook: the kind of the VQ-VAE's codebook; None for the default.
-
-    Returns:
-        The first versions of VQ-VAE and codebook; empty if they are known, or if there is no VQ-VAE upstream.
-    """
-    lacking = "memory.vq" in known and "vqvae" not in known
-    return {"vqvae": 1, f"codebook.{codebook or 'ema'}": 1} if lacking else {}

@@ -32,29 +32,26 @@ from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.environment import changed, changes, code_digests, environment, host
 from memmlp.runs.evaluation_file import intact
 from memmlp.runs.evaluations_as_configured import EvaluationsAsConfigured
-from memmlp.runs.former_keys import with_present_names
 from memmlp.runs.identity import (
-    NETWORK,
     belongs,
     deployment_settings,
     exported_otherwise,
     used_as_configured,
 )
 from memmlp.runs.metrics_log import LogRecord, MetricsLog
-from memmlp.runs.resumed_origin import joined
+from memmlp.runs.origin import join_origins
 
 STAGE_WORDS = {"training": "training", "evaluation": "evaluating", "deployment": "exporting"}
-"""What a process is doing that works on a stage of a run."""
+"""What a process does that works on a stage of a run."""
 
 STATUSES = (*STAGE_WORDS.values(), "done", "trained", "lost", "failed", "stopped", "new")
-"""What the status of a run may be: lost is one whose process died; see `Run.state`."""
+"""The statuses of runs; a lost run's process died (see `Run.state`)."""
 
-LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # six times as quick, where PyYAML was built with it
+LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the C loader is six times as fast
 
 
 @functools.lru_cache(maxsize=16)
-def _parsed(text: str) -> Any:
-    """Return what YAML says; a list of runs asks for each config five times."""
+def _parse(text: str) -> Any:
     return yaml.load(text, LOADER)
 
 
@@ -133,7 +130,7 @@ class Run:
     def wanted(self) -> tuple[str, ...]:
         """The identities of the evaluations and the deployment that were last asked for.
 
-        Empty for a run upstream of a network's, and for runs from before this was recorded.
+        Empty for a prerequisite run.
         """
         return tuple(self.manifest.get("stages", ()))
 
@@ -144,22 +141,8 @@ class Run:
 
     @property
     def complete(self) -> bool:
-        """Whether the run is trained and has the evaluations and the deployment that were last asked for.
-
-        For a network's run from before these were recorded it is whether each of its config's modes has an
-        evaluation, or one file has the results of all; whether a deployment was asked for is not known.
-        """
-        manifest = self.manifest
-        if manifest.get("kind") != NETWORK or "stages" in manifest or self.results_path.exists():
-            return self.done and all(map(self.has, self.wanted))
-        return self.done and all(any(self.evaluations.glob(f"{mode}*.json")) for mode in self._modes())
-
-    def _modes(self) -> Sequence[str]:
-        """Return the modes in which the run's config evaluates it; "" for any, if that is not known."""
-        try:
-            return (self.config.get("evaluation") or {}).get("modes") or [""]
-        except InputError:
-            return [""]
+        """Whether the run is trained and has the evaluations and the deployment that were last asked for."""
+        return self.done and all(map(self.has, self.wanted))
 
     @property
     def preferred_deployment(self) -> DeploymentFolder:
@@ -249,7 +232,7 @@ class Run:
         if doing := self.doing:
             return doing
         word = self.state(self.complete and not self.failure)
-        return "trained" if word == "running" else word  # somebody holds it, at none of its stages
+        return "trained" if word == "running" else word  # held by a process, at no stage
 
     @property
     def doing(self) -> str | None:
@@ -290,11 +273,11 @@ class Run:
     def retry(self) -> None:
         """Forget the failure, and the attempts that led to it."""
         if self.failure:
-            self.forgive()
+            self.reset_deaths()
         check_owner(self.folder)
         (self.folder / "FAILED").unlink(missing_ok=True)
 
-    def forgive(self) -> None:
+    def reset_deaths(self) -> None:
         """Stop counting attempts so far as ones that died: the run ended well, or is to be tried again."""
         manifest = self.manifest
         attempts = len(manifest.get("attempts", []))
@@ -322,13 +305,15 @@ class Run:
             atomic_write(self.folder / "code.patch", patch)
         identity = {"id": self.id, "kind": kind, "data": data, "upstream": upstream}
         before = self.manifest if self.checkpoint.exists() else {}
-        made = joined(before, {**facts, **environment(), "sources": code_digests(facts.get("plugins", ()))})
+        made = join_origins(
+            before, {**facts, **environment(), "sources": code_digests(facts.get("plugins", ()))}
+        )
         self.attempt("training")
         times = {"started": self.manifest.get("started", now()), "finished": None, "seconds": {}}
         self.write_manifest(identity | times | made)
 
-    def took(self, stage: str, seconds: float) -> None:
-        """Record in the manifest how long a stage took, summed over all processes that worked on it."""
+    def record_seconds(self, stage: str, seconds: float) -> None:
+        """Record in the manifest the seconds of a stage, summed over all processes that worked on it."""
         known = self.manifest.get("seconds", {})
         self.write_manifest({"seconds": {**known, stage: round(seconds, 3)}})
 
@@ -346,7 +331,7 @@ class Run:
         """
         known = self.manifest
         if not known and self.manifest_path.exists():
-            raise InputError(f"{self.manifest_path}: damaged; allowed is a manifest, or no folder of the run")
+            raise InputError(f"{self.manifest_path}: damaged; remove the run folder to make the run again")
         write_json(self.manifest_path, known | dict(fields))
 
     @property
@@ -356,18 +341,20 @@ class Run:
 
     @property
     def config(self) -> dict[str, Any]:
-        """The resolved config, with the names that its keys have today; empty before the run began.
+        """The resolved config; empty before the run began.
 
         Raises:
             InputError: if the file is damaged.
         """
         try:
-            found = copy.deepcopy(_parsed(self.config_path.read_text())) if self.config_path.exists() else {}
+            found = copy.deepcopy(_parse(self.config_path.read_text())) if self.config_path.exists() else {}
         except (yaml.YAMLError, UnicodeDecodeError):
             found = None
         if not isinstance(found, dict):
-            raise InputError(f"{self.config_path}: cannot be read; remove the run's folder to do it again")
-        return with_present_names(found)
+            raise InputError(
+                f"{self.config_path}: cannot be read; remove the run folder to make the run again"
+            )
+        return found
 
     @property
     def results(self) -> dict[str, Any]:

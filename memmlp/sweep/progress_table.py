@@ -14,9 +14,9 @@ from rich.table import Table
 from rich.text import Text
 
 from memmlp.runs.identity import NETWORK, training_settings
+from memmlp.runs.lookup import kind_words
 from memmlp.runs.metrics_log import LogRecord
 from memmlp.runs.run import Run
-from memmlp.runs.shown_name import kind_words
 from memmlp.sweep.plan import Plan, RunTask
 
 COLOURS = {

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import numpy as np
 
 from memmlp.common.processes import MIN_CORE_SHARE
-from memmlp.runs.motion_seen import hardly_trained
+from memmlp.runs.lookup import hardly_trained
 from memmlp.sweep.definition import COSTS, TIMES, Sweep, Variant
 from memmlp.tables import flags_of_code
 from memmlp.tables.effects import RunsBySeed, control_variant, one_and_the_same

@@ -18,9 +18,9 @@ from memmlp.motion.preparing.groups import Grouping
 from memmlp.runs.deployment_folder import as_deployed, deployed_precision, timed_on
 from memmlp.runs.environment import computed_imports
 from memmlp.runs.evaluation_file import intact, of_one_solver
-from memmlp.runs.motion_seen import frames_seen
+from memmlp.runs.lookup import frames_seen
+from memmlp.runs.origin import recorded_upstream, upstream_recipes
 from memmlp.runs.run import Run
-from memmlp.runs.upstream_origin import recorded_upstream, upstream_recipes
 
 Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # values by mode, branch and metric
 UNKNOWN = "?"

@@ -123,7 +123,7 @@ def train(
             if validation and on_validation:
                 on_validation(step + 1, validation)
     if distributed.is_first():
-        run.took("train", time.monotonic() - started)
+        run.record_seconds("train", time.monotonic() - started)
     average.put_in_place()
 
 

@@ -36,9 +36,8 @@ from memmlp.runs.identity import (
     evaluation_settings,
 )
 from memmlp.runs.loggers.logger import Loggers
-from memmlp.runs.resumed_origin import UPSTREAM
+from memmlp.runs.origin import UPSTREAM, upstream_origins
 from memmlp.runs.run import Run
-from memmlp.runs.upstream_origin import upstream_origins
 from memmlp.training.data_remarks import data_warnings, partial_words
 from memmlp.training.devices import described, overlooked_gpu
 from memmlp.training.experiment import Experiment, PrerequisiteTraining
@@ -220,7 +219,7 @@ def recording_outcome(experiment: Experiment, run: Run, again: bool = False) -> 
             if not is_disk_error(error):
                 run.fail(f"{type(error).__name__}: {error}", traceback.format_exc())
             raise
-        run.forgive()
+        run.reset_deaths()
 
 
 def train_run(
@@ -338,4 +337,4 @@ def timed(run: Run, stage: str) -> Iterator[None]:
     started = time.monotonic()
     yield
     before = run.manifest.get("seconds", {}).get(stage, 0.0)
-    run.took(stage, before + time.monotonic() - started)
+    run.record_seconds(stage, before + time.monotonic() - started)

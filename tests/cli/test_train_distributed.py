@@ -75,7 +75,7 @@ def test_two_processes_make_the_run_of_one(tmp_path: Path):
     ("words", "line"),
     [
         (["runs", "list"], "torchrun: allowed are several processes for memmlp train alone"),
-        (["train", "-m", "seed=0,1"], "torchrun: several processes train one run; allowed is no multirun"),
+        (["train", "-m", "seed=0,1"], "torchrun: several processes train one run"),
     ],
 )
 def test_what_several_processes_cannot_do_is_one_line(

@@ -346,7 +346,7 @@ def test_an_experiment_that_leads_back_to_itself_is_refused(memmlp: Memmlp, tmp_
     own = tmp_path / "mine" / "experiment" / "own.yaml"
     own.write_text("# @package _global_\ndefaults: [{/experiment: no_codes}]\n")
     ran = memmlp("train", "--config-dir", "mine", "experiment=own")
-    assert one_line(ran, "experiment=own", "leads back to itself", "'- NAME'")
+    assert one_line(ran, "experiment=own", "includes itself", "'- NAME'")
 
 
 def test_a_config_without_the_schema_is_refused(memmlp: Memmlp, tmp_path: Path):

@@ -121,13 +121,10 @@ def test_a_finished_vqvae_of_a_search_under_way_stays(outputs: Path):
 
 
 def test_a_network_upon_an_older_vqvae_may_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Its own recipes say nothing of a VQ-VAE that was trained upstream of it."""
-    for name, memory in ((OLD, "memory.vq"), (GOOD, "memory.none")):
-        run = Run.of(tmp_path, name)
-        run.begin("memmlp", {}, data="d", upstream=None, recipes={memory: 1})
+    """Its own component versions do not include those of its prerequisite runs."""
+    run = Run.of(tmp_path, OLD)
+    above = [{"id": CODES, "recipes": {"codebook.ema": RECIPES["codebook.ema"]}}]
+    run.begin("memmlp", {}, data="d", upstream=None, recipes={"memory.vq": 1}, upstream_runs=above)
     assert found(tmp_path, "old") == {}
     monkeypatch.setitem(RECIPES, "codebook.ema", RECIPES["codebook.ema"] + 1)
     assert found(tmp_path, "old") == {OLD: "old"}
-    now = [{"id": CODES, "recipes": {name: RECIPES[name] for name in ("vqvae", "codebook.ema")}}]
-    Run.of(tmp_path, OLD).write_manifest({"upstream_runs": now})
-    assert found(tmp_path, "old") == {}

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 from begun_runs import CONFIG, begun
+from fake_runs import fake_run
 
 from memmlp.common.errors import InputError
-from memmlp.runs.lookup import find_run, list_runs
+from memmlp.runs.lookup import LITTLE, find_run, frames_seen, hardly_trained, list_runs
 from memmlp.runs.run import Run
 
 
@@ -30,10 +31,7 @@ def test_the_newest_run_is_first(tmp_path: Path):
 @pytest.mark.parametrize("name", ["zz", "", "no/such"])
 def test_no_such_run_is_one_line(tmp_path: Path, name: str):
     begun(tmp_path)
-    with pytest.raises(
-        InputError,
-        match=r"no such folder, and the id of none of the \d+ runs in .*runs begins so \(memmlp runs list\)",
-    ):
+    with pytest.raises(InputError, match=f"run '{name}'"):
         find_run(tmp_path, name)
 
 
@@ -47,5 +45,31 @@ def test_a_run_by_the_bare_name_of_its_folder(tmp_path: Path, monkeypatch: pytes
 def test_an_ambiguous_beginning_lists_the_runs(tmp_path: Path):
     for name in ("ab" + "0" * 14, "ab" + "1" * 14):
         Run.of(tmp_path, name).begin("memmlp", {}, data="d", upstream=None)
-    with pytest.raises(InputError, match=r"2 ids begin so: ab0+, ab1+"):
+    with pytest.raises(InputError, match=r"2 ids .*: ab0+, ab1+"):
         find_run(tmp_path, "ab")
+
+
+SEEN = {"optim": {"steps": 100, "batch": 8}, "model": {"frames": 11}}
+
+
+def test_a_network_saw_a_batch_of_windows_at_each_step(tmp_path: Path):
+    assert frames_seen(fake_run(tmp_path, "a", config=SEEN)) == 100 * 8 * 11
+
+
+def test_a_refiner_saw_its_network_s_frames_and_its_own_pieces(tmp_path: Path):
+    network = fake_run(tmp_path, "network", config=SEEN)
+    above = {"upstream": network.id}
+    config = SEEN | {"refiner": {"frames": 20}}
+    assert frames_seen(fake_run(tmp_path, "refiner", config=config, origin=above)) == 100 * 8 * (11 + 20)
+
+
+@pytest.mark.parametrize("lacking", ["optim", "model"])
+def test_what_is_not_known_is_0(tmp_path: Path, lacking: str):
+    config = {key: value for key, value in SEEN.items() if key != lacking}
+    assert frames_seen(fake_run(tmp_path, lacking, config=config)) == 0
+
+
+def test_less_than_half_an_hour_of_motion_is_warned_of():
+    assert hardly_trained(LITTLE) == hardly_trained(0) == ""
+    assert "30 minutes" in hardly_trained(LITTLE - 1)
+    assert "2.5 minutes" in hardly_trained(9000)

@@ -299,12 +299,12 @@ def test_the_status_names_the_stage_that_somebody_is_at(tmp_path: Path):
 
 
 def test_a_run_that_was_killed_before_its_evaluation_is_trained_and_not_done(tmp_path: Path):
-    """Older code did not record which evaluations it was to make; its config says in which modes."""
     run = begun(tmp_path, CONFIG | {"evaluation": {"modes": ["window", "stream"]}})
     run.model.write_bytes(b"weights")
     run.finish(["model.safetensors"])
     run.evaluations.mkdir()
-    for name, status in (("none", "trained"), ("stream-0", "trained"), ("window-0", "done")):
+    run.want(["window-0", "stream-0"])
+    for name, status in (("stream-0", "trained"), ("window-0", "done")):
         run.evaluation(name).write_text("{}")
         assert (run.status, read_facts(run.folder)["complete"]) == (status, status == "done")
     run.want(["window-0", "stream-1"])
@@ -321,14 +321,6 @@ def test_a_run_of_which_nothing_but_training_is_asked_is_done_then(tmp_path: Pat
     run.finish(["model.safetensors"])
     run.want([])
     assert run.status == "done"
-
-
-def test_an_old_run_with_a_damaged_config_is_done_if_it_has_an_evaluation(tmp_path: Path):
-    run = complete(tmp_path)
-    run.config_path.write_text("a: [b")
-    assert run.status == "done"
-    run.evaluation("stream-0").unlink()
-    assert run.status == "trained"
 
 
 def test_a_vqvae_s_run_is_done_without_an_evaluation(tmp_path: Path):
@@ -355,7 +347,7 @@ def test_a_config_that_was_read_belongs_to_whoever_read_it(tmp_path: Path):
 def test_a_damaged_manifest_is_not_replaced(tmp_path: Path):
     run = begun(tmp_path)
     run.manifest_path.write_bytes(content := run.manifest_path.read_bytes()[:-2])
-    for write in (lambda: run.took("training", 1.0), lambda: run.attempt("training")):
+    for write in (lambda: run.record_seconds("training", 1.0), lambda: run.attempt("training")):
         with pytest.raises(InputError, match=r"manifest\.json: damaged"):
             write()
     assert run.manifest_path.read_bytes() == content

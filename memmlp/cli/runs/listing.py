@@ -17,7 +17,7 @@ from memmlp.cli.options import outputs_option
 from memmlp.cli.runs.show import SHORT, age, console, outdated_results, plain_table, record_of, value_text
 from memmlp.evaluation.metric_facts import UNITS
 from memmlp.runs.identity import NETWORK
-from memmlp.runs.shown_name import kind_words
+from memmlp.runs.lookup import kind_words
 
 if TYPE_CHECKING:
     from memmlp.runs.query import Record
@@ -105,7 +105,7 @@ def _outdated_lines(listed: Sequence[Run]) -> list[str]:
 
 def _hardly_trained_lines(listed: Sequence[Run]) -> list[str]:
     """Return a line that names the finished runs whose networks hardly saw motion, if there are any."""
-    from memmlp.runs.motion_seen import frames_seen, hardly_trained
+    from memmlp.runs.lookup import frames_seen, hardly_trained
 
     networks = [run for run in listed if run.manifest.get("kind") == NETWORK and run.done]
     ids = [run.id[:SHORT] for run in networks if hardly_trained(frames_seen(run))]

@@ -96,8 +96,7 @@ def diff(a: str, b: str, outputs: Path) -> None:
     Compared are the config keys that affect results, the data, the results, and code and machine. The change
     is B minus A.
     """
-    from memmlp.runs.lookup import find_run
-    from memmlp.runs.motion_seen import frames_seen, hardly_trained
+    from memmlp.runs.lookup import find_run, frames_seen, hardly_trained
 
     pair = first, second = find_run(outputs, a), find_run(outputs, b)
     ids, short = [run.id for run in pair], [run.id[:SHORT] for run in pair]

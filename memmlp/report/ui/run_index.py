@@ -21,10 +21,9 @@ from memmlp.common.files import plain, read_json
 from memmlp.runs.deployment_folder import as_deployed
 from memmlp.runs.evaluation_file import with_solvers
 from memmlp.runs.evaluations_as_configured import EvaluationsAsConfigured
-from memmlp.runs.former_keys import with_present_names
 from memmlp.runs.identity import DEPLOYMENT, EVALUATION, ID, INFERENCE, flatten, training_settings
+from memmlp.runs.lookup import run_name
 from memmlp.runs.run import LOADER, Run, latency_name
-from memmlp.runs.shown_name import run_name
 
 HIDDEN = ("paths", "loggers", "force", "hydra", "save_predictions")
 """Config groups that are not listed."""
@@ -169,7 +168,6 @@ def _parse_group(text: str) -> tuple[dict[str, Any], dict[str, Any]]:
     found = yaml.load(text, LOADER)  # a safe loader
     if not isinstance(found, dict):
         raise TypeError("not a config")
-    found = with_present_names(found)
     flat = plain(flatten(found))
     hidden = {key for key in flat if key.split(".")[0] in HIDDEN or key.endswith(("._target_", "._partial_"))}
     return found, {key: value for key, value in flat.items() if key not in hidden}

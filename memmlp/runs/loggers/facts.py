@@ -13,10 +13,10 @@ from memmlp.common.files import digest, file_digest, plain, read_json
 from memmlp.runs.deployment_folder import with_times_as_deployed
 from memmlp.runs.evaluation_file import with_solvers
 from memmlp.runs.identity import flatten
+from memmlp.runs.lookup import run_name
 from memmlp.runs.metrics_log import parsed
 from memmlp.runs.notes import read_notes
 from memmlp.runs.run import Run
-from memmlp.runs.shown_name import run_name
 
 ORIGIN = ("kind", "data", "upstream", "started", "version", "user", "host", "device", "gpu", "threads")
 

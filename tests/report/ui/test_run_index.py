@@ -115,6 +115,7 @@ def test_a_trained_run_whose_deployment_failed_is_not_done(outputs: Path):
 
 def test_a_trained_run_without_its_evaluation_is_not_done(outputs: Path):
     run, index = run_of(outputs), RunIndex(outputs)
+    run.want([path.stem for path in run.evaluations.iterdir()])
     for path in run.evaluations.iterdir():
         path.unlink()
     index.refresh()

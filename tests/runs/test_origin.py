@@ -1,4 +1,4 @@
-"""A run tells which weights it builds upon, and by what these were made."""
+"""The origins of a run: the weights that it builds upon, and the machines that trained it."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from memmlp.common.files import file_digest
+from memmlp.runs.origin import upstream_origins, upstream_recipes
 from memmlp.runs.run import Run
-from memmlp.runs.upstream_origin import upstream_origins, upstream_recipes
 
 CODES, PART, NETWORK = (letter * 16 for letter in "abc")
 
@@ -57,23 +57,23 @@ def test_a_training_that_is_resumed_upon_other_weights_has_both(tmp_path: Path):
     assert found[0] == codes.weights_digest != found[1]
 
 
-@pytest.mark.parametrize(
-    ("memory", "config", "expected"),
-    [
-        ("memory.vq", {}, {"vqvae": 1, "codebook.ema": 1}),
-        ("memory.vq", {"vqvae": {"codebook": "gradient"}}, {"vqvae": 1, "codebook.gradient": 1}),
-        ("memory.vq_joint", {}, {}),  # its own recipes have them
-    ],
-)
-def test_a_run_from_before_this_was_recorded_has_the_first_recipes(
-    tmp_path: Path, memory: str, config: dict, expected: dict
-):
-    run = Run.of(tmp_path, NETWORK)
-    run.begin("memmlp", config, data="d", upstream=CODES, recipes={memory: 1})
-    assert upstream_recipes(run) == expected
+def test_a_training_that_is_resumed_elsewhere_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Its weights come from both machines and both versions of the code."""
+    run = Run.of(tmp_path, "0" * 16)
 
+    def begin(device: str, commit: str, dirty: bool, losses: str) -> dict:
+        made = {"git": {"commit": commit, "dirty": dirty}, "cpu": "A"}
+        monkeypatch.setattr("memmlp.runs.run.environment", lambda: made)
+        monkeypatch.setattr(
+            "memmlp.runs.run.code_digests", lambda packages: {"losses.py": losses, "ik.py": "i"}
+        )
+        run.begin("memmlp", {}, data="d", upstream=None, device=device, threads=2)
+        return run.manifest
 
-def test_a_refiner_upon_a_network_from_before_has_the_first_recipes_of_its_vqvae(tmp_path: Path):
-    network = trained(tmp_path, NETWORK, recipes={"memory.vq": 1})
-    refined = trained(tmp_path, PART, network, recipes={"memory.vq": 1, "refiner.sage": 1})
-    assert upstream_recipes(refined) == {"memory.vq": 1, "vqvae": 1, "codebook.ema": 1}
+    begin("cuda:0", "a" * 40, True, "old")
+    assert begin("cpu", "b" * 40, False, "new")["device"] == "cpu"  # nothing was trained before
+    run.checkpoint.touch()
+    found = begin("cuda:0", "c" * 40, False, "newer")
+    assert (found["device"], found["threads"], found["cpu"]) == ("cpu, cuda:0", 2, "A")
+    assert found["git"] == {"commit": "c" * 40, "dirty": False, "before": "b" * 40}
+    assert run.changed_sources == ["losses.py"]

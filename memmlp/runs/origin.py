@@ -1,0 +1,81 @@
+"""The origin of a run: machines and code of its training, and the prerequisite runs whose weights it uses.
+
+The id of a prerequisite run says how it is trained, not which weights came of it: trained again, or on
+another machine, it has others. So a run's manifest has the origins of both, as they were when it began.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from memmlp.runs.environment import changed
+
+if TYPE_CHECKING:
+    from memmlp.runs.run import Run
+
+MACHINE = ("device", "gpu", "gpu_index", "threads", "processes", "precision", "cpu")
+"""What can change a result's last digits, and which of a machine's GPUs it was."""
+
+UPSTREAM = "upstream_runs"
+"""The key of the manifest with the origins of a run's prerequisite runs."""
+
+FACTS = ("recipes", "git", "version", "sources", "plugins", "packages", *MACHINE)
+"""What the manifest of a prerequisite run has on its code and its machine."""
+
+
+def upstream_origins(upstream: Run | None) -> list[dict[str, Any]]:
+    """Return the origins of the prerequisite runs of a run that begins, the nearest first.
+
+    Each has the run's `id` and `kind`, the SHA-256 of its `weights`, and FACTS as far as known.
+
+    Args:
+        upstream: the finished run whose weights the run uses; None without one.
+    """
+    if upstream is None:
+        return []
+    manifest = upstream.manifest
+    own = {"id": upstream.id, "kind": manifest.get("kind"), "weights": upstream.weights_digest}
+    facts = {name: manifest[name] for name in FACTS if name in manifest}
+    return [own | facts, *recorded_upstream(manifest)]
+
+
+def recorded_upstream(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the origins of the prerequisite runs in a run's manifest."""
+    return manifest.get(UPSTREAM) or []
+
+
+def upstream_recipes(run: Run) -> dict[str, int]:
+    """Return the component versions with which a run's prerequisite runs were trained."""
+    every = [one.get("recipes") or {} for one in recorded_upstream(run.manifest)]
+    return {name: number for recipes in every for name, number in recipes.items()}
+
+
+def join_origins(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
+    """Join the origins of a training before and after it was resumed; if they differ, both are kept.
+
+    A file whose code changed in between gets "mixed" in place of a digest. Prerequisite runs that changed
+    since (trained again, under the same ids) follow the present ones.
+
+    Args:
+        before: the manifest so far, empty for a training from the start.
+        after: the origin of the resumed training.
+    """
+    found = dict(after)
+    for key in MACHINE:
+        words = [before[key]] if key in before and before[key] != after.get(key) else []
+        found[key] = ", ".join(map(str, [*words, after[key]])) if words else after.get(key)
+    old, new = before.get("git"), after.get("git")
+    if old and new:
+        other = old.get("before") or (old["commit"] if old["commit"] != new["commit"] else None)
+        found["git"] = {**new, "dirty": old["dirty"] or new["dirty"]} | ({"before": other} if other else {})
+    known = before.get("sources", after["sources"])
+    found["sources"] = after["sources"] | dict.fromkeys(changed(known, after["sources"]), "mixed")
+    upstream = after.get(UPSTREAM, [])
+    if earlier := [one for one in before.get(UPSTREAM, []) if one not in upstream]:
+        found[UPSTREAM] = [*upstream, *earlier]
+    for name, package in (before.get("plugins") or {}).items():
+        now = (after.get("plugins") or {}).get(name, package)
+        if now["digest"] != package["digest"]:
+            found["plugins"] = {**found["plugins"], name: {**now, "digest": "mixed"}}
+    return found
