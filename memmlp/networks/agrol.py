@@ -37,7 +37,6 @@ class AGRoLMLPGraph(AGRoLGraph):
     blocks: list[MLPBlock]
 
     def build(self, model: Any) -> None:
-        """Make the graph's parts from a copy of the network."""
         self.model, self.width = model, model.stem.out_features
         self.blocks = cast(list[MLPBlock], list(model.blocks))
 
@@ -86,7 +85,6 @@ class AGRoLMLP(WholeWindow):
         self.head = nn.Linear(settings.width, ROTATION.stop)
 
     def rotations(self, encoded: Tensor) -> Tensor:
-        """Map inputs (B, T, 54) to rotations (B, T, 132), both in network space."""
         h = self.stem(encoded)
         for block in self.blocks:
             h = block(h)
@@ -123,7 +121,6 @@ class AGRoLDiffusionGraph(AGRoLGraph):
     shifts: Tensor
 
     def build(self, model: Any) -> None:
-        """Make the graph's parts from a copy of the network."""
         self.model, self.width = model, model.stem.out_features
         self.blocks = cast(list[MLPBlock], list(model.blocks))
         embedding = F.silu(model.time(torch.tensor(model.diffusion.times).to(model.noise)))

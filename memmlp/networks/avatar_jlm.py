@@ -86,7 +86,6 @@ class AvatarJLMGraph(StreamingGraph):
     layers: list[EncoderLayer]
 
     def build(self, model: Any) -> None:
-        """Make the graph's parts from a copy of the network."""
         self.model, self.layers = model, cast(list[EncoderLayer], list(model.layers))
 
     def windows(self) -> State:
@@ -94,7 +93,6 @@ class AvatarJLMGraph(StreamingGraph):
         return {"tokens": torch.zeros(self.frames - 1, self.model.joint_places.numel())}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
         entering = self.model.tokens(encoded).flatten(1)
         window = torch.cat([fill_past(state["tokens"], entering, fresh), entering])
@@ -221,7 +219,6 @@ class AvatarJLM(WholeWindow):
         return torch.cat([h[..., :-1, :], first.detach()], -2)
 
     def rotations(self, encoded: Tensor) -> Tensor:
-        """Map inputs (B, T, 54) to rotations (B, T, 132), both in network space."""
         return self.regress(encoded)
 
     def regress(self, encoded: Tensor) -> Tensor:

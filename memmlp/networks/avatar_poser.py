@@ -35,7 +35,6 @@ class AvatarPoserGraph(StreamingGraph):
     layers: list[EncoderLayer]
 
     def build(self, model: Any) -> None:
-        """Make the graph's parts from a copy of the network."""
         self.model, self.layers = model, cast(list[EncoderLayer], list(model.layers))
 
     def windows(self) -> State:
@@ -43,7 +42,6 @@ class AvatarPoserGraph(StreamingGraph):
         return {"first": torch.zeros(self.frames, 4 * self.model.embedding.out_features)}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
         embedded = self.model.embedding(encoded)
         *earlier, last = self.layers
@@ -116,7 +114,6 @@ class AvatarPoser(OwnWindows):
         draw_weights(self)
 
     def rotations(self, encoded: Tensor) -> Tensor:
-        """Map windows (B, T, 54) to their last frames' rotations (B, 132), both in network space."""
         return self.encode(self.embedding(encoded))
 
     def encode(self, h: Tensor) -> Tensor:

@@ -43,7 +43,6 @@ class BoDiffusionGraph(AGRoLGraph):
     modulations: Tensor
 
     def build(self, model: Any) -> None:
-        """Make the graph's parts from a copy of the network."""
         self.model, self.width = model, model.stem.out_features
         self.blocks = cast(list[DiTBlock], list(model.blocks))
         embedding = F.silu(model.time(torch.tensor(model.diffusion.times).to(model.noises)))

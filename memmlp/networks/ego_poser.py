@@ -48,7 +48,6 @@ class EgoPoserGraph(StreamingGraph):
     model: EgoPoser
 
     def build(self, model: Any) -> None:
-        """Make the graph's parts from a copy of the network."""
         self.model, self.layers = model, cast(list[EncoderLayer], list(model.layers))
 
     def windows(self) -> State:
@@ -57,7 +56,6 @@ class EgoPoserGraph(StreamingGraph):
         return {name: torch.zeros(self.frames - 1, size) for name, size in sizes.items()}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         local = center_on_head(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
         place = places(local)
         entering = {"embedded": self.model.embedding(torch.cat([local, place], -1)), "places": place}
@@ -111,7 +109,6 @@ class EgoPoser(AvatarPoser):
     inputs: ClassVar[int] = SPARSE_DIM + PLACES
 
     def rotations(self, encoded: Tensor) -> Tensor:
-        """Map windows (B, T, 54) to their last frames' rotations (B, 132), both in network space."""
         local = center_on_head(encoded)
         moved = places(local) - places(local[:, :1])
         slow, fast = self.views(torch.cat([local, moved], -1))

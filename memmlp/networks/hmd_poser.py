@@ -170,7 +170,6 @@ class HMDPoserGraph(FrameGraph):
     model: HMDPoser
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         features, kept = self.model.features(sparse[None], state)
         return self.normalizer.posed(self.model.pose(features[0]), sparse), kept
 

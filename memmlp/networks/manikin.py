@@ -223,7 +223,6 @@ class ManikinSGraph(AvatarPoserGraph):
     model: ManikinS
 
     def rotation(self, newest: Tensor, encoded: Tensor) -> Tensor:
-        """Map the newest frame's feature (1, d) and inputs (1, 54) to its rotations (1, 132)."""
         return self.model.posed(self.model.read(newest), encoded)
 
 
@@ -271,7 +270,6 @@ class ManikinS(Manikin, AvatarPoser):
         return self.encode(self.embedding(encoded))[:, None]
 
     def rotations(self, encoded: Tensor) -> Tensor:
-        """Map windows (B, T, 54) to their last frames' rotations (B, 132), both in network space."""
         return self.posed(self.predict_parts(encoded), encoded[:, -1:])[:, 0]
 
     def compute_part_losses(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
@@ -304,7 +302,6 @@ class ManikinLGraph(AvatarJLMGraph):
     model: ManikinL
 
     def rotation(self, features: Tensor, encoded: Tensor) -> Tensor:
-        """Map the newest frame's tokens (1, 45 d) and inputs (1, 54) to its rotations (1, 132)."""
         return self.model.posed(self.model.regressor(features), encoded)
 
 
@@ -356,7 +353,6 @@ class ManikinL(Manikin, AvatarJLM):
         return self.regress(encoded)
 
     def rotations(self, encoded: Tensor) -> Tensor:
-        """Map inputs (B, T, 54) to rotations (B, T, 132), both in network space."""
         return self.posed(self.predict_parts(encoded), encoded)
 
     def losses(self, made: Tensor, true: Tensor) -> dict[str, Tensor]:

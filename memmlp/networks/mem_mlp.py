@@ -108,7 +108,6 @@ class ResidualBlock(SharedBlock):
         self.linear = self.divided(block.linear)
 
     def channels(self, h: Tensor, contributions: Sequence[Tensor], take: Selection) -> Tensor:
-        """Apply the block's second half, which works frame by frame."""
         return h + F.silu(self.linear(self.norm(h)) + take(contributions[self.index]))
 
 
@@ -202,7 +201,6 @@ class MemMLPGraph(StreamingGraph):
         return all(isinstance(part, Branch) for part in model.predictor.children())
 
     def build(self, model: Any) -> None:
-        """Make the graph's parts from a copy of the network."""
         self.conversions = OneFrameNormalizer(model.normalizer)
         self.stem = model.stem
         converter = Converter()
@@ -225,7 +223,6 @@ class MemMLPGraph(StreamingGraph):
         }
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         memory = self.recall.memory
         origin = self.normalizer.origin(sparse)
         encoded = self.conversions.encode_sparse(sparse, origin)

@@ -199,7 +199,6 @@ class NoMemory(Memory):
         self.past_frames = frames - 1
 
     def block(self, layer: int) -> nn.Module:
-        """Make the backbone's block of a layer (1-based)."""
         return MLPBlock(self.hidden, self.frames)
 
     def memory_block(self) -> nn.Module:
@@ -232,7 +231,6 @@ class FeatureMemory(Memory):
         self.hidden, self.frames = hidden, frames
 
     def block(self, layer: int) -> nn.Module:
-        """Make the backbone's block of a layer (1-based)."""
         return self.memory_block() if layer in self.layers else MLPBlock(self.hidden, self.frames)
 
     def memory_block(self) -> nn.Module:

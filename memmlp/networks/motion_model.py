@@ -167,7 +167,6 @@ class WindowlessModel(MotionModel):
 
     @property
     def windowless(self) -> bool:
-        """Whether the network has no window; true here."""
         return True
 
     @property
@@ -338,7 +337,6 @@ class FrameGraph(StreamingGraph):
     model: WindowlessModel
 
     def build(self, model: Any) -> None:
-        """Make the graph's parts from a copy of the network."""
         self.model = model
 
     def windows(self) -> State:
@@ -346,6 +344,5 @@ class FrameGraph(StreamingGraph):
         return self.model.initial_state(1)
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         motion, kept = self.model.advance(sparse[None], state, 1)
         return motion[0], kept

@@ -154,7 +154,6 @@ class OwnPastRecall(Recall):
         return JointProjections(parts)
 
     def feature(self, past: Past) -> Tensor:
-        """Return the features (1, blocks, k) of the frame that enters."""
         return self.whole(Past(*(part[0] for part in past)))
 
 
@@ -162,7 +161,6 @@ class CodeRecall(OwnPastRecall):
     """Recall for memories that have code-vectors as well, whose projections are looked up."""
 
     def join(self, features: Sequence[PastFeature]) -> None:
-        """Make one feature module whose projections are those of all blocks."""
         assert isinstance(self.memory, VQMemory)
         self.vectors = self.memory.codes.codebook.vectors
         super().join(features)
@@ -275,7 +273,6 @@ class OwnPastMemory(FeatureMemory):
         return {"motion": motion}
 
     def needed(self, new: int) -> int:
-        """Return how many of the output's newest frames `remember` looks at."""
         return self.frames if self.history == "latest" else new
 
     def recall(self, sparse: Tensor, state: State, new: int) -> Past:
@@ -318,7 +315,6 @@ class NoCodesMemory(OwnPastMemory):
     """A memory of the network's own past without code-vectors (Table 11)."""
 
     def feature(self) -> nn.Module:
-        """Make the module that computes a block's memory feature."""
         return PastFeature(self.width, None, self.blend)
 
     def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
@@ -336,11 +332,9 @@ class VQMemory(OwnPastMemory):
     codes: VQVAE
 
     def feature(self) -> nn.Module:
-        """Make the module that computes a block's memory feature."""
         return PastFeature(self.width, self.codes.width, self.blend)
 
     def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
-        """Return code-vectors (B, T, code width) of inputs (B, T, 54) and motion (B, T, 198)."""
         return self.codes.code_vectors(sparse, motion)
 
 

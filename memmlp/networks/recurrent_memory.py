@@ -66,7 +66,6 @@ class LSTM(Recurrence):
     carried = ("hidden", "cell")
 
     def run(self, x: Tensor, states: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
-        """Run the recurrent layer over inputs (B, n, 54) from a sequence of states, each (1, B, k)."""
         return self.layer(x, tuple(states))
 
 
@@ -106,7 +105,6 @@ class RecurrentRecall(Recall):
                 recurrence.layer = FrameGRU(recurrence.layer)
 
     def feature(self, past: RecurrentPast) -> Tensor:
-        """Return the features (1, blocks, k) of the frame that enters."""
         newest = past.features[:, :, -1]
         return newest.index_select(1, torch.tensor(self.layers, device=newest.device))
 

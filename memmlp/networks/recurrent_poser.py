@@ -69,7 +69,6 @@ class GRUCell(RecurrentCell):
         self.layer = nn.GRU(width, width, batch_first=True)
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Run over inputs (B, n, d) from a state (B, d); see RecurrentCell."""
         made, after = self.layer(x, state[None].contiguous())
         return made, after[0]
 
@@ -134,7 +133,6 @@ class LinearCell(RecurrentCell):
         raise NotImplementedError
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Run over inputs (B, n, d) from a state (B, d); see RecurrentCell."""
         h = scan(*self.gates(x), state)
         return h, h[:, -1]
 
@@ -153,7 +151,6 @@ class MinGRU(LinearCell):
         self.linear = nn.Linear(width, 2 * width)
 
     def gates(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Map inputs (..., d) to the share that is kept and to what is added; see LinearCell."""
         gate, new = self.linear(x).chunk(2, -1)
         update = torch.sigmoid(gate)
         return 1 - update, update * new
@@ -169,7 +166,6 @@ class LRU(LinearCell):
         self.decay = nn.Parameter(rate.expm1().log())  # softplus makes the rate of it
 
     def gates(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Map inputs (..., d) to the share that is kept and to what is added; see LinearCell."""
         forget, enter, new = self.linear(x).chunk(3, -1)
         keep = torch.exp(-F.softplus(self.decay) * torch.sigmoid(forget))
         room = (1 - keep.square()).clamp_min(1e-6).sqrt()  # keeps the state's variance that of its inputs
@@ -233,7 +229,6 @@ class LocalRotations(RotationOutput):
     """Each joint's rotation in its parent's frame."""
 
     def posed(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        """Map a member's outputs (..., 132) to world motion (..., 198), given inputs (..., 54)."""
         return normalizer.posed(made, sparse)
 
 
@@ -250,7 +245,6 @@ class GlobalRotations(RotationOutput):
             head.bias.copy_(mean_pose(normalizer))
 
     def posed(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        """Map a member's outputs (..., 132) to world motion (..., 198), given inputs (..., 54)."""
         with in_float32(made.device):
             return normalizer.posed_in_world(self.in_world(made, sparse, normalizer), sparse)
 
@@ -267,7 +261,6 @@ class ReachingArms(GlobalRotations):
     """
 
     def posed(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        """Map a member's outputs (..., 132) to world motion (..., 198), given inputs (..., 54)."""
         with in_float32(made.device):
             rotations = use_tracker_rotations(self.in_world(made, sparse, normalizer), sparse)
             return normalizer.posed_in_world(rotations, sparse, reach_hands)
@@ -358,7 +351,6 @@ class RecurrentPoserGraph(FrameGraph):
     model: RecurrentPoser
 
     def build(self, model: Any) -> None:
-        """Make the graph's parts from a copy of the network."""
         self.model = model
         self.model.normalizer = OneFrameNormalizer(model.normalizer)
         outer = ["model.normalizer"]
@@ -368,7 +360,6 @@ class RecurrentPoserGraph(FrameGraph):
         self.float32_modules = tuple(outer)
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         return self.model.step(sparse, state)
 
 

@@ -71,7 +71,6 @@ class RefinedGraph(StreamingGraph):
         return {**self.graph.windows(), HIDDEN: self.hidden}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         motion, kept = self.graph.step(sparse, state, fresh)
         refined, hidden = self.model.refined(motion[None], sparse[None], state[HIDDEN])
         return refined[0], {**kept, HIDDEN: hidden}
@@ -135,7 +134,6 @@ class Refined(MotionModel):
         return {**self.network.initial_state(batch), HIDDEN: hidden.to(self.normalizer.mean)}
 
     def running_state(self, sparse: Tensor) -> State:
-        """Return the state after world inputs (B, past, 54), without any history of motion yet."""
         return self.initial_state(len(sparse)) | self.network.running_state(sparse)
 
     def true_state(self, frames: Tensor) -> State:

@@ -68,7 +68,6 @@ class SAGENetGraph(StreamingGraph):
     places: Tensor
 
     def build(self, model: Any) -> None:
-        """Make the graph's parts from a copy of the network."""
         self.diffusion, self.noises, self.decoder = model.diffusion, model.noises, model.decoder
         self.upper, self.lower = (
             DenoiserAtSamplingTimes(part, model.diffusion.times) for part in (model.upper, model.lower)
@@ -92,7 +91,6 @@ class SAGENetGraph(StreamingGraph):
         return {"seen": torch.zeros(self.frames, sum(self.widths))}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
         entering = self.sparse(encoded)
         seen = slide_window(state["seen"], entering, entering, fresh)
@@ -219,7 +217,6 @@ class SAGENet(OwnWindows):
         )
 
     def rotations(self, encoded: Tensor) -> Tensor:
-        """Map windows (B, T, 54) to their last frames' rotations (B, 132), both in network space."""
         upper = self.upper_latent(encoded)
         return self.decoder(upper, self.lower_latent(upper, encoded), encoded)[:, -1]
 

@@ -179,7 +179,6 @@ class AGRoLGraph(StreamingGraph):
         return {"stem": torch.zeros(self.frames - 1, self.width)}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and the new state."""
         entering = self.entering(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
         window = torch.cat([fill_past(state["stem"], entering, fresh), entering])
         return self.normalizer.posed(self.rotation(window), sparse), {"stem": window[1:]}

@@ -73,13 +73,11 @@ class EMA(Average):
         self.averages = {name: one.detach().clone() for name, one in self.parameters.items()}
 
     def update(self, steps: int) -> None:
-        """Update the average with the module's weights after `steps` steps."""
         decay = min(self.decay, (1 + steps) / (10 + steps))
         weights = [one.detach() for one in self.parameters.values()]
         get_ema_multi_avg_fn(decay)(list(self.averages.values()), weights, steps)
 
     def put_in_place(self) -> None:
-        """Put the average into the module."""
         self._put(self.averages)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -87,7 +85,6 @@ class EMA(Average):
         return {f"average.{name}": value for name, value in self.averages.items()}
 
     def load(self, tensors: dict[str, Tensor]) -> None:
-        """Load the average."""
         for name, value in self.averages.items():
             value.copy_(tensors[f"average.{name}"])
 
@@ -108,7 +105,6 @@ class ScheduleFreeAverage(Average):
         self.optimiser = optimiser
 
     def put_in_place(self) -> None:
-        """Put the average into the module."""
         self.optimiser.eval()  # type: ignore[attr-defined]
 
     @contextlib.contextmanager

@@ -62,7 +62,6 @@ class TeacherForcing(Rollout):
     def draw(
         self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int
     ) -> TrainingCall:
-        """Draw the training call of a step."""
         clips, end = map(distributed.local_rows, sampler.draw(step))
         past, stride = model.past_frames, model.stride
         stretch = dataset.stretches(clips, end, past + stride)

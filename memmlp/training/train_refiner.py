@@ -44,7 +44,6 @@ class SAGERefinerLoss(Loss):
         self.weighting = Fixed({**weights, "position_from_pelvis": 0.01, "trackers": 0.01, "jerk": 0.03})
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
         error, pair = (motion - truth)[..., ROTATION], Comparison(motion, truth, sparse, normalizer)
         true, rooted = pair.true_positions, pair.made.posed[1]
         return {

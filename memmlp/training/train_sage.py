@@ -71,7 +71,6 @@ class DroppingOptim(Optim):
     lr_drop: float = 1.0
 
     def factor(self, step: int) -> float:
-        """Return the learning rate at a step as a fraction of the learning rate at the start."""
         return self.lr_drop ** sum(step >= at * self.steps for at in self.lr_drops_at)
 
 

@@ -110,7 +110,6 @@ class AvatarPoserLoss(Loss):
         self.weighting, self.anchored = Fixed(weights), ANCHORS[anchor]
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
         error = (motion - truth)[..., ROTATION].abs()
         position = self.anchored(normalizer.pose(motion, sparse)) - self.anchored(joints(truth))
         return {
@@ -170,7 +169,6 @@ class RPMLoss(Loss):
         self.weighting = Fixed({**weights, "world_position": world_position, "velocity": velocity})
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
         origin = normalizer.origin(sparse)
         error = normalizer.encode_motion(motion, origin) - normalizer.encode_motion(truth, origin)
         rotations, pair = error[..., ROTATION], Comparison(motion, truth, sparse, normalizer)

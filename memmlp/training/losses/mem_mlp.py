@@ -141,7 +141,6 @@ class MotionLoss(Loss):
         weighting.build(list(self.terms(*probed)), own)
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
         paper = self._paper(motion, truth, sparse, normalizer)
         return paper | self._own(motion, truth, sparse, normalizer)
 
