@@ -29,13 +29,7 @@ from memmlp.evaluation.ik import IK, LBFGS, Arms, NoIK
 from memmlp.evaluation.metrics import UserMetric
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.architectures import (
-    Architecture,
-    MemMLPArchitecture,
-    PartedArchitecture,
-    PlainArchitecture,
-    RefinedArchitecture,
-)
+from memmlp.networks.architectures import Architecture
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.vqvae import VQVAE
 from memmlp.runs.identity import VQVAE_SHAPE
@@ -168,39 +162,38 @@ def _plain(node: DictConfig) -> dict[str, Any]:
 
 def build_architecture(cfg: DictConfig) -> Architecture:
     """Build the architecture of a checked config, which makes and loads the network."""
-    network = build_unrefined_architecture(cfg)
-    if cfg.refiner is None:
-        return network
-    common = {name: getattr(network, name) for name in ("coordinates", "normalize", "vqvae")}
-    return RefinedArchitecture(**common, network=network, refiner=_settings(cfg, "refiner"))
-
-
-def build_unrefined_architecture(cfg: DictConfig) -> Architecture:
-    """Build the architecture of a checked config's network, without a refiner."""
     vqvae = partial(VQVAE, **{name: cfg.vqvae[name] for name in VQVAE_SHAPE})
     coordinates = find("coordinates", cfg.normalizer.coordinates).kind()
-    common = {"coordinates": coordinates, "normalize": cfg.normalizer.z_scores, "vqvae": vqvae}
-    network, keys = _chosen(cfg, "model")
+    refiner = _settings(cfg, "refiner") if cfg.refiner is not None else None
+    build_network, codes = _network(cfg, vqvae)
+    return Architecture(
+        coordinates=coordinates,
+        normalize=cfg.normalizer.z_scores,
+        vqvae=vqvae,
+        network=build_network,
+        uses_codes=codes == "frozen",
+        trained_parts=None if cfg.upstream is None else (),
+        refiner=refiner,
+    )
+
+
+def _network(
+    cfg: DictConfig, vqvae: Callable[[], VQVAE]
+) -> tuple[Callable[[Normalizer, VQVAE | None], MotionModel], str]:
+    network, settings = find("model", cfg.model.name).kind, _settings(cfg, "model")
     if cfg.memory is None:
-        family = PlainArchitecture if cfg.upstream is None else PartedArchitecture
-        return family(**common, network=partial(_network, network, keys))
+        return lambda normalizer, codes: network(normalizer, settings), ""
     memory, memory_keys = _chosen(cfg, "memory")
     predictor, predictor_keys = _chosen(cfg, "predictor")
     codes = getattr(memory.settings, "codes", "")
     joint = {"vqvae": vqvae} if codes == "joint" else {}
-    return MemMLPArchitecture(
-        **common,
-        frames=cfg.model.frames,
-        hidden=cfg.model.width,
-        depth=cfg.model.depth,
+    assemble = partial(
+        network.assemble,  # type: ignore[attr-defined]
+        settings=settings,
         memory=partial(memory.build, memory_keys, **joint),
         predictor=partial(predictor.build, predictor_keys),
-        codes=codes,
     )
-
-
-def _network(network: Component, keys: dict[str, Any], normalizer: Normalizer) -> MotionModel:
-    return network.kind(normalizer, network.make_settings(keys))
+    return assemble, codes
 
 
 def build_metrics(names: Iterable[str]) -> dict[str, UserMetric]:

@@ -94,7 +94,9 @@ def clip_by_clip(network: MotionModel, clips: Sequence[Tensor]) -> list[Tensor]:
     for clip in clips:  # at least T frames, by repeating the first one
         sparse = clip[:, :SPARSE_DIM]
         inputs.append(torch.cat([sparse[:1].expand(max(network.frames - len(clip), 0), -1), sparse]))
-    motions = [network.whole(sparse) for sparse in progress_bar(inputs, "windows together", unit="clips")]
+    motions = [
+        network.predict_clip(sparse) for sparse in progress_bar(inputs, "windows together", unit="clips")
+    ]
     return [motion[-len(clip) :] for motion, clip in zip(motions, clips, strict=True)]
 
 

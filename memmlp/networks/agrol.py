@@ -24,13 +24,13 @@ from memmlp.networks.layers import MLPBlock
 from memmlp.networks.motion_model import (
     State,
     TrainingOutputs,
-    WholeWindow,
+    WindowModel,
 )
 from memmlp.networks.settings import NetworkSettings
-from memmlp.networks.streaming import AGRoLGraph
+from memmlp.networks.streaming import StemGraph
 
 
-class AGRoLMLPGraph(AGRoLGraph):
+class AGRoLMLPGraph(StemGraph):
     """The streaming graph of AGRoL's MLP."""
 
     model: AGRoLMLP
@@ -70,7 +70,7 @@ class AGRoLMLPSettings(NetworkSettings):
     defaults: ClassVar = {"loss": "agrol"}
 
 
-class AGRoLMLP(WholeWindow):
+class AGRoLMLP(WindowModel):
     """AGRoL's MLP: stem, MLP blocks, head.
 
     It has 3,735,668 parameters at the paper's sizes (3.74 M in Table 16).
@@ -84,7 +84,7 @@ class AGRoLMLP(WholeWindow):
         self.blocks = nn.ModuleList(MLPBlock(settings.width, settings.frames) for _ in range(settings.depth))
         self.head = nn.Linear(settings.width, ROTATION.stop)
 
-    def rotations(self, encoded: Tensor) -> Tensor:
+    def predict_rotations(self, encoded: Tensor) -> Tensor:
         h = self.stem(encoded)
         for block in self.blocks:
             h = block(h)
@@ -109,7 +109,7 @@ class TimedBlock(MLPBlock):
         return super().forward(h + self.time(F.silu(past))[:, None])
 
 
-class AGRoLDiffusionGraph(AGRoLGraph):
+class AGRoLDiffusionGraph(StemGraph):
     """The streaming graph of AGRoL's diffusion model.
 
     The shift that each block adds for the diffusion time is the same at every step of a stream, so it is
@@ -170,7 +170,7 @@ class AGRoLDiffusionSettings(AGRoLMLPSettings):
     recipe: ClassVar = {"normalizer.z_scores": True}
 
 
-class AGRoLDiffusion(WholeWindow):
+class AGRoLDiffusion(WindowModel):
     """A denoiser of rotations, conditioned on the window's inputs, that predicts the clean rotations.
 
     It has 7,480,436 parameters at the paper's sizes (7.48 M in Table 16): the MLP's blocks and head
@@ -213,7 +213,7 @@ class AGRoLDiffusion(WholeWindow):
             h = block(h, embedding)
         return self.head(h)
 
-    def rotations(self, encoded: Tensor) -> Tensor:
+    def predict_rotations(self, encoded: Tensor) -> Tensor:
         """Sample rotations (B, T, 132) for inputs (B, T, 54), both in network space."""
         noise = self.noise.expand(len(encoded), -1, -1)
         return self.diffusion.sample(lambda noisy, time: self.denoise(noisy, time, encoded), noise)

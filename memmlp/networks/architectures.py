@@ -1,4 +1,4 @@
-"""Families of networks: an `Architecture` builds the networks of one family, and loads trained ones."""
+"""How the network of a config is built, begins its training, and is loaded with trained weights."""
 
 from __future__ import annotations
 
@@ -14,37 +14,33 @@ from memmlp.motion.network_coordinates import Coordinates
 from memmlp.motion.normalizer import Normalizer
 from memmlp.motion.preparing.manifest import Manifest
 from memmlp.networks import checkpoint
-from memmlp.networks.mem_mlp import MemMLP
-from memmlp.networks.memory import Memory
 from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.predictor import Predictor
-from memmlp.networks.refiner import Refined, SAGERefinerSettings
+from memmlp.networks.refiner import SAGERefinerSettings
 from memmlp.networks.vqvae import VQVAE
 
 
 @dataclass(frozen=True)
 class Architecture:
-    """How the networks of a family are built, and the VQ-VAE that some of them use; the base of all families.
+    """How a network is built, with the VQ-VAE that it may use and the refiner that may follow it.
 
     Attributes:
         coordinates: the coordinates in which the network sees the world.
         normalize: whether features are normalised to z-scores.
         vqvae: makes a VQ-VAE with fresh weights.
+        network: makes the network with fresh weights, given its normalizer and the frozen VQ-VAE, if any.
+        uses_codes: whether the network needs a frozen VQ-VAE.
+        trained_parts: names of the parts that a prerequisite run trained and that stay frozen; empty where
+            all parts are trained further, None for a network whose parts are not trained beforehand.
+        refiner: the settings of the refiner behind the network; None for none.
     """
 
     coordinates: Coordinates
     normalize: bool
     vqvae: Callable[[], VQVAE]
-
-    @property
-    def uses_codes(self) -> bool:
-        """Whether the network needs a frozen VQ-VAE."""
-        return False
-
-    @property
-    def trains_codes(self) -> bool:
-        """Whether the network has a VQ-VAE of its own that is trained with it."""
-        return False
+    network: Callable[[Normalizer, VQVAE | None], MotionModel]
+    uses_codes: bool = False
+    trained_parts: tuple[str, ...] | None = None
+    refiner: SAGERefinerSettings | None = None
 
     def build(self, normalizer: Normalizer, codes: VQVAE | None) -> MotionModel:
         """Build the network with fresh weights.
@@ -53,22 +49,29 @@ class Architecture:
             normalizer: converts between the world and network space.
             codes: the frozen VQ-VAE, where the network uses one.
         """
-        raise NotImplementedError
+        model = self.network(normalizer, codes)
+        return self.refiner.build(model) if self.refiner else model
 
     def build_for_training(self, normalizer: Normalizer, upstream: Path | None) -> MotionModel:
-        """Build the network as its training begins.
+        """Build the network as its training begins, without its refiner.
 
         Args:
             normalizer: converts between the world and network space.
-            upstream: file of the weights of the run that this one builds upon; None where there is no such
-                run.
+            upstream: file of the weights of the prerequisite run; None for a network without one.
 
         Raises:
             InputError: if the file of weights is damaged.
         """
-        return self.build(normalizer, self.load_vqvae(upstream) if upstream else None)
+        if self.trained_parts is None or upstream is None:
+            return self.network(normalizer, self.load_vqvae(upstream) if upstream else None)
+        model, (tensors, _) = self.network(normalizer, None), checkpoint.read(upstream)
+        for name in self.trained_parts:
+            checkpoint.load_module(f"model.{name}", model.get_submodule(name).requires_grad_(False), tensors)
+        if not self.trained_parts:
+            checkpoint.load_module("model", model, tensors)
+        return model
 
-    def normalizer(self, manifest: Manifest, frames: Tensor) -> Normalizer:
+    def make_normalizer(self, manifest: Manifest, frames: Tensor) -> Normalizer:
         """Make the normalizer, with the statistics of the training frames (F, 252) if `normalize` is set."""
         rest = torch.as_tensor(np.asarray(manifest.rest), dtype=torch.float32)
         if self.normalize:
@@ -96,105 +99,3 @@ class Architecture:
         model = self.build(Normalizer.raw(self.coordinates, torch.zeros(22, 3)), codes)
         checkpoint.load_module("model", model, tensors)
         return model.eval()
-
-
-@dataclass(frozen=True)
-class MemMLPArchitecture(Architecture):
-    """How Mem-MLP is built.
-
-    Attributes:
-        frames: T, the window's length.
-        hidden: d, the width of the hidden state.
-        depth: L, the number of the backbone's blocks.
-        memory: makes the memory, given `codes`, `depth`, `hidden` and `frames`.
-        predictor: makes the predictor, given `memory_block`, `hidden` and `frames`.
-        codes: "frozen" if the memory needs a VQ-VAE that is trained before, "joint" if it has one of its own.
-    """
-
-    frames: int
-    hidden: int
-    depth: int
-    memory: Callable[..., Memory]
-    predictor: Callable[..., Predictor]
-    codes: str = ""
-
-    @property
-    def uses_codes(self) -> bool:
-        """Whether the memory needs a frozen VQ-VAE."""
-        return self.codes == "frozen"
-
-    @property
-    def trains_codes(self) -> bool:
-        """Whether the memory has a VQ-VAE of its own that is trained with the network."""
-        return self.codes == "joint"
-
-    def build(self, normalizer: Normalizer, codes: VQVAE | None) -> MemMLP:
-        """Build the network with fresh weights."""
-        sizes = {"hidden": self.hidden, "frames": self.frames}
-        memory = self.memory(codes=codes, depth=self.depth, **sizes)
-        predictor = self.predictor(memory_block=memory.memory_block, **sizes)
-        return MemMLP(normalizer, memory, predictor, depth=self.depth, **sizes)
-
-
-@dataclass(frozen=True)
-class PlainArchitecture(Architecture):
-    """How a network with neither memory nor predictor slot is built, as all baselines are.
-
-    Attributes:
-        network: makes the network from its normalizer; all other arguments are bound already.
-    """
-
-    network: Callable[[Normalizer], MotionModel]
-
-    def build(self, normalizer: Normalizer, codes: VQVAE | None) -> MotionModel:
-        """Build the network with fresh weights; `codes` is not used."""
-        return self.network(normalizer)
-
-
-@dataclass(frozen=True)
-class PartedArchitecture(PlainArchitecture):
-    """The architecture of a network whose parts are trained one after the other, before the whole network is.
-
-    Attributes:
-        finished: names of the parts whose trained weights are loaded and frozen where the training of the
-            remaining parts begins; empty where the whole network is trained further.
-    """
-
-    finished: tuple[str, ...] = ()
-
-    def build_for_training(self, normalizer: Normalizer, upstream: Path | None) -> MotionModel:
-        """Build the network with the weights of its parts; see Architecture."""
-        assert upstream is not None
-        model, (tensors, _) = self.build(normalizer, None), checkpoint.read(upstream)
-        for name in self.finished:
-            checkpoint.load_module(f"model.{name}", model.get_submodule(name).requires_grad_(False), tensors)
-        if not self.finished:
-            checkpoint.load_module("model", model, tensors)
-        return model
-
-
-@dataclass(frozen=True)
-class RefinedArchitecture(Architecture):
-    """How a network with a refiner behind it is built.
-
-    Attributes:
-        network: builds the network itself.
-        refiner: makes the refiner around it.
-    """
-
-    network: Architecture
-    refiner: SAGERefinerSettings
-
-    @property
-    def uses_codes(self) -> bool:
-        """Whether the network needs a frozen VQ-VAE."""
-        return self.network.uses_codes
-
-    @property
-    def trains_codes(self) -> bool:
-        """Whether the network has a VQ-VAE of its own that was trained with it."""
-        return self.network.trains_codes
-
-    def build(self, normalizer: Normalizer, codes: VQVAE | None) -> Refined:
-        """Build the network and its refiner with fresh weights."""
-        return self.refiner.around(self.network.build(normalizer, codes))

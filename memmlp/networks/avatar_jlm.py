@@ -30,7 +30,7 @@ from memmlp.networks.motion_model import (
     State,
     StreamingGraph,
     TrainingOutputs,
-    WholeWindow,
+    WindowModel,
     fill_past,
 )
 from memmlp.networks.settings import NetworkSettings
@@ -143,7 +143,7 @@ class AvatarJLMSettings(NetworkSettings):
             yield f"model.width={config['model']['width']}: must be a multiple of 4 with this model"
 
 
-class AvatarJLM(WholeWindow):
+class AvatarJLM(WindowModel):
     """A coarse pose of each frame, tokens of its joints, encoder layers, and a head on all tokens of a frame.
 
     It has 63,807,240 parameters at the paper's sizes (T = 41, d = 512, 6 blocks). It predicts all frames of a
@@ -218,7 +218,7 @@ class AvatarJLM(WholeWindow):
         """
         return torch.cat([h[..., :-1, :], first.detach()], -2)
 
-    def rotations(self, encoded: Tensor) -> Tensor:
+    def predict_rotations(self, encoded: Tensor) -> Tensor:
         return self.regress(encoded)
 
     def regress(self, encoded: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from memmlp.common.components import component
 from memmlp.common.settings import at_least, fraction, setting
 from memmlp.motion.body import N_JOINTS, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.motion_model import OwnWindows, State, StreamingGraph, slide_window
+from memmlp.networks.motion_model import NewestFrameModel, State, StreamingGraph, slide_window
 from memmlp.networks.settings import NetworkSettings
 from memmlp.networks.transformer import EncoderLayer, draw_weights
 
@@ -86,7 +86,7 @@ class AvatarPoserSettings(NetworkSettings):
     defaults: ClassVar = {"loss": "avatar_poser"}
 
 
-class AvatarPoser(OwnWindows):
+class AvatarPoser(NewestFrameModel):
     """An embedding, an encoder, and two heads on the newest frame, for the root's orientation and the rest.
 
     It has 4,124,804 parameters at the paper's sizes (T = 40, d = 256, 8 heads, 3 layers, feed-forward 2048),
@@ -113,7 +113,7 @@ class AvatarPoser(OwnWindows):
         self.rotation = head(settings.width, 6 * self.rotated)
         draw_weights(self)
 
-    def rotations(self, encoded: Tensor) -> Tensor:
+    def predict_rotations(self, encoded: Tensor) -> Tensor:
         return self.encode(self.embedding(encoded))
 
     def encode(self, h: Tensor) -> Tensor:

@@ -19,9 +19,9 @@ from memmlp.common.settings import at_least, positive, setting
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM, TRACKED
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.diffusion import AncestralDiffusion, Denoised, TimeEmbedding
-from memmlp.networks.motion_model import State, TrainingOutputs, WholeWindow
+from memmlp.networks.motion_model import State, TrainingOutputs, WindowModel
 from memmlp.networks.settings import NetworkSettings
-from memmlp.networks.streaming import AGRoLGraph, linear
+from memmlp.networks.streaming import StemGraph, linear
 from memmlp.networks.transformer import DiTBlock
 
 SINES = 256  # of the diffusion time
@@ -29,7 +29,7 @@ CHANNELS = SPARSE_DIM // len(TRACKED)  # of the inputs, of which each joint gets
 NOISY = 6  # channels of the noisy motion, a joint's 6D rotation
 
 
-class BoDiffusionGraph(AGRoLGraph):
+class BoDiffusionGraph(StemGraph):
     """BoDiffusion's streaming graph, in which successive layers without a non-linearity between are merged.
 
     The stem's output for each frame's inputs is carried, in order of time. What the blocks compute from the
@@ -129,7 +129,7 @@ class BoDiffusionSettings(NetworkSettings):
             yield "model.noise_weight=0: must be above 0 with loss=of_network"
 
 
-class BoDiffusion(WholeWindow):
+class BoDiffusion(WindowModel):
     """A denoiser of rotations that predicts their noise, conditioned on the window's inputs.
 
     It has 21,942,270 trained parameters at the paper's sizes (T = 41, d = 384, 12 blocks), and position
@@ -145,7 +145,8 @@ class BoDiffusion(WholeWindow):
     def __init__(self, normalizer: Normalizer, settings: BoDiffusionSettings):
         super().__init__(normalizer, settings.frames)
         self.noise_weight, self.bound_weight = settings.noise_weight, settings.bound_weight
-        self.noise_seed, self.offline = settings.noise_seed, settings.offline
+        self.noise_seed = settings.noise_seed
+        self.is_stream, self.takes_whole_clip = not settings.offline, settings.offline
         self.diffusion = AncestralDiffusion(settings.diffusion_steps, settings.sampling_steps)
         self.time = TimeEmbedding(settings.width, SINES)
         self.spread = nn.Linear(len(TRACKED), N_JOINTS, bias=False)
@@ -157,16 +158,6 @@ class BoDiffusion(WholeWindow):
         self.register_buffer(
             "noises", self.drawn(settings.frames), persistent=False
         )  # more with more sampling steps
-
-    @property
-    def is_stream(self) -> bool:
-        """Whether each frame is predicted without later ones; false in the published, offline mode."""
-        return not self.offline
-
-    @property
-    def takes_whole_clip(self) -> bool:
-        """Whether window mode denoises all windows of a clip together; true in the published mode."""
-        return self.offline
 
     def drawn(self, frames: int) -> Tensor:
         """Draw the noise (draws, N, 132) for a sample of N frames; it is always the same."""
@@ -203,7 +194,7 @@ class BoDiffusion(WholeWindow):
         time = torch.full((len(noisy),), self.diffusion.times[index], device=noisy.device)
         return self.diffusion.step(noisy, self.denoise(noisy, time, encoded), index, self.limits())
 
-    def rotations(self, encoded: Tensor) -> Tensor:
+    def predict_rotations(self, encoded: Tensor) -> Tensor:
         """Sample rotations (B, T, 132) for inputs (B, T, 54), both in network space."""
 
         def step(noisy: Tensor, index: int) -> tuple[Tensor, Tensor]:
@@ -212,7 +203,7 @@ class BoDiffusion(WholeWindow):
 
         return self.diffusion.sample(step, self.noises[:, None].expand(-1, len(encoded), -1, -1))
 
-    def whole(self, sparse: Tensor) -> Tensor:
+    def predict_clip(self, sparse: Tensor) -> Tensor:
         """Sample the world motion (N, 198) of a clip's world inputs (N, 54), N >= T, all windows together.
 
         A window begins every T // 2 frames, and the last one ends with the clip. After every sampling step,

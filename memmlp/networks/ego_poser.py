@@ -108,7 +108,7 @@ class EgoPoser(AvatarPoser):
     graph = EgoPoserGraph
     inputs: ClassVar[int] = SPARSE_DIM + PLACES
 
-    def rotations(self, encoded: Tensor) -> Tensor:
+    def predict_rotations(self, encoded: Tensor) -> Tensor:
         local = center_on_head(encoded)
         moved = places(local) - places(local[:, :1])
         slow, fast = self.views(torch.cat([local, moved], -1))

@@ -269,7 +269,7 @@ class ManikinS(Manikin, AvatarPoser):
         """Map windows (B, T, 54) in network space to outputs (B, 1, 86) for their last frame."""
         return self.encode(self.embedding(encoded))[:, None]
 
-    def rotations(self, encoded: Tensor) -> Tensor:
+    def predict_rotations(self, encoded: Tensor) -> Tensor:
         return self.posed(self.predict_parts(encoded), encoded[:, -1:])[:, 0]
 
     def compute_part_losses(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
@@ -337,22 +337,14 @@ class ManikinL(Manikin, AvatarJLM):
 
     def __init__(self, normalizer: Normalizer, settings: ManikinLSettings):
         super().__init__(normalizer, settings)
-        self.parts_weight, self.turned, self.offline = (
-            settings.parts_weight,
-            settings.turned,
-            settings.offline,
-        )
-
-    @property
-    def is_stream(self) -> bool:
-        """Whether each frame is predicted without later ones; false for MANIKIN-LN."""
-        return not self.offline
+        self.parts_weight, self.turned = settings.parts_weight, settings.turned
+        self.is_stream = not settings.offline
 
     def predict_parts(self, encoded: Tensor) -> Tensor:
         """Map windows (B, T, 54) in network space to outputs (B, T, 212) for all their frames."""
         return self.regress(encoded)
 
-    def rotations(self, encoded: Tensor) -> Tensor:
+    def predict_rotations(self, encoded: Tensor) -> Tensor:
         return self.posed(self.predict_parts(encoded), encoded)
 
     def losses(self, made: Tensor, true: Tensor) -> dict[str, Tensor]:

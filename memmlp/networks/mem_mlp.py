@@ -26,6 +26,7 @@ from memmlp.networks.motion_model import (
 )
 from memmlp.networks.predictor import Branch, Predictor
 from memmlp.networks.streaming import OneFrameNormalizer
+from memmlp.networks.vqvae import VQVAE
 
 Selection = Callable[[Tensor], Tensor]
 
@@ -314,21 +315,35 @@ class MemMLP(MotionModel):
     ):
         super().__init__(normalizer, frames)
         self.hidden = hidden
-        self.memory = memory
+        self.memory, self.shift, self.settled = memory, memory.shift, memory.settled
         self.stem = nn.Linear(SPARSE_DIM, hidden)
         self.blocks = nn.ModuleList(memory.block(layer) for layer in range(1, depth + 1))
         self.predictor = predictor
         self.branches = predictor.branches
 
-    @property
-    def shift(self) -> int:
-        """How many frames before the newest one the memory's recalled past ends; 0 without a memory."""
-        return self.memory.shift
+    @classmethod
+    def assemble(
+        cls,
+        normalizer: Normalizer,
+        codes: VQVAE | None,
+        *,
+        settings: MemMLPSettings,
+        memory: Callable[..., Memory],
+        predictor: Callable[..., Predictor],
+    ) -> MemMLP:
+        """Build the network with fresh weights.
 
-    @property
-    def settled(self) -> bool:
-        """Whether the memory never changes an estimate of a past frame once it is made."""
-        return self.memory.settled
+        Args:
+            normalizer: converts between the world and network space.
+            codes: the frozen VQ-VAE, where the memory uses one.
+            settings: the backbone's sizes.
+            memory: makes the memory, given `codes`, `depth`, `hidden` and `frames`.
+            predictor: makes the predictor, given `memory_block`, `hidden` and `frames`.
+        """
+        sizes = {"hidden": settings.width, "frames": settings.frames}
+        slot = memory(codes=codes, depth=settings.depth, **sizes)
+        branches = predictor(memory_block=slot.memory_block, **sizes)
+        return cls(normalizer, slot, branches, depth=settings.depth, **sizes)
 
     @property
     def past_frames(self) -> int:

@@ -45,43 +45,26 @@ class MotionModel(nn.Module):
             are not learned follow from the rotations.
         graph: the class of the streaming graph, or None. A subclass names its own, since it may compute
             something else than its base.
+        shift: how many frames before the newest one the recalled past ends; 0 without a recalled past.
+        settled: whether recalled values of a past frame never change, so that a live stream may keep them.
+        windowless: whether the network is a stream in both evaluation modes; see WindowlessModel.
+        is_stream: whether it needs no future frames; if it does, only window mode can evaluate it.
+        takes_whole_clip: whether window mode passes a whole clip to `predict_clip`, which predicts all its
+            windows together; they may overlap.
     """
 
     branches: frozenset[str] = frozenset({"rotation"})
+    shift: int = 0
+    settled: bool = True
+    windowless: bool = False
+    is_stream: bool = True
+    takes_whole_clip: bool = False
     graph: ClassVar[type[StreamingGraph] | None] = None
 
     def __init__(self, normalizer: Normalizer, frames: int):
         super().__init__()
         self.normalizer = normalizer
         self.frames = frames
-
-    @property
-    def shift(self) -> int:
-        """How many frames before the newest one the recalled past ends; 0 for a network that recalls none."""
-        return 0
-
-    @property
-    def settled(self) -> bool:
-        """Whether a past frame's recalled values never change again, so that a live stream may keep them."""
-        return True
-
-    @property
-    def windowless(self) -> bool:
-        """Whether the network has no window and is a stream in both evaluation modes; see WindowlessModel."""
-        return False
-
-    @property
-    def is_stream(self) -> bool:
-        """Whether each frame is predicted without later ones; if not, only window mode can evaluate it."""
-        return True
-
-    @property
-    def takes_whole_clip(self) -> bool:
-        """Whether window mode passes a whole clip to `whole`, which makes all its windows together.
-
-        Such windows may overlap.
-        """
-        return False
 
     @property
     def past_frames(self) -> int:
@@ -136,7 +119,7 @@ class MotionModel(nn.Module):
         """
         raise NotImplementedError
 
-    def whole(self, sparse: Tensor) -> Tensor:
+    def predict_clip(self, sparse: Tensor) -> Tensor:
         """Map a clip's world inputs (N, 54), N >= T, to its world motion (N, 198); see `takes_whole_clip`."""
         raise NotImplementedError
 
@@ -162,12 +145,11 @@ class WindowlessModel(MotionModel):
     """A network that carries all it knows of the past in its state; every live step takes the same work.
 
     `frames` is how many frames a training call takes in, from a fresh start. In both evaluation modes the
-    network is a stream over the whole clip.
+    network is a stream over the whole clip. By default `advance` returns the motion of the n new frames; more
+    than these cannot be predicted.
     """
 
-    @property
-    def windowless(self) -> bool:
-        return True
+    windowless = True
 
     @property
     def past_frames(self) -> int:
@@ -188,10 +170,10 @@ class WindowlessModel(MotionModel):
         return self.initial_state(len(sparse))
 
 
-class WholeWindow(MotionModel):
-    """The base of networks that map a whole window of inputs to its rotations (`rotations`)."""
+class WindowModel(MotionModel):
+    """The base of networks that map a whole window of inputs to its rotations (`predict_rotations`)."""
 
-    def rotations(self, encoded: Tensor) -> Tensor:
+    def predict_rotations(self, encoded: Tensor) -> Tensor:
         """Map inputs (B, T, 54) to rotations (B, T, 132), both in network space."""
         raise NotImplementedError
 
@@ -202,18 +184,20 @@ class WholeWindow(MotionModel):
         """
         inputs, kept = self.append_inputs(sparse, state)
         window = inputs[:, -self.frames :]
-        rotation = self.rotations(self.normalizer.encode_sparse(window, self.normalizer.origin(window)))
+        rotation = self.predict_rotations(
+            self.normalizer.encode_sparse(window, self.normalizer.origin(window))
+        )
         wanted = self.frames if newest is None else newest
         return self.normalizer.posed(rotation[:, -wanted:], window[:, -wanted:]), kept
 
 
-class OwnWindows(MotionModel):
-    """The base of networks that predict every frame from the window that ends with it (`rotations`).
+class NewestFrameModel(MotionModel):
+    """The base of networks that predict every frame from the window that ends with it (`predict_rotations`).
 
     Both evaluation modes give the same numbers, to rounding.
     """
 
-    def rotations(self, encoded: Tensor) -> Tensor:
+    def predict_rotations(self, encoded: Tensor) -> Tensor:
         """Map windows (B, T, 54) to their last frames' rotations (B, 132), both in network space."""
         raise NotImplementedError
 
@@ -228,7 +212,7 @@ class OwnWindows(MotionModel):
         window = ends[:, None] + torch.arange(1 - self.frames, 1, device=inputs.device)
         encoded = self.normalizer.encode_sparse(inputs, self.normalizer.origin(inputs))
         windows = torch.unflatten(encoded.index_select(1, window.flatten()), 1, window.shape)
-        rotation = torch.unflatten(self.rotations(windows.flatten(0, 1)), 0, (len(inputs), wanted))
+        rotation = torch.unflatten(self.predict_rotations(windows.flatten(0, 1)), 0, (len(inputs), wanted))
         return self.normalizer.posed(rotation, inputs[:, -wanted:]), kept
 
 

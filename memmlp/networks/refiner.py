@@ -43,8 +43,8 @@ class SAGERefinerSettings(Settings):
     velocities: str = setting(one_of("rotations", "joints"), "rotations")  # whose movement its loss compares
     lr: float | None = setting(positive(), None)  # learning rate at the start; null: that of optim
 
-    def around(self, network: MotionModel) -> Refined:
-        """Return a network with a refiner of fresh weights behind it."""
+    def build(self, network: MotionModel) -> Refined:
+        """Put a refiner with fresh weights behind a network."""
         return Refined(network, self.width, self.depth)
 
 
@@ -91,10 +91,12 @@ class Refined(MotionModel):
     """
 
     graph = RefinedGraph
+    windowless = True
 
     def __init__(self, network: MotionModel, width: int, depth: int):
         nn.Module.__init__(self)
         self.network, self.frames, self.branches = network, network.frames, network.branches
+        self.settled, self.is_stream = network.settled, network.is_stream
         self.layers = nn.GRU(ROTATION.stop, width, depth, batch_first=True)
         self.head = nn.Linear(width, ROTATION.stop)
 
@@ -102,21 +104,6 @@ class Refined(MotionModel):
     def normalizer(self) -> Normalizer:  # type: ignore[override]
         """The network's normalizer."""
         return self.network.normalizer
-
-    @property
-    def settled(self) -> bool:
-        """Whether what the network recalls of a frame never changes."""
-        return self.network.settled
-
-    @property
-    def is_stream(self) -> bool:
-        """Whether the network predicts each frame without later ones."""
-        return self.network.is_stream
-
-    @property
-    def windowless(self) -> bool:
-        """Whether the network has no window; true here, since the refiner corrects a stream."""
-        return True
 
     def count_parameters(self) -> int:
         """Return how many parameters the network uses, including those of the refiner."""

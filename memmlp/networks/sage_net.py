@@ -18,7 +18,13 @@ from memmlp.common.settings import at_least, fraction, setting, sized
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.diffusion import Diffusion
-from memmlp.networks.motion_model import OwnWindows, State, StreamingGraph, TrainingOutputs, slide_window
+from memmlp.networks.motion_model import (
+    NewestFrameModel,
+    State,
+    StreamingGraph,
+    TrainingOutputs,
+    slide_window,
+)
 from memmlp.networks.sage_parts import LATENT, Decoder, HalfVQVAE, LowerDenoiser, UpperDenoiser, places
 from memmlp.networks.settings import NetworkSettings
 from memmlp.networks.streaming import linear
@@ -162,7 +168,7 @@ class SAGESettings(NetworkSettings):
                 yield f"model.{key}={config['model'][key]}: must be even with model=sage"
 
 
-class SAGENet(OwnWindows):
+class SAGENet(NewestFrameModel):
     """Samples the upper half's latents, then the lower half's given these, and decodes both to a pose.
 
     It has 120,269,534 parameters at the paper's sizes (120.27 M in Table 16); the VQ-VAEs that make the
@@ -216,7 +222,7 @@ class SAGENet(OwnWindows):
             self.noises[1].expand(len(encoded), -1, -1),
         )
 
-    def rotations(self, encoded: Tensor) -> Tensor:
+    def predict_rotations(self, encoded: Tensor) -> Tensor:
         upper = self.upper_latent(encoded)
         return self.decoder(upper, self.lower_latent(upper, encoded), encoded)[:, -1]
 

@@ -168,7 +168,7 @@ class OneFrame(nn.Module):
         return turn @ products
 
 
-class AGRoLGraph(StreamingGraph):
+class StemGraph(StreamingGraph):
     """The base of the streaming graphs of AGRoL's networks; it carries the stem's outputs."""
 
     float32_modules: tuple[str, ...] = ("model.stem", "model.head")

@@ -88,7 +88,7 @@ class NetworkTraining:
         """
         dataset = data.open("train").to(device)
         torch.manual_seed(self.seed)
-        normalizer = architecture.normalizer(data.manifest, dataset.frames)
+        normalizer = architecture.make_normalizer(data.manifest, dataset.frames)
         model = architecture.build_for_training(normalizer, upstream).to(device)
         self.rollout.begin(model)
         pieces = modes.chunks(data.open("val").to(device), VALIDATION_PIECE, least=60)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -17,7 +17,7 @@ from memmlp.motion.dataset import MirroredDataset, MotionDataset, WindowSampler
 from memmlp.motion.motion_source import Prepared
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import checkpoint
-from memmlp.networks.architectures import Architecture, RefinedArchitecture
+from memmlp.networks.architectures import Architecture
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.refiner import HIDDEN, Refined, SAGERefinerSettings
 from memmlp.runs.run import Run
@@ -122,13 +122,12 @@ class RefinerTraining:
         Returns:
             The refined network in evaluation mode.
         """
-        assert isinstance(architecture, RefinedArchitecture)
         assert upstream is not None
         plain = data.open("train").to(device)
         dataset = MirroredDataset(plain) if self.mirror else plain
-        finished = architecture.network.load(upstream).to(device).requires_grad_(False)
+        finished = replace(architecture, refiner=None).load(upstream).to(device).requires_grad_(False)
         torch.manual_seed(self.seed)
-        model = self.refiner.around(finished).to(device)
+        model = self.refiner.build(finished).to(device)
         validation = modes.chunks(data.open("val").to(device), VALIDATION_PIECE, least=60)
         task = RefinerTask(
             model,

@@ -26,7 +26,7 @@ from memmlp.motion.body import HANDS, HEAD, N_JOINTS, ROOT, ROTATION, SPARSE_DIM
 from memmlp.motion.dataset import MirroredDataset, MotionDataset, WindowSampler
 from memmlp.motion.motion_source import Prepared
 from memmlp.networks import checkpoint
-from memmlp.networks.architectures import Architecture, PartedArchitecture
+from memmlp.networks.architectures import Architecture
 from memmlp.networks.sage_net import SAGENet
 from memmlp.networks.sage_parts import HIDDEN, LOWER, UPPER, HalfVQVAE
 from memmlp.runs.run import Run
@@ -200,7 +200,7 @@ class PartTraining:
         """
         before, dataset = checkpoint.read(upstream)[0] if upstream else {}, data.open("train").to(device)
         torch.manual_seed(self.network.seed)
-        net = architecture.build(architecture.normalizer(data.manifest, dataset.frames), None)
+        net = architecture.build(architecture.make_normalizer(data.manifest, dataset.frames), None)
         assert isinstance(net, SAGENet)
         parts: dict[str, nn.Module] = {"codes.upper": net.codes(UPPER), "codes.lower": net.codes(LOWER)}
         parts |= {"model.upper": net.upper, "model.lower": net.lower}
@@ -230,8 +230,7 @@ class DecoderTraining(PartTraining):
         device: torch.device,
     ) -> dict[str, float]:
         """Train the decoder and write it together with the diffusion models; see PartTraining."""
-        assert isinstance(architecture, PartedArchitecture)
-        fixed = replace(architecture, finished=("upper", "lower"))
+        fixed = replace(architecture, trained_parts=("upper", "lower"))
         self.network.train(fixed, data, upstream, run, device)
         return last_errors(run)
 

@@ -59,7 +59,7 @@ class VQVAETraining:
         """
         dataset, validation = (data.open(split).to(device) for split in ("train", "val"))
         torch.manual_seed(self.seed)
-        normalizer = architecture.normalizer(data.manifest, dataset.frames).to(device)
+        normalizer = architecture.make_normalizer(data.manifest, dataset.frames).to(device)
         model = architecture.vqvae().to(device)
         optim = self.optim(len(dataset.frames))
         training = MirroredDataset(dataset) if self.mirror else dataset

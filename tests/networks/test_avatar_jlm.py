@@ -48,7 +48,7 @@ def test_the_inputs_token_is_renewed_and_teaches_the_embedding_nothing():
     for layer in model.layers:
         layer.register_forward_hook(lambda _, given, made: seen.append(given[0]))
     encoded = model.normalizer.encode_sparse(SPARSE, model.normalizer.origin(SPARSE))
-    model.rotations(encoded)
+    model.predict_rotations(encoded)
     first = seen[0].unflatten(0, (2, 7))[:, :, -1]
     for index, h in enumerate(seen):
         shape = (2, 7) if index % 2 == 0 else (2, avatar_jlm.TOKENS)

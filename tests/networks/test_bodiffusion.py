@@ -76,7 +76,7 @@ def test_windows_are_denoised_together_and_averaged_where_they_overlap(monkeypat
     model = tiny.baseline("bodiffusion", offline=True, sampling_steps=2, depth=1).double()
     sparse = CLIP[:, :SPARSE_DIM].double()
     noise = torch.randn(2, 25, 132, generator=torch.Generator().manual_seed(0)).double()
-    found = model.whole(sparse)
+    found = model.predict_clip(sparse)
     encoded = model.normalizer.encode_sparse(sparse, model.normalizer.origin(sparse))
     x = noise[0]
     for index in range(2):

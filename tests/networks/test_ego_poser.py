@@ -15,7 +15,7 @@ def test_tokens_are_an_independent_computation():
     model, window = tiny.baseline("ego_poser", frames=8).double(), CLIP[None, :8, :SPARSE_DIM].double()
     seen = []
     model.encode = lambda h: (seen.append(h), torch.zeros(1, 132).double())[1]
-    model.rotations(window)
+    model.predict_rotations(window)
     rows = []
     for frame in window[0].numpy():
         row = frame.copy()
@@ -36,6 +36,6 @@ def test_where_on_the_floor_the_person_is_does_not_matter():
     model, window = tiny.baseline("ego_poser").double(), CLIP[None, :7, :SPARSE_DIM].double()
     elsewhere = window.clone()
     elsewhere[..., SPARSE_POSITION] += torch.tensor([3.0, -2.0, 0.0] * 3)
-    torch.testing.assert_close(model.rotations(elsewhere), model.rotations(window))
+    torch.testing.assert_close(model.predict_rotations(elsewhere), model.predict_rotations(window))
     elsewhere[..., SPARSE_POSITION] += torch.tensor([0.0, 0.0, 0.1] * 3)
-    assert not torch.allclose(model.rotations(elsewhere), model.rotations(window), atol=1e-3)
+    assert not torch.allclose(model.predict_rotations(elsewhere), model.predict_rotations(window), atol=1e-3)

@@ -13,7 +13,6 @@ from memmlp.evaluation.ik import Arms
 from memmlp.evaluation.modes import joint_positions
 from memmlp.motion.body import HANDS, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.network_coordinates import Heading
-from memmlp.networks.architectures import RefinedArchitecture
 from memmlp.networks.flop_counter import counting_flops
 from memmlp.networks.refiner import HIDDEN, Refined
 from memmlp.networks.streaming import has_stream, streaming
@@ -38,7 +37,7 @@ def test_it_has_the_published_size(name):
 
 
 def test_none_is_the_network_itself():
-    assert not isinstance(build_architecture(composed(["model=avatar_poser"])), RefinedArchitecture)
+    assert build_architecture(composed(["model=avatar_poser"])).refiner is None
     assert not isinstance(untrained(["model=avatar_poser", "profile=tiny"]), Refined)
 
 

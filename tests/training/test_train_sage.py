@@ -18,7 +18,7 @@ from memmlp.motion.body import HEAD, N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.network_coordinates import World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import checkpoint
-from memmlp.networks.architectures import PartedArchitecture
+from memmlp.networks.architectures import Architecture
 from memmlp.networks.sage_parts import LOWER, UPPER
 from memmlp.training import train_sage
 from memmlp.training.loop import train_step
@@ -124,7 +124,7 @@ def test_the_lower_half_is_given_what_the_upper_one_samples():
     with torch.no_grad():
         for training in (True, False):
             train_sage.compute_lower_losses(net, codes, FRAMES, training)
-        net.rotations(encoded)
+        net.predict_rotations(encoded)
         expected = net.upper_latent(encoded)
     assert len(net.lower.joined.calls) == 1 + 2 * len(net.diffusion.times)
     assert all(torch.equal(upper, expected) for _, upper in net.lower.joined.calls)
@@ -143,9 +143,11 @@ def test_it_begins_with_the_weights_of_its_parts(tmp_path: Path):
     kept = tiny.baseline("sage", seed=1)
     checkpoint.write(tmp_path / "model", checkpoint.module_tensors("model", kept), {})
     network = partial(tiny.build_baseline, "sage")
-    architecture = PartedArchitecture(World(), normalize=False, vqvae=tiny.vqvae, network=network)
+    architecture = Architecture(
+        World(), normalize=False, vqvae=tiny.vqvae, network=lambda *of: network(of[0])
+    )
     for finished in ((), ("upper", "lower")):
-        net = replace(architecture, finished=finished).build_for_training(
+        net = replace(architecture, trained_parts=finished).build_for_training(
             tiny.normalizer(), tmp_path / "model"
         )
         stems = {name: net.get_submodule(name).stem.weight for name in ("upper", "lower", "decoder")}

@@ -65,7 +65,7 @@ def test_avatar_poser_is_the_network_of_torch_layers():
     theirs = TorchAvatarPoser(width=16, depth=2, heads=4, feedforward=32).eval()
     theirs.load_state_dict(weights)
     window = torch.randn(1, 7, SPARSE_DIM)
-    torch.testing.assert_close(theirs(window), ours.rotations(window), atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(theirs(window), ours.predict_rotations(window), atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.slow
