@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -19,47 +20,29 @@ MakeBlock = Callable[[], nn.Module]
 
 
 class Branch(nn.Module):
-    """A branch of the predictor: `depth` MLP blocks and one linear layer.
+    """A branch of the predictor: `depth` blocks and one linear layer.
 
     Args:
         size: number of outputs.
         depth: number of blocks.
         hidden: the backbone's d.
         frames: the backbone's T.
-        memory_block: makes a memory block; not used here.
+        memory_block: makes the blocks, which see memory features like those of the backbone (Table 8); None
+            for MLP blocks.
     """
 
     def __init__(self, size: int, depth: int, hidden: int, frames: int, memory_block: MakeBlock | None):
         super().__init__()
-        self.blocks = nn.ModuleList(self.block(hidden, frames, memory_block) for _ in range(depth))
+        make = memory_block or partial(MLPBlock, hidden, frames)
+        self.blocks = nn.ModuleList(make() for _ in range(depth))
         self.linear = nn.Linear(hidden, size)
-
-    def block(self, hidden: int, frames: int, memory_block: MakeBlock | None) -> nn.Module:
-        """Make one of the branch's blocks."""
-        return MLPBlock(hidden, frames)
-
-    def forward(self, h: Tensor, past: object, newest: int) -> Tensor:
-        """Map the hidden state (B, T, d) to the newest frames' (B, newest, size); `past` is ignored."""
-        for block in self.blocks[:-1]:
-            h = block(h)
-        for block in self.blocks[-1:]:
-            assert isinstance(block, MLPBlock)
-            h = block.newest(h, newest)
-        return self.linear(h[..., -newest:, :])
-
-
-class MemoryBranch(Branch):
-    """A branch whose blocks take in memory features, as those of the backbone do (Table 8)."""
-
-    def block(self, hidden: int, frames: int, memory_block: MakeBlock | None) -> nn.Module:
-        """Make one of the branch's blocks, which is a memory block."""
-        assert memory_block is not None
-        return memory_block()
 
     def forward(self, h: Tensor, past: object, newest: int) -> Tensor:
         """Map the hidden state (B, T, d) and the recalled past to the newest frames' (B, newest, size)."""
-        for block in self.blocks:
+        for block in self.blocks[:-1]:
             h = block(h, past)
+        for last in self.blocks[-1:]:
+            h = last.newest(h, newest) if isinstance(last, MLPBlock) else last(h, past)
         return self.linear(h[..., -newest:, :])
 
 
@@ -103,62 +86,30 @@ class RotationOnlyMemorySettings(TwoBranchMemorySettings):
     positions: ClassVar[bool] = False
 
 
-class TwoBranch(nn.Module):
-    """One branch for the rotations and one for the positions.
+class Predictor(nn.Module):
+    """A branch for the rotations, and one for the positions where `branches` has them.
 
     Args:
         depth: number of blocks in each branch.
         hidden: the backbone's d.
         frames: the backbone's T.
-        memory_block: makes a memory block; not used here.
+        memory_block: makes a memory block.
+
+    Attributes:
+        branches: the parts of the motion that have a branch, "rotation" and perhaps "position". Without the
+            latter, positions follow by forward kinematics, without gradients.
+        memory_blocks: whether the branches consist of memory blocks.
     """
 
     branches: ClassVar[frozenset[str]] = frozenset({"rotation", "position"})
-    kind: ClassVar[type[Branch]] = Branch
+    memory_blocks: ClassVar[bool] = False
 
     def __init__(self, depth: int, *, hidden: int, frames: int, memory_block: MakeBlock | None = None):
         super().__init__()
-        self.rotation = self.kind(ROTATION.stop, depth, hidden, frames, memory_block)
-        self.position = self.kind(MOTION_DIM - ROTATION.stop, depth, hidden, frames, memory_block)
-
-    def forward(self, h: Tensor, past: object, sparse: Tensor, normalizer: Normalizer, newest: int) -> Tensor:
-        """Predict the newest frames' motion.
-
-        Args:
-            h: hidden state (B, T, d).
-            past: what the memory recalls.
-            sparse: not used here.
-            normalizer: not used here.
-            newest: how many of the newest frames are wanted.
-
-        Returns:
-            Motion (B, newest, 198) in network space.
-        """
-        return torch.cat([self.rotation(h, past, newest), self.position(h, past, newest)], -1)
-
-
-class TwoBranchMemory(TwoBranch):
-    """Two branches, both of memory blocks (Table 8, "MHP w/ MB")."""
-
-    kind = MemoryBranch
-
-
-class RotationOnly(nn.Module):
-    """One branch for the rotations; positions follow by forward kinematics, without gradients.
-
-    Args:
-        depth: number of blocks.
-        hidden: the backbone's d.
-        frames: the backbone's T.
-        memory_block: makes a memory block; not used here.
-    """
-
-    branches: ClassVar[frozenset[str]] = frozenset({"rotation"})
-    kind: ClassVar[type[Branch]] = Branch
-
-    def __init__(self, depth: int, *, hidden: int, frames: int, memory_block: MakeBlock | None = None):
-        super().__init__()
-        self.rotation = self.kind(ROTATION.stop, depth, hidden, frames, memory_block)
+        make = memory_block if self.memory_blocks else None
+        self.rotation = Branch(ROTATION.stop, depth, hidden, frames, make)
+        if "position" in self.branches:
+            self.position = Branch(MOTION_DIM - ROTATION.stop, depth, hidden, frames, make)
 
     def forward(self, h: Tensor, past: object, sparse: Tensor, normalizer: Normalizer, newest: int) -> Tensor:
         """Predict the newest frames' motion.
@@ -173,17 +124,32 @@ class RotationOnly(nn.Module):
         Returns:
             Motion (B, newest, 198) in network space.
         """
-        rotation, sparse = self.rotation(h, past, newest), sparse[..., -newest:, :]
+        rotation = self.rotation(h, past, newest)
+        if "position" in self.branches:
+            return torch.cat([rotation, self.position(h, past, newest)], -1)
+        sparse = sparse[..., -newest:, :]
         posed = normalizer.posed(rotation.detach(), sparse)
         motion = normalizer.encode_motion(posed, normalizer.origin(sparse))
-        position = motion[..., ROTATION.stop :]
-        return torch.cat([rotation, position], -1)
+        return torch.cat([rotation, motion[..., ROTATION.stop :]], -1)
+
+
+class TwoBranch(Predictor):
+    """One branch for the rotations and one for the positions."""
+
+
+class TwoBranchMemory(Predictor):
+    """Two branches, both of memory blocks (Table 8, "MHP w/ MB")."""
+
+    memory_blocks = True
+
+
+class RotationOnly(Predictor):
+    """One branch for the rotations."""
+
+    branches = frozenset({"rotation"})
 
 
 class RotationOnlyMemory(RotationOnly):
     """One rotation branch of memory blocks: Table 8's comparison without a position branch."""
 
-    kind = MemoryBranch
-
-
-Predictor = TwoBranch | RotationOnly
+    memory_blocks = True
