@@ -144,7 +144,7 @@ def mirror() -> Numbers:
 def schedule(name: str) -> Numbers:
     """Its course."""
     optim = Optim(steps=20, batch=1, lr=1e-2, final_lr=1e-4, schedule=name, drop_at=0.6)
-    return {str(step): optim.factor(step) for step in range(20)}
+    return {str(step): optim.compute_factor(step) for step in range(20)}
 
 
 def rollout(make: Callable[[], Rollout]) -> Numbers:

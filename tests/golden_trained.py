@@ -49,7 +49,7 @@ def vqvae(codebook: str = "ema") -> Numbers:
 def _trained(task: VQVAETask | MotionTask | RefinerTask | PartTask, optim: Optim) -> Numbers:
     """The losses of three steps, and the weights after them."""
     optimiser, found = optim.build(task.parameter_groups()), {}
-    average = optim.average(task.module, optimiser)
+    average = optim.make_average(task.module, optimiser)
     for step in range(optim.steps):
         seed_step(0, step)
         result = train_step(task, optim, optimiser, step)

@@ -57,7 +57,9 @@ def vqvae_task(optim: Optim = OPTIM) -> VQVAETask:
 def part_task(kind: str, optim: Optim = OPTIM, seed: int = 0) -> PartTask:
     """The task of training one of SAGE-Net's parts; those before it have random weights."""
     net = tiny.baseline("sage", seed=seed)
-    halves = nn.ModuleDict({"net": net, "upper": net.codes(UPPER), "lower": net.codes(LOWER)}).eval()
+    halves = nn.ModuleDict(
+        {"net": net, "upper": net.make_codes(UPPER), "lower": net.make_codes(LOWER)}
+    ).eval()
     part = {"upper_diffusion": net.upper, "lower_diffusion": net.lower}.get(kind, halves[kind.split("_")[0]])
     network = NetworkTraining(seed, lambda branches: TermsLoss(angle=1), TeacherForcing(), optim, "frames")
     windows = Windows(network, tiny.frames(), tiny.frames((30,), seed=9), net.frames)

@@ -111,7 +111,7 @@ def build_training(cfg: DictConfig, metrics: dict[str, UserMetric]) -> NetworkTr
     common |= {"shares": shares(cfg.data), "mirror": cfg.data.mirror, "metrics": metrics}
     if cfg.refiner is not None:
         refiner = _settings(cfg, "refiner")
-        return RefinerTraining(refiner=refiner, **common | {"optim": common["optim"].at(refiner.lr)})
+        return RefinerTraining(refiner=refiner, **common | {"optim": common["optim"].with_lr(refiner.lr)})
     return NetworkTraining(loss=build_loss(cfg), rollout=build(cfg, "rollout"), **common)
 
 

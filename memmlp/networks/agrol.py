@@ -40,11 +40,11 @@ class AGRoLMLPGraph(StemGraph):
         self.model, self.width = model, model.stem.out_features
         self.blocks = cast(list[MLPBlock], list(model.blocks))
 
-    def entering(self, encoded: Tensor) -> Tensor:
+    def embed_frame(self, encoded: Tensor) -> Tensor:
         """Return the stem's output (1, d) for a frame's inputs (1, 54)."""
         return self.model.stem(encoded)
 
-    def rotation(self, window: Tensor) -> Tensor:
+    def predict_rotation(self, window: Tensor) -> Tensor:
         """Apply the blocks to (T, d), the last block for the newest frame alone, then the head: (1, 132)."""
         *earlier, last = self.blocks
         for block in earlier:
@@ -127,14 +127,14 @@ class AGRoLDiffusionGraph(StemGraph):
         timed = cast(list[TimedBlock], self.blocks)
         self.register_buffer("shifts", torch.stack([block.time(embedding) for block in timed], 1))
 
-    def entering(self, encoded: Tensor) -> Tensor:
+    def embed_frame(self, encoded: Tensor) -> Tensor:
         """Return the part of the stem's output (1, d) that comes from a frame's inputs (1, 54).
 
         The part that comes from the noisy motion is added at each denoiser call.
         """
         return F.linear(encoded, self.model.stem.weight[:, ROTATION.stop :], self.model.stem.bias)
 
-    def rotation(self, window: Tensor) -> Tensor:
+    def predict_rotation(self, window: Tensor) -> Tensor:
         """Sample by DDIM; the denoiser's last call computes the newest frame (1, 132) alone."""
         diffusion, noisy = self.model.diffusion, self.model.noise
         for index in range(len(diffusion.times) - 1):
@@ -231,6 +231,6 @@ class AGRoLDiffusion(WindowModel):
         _, kept = self.append_inputs(sparse, state)
         window, frames = true_frames[..., :SPARSE_DIM], self.normalizer.encode(true_frames)
         encoded, clean = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:][..., ROTATION]
-        time = distributed.draw_rows(self.diffusion.random_times, true_frames)
+        time = distributed.draw_rows(self.diffusion.draw_times, true_frames)
         noisy = self.diffusion.add_noise(clean, time, distributed.draw_rows(torch.randn_like, clean))
         return TrainingOutputs(self.normalizer.posed(self.denoise(noisy, time, encoded), window), kept, {})

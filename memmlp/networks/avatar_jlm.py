@@ -94,9 +94,9 @@ class AvatarJLMGraph(StreamingGraph):
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
-        entering = self.model.tokens(encoded).flatten(1)
+        entering = self.model.make_tokens(encoded).flatten(1)
         window = torch.cat([fill_past(state["tokens"], entering, fresh), entering])
-        h = self.model.placed(window.unflatten(-1, (TOKENS, -1)))
+        h = self.model.add_places(window.unflatten(-1, (TOKENS, -1)))
         first = h[:, -1:]
         for index, layer in enumerate(self.layers[:-1]):
             turned = h if index % 2 == 0 else h.transpose(0, 1)
@@ -105,9 +105,9 @@ class AvatarJLMGraph(StreamingGraph):
         by_token = h.transpose(0, 1)
         newest = attended(self.layers[-1], by_token[:, -1:], by_token).transpose(0, 1)
         features = self.model.reset_input_token(newest, first[-1:]).flatten(1)
-        return self.normalizer.posed(self.rotation(features, encoded), sparse), {"tokens": window[1:]}
+        return self.normalizer.posed(self.predict_rotation(features, encoded), sparse), {"tokens": window[1:]}
 
-    def rotation(self, features: Tensor, encoded: Tensor) -> Tensor:
+    def predict_rotation(self, features: Tensor, encoded: Tensor) -> Tensor:
         """Map the newest frame's tokens (1, 45 d) and inputs (1, 54) to its rotations (1, 132)."""
         return self.model.regressor(features)
 
@@ -195,7 +195,7 @@ class AvatarJLM(WindowModel):
             rotations, positions = forward_kinematics(local, pelvis, self.normalizer.rest)
         return positions - positions[..., HEAD : HEAD + 1, :], matrix_to_sixd(rotations)
 
-    def tokens(self, encoded: Tensor) -> Tensor:
+    def make_tokens(self, encoded: Tensor) -> Tensor:
         """Map inputs (..., 54) in network space to tokens (..., 45, d), without position embeddings."""
         embedded = self.embedding(spread_over_joints(encoded))
         positions, rotations = self.place_coarse_joints(embedded)
@@ -206,7 +206,7 @@ class AvatarJLM(WindowModel):
         whole = self.input_token(embedded.detach())[..., None, :]
         return torch.cat([self.position_token(positions), self.rotation_token(rotations), whole], -2)
 
-    def placed(self, tokens: Tensor) -> Tensor:
+    def add_places(self, tokens: Tensor) -> Tensor:
         """Add the position embeddings of joints and frames to the tokens (..., T, 45, d) of a window."""
         return tokens + self.joint_places + self.time_places[: tokens.shape[-3]]
 
@@ -223,7 +223,7 @@ class AvatarJLM(WindowModel):
 
     def regress(self, encoded: Tensor) -> Tensor:
         """Map inputs (B, T, 54) in network space to what the regressor reads from their tokens (B, T, n)."""
-        h = self.placed(self.tokens(encoded))
+        h = self.add_places(self.make_tokens(encoded))
         first = h[..., -1:, :]
         for index, layer in enumerate(self.layers):
             if index % 2 == 0:

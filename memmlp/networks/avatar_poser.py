@@ -57,9 +57,9 @@ class AvatarPoserGraph(StreamingGraph):
             query, key, value = attention.query(h), attention.key(h), attention.value(h)
         attended = last.attention.attend(query[-1:][None], key[None], value[None])[0]
         features = last.finish(h[-1:], attended)
-        return self.normalizer.posed(self.rotation(features, encoded), sparse), {"first": first}
+        return self.normalizer.posed(self.predict_rotation(features, encoded), sparse), {"first": first}
 
-    def rotation(self, newest: Tensor, encoded: Tensor) -> Tensor:
+    def predict_rotation(self, newest: Tensor, encoded: Tensor) -> Tensor:
         """Map the newest frame's feature (1, d) and inputs (1, 54) to its rotations (1, 132)."""
         return self.model.read(newest)
 

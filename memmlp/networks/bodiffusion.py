@@ -51,7 +51,7 @@ class BoDiffusionGraph(StemGraph):
         )
         motion, sparse = model.stem.weight.unflatten(-1, (N_JOINTS, -1)).tensor_split([NOISY], -1)
         self.motion = linear(motion.flatten(1))
-        mixture = model.mixed(torch.eye(SPARSE_DIM).to(sparse)).flatten(1)
+        mixture = model.mix_thirds(torch.eye(SPARSE_DIM).to(sparse)).flatten(1)
         self.sparse = linear(sparse.flatten(1) @ mixture.T, model.stem.bias)
         head = model.head.weight.unflatten(0, (N_JOINTS, -1)).transpose(0, 1).flatten(1)
         offset = model.head.bias.unflatten(0, (N_JOINTS, -1))
@@ -59,16 +59,16 @@ class BoDiffusionGraph(StemGraph):
         bias = model.joint_head(offset).unflatten(1, (2, NOISY))
         self.made = linear(made.transpose(1, 2).flatten(0, 2), bias.transpose(0, 1).flatten())
 
-    def entering(self, encoded: Tensor) -> Tensor:
+    def embed_frame(self, encoded: Tensor) -> Tensor:
         """Return the part of the stem's output (1, d) that comes from a frame's inputs (1, 54).
 
         The part that comes from the noisy motion is added at each denoiser call.
         """
         return self.sparse(encoded)
 
-    def rotation(self, window: Tensor) -> Tensor:
+    def predict_rotation(self, window: Tensor) -> Tensor:
         """Sample step by step; the last step makes the newest frame (1, 132) alone."""
-        diffusion, limits = self.model.diffusion, self.model.limits()
+        diffusion, limits = self.model.diffusion, self.model.compute_limits()
         last = len(diffusion.times) - 1
 
         def step(noisy: Tensor, index: int) -> tuple[Tensor, Tensor]:
@@ -156,20 +156,20 @@ class BoDiffusion(WindowModel):
         self.head = nn.Linear(settings.width, N_JOINTS * (NOISY + CHANNELS))
         self.joint_head = nn.Linear(NOISY + CHANNELS, 2 * NOISY)
         self.register_buffer(
-            "noises", self.drawn(settings.frames), persistent=False
+            "noises", self.draw_noise(settings.frames), persistent=False
         )  # more with more sampling steps
 
-    def drawn(self, frames: int) -> Tensor:
+    def draw_noise(self, frames: int) -> Tensor:
         """Draw the noise (draws, N, 132) for a sample of N frames; it is always the same."""
         draw = torch.Generator().manual_seed(self.noise_seed)
         return torch.randn(self.diffusion.draws, frames, ROTATION.stop, generator=draw)
 
-    def limits(self) -> tuple[Tensor, Tensor]:
+    def compute_limits(self) -> tuple[Tensor, Tensor]:
         """Return the least and the largest values (132,) of 6D rotations, -1 and 1, in network space."""
         mean, std = (part[SPARSE_DIM:][ROTATION] for part in (self.normalizer.mean, self.normalizer.std))
         return (-1 - mean) / std, (1 - mean) / std
 
-    def mixed(self, encoded: Tensor) -> Tensor:
+    def mix_thirds(self, encoded: Tensor) -> Tensor:
         """Spread inputs (..., 54) over the joints (..., 22, 18), mixing the thirds of the input vector."""
         thirds = encoded.unflatten(-1, (len(TRACKED), CHANNELS))
         return self.spread(thirds.transpose(-1, -2)).transpose(-1, -2)
@@ -182,7 +182,7 @@ class BoDiffusion(WindowModel):
             time: diffusion times (B,).
             encoded: inputs (B, T, 54) in network space.
         """
-        joints = torch.cat([noisy.unflatten(-1, (N_JOINTS, NOISY)), self.mixed(encoded)], -1)
+        joints = torch.cat([noisy.unflatten(-1, (N_JOINTS, NOISY)), self.mix_thirds(encoded)], -1)
         h, embedding = self.stem(joints.flatten(-2)) + self.places, F.silu(self.time(time))
         for block in self.blocks:
             h = block(h, embedding)
@@ -192,7 +192,7 @@ class BoDiffusion(WindowModel):
     def step(self, noisy: Tensor, encoded: Tensor, index: int) -> tuple[Tensor, Tensor]:
         """Return mean and variance (B, T, 132) after a sampling step, given motion and inputs (B, T, 54)."""
         time = torch.full((len(noisy),), self.diffusion.times[index], device=noisy.device)
-        return self.diffusion.step(noisy, self.denoise(noisy, time, encoded), index, self.limits())
+        return self.diffusion.step(noisy, self.denoise(noisy, time, encoded), index, self.compute_limits())
 
     def predict_rotations(self, encoded: Tensor) -> Tensor:
         """Sample rotations (B, T, 132) for inputs (B, T, 54), both in network space."""
@@ -222,7 +222,7 @@ class BoDiffusion(WindowModel):
             mean, variance = self.step(noisy[windows], encoded, index)
             return total(mean) / times_covered, total(variance).sqrt() / times_covered
 
-        rotation = self.diffusion.sample(step, self.drawn(count).to(self.noises))
+        rotation = self.diffusion.sample(step, self.draw_noise(count).to(self.noises))
         return self.normalizer.posed(rotation, sparse)
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
@@ -240,11 +240,11 @@ class BoDiffusion(WindowModel):
         _, kept = self.append_inputs(sparse, state)
         window, frames = true_frames[..., :SPARSE_DIM], self.normalizer.encode(true_frames)
         encoded, clean = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:][..., ROTATION]
-        time = distributed.draw_rows(self.diffusion.random_times, true_frames)
+        time = distributed.draw_rows(self.diffusion.draw_times, true_frames)
         noise = distributed.draw_rows(torch.randn_like, clean)
         noisy = self.diffusion.add_noise(clean, time, noise)
         made = self.denoise(noisy, time, encoded)
-        error, bound = self.diffusion.losses(clean, noise, time, made, self.limits())
-        found = self.diffusion.clean(noisy, made.noise, time).clamp(*self.limits())
+        error, bound = self.diffusion.compute_losses(clean, noise, time, made, self.compute_limits())
+        found = self.diffusion.remove_noise(noisy, made.noise, time).clamp(*self.compute_limits())
         losses = {"noise": self.noise_weight * error, "bound": self.bound_weight * bound}
         return TrainingOutputs(self.normalizer.posed(found, window), kept, losses)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 Denoise = Callable[[Tensor, Tensor], Tensor]
 
 
-def cosine_schedule(steps: int) -> Tensor:
+def make_cosine_schedule(steps: int) -> Tensor:
     """Return the cosine schedule: the signal's share (steps,) of the noisy signal's variance, float64.
 
     This is Eq. 17 of Nichol & Dhariwal 2021, where the noise that one step adds has a share of at most 0.999.
@@ -24,7 +24,7 @@ def cosine_schedule(steps: int) -> Tensor:
     return kept.cumprod(0)
 
 
-def linear_schedule(steps: int) -> Tensor:
+def make_linear_schedule(steps: int) -> Tensor:
     """Return the linear schedule: the signal's share (steps,) of the noisy signal's variance, float64.
 
     The noise that one step adds has a share that grows linearly from 1e-4 to 0.02 over 1000 steps (Ho et al.
@@ -51,17 +51,17 @@ class Noising(nn.Module):
         self.times = [self.steps * (i + 1) // sampling_steps - 1 for i in reversed(range(sampling_steps))]
         self.register_buffer("signal", signal.float(), persistent=False)
 
-    def random_times(self, clean: Tensor) -> Tensor:
+    def draw_times(self, clean: Tensor) -> Tensor:
         """Draw a time (B,) for each signal of a batch (B, ...)."""
         return torch.randint(self.steps, (len(clean),), device=clean.device)
 
     def add_noise(self, clean: Tensor, time: Tensor, noise: Tensor) -> Tensor:
         """Mix clean signals (B, ...) with standard normal noise (B, ...) as the times (B,) demand."""
-        signal = at(self.signal, time, clean)
+        signal = look_up(self.signal, time, clean)
         return signal.sqrt() * clean + (1 - signal).sqrt() * noise
 
 
-def at(table: Tensor, time: Tensor, like: Tensor) -> Tensor:
+def look_up(table: Tensor, time: Tensor, like: Tensor) -> Tensor:
     """Return a table's values (..., B, 1, ...) at times (B,), to be broadcast to signals (B, ...)."""
     return table[..., time].unflatten(-1, (-1, *[1] * (like.dim() - 1)))
 
@@ -75,7 +75,7 @@ class Diffusion(Noising):
     """
 
     def __init__(self, steps: int, sampling_steps: int):
-        super().__init__(cosine_schedule(steps), sampling_steps)
+        super().__init__(make_cosine_schedule(steps), sampling_steps)
 
     def sample(self, denoise: Denoise, noise: Tensor) -> Tensor:
         """Sample the clean signal (B, ...) by DDIM that adds no noise (Song et al. 2021, Eq. 12, eta = 0).
@@ -126,7 +126,7 @@ class Denoised(NamedTuple):
     share: Tensor
 
 
-def posterior(signal: Tensor) -> Tensor:
+def compute_posterior(signal: Tensor) -> Tensor:
     """Return the coefficients of the step from a noisy signal to the one before it (Ho et al. 2020, Eq. 7).
 
     Args:
@@ -157,10 +157,10 @@ class AncestralDiffusion(Noising):
     spaced: Tensor
 
     def __init__(self, steps: int, sampling_steps: int):
-        signal = linear_schedule(steps)
+        signal = make_linear_schedule(steps)
         super().__init__(signal, sampling_steps)
-        self.register_buffer("trained", posterior(signal).float(), persistent=False)
-        spaced = posterior(signal[self.times[::-1]]).flip(-1)  # by sampling step: the noisiest first
+        self.register_buffer("trained", compute_posterior(signal).float(), persistent=False)
+        spaced = compute_posterior(signal[self.times[::-1]]).flip(-1)  # by sampling step: the noisiest first
         self.register_buffer("spaced", spaced.float(), persistent=False)
 
     @property
@@ -172,12 +172,12 @@ class AncestralDiffusion(Noising):
         """
         return 1 + sum(time >= QUIET for time in self.times[:-1])
 
-    def clean(self, noisy: Tensor, noise: Tensor, time: Tensor) -> Tensor:
+    def remove_noise(self, noisy: Tensor, noise: Tensor, time: Tensor) -> Tensor:
         """Return the clean signals (B, ...) of noisy ones, given their noise (B, ...) and times (B,)."""
-        signal = at(self.signal, time, noisy)
+        signal = look_up(self.signal, time, noisy)
         return (noisy - (1 - signal).sqrt() * noise) / signal.sqrt()
 
-    def losses(
+    def compute_losses(
         self, clean: Tensor, noise: Tensor, time: Tensor, made: Denoised, limits: tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor]:
         """Return the hybrid loss' two terms, means over components (Nichol & Dhariwal 2021, Eq. 16).
@@ -194,8 +194,8 @@ class AncestralDiffusion(Noising):
             variances only.
         """
         noisy = self.add_noise(clean, time, noise)
-        first, second, least, largest = at(self.trained, time, clean)
-        found = first * self.clean(noisy, made.noise.detach(), time) + second * noisy
+        first, second, least, largest = look_up(self.trained, time, clean)
+        found = first * self.remove_noise(noisy, made.noise.detach(), time) + second * noisy
         true = first * clean + second * noisy
         log_variance = least + (made.share + 1) / 2 * (largest - least)
         spread = log_variance - least
@@ -220,7 +220,7 @@ class AncestralDiffusion(Noising):
         """
         time = torch.full((1,), self.times[index], device=noisy.device)
         first, second, least, largest = self.spaced[:, index]
-        clean = self.clean(noisy, made.noise, time)
+        clean = self.remove_noise(noisy, made.noise, time)
         if index + 1 < len(self.times):
             clean = clean.clamp(*limits)
         mean = first * clean + second * noisy

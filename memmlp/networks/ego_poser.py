@@ -31,7 +31,7 @@ def center_on_head(sparse: Tensor) -> Tensor:
     return space.sparse_in(sparse, space.origin(sparse))
 
 
-def places(sparse: Tensor) -> Tensor:
+def select_places(sparse: Tensor) -> Tensor:
     """Return the trackers' positions on the floor (..., 6), from inputs (..., 54)."""
     return sparse[..., SPARSE_POSITION].unflatten(-1, (len(TRACKED), 3))[..., :2].flatten(-2)
 
@@ -57,12 +57,12 @@ class EgoPoserGraph(StreamingGraph):
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         local = center_on_head(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
-        place = places(local)
+        place = select_places(local)
         entering = {"embedded": self.model.embedding(torch.cat([local, place], -1)), "places": place}
         window = {
             name: torch.cat([fill_past(state[name], frame, fresh), frame]) for name, frame in entering.items()
         }
-        slow, fast = self.model.views(window["embedded"])
+        slow, fast = self.model.make_views(window["embedded"])
         first = F.linear(window["places"][:1], self.model.embedding.weight[:, SPARSE_DIM:])
         newest = encode_newest_frame(self.layers, slow + fast - 2 * first)
         kept = {name: frames[1:] for name, frames in window.items()}
@@ -110,12 +110,12 @@ class EgoPoser(AvatarPoser):
 
     def predict_rotations(self, encoded: Tensor) -> Tensor:
         local = center_on_head(encoded)
-        moved = places(local) - places(local[:, :1])
-        slow, fast = self.views(torch.cat([local, moved], -1))
+        moved = select_places(local) - select_places(local[:, :1])
+        slow, fast = self.make_views(torch.cat([local, moved], -1))
         return self.encode(self.embedding(slow) + self.embedding(fast))
 
     @staticmethod
-    def views(window: Tensor) -> tuple[Tensor, Tensor]:
+    def make_views(window: Tensor) -> tuple[Tensor, Tensor]:
         """Return the slow and the fast view of a window (..., T, n): half of its frames each."""
         slow = window[..., ::2, :]
         return slow, window[..., -slow.shape[-2] :, :]

@@ -49,7 +49,7 @@ def split_by_tracker(sparse: Tensor) -> list[Tensor]:
     return [sparse[..., part].unflatten(-1, (len(TRACKED), -1)) for part in parts]
 
 
-def in_head(rotation: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
+def move_to_head(rotation: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
     """Return the hands' rotations (..., 2, 3, 3) and positions (..., 2, 3) in the head's frame.
 
     Args:
@@ -71,8 +71,8 @@ def locate_hands(sparse: Tensor) -> list[Tensor]:
     with in_float32(sparse.device):
         now = sixd_to_matrix(rotation)
         before = now @ sixd_to_matrix(turn).transpose(-1, -2)
-        rotations, positions = in_head(now, position)
-        earlier, places = in_head(before, position - velocity)
+        rotations, positions = move_to_head(now, position)
+        earlier, places = move_to_head(before, position - velocity)
         turned = earlier.transpose(-1, -2) @ rotations
     return [matrix_to_sixd(rotations), matrix_to_sixd(turned), positions, positions - places]
 
@@ -95,7 +95,7 @@ class TokenEmbedding(nn.Module):
         return F.leaky_relu(torch.cat(made, -1))
 
 
-def shares(width: int) -> list[int]:
+def split_width(width: int) -> list[int]:
     """Divide a width into four parts that are as equal as possible."""
     bounds = [width * part // 4 for part in range(5)]
     return [stop - start for start, stop in pairwise(bounds)]
@@ -170,7 +170,7 @@ class HMDPoserGraph(FrameGraph):
     model: HMDPoser
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        features, kept = self.model.features(sparse[None], state)
+        features, kept = self.model.compute_features(sparse[None], state)
         return self.normalizer.posed(self.model.pose(features[0]), sparse), kept
 
 
@@ -213,7 +213,7 @@ class HMDPoser(WindowlessModel):
     def __init__(self, normalizer: Normalizer, settings: HMDPoserSettings):
         super().__init__(normalizer, settings.frames)
         self.width, self.depth, self.shape_weight = settings.width, settings.depth, settings.shape_weight
-        tracked, turns = ((6, 6, 3, 3), shares(settings.width)), 15 * settings.width // 32
+        tracked, turns = ((6, 6, 3, 3), split_width(settings.width)), 15 * settings.width // 32
         self.trackers = nn.ModuleList(TokenEmbedding(*tracked) for _ in TRACKED)
         self.hands = nn.ModuleList(TokenEmbedding(*tracked) for _ in range(HANDS))
         unseen = (6, 6, 3), (turns, turns, settings.width - 2 * turns)
@@ -242,7 +242,7 @@ class HMDPoser(WindowlessModel):
         state = torch.zeros(batch, TOKENS * self.depth, self.width).to(self.normalizer.mean)
         return {"hidden": state, "cell": state.clone()}
 
-    def tokens(self, sparse: Tensor) -> Tensor:
+    def make_tokens(self, sparse: Tensor) -> Tensor:
         """Map world inputs (B, n, 54) to the tokens (B, n, 8, d)."""
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
         nothing = [encoded.new_zeros(*encoded.shape[:-1], OTHERS, size) for size in (6, 6, 3)]
@@ -256,9 +256,9 @@ class HMDPoser(WindowlessModel):
             found += [layer(*own) for layer, *own in each]
         return self.norm(torch.stack(found, -2))
 
-    def features(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
+    def compute_features(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
         """Map world inputs (B, n, 54) and the state to features (B, n, 8 d) and the state after them."""
-        tokens = self.tokens(sparse)
+        tokens = self.make_tokens(sparse)
         states = (state[name].split(TOKENS, 1) for name in ("hidden", "cell"))
         carried = []
         for block, *of in zip(self.blocks, *states, strict=True):
@@ -272,13 +272,13 @@ class HMDPoser(WindowlessModel):
 
         By default the n new frames are returned, which are the most that this network can make.
         """
-        features, kept = self.features(sparse, state)
+        features, kept = self.compute_features(sparse, state)
         wanted = sparse.shape[1] if newest is None else newest
         return self.normalizer.posed(self.pose(features[:, -wanted:]), sparse[:, -wanted:]), kept
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call, which adds the loss of the predicted shape; see MotionModel."""
-        features, kept = self.features(sparse, state)
+        features, kept = self.compute_features(sparse, state)
         return TrainingOutputs(
             self.normalizer.posed(self.pose(features), sparse), kept, self._shape_loss(features)
         )

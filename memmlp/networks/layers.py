@@ -131,7 +131,7 @@ def _counts(layer: nn.Module) -> bool:
     return isinstance(layer, _BatchNorm) or getattr(layer, "of_whole_batch", False)
 
 
-def products(weights: Sequence[Tensor], x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+def compute_products(weights: Sequence[Tensor], x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
     """Return the contributions of an input (B, n) and of the hidden state (B, d) to a layer's gates.
 
     Args:
@@ -143,9 +143,9 @@ def products(weights: Sequence[Tensor], x: Tensor, hidden: Tensor) -> tuple[Tens
     return F.linear(x, of_input, input_bias), F.linear(hidden, of_hidden, hidden_bias)
 
 
-def gru_step(weights: Sequence[Tensor], x: Tensor, state: Tensor) -> Tensor:
+def step_gru(weights: Sequence[Tensor], x: Tensor, state: Tensor) -> Tensor:
     """Return a GRU layer's state (B, d) after an input (B, n) at a state (B, d), in plain layers."""
-    entering, again = (part.chunk(3, -1) for part in products(weights, x, state))
+    entering, again = (part.chunk(3, -1) for part in compute_products(weights, x, state))
     reset, keep = (torch.sigmoid(entering[gate] + again[gate]) for gate in range(2))
     new = torch.tanh(entering[2] + reset * again[2])
     return new + keep * (state - new)

@@ -59,13 +59,13 @@ PREDICTED = 6 * (1 + len(KEPT)) + SWIVELS + PLACES
 AUXILIARY = 6 * (N_JOINTS - 1)  # rotations that MANIKIN-L predicts in training alone
 
 
-def follows(joint: int) -> bool:
+def is_placed(joint: int) -> bool:
     """Return whether a joint's position follows from the predicted rotations alone."""
     parent = PARENTS[joint]
-    return parent <= ROOT or (parent in KEPT and follows(parent))
+    return parent <= ROOT or (parent in KEPT and is_placed(parent))
 
 
-PLACED = [joint for joint in range(N_JOINTS) if follows(joint)]
+PLACED = [joint for joint in range(N_JOINTS) if is_placed(joint)]
 
 
 class PredictedParts(NamedTuple):
@@ -84,7 +84,7 @@ class PredictedParts(NamedTuple):
     toe: Tensor
 
     @classmethod
-    def of(cls, made: Tensor, normalizer: Normalizer) -> PredictedParts:
+    def from_outputs(cls, made: Tensor, normalizer: Normalizer) -> PredictedParts:
         """Return the parts of a network's outputs (..., 86 or more)."""
         chosen = [ROOT, *KEPT]
         mean, std = (
@@ -108,17 +108,17 @@ class PredictedParts(NamedTuple):
             rows[joint] = rotation
         return torch.stack(rows, -3)
 
-    def body(self, rest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def pose_body(self, rest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the trunk, its global rotations (..., 22, 3, 3), and joints (..., 22, 3) from the pelvis."""
         trunk = self.trunk
         return trunk, *forward_kinematics(trunk, torch.zeros_like(trunk[..., ROOT, :, 0]), rest)
 
-    def posed(self, encoded: Tensor, normalizer: Normalizer) -> Tensor:
+    def solve_pose(self, encoded: Tensor, normalizer: Normalizer) -> Tensor:
         """Return the rotations (..., 132) in network space, with the limbs solved, given inputs (..., 54)."""
         seen = encoded * normalizer.std[:SPARSE_DIM] + normalizer.mean[:SPARSE_DIM]
         places = seen[..., SPARSE_POSITION].unflatten(-1, (len(TRACKED), 3))
         trackers = sixd_to_matrix(seen[..., SPARSE_ROTATION].unflatten(-1, (len(TRACKED), 6)))
-        trunk, turned, joints = self.body(normalizer.rest)
+        trunk, turned, joints = self.pose_body(normalizer.rest)
         anchor = places[..., :1, :]
         joints = joints + (anchor - joints[..., HEAD : HEAD + 1, :])
         local = solve_limbs(
@@ -180,33 +180,35 @@ class Manikin(MotionModel):
         """Return the losses of the parts in outputs (B, n, 86 or more), weighted as in the authors' work."""
         raise NotImplementedError
 
-    def posed(self, made: Tensor, encoded: Tensor) -> Tensor:
+    def solve_pose(self, made: Tensor, encoded: Tensor) -> Tensor:
         """Map outputs (..., 86 or more) and the same frames' inputs (..., 54) to rotations (..., 132).
 
         Limbs are solved in float32 in a mixed-precision training, too.
         """
         with in_float32(made.device):
-            return PredictedParts.of(made.to(encoded.dtype), self.normalizer).posed(encoded, self.normalizer)
+            return PredictedParts.from_outputs(made.to(encoded.dtype), self.normalizer).solve_pose(
+                encoded, self.normalizer
+            )
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call in which each window is turned by its own random heading; see MotionModel."""
         inputs, kept = self.append_inputs(sparse, state)
-        heading, space = self.heading(true_frames), Heading()
+        heading, space = self.draw_headings(true_frames), Heading()
         window = space.sparse_in(inputs[:, -self.frames :], heading)
         encoded = self.normalizer.encode_sparse(window, self.normalizer.origin(window))
         made = self.predict_parts(encoded)
         count = made.shape[1]
-        rotation = self.posed(made, encoded[:, -count:])
+        rotation = self.solve_pose(made, encoded[:, -count:])
         motion = space.motion_out(self.normalizer.posed(rotation, window[:, -count:]), heading)
         true = torch.cat([window, space.motion_in(true_frames[..., SPARSE_DIM:], heading)], -1)
-        return TrainingOutputs(motion, kept, self.losses(made, true))
+        return TrainingOutputs(motion, kept, self.compute_losses(made, true))
 
-    def heading(self, true_frames: Tensor) -> Tensor:
+    def draw_headings(self, true_frames: Tensor) -> Tensor:
         """Draw a turn about the world's vertical axis for each window, as an origin (B, 1, 5) of Heading."""
         angle = self.turned * 2 * math.pi * distributed.draw_rows(torch.rand_like, true_frames[:, :1, :1])
         return torch.cat([torch.zeros_like(true_frames[:, :1, :3]), angle.cos(), angle.sin()], -1)
 
-    def losses(self, made: Tensor, true: Tensor) -> dict[str, Tensor]:
+    def compute_losses(self, made: Tensor, true: Tensor) -> dict[str, Tensor]:
         """Return the weighted losses of outputs (B, n, 86 or more), given true world frames (B, T, 252)."""
         motion = self.normalizer.coordinates.motion_in(
             true[..., SPARSE_DIM:], self.normalizer.origin(true[..., :SPARSE_DIM])
@@ -222,8 +224,8 @@ class ManikinSGraph(AvatarPoserGraph):
     float32_modules = (*AvatarPoserGraph.float32_modules, "model.swivel", "model.places")
     model: ManikinS
 
-    def rotation(self, newest: Tensor, encoded: Tensor) -> Tensor:
-        return self.model.posed(self.model.read(newest), encoded)
+    def predict_rotation(self, newest: Tensor, encoded: Tensor) -> Tensor:
+        return self.model.solve_pose(self.model.read(newest), encoded)
 
 
 @component("model", "manikin_s", version=3, builds="ManikinS")
@@ -270,7 +272,7 @@ class ManikinS(Manikin, AvatarPoser):
         return self.encode(self.embedding(encoded))[:, None]
 
     def predict_rotations(self, encoded: Tensor) -> Tensor:
-        return self.posed(self.predict_parts(encoded), encoded[:, -1:])[:, 0]
+        return self.solve_pose(self.predict_parts(encoded), encoded[:, -1:])[:, 0]
 
     def compute_part_losses(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
         """Return the losses of the parts in outputs (B, 1, 86), weighted as in the authors' work.
@@ -279,8 +281,8 @@ class ManikinS(Manikin, AvatarPoser):
         would have no bound where a limb is nearly along the axis from which its swivel is measured, as in a
         standing leg, and trainings diverged. The losses of middles and of swivels are sums over the limbs.
         """
-        parts = PredictedParts.of(made, self.normalizer)
-        _, turned, joints = parts.body(self.normalizer.rest)
+        parts = PredictedParts.from_outputs(made, self.normalizer)
+        _, turned, joints = parts.pose_body(self.normalizer.rest)
         base, middle, end = true.limbs()
         up, angle = turned[..., list(BASES), :, 1].detach(), F.normalize(parts.swivel, dim=-1)
         lengths = [(one - other).norm(dim=-1, keepdim=True) for one, other in ((base, middle), (middle, end))]
@@ -301,8 +303,8 @@ class ManikinLGraph(AvatarJLMGraph):
 
     model: ManikinL
 
-    def rotation(self, features: Tensor, encoded: Tensor) -> Tensor:
-        return self.model.posed(self.model.regressor(features), encoded)
+    def predict_rotation(self, features: Tensor, encoded: Tensor) -> Tensor:
+        return self.model.solve_pose(self.model.regressor(features), encoded)
 
 
 @component("model", "manikin_l", version=2, builds="ManikinL")
@@ -345,11 +347,11 @@ class ManikinL(Manikin, AvatarJLM):
         return self.regress(encoded)
 
     def predict_rotations(self, encoded: Tensor) -> Tensor:
-        return self.posed(self.predict_parts(encoded), encoded)
+        return self.solve_pose(self.predict_parts(encoded), encoded)
 
-    def losses(self, made: Tensor, true: Tensor) -> dict[str, Tensor]:
+    def compute_losses(self, made: Tensor, true: Tensor) -> dict[str, Tensor]:
         """Return the weighted losses of the parts and of the coarse pose; see Manikin."""
-        return super().losses(made, true) | self.compute_coarse_loss(true)
+        return super().compute_losses(made, true) | self.compute_coarse_loss(true)
 
     def compute_part_losses(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
         """Return the losses of the parts in outputs (B, T, 212), weighted as in the authors' work.
@@ -357,7 +359,7 @@ class ManikinL(Manikin, AvatarJLM):
         Swivels are compared as angles, measured from the true shoulders and hips. Toes are compared with the
         head on its tracker.
         """
-        parts = PredictedParts.of(made, self.normalizer)
+        parts = PredictedParts.from_outputs(made, self.normalizer)
         turned, _ = forward_kinematics(
             sixd_to_matrix(true.sixd), torch.zeros_like(true.joints[..., ROOT, :]), self.normalizer.rest
         )

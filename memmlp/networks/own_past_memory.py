@@ -136,7 +136,7 @@ class CodeIndices(nn.Module):
 
     def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
         """Return the index (1, 1) for a frame's inputs (1, 1, 54) and motion (1, 1, 198)."""
-        return self.codebook.indices(self.encoder(torch.cat([sparse[0], motion[0]], -1)))[None]
+        return self.codebook.find_indices(self.encoder(torch.cat([sparse[0], motion[0]], -1)))[None]
 
 
 class OwnPastRecall(Recall):
@@ -376,7 +376,7 @@ class JointCodeMemory(VQMemory):
         """
         if not self.training:
             return super().code_vectors(sparse, motion)
-        latent = self.codes.latent(torch.cat([sparse, motion], -1))
+        latent = self.codes.encode(torch.cat([sparse, motion], -1))
         return straight_through(latent, self.codes.codebook(latent)[0])
 
     def auxiliary_losses(self, frames: Tensor, normalizer: Normalizer) -> dict[str, Tensor]:
@@ -384,5 +384,5 @@ class JointCodeMemory(VQMemory):
 
         An EMA codebook learns from this call.
         """
-        auxiliary_losses, _ = self.codes.loss_terms(normalizer.encode(frames).flatten(0, 1), normalizer)
+        auxiliary_losses, _ = self.codes.compute_losses(normalizer.encode(frames).flatten(0, 1), normalizer)
         return {f"vqvae_{name}": term for name, term in auxiliary_losses.items()}

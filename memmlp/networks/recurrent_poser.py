@@ -16,7 +16,7 @@ from memmlp.common.settings import at_least, one_of, setting, sized
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.layers import gru_step, products
+from memmlp.networks.layers import compute_products, step_gru
 from memmlp.networks.limb_solver import reach_hands, use_tracker_rotations
 from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel
 from memmlp.networks.settings import NetworkSettings
@@ -74,7 +74,7 @@ class GRUCell(RecurrentCell):
 
     def step(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Take in one input (B, d) at a state (B, d); see RecurrentCell."""
-        state = gru_step(self.layer.all_weights[0], x, state)
+        state = step_gru(self.layer.all_weights[0], x, state)
         return state, state
 
 
@@ -96,7 +96,7 @@ class LSTMCell(RecurrentCell):
     def step(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Take in one input (B, d) at a state (B, 2 d); see RecurrentCell."""
         hidden, cell = state.chunk(2, -1)
-        entering, again = products(self.layer.all_weights[0], x, hidden)
+        entering, again = compute_products(self.layer.all_weights[0], x, hidden)
         enter, keep, new, show = (entering + again).chunk(4, -1)
         cell = torch.sigmoid(keep) * cell + torch.sigmoid(enter) * torch.tanh(new)
         hidden = torch.sigmoid(show) * torch.tanh(cell)
@@ -198,14 +198,14 @@ class RecurrentBlock(nn.Module):
         x = self.cell_norm(h)
         with in_float32(h.device):  # a state adds up what bfloat16 rounds
             made, state = self.cell(x.float() if x.dtype == torch.bfloat16 else x, state)
-        return self.mixed(h + made), state
+        return self.mix_channels(h + made), state
 
     def step(self, h: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Map one frame (B, d) and the cell's state to (B, d) and the state after it."""
         made, state = self.cell.step(self.cell_norm(h), state)
-        return self.mixed(h + made), state
+        return self.mix_channels(h + made), state
 
-    def mixed(self, h: Tensor) -> Tensor:
+    def mix_channels(self, h: Tensor) -> Tensor:
         """Mix the channels of (..., d)."""
         return h + self.mlp(self.norm(h))
 
@@ -213,22 +213,22 @@ class RecurrentBlock(nn.Module):
 class RotationOutput(nn.Module):
     """What a member's outputs (..., 132) mean as rotations; the interface of the option `model.output`."""
 
-    def begin(self, head: nn.Linear, normalizer: Normalizer) -> None:
+    def init_head(self, head: nn.Linear, normalizer: Normalizer) -> None:
         """Change the initial weights of a member's head; by default they stay as they are."""
 
-    def posed(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
+    def pose(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
         """Map a member's outputs (..., 132) to world motion (..., 198), given inputs (..., 54)."""
         raise NotImplementedError
 
-    def learned(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        """Map a member's outputs to the motion that the losses compare; by default the same as `posed`."""
-        return self.posed(made, sparse, normalizer)
+    def pose_for_losses(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
+        """Map a member's outputs to the motion that the losses compare; by default the same as `pose`."""
+        return self.pose(made, sparse, normalizer)
 
 
 class LocalRotations(RotationOutput):
     """Each joint's rotation in its parent's frame."""
 
-    def posed(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
+    def pose(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
         return normalizer.posed(made, sparse)
 
 
@@ -238,17 +238,17 @@ class GlobalRotations(RotationOutput):
     No joint inherits its ancestors' errors, and the positions are sums of turned bones.
     """
 
-    def begin(self, head: nn.Linear, normalizer: Normalizer) -> None:
+    def init_head(self, head: nn.Linear, normalizer: Normalizer) -> None:
         """Begin near the mean pose: trainings that begin at random rotations leave legs turned wrongly."""
         with torch.no_grad():
             head.weight *= 0.3
-            head.bias.copy_(mean_pose(normalizer))
+            head.bias.copy_(compute_mean_pose(normalizer))
 
-    def posed(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
+    def pose(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
         with in_float32(made.device):
-            return normalizer.posed_in_world(self.in_world(made, sparse, normalizer), sparse)
+            return normalizer.posed_in_world(self.turn_to_world(made, sparse, normalizer), sparse)
 
-    def in_world(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
+    def turn_to_world(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
         """Map a member's outputs (..., 132) to global rotations in the world, given inputs (..., 54)."""
         return normalizer.rotations_out(made.to(sparse.dtype), normalizer.origin(sparse))
 
@@ -260,14 +260,14 @@ class ReachingArms(GlobalRotations):
     errors.
     """
 
-    def posed(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
+    def pose(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
         with in_float32(made.device):
-            rotations = use_tracker_rotations(self.in_world(made, sparse, normalizer), sparse)
+            rotations = use_tracker_rotations(self.turn_to_world(made, sparse, normalizer), sparse)
             return normalizer.posed_in_world(rotations, sparse, reach_hands)
 
-    def learned(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
+    def pose_for_losses(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
         """Map a member's outputs (..., 132) to world motion whose arms have not been made to reach."""
-        return super().posed(made, sparse, normalizer)
+        return super().pose(made, sparse, normalizer)
 
 
 OUTPUTS: dict[str, type[RotationOutput]] = {
@@ -278,7 +278,7 @@ OUTPUTS: dict[str, type[RotationOutput]] = {
 """What the rotations may stand for, by the names that the config knows."""
 
 
-def mean_pose(normalizer: Normalizer) -> Tensor:
+def compute_mean_pose(normalizer: Normalizer) -> Tensor:
     """Return the global rotations (132,), 6D, of the mean pose in the network's coordinates.
 
     They are zeros where the normalizer has no mean (`normalizer.z_scores=false`).
@@ -330,12 +330,12 @@ class Member(nn.Module):
         return self.head(self.norm(h)), kept
 
 
-def _joined(states: Mapping[str, State]) -> State:
+def _join(states: Mapping[str, State]) -> State:
     """Merge the states of several members into one."""
     return {f"{name}_{block}": value for name, state in states.items() for block, value in state.items()}
 
 
-def _of(state: State, member: str) -> State:
+def _select(state: State, member: str) -> State:
     """Return the state of one member, taken from the merged state of all."""
     own = f"{member}_"
     return {name.removeprefix(own): value for name, value in state.items() if name.startswith(own)}
@@ -430,7 +430,7 @@ class RecurrentPoser(WindowlessModel):
             }
         )
         for _, member in self.named_members():
-            self.output.begin(member.head, normalizer)
+            self.output.init_head(member.head, normalizer)
 
     def named_members(self) -> Iterator[tuple[str, Member]]:
         """Yield the members by their names, in order."""
@@ -438,36 +438,36 @@ class RecurrentPoser(WindowlessModel):
 
     def initial_state(self, batch: int = 1) -> State:
         """Return the state of a fresh start: zeros (B, size) for each cell, named by its member and block."""
-        return _joined(
+        return _join(
             {name: one.initial_state(self.normalizer.mean, batch) for name, one in self.named_members()}
         )
 
-    def encoded(self, sparse: Tensor) -> Tensor:
+    def encode(self, sparse: Tensor) -> Tensor:
         """Map world inputs (..., 54) to network space, as the members see them."""
         return self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
 
-    def posed(self, made: Tensor, sparse: Tensor) -> Tensor:
+    def pose(self, made: Tensor, sparse: Tensor) -> Tensor:
         """Map a member's rotations (..., 132) to world motion (..., 198), given inputs (..., 54)."""
-        return self.output.posed(made, sparse, self.normalizer)
+        return self.output.pose(made, sparse, self.normalizer)
 
-    def made(self, sparse: Tensor, state: State, newest: int) -> tuple[Tensor, State]:
+    def predict_members(self, sparse: Tensor, state: State, newest: int) -> tuple[Tensor, State]:
         """Return the newest rotations of each member (members, B, newest, 132), and the state after them."""
-        x, made, kept = self.encoded(sparse), [], {}
+        x, made, kept = self.encode(sparse), [], {}
         for name, member in self.named_members():
-            rotations, kept[name] = member(x, _of(state, name), newest)
+            rotations, kept[name] = member(x, _select(state, name), newest)
             made.append(rotations)
-        return torch.stack(made), _joined(kept)
+        return torch.stack(made), _join(kept)
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         """Take in the newest frames; see MotionModel."""
         wanted = sparse.shape[1] if newest is None else newest
-        made, kept = self.made(sparse, state, wanted)
-        return self.posed(made.mean(0), sparse[:, sparse.shape[1] - wanted :]), kept
+        made, kept = self.predict_members(sparse, state, wanted)
+        return self.pose(made.mean(0), sparse[:, sparse.shape[1] - wanted :]), kept
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call; it returns the motion of each member (members B, T, 198), one by one."""
-        made, kept = self.made(sparse, state, sparse.shape[1])
-        motion = self.output.learned(made, sparse.expand(len(made), -1, -1, -1), self.normalizer)
+        made, kept = self.predict_members(sparse, state, sparse.shape[1])
+        motion = self.output.pose_for_losses(made, sparse.expand(len(made), -1, -1, -1), self.normalizer)
         return TrainingOutputs(motion.flatten(0, 1), kept, {})
 
     def step(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
@@ -476,8 +476,8 @@ class RecurrentPoser(WindowlessModel):
         Returns:
             World motion (B, 198), and the state after the frame.
         """
-        x, made, kept = self.encoded(sparse), [], {}
+        x, made, kept = self.encode(sparse), [], {}
         for name, member in self.named_members():
-            rotations, kept[name] = member.step(x, _of(state, name))
+            rotations, kept[name] = member.step(x, _select(state, name))
             made.append(rotations)
-        return self.posed(torch.stack(made).mean(0), sparse), _joined(kept)
+        return self.pose(torch.stack(made).mean(0), sparse), _join(kept)

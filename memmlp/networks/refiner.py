@@ -72,7 +72,7 @@ class RefinedGraph(StreamingGraph):
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         motion, kept = self.graph.step(sparse, state, fresh)
-        refined, hidden = self.model.refined(motion[None], sparse[None], state[HIDDEN])
+        refined, hidden = self.model.refine(motion[None], sparse[None], state[HIDDEN])
         return refined[0], {**kept, HIDDEN: hidden}
 
 
@@ -136,11 +136,11 @@ class Refined(MotionModel):
         for frame in sparse.split(1, 1):
             motion, kept = self.network.advance(frame, kept, 1)
             made.append(motion)
-        refined, hidden = self.refined(torch.cat(made, 1), sparse, state[HIDDEN])
+        refined, hidden = self.refine(torch.cat(made, 1), sparse, state[HIDDEN])
         wanted = sparse.shape[1] if newest is None else newest
         return refined[:, -wanted:], {**kept, HIDDEN: hidden}
 
-    def refined(self, motion: Tensor, sparse: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+    def refine(self, motion: Tensor, sparse: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
         """Correct the motion of consecutive frames.
 
         Args:

@@ -26,14 +26,14 @@ from memmlp.networks.transformer import Attention, EncoderLayer
 FRESH = 0.25  # of the training windows begin as a live stream does, without a past
 
 
-def sines(length: int, width: int) -> Tensor:
+def make_sines(length: int, width: int) -> Tensor:
     """Return the position embeddings (length, d), sines and cosines (Vaswani et al. 2017, Sec. 3.5)."""
     rates = torch.exp(-math.log(10_000) * torch.arange(0, width, 2) / width)
     angles = torch.arange(length)[:, None] * rates
     return torch.stack([angles.sin(), angles.cos()], -1).flatten(-2)[:, :width]
 
 
-def freedom(horizon: int) -> Tensor:
+def compute_freedom(horizon: int) -> Tensor:
     """Return how far each of the W predicted frames (W, 1) may change at a step, from almost 0 to 1."""
     distance = torch.arange(1, horizon + 1) / horizon
     return (1 - (distance * math.pi / 2).cos())[:, None]
@@ -113,9 +113,9 @@ class RPM(WindowlessModel):
         )
         self.head = nn.Linear(settings.width, ROTATION.stop)
         self.register_buffer(
-            "places", sines(settings.context + settings.horizon, settings.width), persistent=False
+            "places", make_sines(settings.context + settings.horizon, settings.width), persistent=False
         )
-        self.register_buffer("freedom", freedom(settings.horizon), persistent=False)
+        self.register_buffer("freedom", compute_freedom(settings.horizon), persistent=False)
 
     def initial_state(self, batch: int = 1) -> State:
         """Return the state of a fresh start, zeros.
@@ -167,7 +167,7 @@ class RPM(WindowlessModel):
             "predicted": torch.ones_like(state["predicted"]),
         }
 
-    def encoded(self, sparse: Tensor) -> Tensor:
+    def encode(self, sparse: Tensor) -> Tensor:
         """Map world inputs (..., 54) to network space."""
         return self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
 
@@ -177,7 +177,7 @@ class RPM(WindowlessModel):
         `newest`: how many of the last frames to return, at most n (the default).
         """
         shown = []
-        for frame in self.encoded(sparse).split(1, 1):
+        for frame in self.encode(sparse).split(1, 1):
             made, state = self.roll(frame, state)
             shown.append(made[:, :1])
         wanted = sparse.shape[1] if newest is None else newest
@@ -196,7 +196,7 @@ class RPM(WindowlessModel):
         """
         now = self.frames - self.horizon
         begin = now - int(torch.randint(now - self.context + 1, ()))
-        encoded = self.encoded(sparse)
+        encoded = self.encode(sparse)
         past = slice(begin - self.context, begin)
         state = self.start_windows(state, encoded[:, past], true_frames[:, past])
         training = self.training

@@ -25,7 +25,7 @@ from memmlp.networks.motion_model import (
     TrainingOutputs,
     slide_window,
 )
-from memmlp.networks.sage_parts import LATENT, Decoder, HalfVQVAE, LowerDenoiser, UpperDenoiser, places
+from memmlp.networks.sage_parts import LATENT, Decoder, HalfVQVAE, LowerDenoiser, UpperDenoiser, make_places
 from memmlp.networks.settings import NetworkSettings
 from memmlp.networks.streaming import linear
 from memmlp.networks.transformer import DiTBlock
@@ -53,11 +53,11 @@ class DenoiserAtSamplingTimes(nn.Module):
 
     def condition(self, seen: Tensor) -> Tensor:
         """Return the condition (T // 2, d) that the stem makes from the window's inputs as carried (T, d)."""
-        return self.seen(self.denoiser.condition.shortened(seen))
+        return self.seen(self.denoiser.condition.shorten(seen))
 
     def forward(self, noisy: Tensor, condition: Tensor, index: int) -> Tensor:
         """Map noisy latents (T // 2, 384) at sampling step `index` to clean ones."""
-        h = condition + self.noisy(self.denoiser.aligned(noisy))
+        h = condition + self.noisy(self.denoiser.align_frames(noisy))
         for block, modulation in zip(self.blocks, self.modulations[index], strict=True):
             h = block.newest(h, modulation.chunk(6), h.shape[-2])
         return self.denoiser.head(h)
@@ -89,7 +89,7 @@ class SAGENetGraph(StreamingGraph):
         offset = entering(nothing)
         self.sparse = linear((entering(torch.eye(SPARSE_DIM).to(nothing)) - offset).T, offset[0])
         self.register_buffer(
-            "places", places(nothing.new_zeros(self.frames // 2, model.decoder.stem.out_features))
+            "places", make_places(nothing.new_zeros(self.frames // 2, model.decoder.stem.out_features))
         )
 
     def windows(self) -> State:
@@ -100,21 +100,21 @@ class SAGENetGraph(StreamingGraph):
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
         entering = self.sparse(encoded)
         seen = slide_window(state["seen"], entering, entering, fresh)
-        rotation = self.decoded(*seen.split(self.widths, -1))
+        rotation = self.decode(*seen.split(self.widths, -1))
         return self.normalizer.posed(rotation, sparse), {"seen": seen}
 
-    def decoded(self, for_upper: Tensor, for_lower: Tensor, for_decoder: Tensor) -> Tensor:
+    def decode(self, for_upper: Tensor, for_lower: Tensor, for_decoder: Tensor) -> Tensor:
         """Return the newest frame's rotations (1, 132), from what each part has of the window (T, ...)."""
-        upper = self.sampled(self.upper, for_upper, self.noises[0], lambda noisy: noisy)
-        lower = self.sampled(
+        upper = self.sample(self.upper, for_upper, self.noises[0], lambda noisy: noisy)
+        lower = self.sample(
             self.lower, for_lower, self.noises[1], lambda noisy: self.beside(torch.cat([upper, noisy], -1))
         )
-        shortened = self.decoder.condition.shortened(for_decoder)
+        shortened = self.decoder.condition.shorten(for_decoder)
         h = self.decoder.stem(torch.cat([shortened, upper, lower], -1))
-        newest = self.decoder.stack.last(h, self.places)
+        newest = self.decoder.stack.predict_last(h, self.places)
         return torch.cat([head(newest) for head in self.decoder.heads], -1)
 
-    def sampled(
+    def sample(
         self,
         sampler: DenoiserAtSamplingTimes,
         seen: Tensor,
@@ -202,11 +202,11 @@ class SAGENet(NewestFrameModel):
             "noises", settings.noise * torch.randn(2, settings.frames // 2, LATENT, generator=draw)
         )
 
-    def codes(self, joints: tuple[int, ...]) -> HalfVQVAE:
+    def make_codes(self, joints: tuple[int, ...]) -> HalfVQVAE:
         """Make a VQ-VAE with fresh weights for the half of the body that has the given joints."""
         return HalfVQVAE(joints, **self._codes, dropout=self._dropout)
 
-    def upper_latent(self, encoded: Tensor) -> Tensor:
+    def sample_upper(self, encoded: Tensor) -> Tensor:
         """Sample the upper half's latents (B, T // 2, 384) for inputs (B, T, 54)."""
         condition = self.upper.condition(encoded)
         return self.diffusion.sample(
@@ -214,17 +214,17 @@ class SAGENet(NewestFrameModel):
             self.noises[0].expand(len(encoded), -1, -1),
         )
 
-    def lower_latent(self, upper: Tensor, encoded: Tensor) -> Tensor:
+    def sample_lower(self, upper: Tensor, encoded: Tensor) -> Tensor:
         """Sample the lower half's latents for inputs (B, T, 54), given the upper half's (B, T // 2, 384)."""
         condition = self.lower.condition(encoded)
         return self.diffusion.sample(
-            lambda noisy, time: self.lower.denoise(self.lower.joined(noisy, upper), time, condition),
+            lambda noisy, time: self.lower.denoise(self.lower.join(noisy, upper), time, condition),
             self.noises[1].expand(len(encoded), -1, -1),
         )
 
     def predict_rotations(self, encoded: Tensor) -> Tensor:
-        upper = self.upper_latent(encoded)
-        return self.decoder(upper, self.lower_latent(upper, encoded), encoded)[:, -1]
+        upper = self.sample_upper(encoded)
+        return self.decoder(upper, self.sample_lower(upper, encoded), encoded)[:, -1]
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call through both samplers, for the newest frame alone; see MotionModel."""

@@ -92,21 +92,21 @@ class Stack(nn.Module):
         self.blocks = nn.Sequential(*(AttentionBlock(width, heads, dropout) for _ in range(depth)))
         self.norm, self.head = nn.LayerNorm(width), nn.Linear(width, width, bias=False)
 
-    def before(self, h: Tensor) -> Tensor:
+    def prepare(self, h: Tensor) -> Tensor:
         """Return the features that the blocks get, made from features (B, T, d); by default unchanged."""
         return h
 
-    def after(self, h: Tensor) -> Tensor:
+    def finish(self, h: Tensor) -> Tensor:
         """Return the features made from the blocks' output (B, T, d); by default unchanged."""
         return h
 
     def forward(self, h: Tensor) -> Tensor:
         """Map features (B, T, d) to features (B, T', d)."""
-        h = self.before(h)
-        return self.head(self.norm(self.after(self.blocks(h + places(h)))))
+        h = self.prepare(h)
+        return self.head(self.norm(self.finish(self.blocks(h + make_places(h)))))
 
 
-def places(h: Tensor) -> Tensor:
+def make_places(h: Tensor) -> Tensor:
     """Return position embeddings (T, d) for features (B, T, d), d even (Vaswani et al. 2017, Sec. 3.5).
 
     They are sines and cosines.
@@ -124,7 +124,7 @@ class Shortened(Stack):
         super().__init__(width, depth, heads, dropout)
         self.convolution = nn.Conv1d(width, width, 3, padding=1)
 
-    def before(self, h: Tensor) -> Tensor:
+    def prepare(self, h: Tensor) -> Tensor:
         """Return features (B, T // 2, d) of features (B, T, d)."""
         return F.max_pool1d(self.convolution(h.transpose(1, 2)), 2).transpose(1, 2)
 
@@ -136,11 +136,11 @@ class Lengthened(Stack):
         super().__init__(width, depth, heads, dropout)
         self.convolution = nn.ConvTranspose1d(width, width, 3, stride=2)
 
-    def after(self, h: Tensor) -> Tensor:
+    def finish(self, h: Tensor) -> Tensor:
         """Return features (B, 2 T, d): a transposed convolution doubles the frames of features (B, T, d)."""
         return self.convolution(h.transpose(1, 2))[..., 1:].transpose(1, 2)
 
-    def last(self, h: Tensor, at: Tensor) -> Tensor:
+    def predict_last(self, h: Tensor, at: Tensor) -> Tensor:
         """Map features (T, d) and their position embeddings (T, d) to the last of 2 T frames (1, d) alone."""
         *earlier, block = self.blocks
         h = h + at
@@ -173,9 +173,9 @@ class ProductQuantiser(nn.Module):
         Distances to the code-vectors are in float32, also in mixed-precision training.
         """
         with in_float32(z.device):
-            return self.quantised(z.to(self.vectors.dtype))
+            return self.quantise(z.to(self.vectors.dtype))
 
-    def quantised(self, z: Tensor) -> tuple[Tensor, Tensor]:
+    def quantise(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return what `forward` does, in the precision of the latents (..., 384)."""
         parts = z.flatten(0, -2).unflatten(-1, (BOOKS, -1)).transpose(0, 1)
         distance = torch.cdist(parts, self.vectors).square()
@@ -185,7 +185,7 @@ class ProductQuantiser(nn.Module):
         loss = (found.detach() - z).square().mean() + (found - z.detach()).square().mean()
         if self.training:
             self.revive(parts.detach(), distance.detach(), index)
-            loss = loss + sum(contrast(one) for one in distance[:CONTRASTED])
+            loss = loss + sum(compute_contrast(one) for one in distance[:CONTRASTED])
         return z + (found - z).detach(), loss
 
     @torch.no_grad()
@@ -204,7 +204,7 @@ class ProductQuantiser(nn.Module):
         self.vectors.data.lerp_(nearest, weight)  # .data: the losses' gradients are those of before
 
 
-def contrast(distance: Tensor) -> Tensor:
+def compute_contrast(distance: Tensor) -> Tensor:
     """Return a codebook's contrastive loss: near for the latents closest to a code, far for the farther half.
 
     Args:
@@ -286,9 +286,9 @@ class Halved(nn.Module):
         mixed = self.mixture(encoded)
         if hidden is not None:
             mixed = mixed.masked_fill(hidden[:, None, :, None], HIDDEN)
-        return self.shortened(self.linear(mixed.flatten(-2)))
+        return self.shorten(self.linear(mixed.flatten(-2)))
 
-    def shortened(self, h: Tensor) -> Tensor:
+    def shorten(self, h: Tensor) -> Tensor:
         """Mix features (..., T, d) over time to (..., T // 2, d)."""
         return self.time(h.transpose(-1, -2)).transpose(-1, -2)
 
@@ -312,7 +312,7 @@ class UpperDenoiser(nn.Module):
         self.blocks = nn.ModuleList(DiTBlock(width, heads, 4) for _ in range(depth))
         self.head = nn.Linear(width, LATENT)
 
-    def aligned(self, latent: Tensor) -> Tensor:
+    def align_frames(self, latent: Tensor) -> Tensor:
         """Mix the frames of latents (B, T // 2, 384)."""
         return self.align(latent.transpose(-1, -2)).transpose(-1, -2)
 
@@ -325,7 +325,7 @@ class UpperDenoiser(nn.Module):
 
     def denoise(self, noisy: Tensor, time: Tensor, condition: Tensor) -> Tensor:
         """Map noisy latents (B, T // 2, 384), times (B,) and a condition (B, T // 2, d) to clean ones."""
-        h = self.stem(torch.cat([condition, self.aligned(noisy)], -1))
+        h = self.stem(torch.cat([condition, self.align_frames(noisy)], -1))
         embedding = F.silu(self.time(time))
         for block in self.blocks:
             h = block(h, embedding)
@@ -339,7 +339,7 @@ class LowerDenoiser(UpperDenoiser):
         super().__init__(frames, width=width, depth=depth, heads=heads)
         self.beside = nn.Linear(2 * LATENT, LATENT)
 
-    def joined(self, noisy: Tensor, upper: Tensor) -> Tensor:
+    def join(self, noisy: Tensor, upper: Tensor) -> Tensor:
         """Merge noisy latents (..., 384) and the upper half's latents (..., 384) into one (..., 384)."""
         return self.beside(torch.cat([upper, noisy], -1))
 

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from memmlp.common.errors import InputError
 from memmlp.motion.body import MOTION_DIM, POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.layers import gru_step
+from memmlp.networks.layers import step_gru
 from memmlp.networks.motion_model import MotionModel, State, StreamingGraph, fill_past
 
 
@@ -75,7 +75,7 @@ class FrameGRU(nn.Module):
         """Map an input (B, 1, n) and states (layers, B, d) to the output (B, 1, d) and the new states."""
         h, after = x[:, 0], []
         for weights, state in zip(self.gru.all_weights, hidden.unbind(), strict=True):
-            h = gru_step(weights, h, state)
+            h = step_gru(weights, h, state)
             after.append(h)
         return h[:, None], torch.stack(after)
 
@@ -179,14 +179,14 @@ class StemGraph(StreamingGraph):
         return {"stem": torch.zeros(self.frames - 1, self.width)}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        entering = self.entering(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
+        entering = self.embed_frame(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
         window = torch.cat([fill_past(state["stem"], entering, fresh), entering])
-        return self.normalizer.posed(self.rotation(window), sparse), {"stem": window[1:]}
+        return self.normalizer.posed(self.predict_rotation(window), sparse), {"stem": window[1:]}
 
-    def entering(self, encoded: Tensor) -> Tensor:
+    def embed_frame(self, encoded: Tensor) -> Tensor:
         """Return the stem's output (1, d) for one frame's inputs (1, 54), as it is carried."""
         raise NotImplementedError
 
-    def rotation(self, window: Tensor) -> Tensor:
+    def predict_rotation(self, window: Tensor) -> Tensor:
         """Map a window of the stem's carried outputs (T, d) to the rotations (1, 132) of its newest frame."""
         raise NotImplementedError

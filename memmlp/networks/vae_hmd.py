@@ -75,7 +75,7 @@ class Perceptron(nn.Module):
         return self.head(self.blocks(self.stem(x)))
 
 
-def divergence(latent: Tensor) -> Tensor:
+def compute_divergence(latent: Tensor) -> Tensor:
     """Return the KL divergence of latents (..., 2 z), means and log variances, from the standard normal.
 
     It is summed over the z components and averaged over all other axes.
@@ -84,7 +84,7 @@ def divergence(latent: Tensor) -> Tensor:
     return 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1).mean()
 
 
-def drawn(latent: Tensor) -> Tensor:
+def draw_latent(latent: Tensor) -> Tensor:
     """Draw samples (..., z) from latents (..., 2 z), which are means and log variances."""
     mean, log_variance = latent.chunk(2, -1)
     return mean + (0.5 * log_variance).exp() * distributed.draw_rows(torch.randn_like, mean)
@@ -98,7 +98,7 @@ class VAEHMDGraph(FrameGraph):
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) to world motion (1, 198); nothing is carried on."""
-        mean = self.model.latent(sparse).chunk(2, -1)[0]
+        mean = self.model.encode(sparse).chunk(2, -1)[0]
         return self.normalizer.posed(self.model.decoder(mean), sparse), {}
 
 
@@ -150,7 +150,7 @@ class VAEHMD(WindowlessModel):
         """Count the trainable parameters of the network in use, without the encoder of whole poses."""
         return super().count_parameters() - sum(p.numel() for p in self.pose_encoder.parameters())
 
-    def latent(self, sparse: Tensor) -> Tensor:
+    def encode(self, sparse: Tensor) -> Tensor:
         """Map world inputs (..., 54) to their latents (..., 2 z)."""
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
         return self.encoder(torch.cat([encoded[..., part] for part in POSES], -1))
@@ -161,7 +161,7 @@ class VAEHMD(WindowlessModel):
         `newest`: how many of the last frames to return, at most n (the default).
         """
         seen = sparse if newest is None else sparse[:, -newest:]
-        return self.normalizer.posed(self.decoder(self.latent(seen).chunk(2, -1)[0]), seen), state
+        return self.normalizer.posed(self.decoder(self.encode(seen).chunk(2, -1)[0]), seen), state
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call: each window is decoded either from its true poses or from its trackers.
@@ -175,9 +175,11 @@ class VAEHMD(WindowlessModel):
         """
         posed = (distributed.draw_rows(torch.rand_like, sparse[:, :1, :1]) < 0.5).to(sparse.dtype)
         of_pose = self.pose_encoder(self.normalizer.encode(true_frames)[..., SPARSE_DIM:])
-        latent = posed * of_pose + (1 - posed) * self.latent(sparse)
-        sample = drawn(latent)
+        latent = posed * of_pose + (1 - posed) * self.encode(sparse)
+        sample = draw_latent(latent)
         frozen = {name: weight.detach() for name, weight in self.decoder.named_parameters()}
         live, still = self.decoder(sample), functional_call(self.decoder, frozen, (sample,))
         motion = self.normalizer.posed(posed * live + (1 - posed) * still, sparse)
-        return TrainingOutputs(motion, state, {"divergence": self.divergence_weight * divergence(latent)})
+        return TrainingOutputs(
+            motion, state, {"divergence": self.divergence_weight * compute_divergence(latent)}
+        )

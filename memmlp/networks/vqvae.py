@@ -42,11 +42,11 @@ class Codebook(nn.Module):
 
     vectors: Tensor
 
-    def indices(self, latent: Tensor) -> Tensor:
+    def find_indices(self, latent: Tensor) -> Tensor:
         """Return the index (...) of the code-vector nearest to each latent (..., width), Euclidean."""
         return self._distances(latent).argmin(-1)
 
-    def margins(self, latent: Tensor) -> Tensor:
+    def measure_margins(self, latent: Tensor) -> Tensor:
         """Return how far (...) each latent (..., width) is from having another code-vector as its nearest.
 
         It is the distance to the plane halfway between the two nearest code-vectors, as a share of the
@@ -67,7 +67,7 @@ class Codebook(nn.Module):
 
     def forward(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         """Return the code-vectors (..., width) and indices (...) of latents (..., width)."""
-        index = self.indices(latent)
+        index = self.find_indices(latent)
         return F.embedding(index, self.vectors), index
 
 
@@ -184,7 +184,7 @@ class VQVAE(nn.Module):
         self.codebook: LearnedCodebook = CODEBOOKS[codebook](codes, width, commitment, decay)
         self.decoder = nn.Sequential(*_blocks(width, decoder_depth), nn.Linear(width, ROTATION.stop))
 
-    def latent(self, frames: Tensor) -> Tensor:
+    def encode(self, frames: Tensor) -> Tensor:
         """Encode frames (..., 252) in network space to latents (..., width).
 
         They are computed in float32 in a mixed-precision training, too: rounded latents have other
@@ -195,18 +195,18 @@ class VQVAE(nn.Module):
 
     def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
         """Return the code-vectors (..., width) of inputs (..., 54) and motion (..., 198) in network space."""
-        return self.codebook(self.latent(torch.cat([sparse, motion], -1)))[0]
+        return self.codebook(self.encode(torch.cat([sparse, motion], -1)))[0]
 
     def reconstruct(self, frames: Tensor) -> tuple[Tensor, Quantised]:
         """Reconstruct the rotations (B, 132) of frames (B, 252), with the straight-through gradient.
 
         An EMA codebook learns from this call.
         """
-        latent = self.latent(frames)
+        latent = self.encode(frames)
         quantised: Quantised = self.codebook.learn(latent)
         return self.decoder(straight_through(latent, quantised.codes)), quantised
 
-    def loss_terms(self, frames: Tensor, normalizer: Normalizer) -> tuple[dict[str, Tensor], Tensor]:
+    def compute_losses(self, frames: Tensor, normalizer: Normalizer) -> tuple[dict[str, Tensor], Tensor]:
         """Return the losses by name (Eq. 1 and the codebook's), and the chosen indices (B,).
 
         An EMA codebook learns from this call.
@@ -216,11 +216,14 @@ class VQVAE(nn.Module):
             normalizer: converts between the world and network space.
         """
         rotations, quantised = self.reconstruct(frames)
-        terms = {"rotation": rotation_error(rotations, frames, normalizer), "codebook": quantised.loss}
+        terms = {
+            "rotation": measure_rotation_error(rotations, frames, normalizer),
+            "codebook": quantised.loss,
+        }
         return terms, quantised.indices
 
 
-def rotation_error(rotations: Tensor, frames: Tensor, normalizer: Normalizer) -> Tensor:
+def measure_rotation_error(rotations: Tensor, frames: Tensor, normalizer: Normalizer) -> Tensor:
     """Return Eq. 1 in the world's units, for rotations (B, 132) and frames (B, 252) in network space."""
     error = (rotations - frames[:, SPARSE_DIM:][:, ROTATION]) * normalizer.std[SPARSE_DIM:][ROTATION]
     return error.abs().sum(-1).mean()

@@ -105,7 +105,7 @@ def train(
     """
     check_processes(task, optim, description)
     optimiser = optim.build(task.parameter_groups())
-    average = optim.average(task.module, optimiser)
+    average = optim.make_average(task.module, optimiser)
     start, spent = resume(task, optimiser, average, run)
     started = time.monotonic() - spent
     if start and distributed.is_first():
@@ -147,7 +147,7 @@ def train_step(task: TrainingTask, optim: Optim, optimiser: torch.optim.Optimize
     task.module.train()
     for group in optimiser.param_groups:
         group.setdefault("initial_lr", group["lr"])
-        group["lr"] = group["initial_lr"] * optim.factor(step)
+        group["lr"] = group["initial_lr"] * optim.compute_factor(step)
     device = task.dataset.frames.device
     mixed = torch.autocast(device.type, torch.bfloat16) if optim.precision == "bf16" else nullcontext()
     with mixed, distributed.share_batch():

@@ -136,7 +136,7 @@ class Optim:
     validate_every: int = 1000
     log_every: int = 50
 
-    def at(self, lr: float | None) -> Self:
+    def with_lr(self, lr: float | None) -> Self:
         """Return this optimisation with another learning rate at the start, and the final one in proportion.
 
         Args:
@@ -144,7 +144,7 @@ class Optim:
         """
         return self if lr is None else replace(self, lr=lr, final_lr=self.final_lr * lr / self.lr)
 
-    def factor(self, step: int) -> float:
+    def compute_factor(self, step: int) -> float:
         """Return the learning rate at a step as a fraction of the learning rate at the start."""
         course = SCHEDULES[self.schedule](step / self.steps, self.final_lr / self.lr, self.drop_at)
         return self.warm(step) * course
@@ -161,7 +161,7 @@ class Optim:
         kind = torch.optim.AdamW if self.decoupled else torch.optim.Adam
         return kind(groups, lr=self.lr, weight_decay=self.weight_decay, betas=self.betas, fused=True)
 
-    def average(self, module: nn.Module, optimiser: torch.optim.Optimizer) -> Average:
+    def make_average(self, module: nn.Module, optimiser: torch.optim.Optimizer) -> Average:
         """Make the object that says which weights of the module count."""
         return EMA(module, self.ema) if self.ema else Average(module)
 
@@ -186,9 +186,9 @@ class Muon(Optim):
     other_lr: float | None = None
     vectors: str = "adamw"
 
-    def at(self, lr: float | None) -> Self:
+    def with_lr(self, lr: float | None) -> Self:
         """Return these settings with another learning rate; `other_lr` is scaled by the same factor."""
-        other = super().at(lr)
+        other = super().with_lr(lr)
         if lr is None or self.other_lr is None:
             return other
         return replace(other, other_lr=self.other_lr * lr / self.lr)
@@ -225,7 +225,7 @@ class ScheduleFree(Optim):
     `ema` have no effect.
     """
 
-    def factor(self, step: int) -> float:
+    def compute_factor(self, step: int) -> float:
         """Return the learning rate at a step as a fraction of `lr`."""
         return self.warm(step)
 
@@ -245,7 +245,7 @@ class ScheduleFree(Optim):
         optimiser.train()
         return optimiser
 
-    def average(self, module: nn.Module, optimiser: torch.optim.Optimizer) -> Average:
+    def make_average(self, module: nn.Module, optimiser: torch.optim.Optimizer) -> Average:
         """Make the object that says which weights count: the optimiser's own average."""
         return ScheduleFreeAverage(module, optimiser)
 

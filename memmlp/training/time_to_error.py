@@ -37,7 +37,7 @@ class Learner:
     def __init__(self, task: TrainingTask, optim: Optim, seed: int, error: str):
         self.task, self.optim, self.seed, self.error = task, optim, seed, error
         self.optimiser = optim.build(task.parameter_groups())
-        self.average = optim.average(task.module, self.optimiser)
+        self.average = optim.make_average(task.module, self.optimiser)
         self.steps, self.seconds = 0, 0.0
         self.validations: list[Validation] = []
 

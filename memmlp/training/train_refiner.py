@@ -175,7 +175,7 @@ class RefinerTask(TrainingTask):
         drawn = torch.randint(len(self.frames), (self.batch,)).to(self.frames.device)
         sparse, truth = self.frames[drawn].split([SPARSE_DIM, self.frames.shape[-1] - SPARSE_DIM], -1)
         hidden = self.model.initial_state(len(drawn))[HIDDEN]
-        motion, _ = self.model.refined(self.streamed[drawn], sparse, hidden)
+        motion, _ = self.model.refine(self.streamed[drawn], sparse, hidden)
         loss, terms = self.loss(motion, truth, sparse, self.model.normalizer)
         return StepResult(loss, terms, self.clips[drawn])
 

@@ -70,7 +70,7 @@ class DroppingOptim(Optim):
     lr_drops_at: Sequence[float] = ()
     lr_drop: float = 1.0
 
-    def factor(self, step: int) -> float:
+    def compute_factor(self, step: int) -> float:
         return self.lr_drop ** sum(step >= at * self.steps for at in self.lr_drops_at)
 
 
@@ -202,7 +202,10 @@ class PartTraining:
         torch.manual_seed(self.network.seed)
         net = architecture.build(architecture.make_normalizer(data.manifest, dataset.frames), None)
         assert isinstance(net, SAGENet)
-        parts: dict[str, nn.Module] = {"codes.upper": net.codes(UPPER), "codes.lower": net.codes(LOWER)}
+        parts: dict[str, nn.Module] = {
+            "codes.upper": net.make_codes(UPPER),
+            "codes.lower": net.make_codes(LOWER),
+        }
         parts |= {"model.upper": net.upper, "model.lower": net.lower}
         *earlier, (name, part) = islice(parts.items(), PARTS.index(self.kind) + 1)
         for finished, module in earlier:
@@ -357,7 +360,7 @@ def compute_upper_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, trainin
     rotation, encoded = encode_windows(net, frames)
     clean = encode_latents(codes, rotation, encoded)
     if not training:
-        return {"latent": F.smooth_l1_loss(net.upper_latent(encoded), clean)}
+        return {"latent": F.smooth_l1_loss(net.sample_upper(encoded), clean)}
     noisy, time, hidden = add_noise(net, clean)
     return {"latent": F.smooth_l1_loss(net.upper(noisy, time, encoded, hidden), clean)}
 
@@ -367,11 +370,11 @@ def compute_lower_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, trainin
     rotation, encoded = encode_windows(net, frames)
     clean = encode_latents(codes, rotation, encoded)
     with torch.no_grad():
-        upper = net.upper_latent(encoded)
+        upper = net.sample_upper(encoded)
     if not training:
-        return {"latent": F.smooth_l1_loss(net.lower_latent(upper, encoded), clean)}
+        return {"latent": F.smooth_l1_loss(net.sample_lower(upper, encoded), clean)}
     noisy, time, hidden = add_noise(net, clean)
-    found = net.lower(net.lower.joined(noisy, upper), time, encoded, hidden)
+    found = net.lower(net.lower.join(noisy, upper), time, encoded, hidden)
     return {"latent": F.smooth_l1_loss(found, clean)}
 
 
@@ -397,7 +400,7 @@ def encode_latents(codes: HalfVQVAE, rotation: Tensor, encoded: Tensor) -> Tenso
 
 def add_noise(net: SAGENet, clean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return noisy latents (B, T // 2, 384), their random times (B,), and random hidden joints (B, 22)."""
-    time = distributed.draw_rows(net.diffusion.random_times, clean)
+    time = distributed.draw_rows(net.diffusion.draw_times, clean)
     noisy = net.diffusion.add_noise(clean, time, distributed.draw_rows(torch.randn_like, clean))
     drawn = distributed.draw_rows(lambda like: torch.rand_like(like[:, 0, :HIDDEN_COUNT]), clean) * N_JOINTS
     return noisy, time, F.one_hot(drawn.long(), N_JOINTS).sum(1) > 0

@@ -16,7 +16,7 @@ from memmlp.motion.motion_source import Prepared
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import checkpoint
 from memmlp.networks.architectures import Architecture
-from memmlp.networks.vqvae import VQVAE, rotation_error
+from memmlp.networks.vqvae import VQVAE, measure_rotation_error
 from memmlp.runs.run import Run
 from memmlp.training.loop import StepResult, TrainingTask, train
 from memmlp.training.optim import Optim
@@ -91,7 +91,7 @@ class VQVAETask(TrainingTask):
         """Compute the loss on a batch of single frames."""
         clips, end = map(distributed.local_rows, self.sampler.draw(step))
         frames = self.normalizer.encode(self.dataset.stretches(clips, end, 1))[:, 0]
-        terms, indices = self.model.loss_terms(frames, self.normalizer)
+        terms, indices = self.model.compute_losses(frames, self.normalizer)
         self.used = torch.bincount(distributed.gather_rows(indices), minlength=len(self.used)).float()
         return StepResult(torch.stack(list(terms.values())).sum(), terms, clips)
 
@@ -103,9 +103,9 @@ class VQVAETask(TrainingTask):
     def validate(self) -> dict[str, float]:
         """Compute Eq. 1 and the perplexity on the validation frames."""
         frames = self.normalizer.encode(self.validation.frames)
-        vectors, index = self.model.codebook(self.model.latent(frames))
+        vectors, index = self.model.codebook(self.model.encode(frames))
         used = torch.bincount(index, minlength=len(self.used)).float()
-        error = rotation_error(self.model.decoder(vectors), frames, self.normalizer)
+        error = measure_rotation_error(self.model.decoder(vectors), frames, self.normalizer)
         return {"rotation": float(error), "perplexity": perplexity(used)}
 
 

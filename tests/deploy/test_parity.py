@@ -136,9 +136,11 @@ def test_rounding_may_choose_another_code_vector(step_files, tmp_path: Path):
     hook = book.register_forward_hook(lambda _, given, __: latents.append(given[0].flatten(0, -2)))
     in_torch(model, CLIP)
     hook.remove()
-    unused = next(code for code in range(len(book.vectors)) if code not in book.indices(torch.cat(latents)))
+    unused = next(
+        code for code in range(len(book.vectors)) if code not in book.find_indices(torch.cat(latents))
+    )
     latent = latents[30][-1]
-    chosen = book.vectors[book.indices(latent)]
+    chosen = book.vectors[book.find_indices(latent)]
     away = book.vectors[unused] - latent
     book.vectors[unused] = latent + (chosen - latent).norm() * away / away.norm()  # as far as the chosen one
     path = tmp_path / "step.onnx"

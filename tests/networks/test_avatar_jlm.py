@@ -31,7 +31,7 @@ def test_tracked_joints_stand_in_the_tokens_as_they_are():
     model.position_token.register_forward_hook(lambda _, given, made: seen.update(position=given[0]))
     model.rotation_token.register_forward_hook(lambda _, given, made: seen.update(rotation=given[0]))
     encoded = model.normalizer.encode_sparse(SPARSE.double(), model.normalizer.origin(SPARSE.double()))
-    model.tokens(encoded)
+    model.make_tokens(encoded)
     joints, turns = model.place_coarse_joints(model.embedding(avatar_jlm.spread_over_joints(encoded)))
     true = SPARSE[..., 36:45].unflatten(-1, (3, 3)).double()
     torch.testing.assert_close(seen["position"][..., [15, 20, 21], :], true - true[..., :1, :])
@@ -54,7 +54,7 @@ def test_the_inputs_token_is_renewed_and_teaches_the_embedding_nothing():
         shape = (2, 7) if index % 2 == 0 else (2, avatar_jlm.TOKENS)
         tokens = h.unflatten(0, shape)
         torch.testing.assert_close(tokens[:, :, -1] if index % 2 == 0 else tokens[:, -1], first)
-    model.tokens(encoded)[..., -1, :].sum().backward()
+    model.make_tokens(encoded)[..., -1, :].sum().backward()
     slope = model.embedding.weight.grad
     assert model.input_token.weight.grad.any()
     assert slope is None or not slope.any()

@@ -24,7 +24,9 @@ def test_each_joint_gets_a_mixture_of_the_inputs_thirds():
     model, x = tiny.baseline("bodiffusion"), torch.randn(2, 54)
     weight = model.spread.weight.numpy()  # joint, third
     thirds = x.numpy().reshape(2, 3, 18)
-    np.testing.assert_allclose(model.mixed(x).numpy(), np.einsum("jk,bkc->bjc", weight, thirds), rtol=1e-4)
+    np.testing.assert_allclose(
+        model.mix_thirds(x).numpy(), np.einsum("jk,bkc->bjc", weight, thirds), rtol=1e-4
+    )
 
 
 def test_the_denoiser_learns_from_the_noised_truth_of_the_window():

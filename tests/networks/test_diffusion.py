@@ -11,14 +11,14 @@ from memmlp.networks.diffusion import (
     Denoised,
     Diffusion,
     TimeEmbedding,
-    cosine_schedule,
-    linear_schedule,
+    make_cosine_schedule,
+    make_linear_schedule,
     measure_surprise,
 )
 
 
 def test_cosine_schedule_is_the_papers():
-    signal = cosine_schedule(1000).numpy()
+    signal = make_cosine_schedule(1000).numpy()
     level = np.cos((np.arange(1001) / 1000 + 0.008) / 1.008 * np.pi / 2) ** 2
     np.testing.assert_allclose(signal[:-1], (level / level[0])[1:-1], rtol=1e-9)
     assert signal[-1] == pytest.approx(signal[-2] * 0.001)
@@ -50,7 +50,7 @@ def test_training_noise_has_the_schedules_variance():
     diffusion = Diffusion(10, 2)
     clean, noise = torch.full((10, 3), 2.0), torch.full((10, 3), 0.5)
     noisy = diffusion.add_noise(clean, torch.arange(10), noise).numpy()
-    signal = cosine_schedule(10).numpy()
+    signal = make_cosine_schedule(10).numpy()
     expected = (np.sqrt(signal) * 2 + np.sqrt(1 - signal) * 0.5)[:, None].repeat(3, 1)
     np.testing.assert_allclose(noisy, expected, rtol=1e-5)
 
@@ -80,9 +80,9 @@ def kept(steps: int) -> np.ndarray:
 
 
 def test_the_linear_schedule_is_the_papers():
-    np.testing.assert_allclose(linear_schedule(1000).numpy(), kept(1000), rtol=1e-9)
-    assert torch.all(linear_schedule(5).diff() < 0)
-    assert torch.all(linear_schedule(5) > 0)
+    np.testing.assert_allclose(make_linear_schedule(1000).numpy(), kept(1000), rtol=1e-9)
+    assert torch.all(make_linear_schedule(5).diff() < 0)
+    assert torch.all(make_linear_schedule(5) > 0)
 
 
 def made(noisy: torch.Tensor, time: torch.Tensor) -> Denoised:
@@ -149,10 +149,12 @@ def test_the_losses_are_an_independent_numpy_computation():
     time = torch.tensor([19, 7, 2])
     noisy = diffusion.add_noise(clean, time, noise)
     guess = Denoised(*(part.requires_grad_() for part in made(noisy, time)))
-    error, bound = diffusion.losses(clean, noise, time, guess, OPEN)
+    error, bound = diffusion.compute_losses(clean, noise, time, guess, OPEN)
     first, second, least, largest = (table[time][:, None, None] for table in tables(kept(20)))
     share = (guess.share.detach().numpy() + 1) / 2
-    estimate = first * diffusion.clean(noisy, guess.noise, time).detach().numpy() + second * noisy.numpy()
+    estimate = (
+        first * diffusion.remove_noise(noisy, guess.noise, time).detach().numpy() + second * noisy.numpy()
+    )
     grid = np.linspace(-12, 12, 200_001)
 
     def density(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
@@ -174,7 +176,7 @@ def test_at_the_first_step_the_bound_is_the_surprise_of_the_true_signal():
     noise, share = torch.zeros(2, 1).double(), -torch.ones(2, 1).double()
     for offset in (0.0, 0.5):
         guess = Denoised(noise + offset, share)
-        _, bound = diffusion.losses(clean, noise, torch.zeros(2).long(), guess, OPEN)
+        _, bound = diffusion.compute_losses(clean, noise, torch.zeros(2).long(), guess, OPEN)
         signal = float(diffusion.signal[0])
         mean = 0.3 - offset * math.sqrt(1 - signal) / math.sqrt(signal)
         log_variance = torch.tensor(tables(kept(20))[2][0]).log()

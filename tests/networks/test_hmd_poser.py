@@ -74,7 +74,7 @@ def test_the_shape_is_trained_to_be_the_same_within_a_window():
     truth = torch.stack([tiny.clip(7, seed) for seed in (1, 2)])
     motion, _, losses = model.training_call(truth[..., :SPARSE_DIM], model.initial_state(2), truth)
     torch.testing.assert_close(motion, model.advance(truth[..., :SPARSE_DIM], model.initial_state(2))[0])
-    features = model.features(truth[..., :SPARSE_DIM], model.initial_state(2))[0]
+    features = model.compute_features(truth[..., :SPARSE_DIM], model.initial_state(2))[0]
     shapes = model.shape(features).detach().numpy()
     expected = 0.5 * np.abs(shapes - shapes.mean(1, keepdims=True)).mean()
     assert float(losses["shape"].detach()) == pytest.approx(expected, rel=1e-4)

@@ -40,7 +40,7 @@ def posed_globally(motion: torch.Tensor) -> torch.Tensor:
 def test_the_true_parts_make_the_true_trunk_hands_and_ankles():
     """And the head and wrists have their trackers' rotations; elbows and knees may reach a limit of twist."""
     normalizer = Normalizer.raw(World(), tiny.REST).double()
-    rotation = PredictedParts.of(outputs(), normalizer).posed(SPARSE, normalizer)
+    rotation = PredictedParts.from_outputs(outputs(), normalizer).solve_pose(SPARSE, normalizer)
     motion = normalizer.posed(rotation, SPARSE)
     made, true = (part[..., POSITION].unflatten(-1, (22, 3)) for part in (motion, MOTION))
     trunk = [0, 1, 2, 3, 6, 9, 12, 13, 14, 15, 16, 17]
@@ -205,7 +205,7 @@ def test_limbs_are_solved_and_compared_in_float32_in_a_mixed_precision_training(
     encoded = model.normalizer.encode_sparse(truth[..., :SPARSE_DIM], model.normalizer.origin(truth))
     made = torch.randn(2, 7, model.regressor[-1].out_features if name == "manikin_l" else 86).bfloat16()
     with torch.autocast("cpu", torch.bfloat16):
-        posed, losses = model.posed(made, encoded), manikin.Manikin.losses(model, made, truth)
-    torch.testing.assert_close(posed, model.posed(made.float(), encoded), rtol=0, atol=0)
-    expected = manikin.Manikin.losses(model, made.float(), truth)
+        posed, losses = model.solve_pose(made, encoded), manikin.Manikin.compute_losses(model, made, truth)
+    torch.testing.assert_close(posed, model.solve_pose(made.float(), encoded), rtol=0, atol=0)
+    expected = manikin.Manikin.compute_losses(model, made.float(), truth)
     torch.testing.assert_close(losses, expected, rtol=0, atol=0)

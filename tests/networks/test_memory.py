@@ -203,7 +203,7 @@ def test_the_vqvaes_terms_are_eq_1_in_the_worlds_units_and_the_codebooks_loss():
     origin = tiny.normalizer().origin(tiny.clip(20)[:, :54])
     truth = tiny.normalizer().coordinates.motion_in(tiny.clip(20)[:, 54:], origin)[:, :132]
     expected = l1((rotations * std + mean - truth)[:, None])
-    terms, indices = model.loss_terms(frames, tiny.normalizer())
+    terms, indices = model.compute_losses(frames, tiny.normalizer())
     torch.testing.assert_close(terms["rotation"], expected, rtol=1e-5, atol=0)
     assert torch.equal(indices, nearest)
     assert set(terms) == {"rotation", "codebook"}

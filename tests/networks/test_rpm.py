@@ -20,7 +20,7 @@ def test_predictions_roll_as_an_independent_computation():
     model.predict = lambda *given: (news.append((given, made := 3 * predicted(*given))), made)[1]
     state, shown = model.initial_state(1), []
     for frame in SPARSE[:1].double().split(1, 1):
-        made, state = model.roll(model.encoded(frame), state)
+        made, state = model.roll(model.encode(frame), state)
         shown.append(made[0].numpy())
     share = 1 - np.cos(np.arange(1, 5) / 4 * np.pi / 2)[:, None]
     expected = news[0][1][0].numpy()
@@ -42,7 +42,7 @@ def test_before_the_first_frame_are_its_inputs():
     predicted = model.predict
     model.predict = lambda motion, inputs: (seen.append(inputs), predicted(motion, inputs))[1]
     model.advance(SPARSE, model.initial_state(2))
-    encoded = model.encoded(SPARSE)
+    encoded = model.encode(SPARSE)
     torch.testing.assert_close(seen[0], encoded[:, :1].expand(-1, 4, -1))
     torch.testing.assert_close(seen[8], encoded[:, 5:])
 
@@ -63,7 +63,7 @@ def test_training_predicts_the_last_frames_after_free_running(monkeypatch, own_d
         assert motion.shape[:2] == (2, 4)
         assert [grad for grad, _ in steps] == [False] * running + [True]
         assert training[-running - 1 :] == [own_dropout] * running + [True]
-        encoded = model.encoded(SPARSE)
+        encoded = model.encode(SPARSE)
         for index, (_, (frame, _)) in enumerate(steps):
             torch.testing.assert_close(frame, encoded[:, 5 - running + index, None])
         first, last = steps[0][1][1], steps[-1][1][1]
@@ -76,7 +76,7 @@ def test_training_predicts_the_last_frames_after_free_running(monkeypatch, own_d
 
 
 def test_places_are_of_sines_and_cosines():
-    places = rpm.sines(5, 8).numpy()
+    places = rpm.make_sines(5, 8).numpy()
     for place, index in np.ndindex(5, 8):
         angle = place / 10_000 ** (2 * (index // 2) / 8)
         np.testing.assert_allclose(places[place, index], (np.sin, np.cos)[index % 2](angle), atol=1e-6)

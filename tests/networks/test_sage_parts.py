@@ -40,7 +40,7 @@ def test_the_way_of_a_window():
     time = torch.tensor([3, 5])
     assert sage_parts.UpperDenoiser(**small)(upper, time, x).shape == (2, 10, 384)
     denoiser = sage_parts.LowerDenoiser(**small)
-    assert denoiser(denoiser.joined(lower, upper), time, x).shape == (2, 10, 384)
+    assert denoiser(denoiser.join(lower, upper), time, x).shape == (2, 10, 384)
     assert sage_parts.Decoder(**small)(upper, lower, x).shape == (2, 20, 132)
     assert sorted({*sage_parts.UPPER, *sage_parts.LOWER}) == list(range(22))
 

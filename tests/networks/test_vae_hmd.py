@@ -40,12 +40,12 @@ def test_the_divergence_is_torchs():
     latent = torch.randn(3, 4, 10)
     mean, variance = latent.chunk(2, -1)
     expected = kl_divergence(Normal(mean, (0.5 * variance).exp()), Normal(0.0, 1.0)).sum(-1).mean()
-    torch.testing.assert_close(vae_hmd.divergence(latent), expected)
+    torch.testing.assert_close(vae_hmd.compute_divergence(latent), expected)
 
 
 def test_draws_have_the_latents_mean_and_deviation():
     torch.manual_seed(0)
-    samples = vae_hmd.drawn(torch.tensor([2.0, -4.0]).expand(20_000, 2))
+    samples = vae_hmd.draw_latent(torch.tensor([2.0, -4.0]).expand(20_000, 2))
     assert float(samples.mean()) == pytest.approx(2, abs=0.01)
     assert float(samples.std()) == pytest.approx(math.exp(-2), rel=0.03)
 
@@ -59,6 +59,6 @@ def test_velocities_are_not_seen():
 
 def test_its_own_loss_is_the_weighted_divergence_of_the_call(monkeypatch):
     model, losses = learned(1.0, monkeypatch)
-    latent = model.latent(TRUTH[..., :SPARSE_DIM])
+    latent = model.encode(TRUTH[..., :SPARSE_DIM])
     assert losses.keys() == {"divergence"}
-    torch.testing.assert_close(losses["divergence"], 0.01 * vae_hmd.divergence(latent))
+    torch.testing.assert_close(losses["divergence"], 0.01 * vae_hmd.compute_divergence(latent))

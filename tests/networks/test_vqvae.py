@@ -20,19 +20,19 @@ def test_the_nearest_code_is_chosen():
 def test_a_margin_is_how_far_a_latent_may_move_before_another_code_is_chosen():
     book = tiny.vqvae().codebook
     latent = torch.randn(5, 3, 12)
-    margins = book.margins(latent)
+    margins = book.measure_margins(latent)
     two = ((latent[..., None, :] - book.vectors) ** 2).sum(-1).topk(2, largest=False).indices
     towards = book.vectors[two[..., 1]] - book.vectors[two[..., 0]]
     step = (margins * latent.norm(dim=-1))[..., None] * towards / towards.norm(dim=-1, keepdim=True)
-    assert torch.equal(book.indices(latent + 0.999 * step), two[..., 0])
-    assert torch.equal(book.indices(latent + 1.001 * step), two[..., 1])
+    assert torch.equal(book.find_indices(latent + 0.999 * step), two[..., 0])
+    assert torch.equal(book.find_indices(latent + 1.001 * step), two[..., 1])
 
 
 def test_the_margin_is_none_between_equal_codes_and_infinite_with_one():
     book = EMACodebook(codes=2, width=3, commitment=0.25, decay=0.9)
-    assert torch.equal(book.margins(torch.ones(4, 3)), torch.zeros(4))
+    assert torch.equal(book.measure_margins(torch.ones(4, 3)), torch.zeros(4))
     one = EMACodebook(codes=1, width=3, commitment=0.25, decay=0.9)
-    assert torch.equal(one.margins(torch.ones(4, 3)), torch.full((4,), torch.inf))
+    assert torch.equal(one.measure_margins(torch.ones(4, 3)), torch.full((4,), torch.inf))
 
 
 @pytest.mark.parametrize("codebook", ["ema", "gradient"])
@@ -46,9 +46,9 @@ def test_a_mixed_precision_training_finds_the_code_vectors_that_evaluation_finds
     model.codebook.vectors.copy_(latent[:64])
     with torch.autocast("cpu", torch.bfloat16):
         vectors = model.code_vectors(frames[:, :54], frames[:, 54:])
-        indices = model.codebook.indices(latent)
+        indices = model.codebook.find_indices(latent)
     assert torch.equal(vectors, model.code_vectors(frames[:, :54], frames[:, 54:]))
-    assert torch.equal(indices, model.codebook.indices(latent))
+    assert torch.equal(indices, model.codebook.find_indices(latent))
 
 
 def learned(codebook: str, steps: int = 150) -> tuple[float, float, int]:

@@ -132,21 +132,28 @@ def test_recurrent_poser_has_no_matrix_of_one_column_or_row():
 def test_the_warm_up_grows_in_equal_parts_and_then_the_schedule_is_what_it_was():
     plain = Optim(steps=10, batch=1, lr=1.0, final_lr=0.1, schedule="cosine")
     warm = replace(plain, warmup=4)
-    parts = [warm.factor(step) / plain.factor(step) for step in range(10)]
+    parts = [warm.compute_factor(step) / plain.compute_factor(step) for step in range(10)]
     assert parts == pytest.approx([0.25, 0.5, 0.75, *[1.0] * 7])
-    assert [replace(OPTIMS["schedule_free"], warmup=2).factor(step) for step in range(4)] == [0.5, 1, 1, 1]
+    assert [replace(OPTIMS["schedule_free"], warmup=2).compute_factor(step) for step in range(4)] == [
+        0.5,
+        1,
+        1,
+        1,
+    ]
 
 
 def test_at_another_rate_the_course_is_the_same():
     plain = Optim(steps=10, batch=1, lr=4.0, final_lr=0.4, schedule="cosine", warmup=2)
-    other = plain.at(1.0)
+    other = plain.with_lr(1.0)
     assert (other.lr, other.final_lr) == (1.0, pytest.approx(0.1))
-    assert [other.factor(step) for step in range(10)] == pytest.approx([plain.factor(n) for n in range(10)])
-    assert plain.at(None) == plain
+    assert [other.compute_factor(step) for step in range(10)] == pytest.approx(
+        [plain.compute_factor(n) for n in range(10)]
+    )
+    assert plain.with_lr(None) == plain
     muon = replace(OPTIMS["muon"], lr=8e-3, other_lr=4e-3)
-    assert muon.at(1e-4).other_lr == pytest.approx(5e-5)
-    assert muon.at(None) == muon
-    assert replace(muon, other_lr=None).at(1e-4).other_lr is None
+    assert muon.with_lr(1e-4).other_lr == pytest.approx(5e-5)
+    assert muon.with_lr(None) == muon
+    assert replace(muon, other_lr=None).with_lr(1e-4).other_lr is None
 
 
 def test_a_library_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch):

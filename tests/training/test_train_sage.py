@@ -110,7 +110,7 @@ def test_the_upper_half_is_validated_on_what_it_samples():
     """Not on one step of denoising, whose error depends on the noise that was drawn."""
     net, codes = parts("upper_diffusion")
     rotation, encoded = train_sage.encode_windows(net, FRAMES)
-    error = net.upper_latent(encoded) - train_sage.encode_latents(codes, rotation, encoded)
+    error = net.sample_upper(encoded) - train_sage.encode_latents(codes, rotation, encoded)
     expected = nn.functional.smooth_l1_loss(error, torch.zeros_like(error))
     assert torch.equal(train_sage.compute_upper_losses(net, codes, FRAMES, False)["latent"], expected)
     assert not torch.equal(train_sage.compute_upper_losses(net, codes, FRAMES, True)["latent"], expected)
@@ -120,14 +120,14 @@ def test_the_lower_half_is_given_what_the_upper_one_samples():
     """Never the true latents, which there are none of at inference."""
     net, codes = parts("lower_diffusion")
     encoded = net.normalizer.encode(FRAMES)[..., :SPARSE_DIM]
-    net.lower.joined = Watched(net.lower.joined)
+    net.lower.join = Watched(net.lower.join)
     with torch.no_grad():
         for training in (True, False):
             train_sage.compute_lower_losses(net, codes, FRAMES, training)
         net.predict_rotations(encoded)
-        expected = net.upper_latent(encoded)
-    assert len(net.lower.joined.calls) == 1 + 2 * len(net.diffusion.times)
-    assert all(torch.equal(upper, expected) for _, upper in net.lower.joined.calls)
+        expected = net.sample_upper(encoded)
+    assert len(net.lower.join.calls) == 1 + 2 * len(net.diffusion.times)
+    assert all(torch.equal(upper, expected) for _, upper in net.lower.join.calls)
 
 
 def test_the_whole_is_trained_through_both_samplers():
@@ -158,7 +158,7 @@ def test_it_begins_with_the_weights_of_its_parts(tmp_path: Path):
 
 
 def test_the_learning_rate_falls_where_it_is_told():
-    assert [OPTIM.factor(step) for step in range(4)] == pytest.approx([1, 1, 0.2, 0.04])
+    assert [OPTIM.compute_factor(step) for step in range(4)] == pytest.approx([1, 1, 0.2, 0.04])
 
 
 def test_parts_are_trained_by_adamw_and_name_what_they_do_not_use():
