@@ -93,7 +93,7 @@ def model(
     torch.manual_seed(seed)
     slot = memory(kind, **changes)
     torch.manual_seed(seed)
-    head = predictor(1, memory_block=slot.memory_block, **SIZES)
+    head = predictor(1, memory_block=slot.make_memory_block, **SIZES)
     return MemMLP(normalizer(coordinates), slot, head, depth=DEPTH, **SIZES).eval()
 
 

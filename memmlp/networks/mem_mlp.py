@@ -91,7 +91,7 @@ class SharedBlock(StreamingBlock):
         self.index = index
         self.hidden = block.norm.normalized_shape[0]
 
-    def divided(self, layer: nn.Linear) -> nn.Linear:
+    def split(self, layer: nn.Linear) -> nn.Linear:
         """Split a layer on [h; z] into its parts for h and for z.
 
         Returns:
@@ -106,7 +106,7 @@ class ResidualBlock(SharedBlock):
 
     def __init__(self, block: ResidualFusion, index: int):
         super().__init__(block, index)
-        self.linear = self.divided(block.linear)
+        self.linear = self.split(block.linear)
 
     def channels(self, h: Tensor, contributions: Sequence[Tensor], take: Selection) -> Tensor:
         return h + F.silu(self.linear(self.norm(h)) + take(contributions[self.index]))
@@ -117,7 +117,7 @@ class PlainBlock(SharedBlock):
 
     def __init__(self, block: PlainFusion, index: int):
         super().__init__(block, index)
-        self.merge = self.divided(block.merge)
+        self.merge = self.split(block.merge)
 
     def channels(self, h: Tensor, contributions: Sequence[Tensor], take: Selection) -> Tensor:
         """Apply the block's second half and the merging layer, which work frame by frame."""
@@ -163,14 +163,14 @@ class Converter:
         self.features: list[nn.Module] = []
         self.shared: list[SharedBlock] = []
 
-    def block(self, source: nn.Module) -> StreamingBlock:
+    def convert(self, source: nn.Module) -> StreamingBlock:
         """Make the streaming block of an MLPBlock or a MemoryBlock."""
         if isinstance(source, MemoryBlock):
-            return self._memory_block(source)
+            return self._convert_memory_block(source)
         assert isinstance(source, MLPBlock)
         return StreamingBlock(source)
 
-    def _memory_block(self, source: MemoryBlock) -> StreamingBlock:
+    def _convert_memory_block(self, source: MemoryBlock) -> StreamingBlock:
         kinds: dict[type[MLPBlock], type[SharedBlock]] = {
             ResidualFusion: ResidualBlock,
             PlainFusion: PlainBlock,
@@ -180,9 +180,9 @@ class Converter:
         self.shared.append(block)
         return block
 
-    def branch(self, source: Branch) -> StreamedBranch:
+    def convert_branch(self, source: Branch) -> StreamedBranch:
         """Make the streaming form of a predictor's branch."""
-        return StreamedBranch([self.block(block) for block in source.blocks], source.linear)
+        return StreamedBranch([self.convert(block) for block in source.blocks], source.linear)
 
 
 class MemMLPGraph(StreamingGraph):
@@ -205,11 +205,11 @@ class MemMLPGraph(StreamingGraph):
         self.conversions = OneFrameNormalizer(model.normalizer)
         self.stem = model.stem
         converter = Converter()
-        self.blocks = nn.ModuleList(converter.block(block) for block in model.blocks)
+        self.blocks = nn.ModuleList(converter.convert(block) for block in model.blocks)
         self.predictor = model.predictor
         for name, branch in list(model.predictor.named_children()):
             assert isinstance(branch, Branch)
-            setattr(self.predictor, name, converter.branch(branch))
+            setattr(self.predictor, name, converter.convert_branch(branch))
         parts = [block.feature_part for block in converter.shared]
         self.recall = model.memory.streaming_recall(model.memory, converter.features, parts)
         self.contributions = [f"memory.{index}" for index in range(len(converter.shared))]
@@ -317,7 +317,7 @@ class MemMLP(MotionModel):
         self.hidden = hidden
         self.memory, self.shift, self.settled = memory, memory.shift, memory.settled
         self.stem = nn.Linear(SPARSE_DIM, hidden)
-        self.blocks = nn.ModuleList(memory.block(layer) for layer in range(1, depth + 1))
+        self.blocks = nn.ModuleList(memory.make_block(layer) for layer in range(1, depth + 1))
         self.predictor = predictor
         self.branches = predictor.branches
 
@@ -342,7 +342,7 @@ class MemMLP(MotionModel):
         """
         sizes = {"hidden": settings.width, "frames": settings.frames}
         slot = memory(codes=codes, depth=settings.depth, **sizes)
-        branches = predictor(memory_block=slot.memory_block, **sizes)
+        branches = predictor(memory_block=slot.make_memory_block, **sizes)
         return cls(normalizer, slot, branches, depth=settings.depth, **sizes)
 
     @property
@@ -379,7 +379,7 @@ class MemMLP(MotionModel):
         for block in self.blocks:
             h = block(h, past)
         wanted = self.frames if newest is None else newest
-        made = max(wanted, self.memory.needed(new))
+        made = max(wanted, self.memory.count_needed(new))
         motion = self.predictor(h, past, inputs[:, -self.frames :], self.normalizer, made)
         kept |= self.memory.remember(motion, past, state, new)
         return self.normalizer.decode_motion(motion[:, -wanted:], origin[:, -wanted:]), kept

@@ -93,16 +93,16 @@ class Recall(nn.Module):
         """Return each block's contribution (1, d): of the entering frame, and of frames before the first."""
         if not self.parts:
             return (), ()
-        z = self.feature(past)
+        z = self.compute_features(past)
         contributions = self._contributions(z)
-        before = self.before(z)
+        before = self.compute_earlier(z)
         return contributions, contributions if before is z else self._contributions(before)
 
-    def feature(self, past: Any) -> Tensor:
+    def compute_features(self, past: Any) -> Tensor:
         """Return the features (1, blocks, k) of the frame that enters."""
         raise NotImplementedError
 
-    def before(self, first: Tensor) -> Tensor:
+    def compute_earlier(self, first: Tensor) -> Tensor:
         """Return the features of frames before the first one, given the first one's (1, blocks, k)."""
         return first
 
@@ -133,11 +133,11 @@ class Memory(nn.Module):
     frames: int
     settled: bool = False
 
-    def block(self, layer: int) -> nn.Module:
+    def make_block(self, layer: int) -> nn.Module:
         """Make the backbone's block of a layer (1-based)."""
         raise NotImplementedError
 
-    def memory_block(self) -> nn.Module:
+    def make_memory_block(self) -> nn.Module:
         """Make one more block that takes in a memory feature, for the predictor's branches (Table 8)."""
         raise NotImplementedError
 
@@ -149,7 +149,7 @@ class Memory(nn.Module):
         """Return the state after inputs (B, past, 54), with the true motion (B, past, 198) as history."""
         return {}
 
-    def needed(self, new: int) -> int:
+    def count_needed(self, new: int) -> int:
         """Return how many of the output's newest frames `remember` looks at."""
         return 0
 
@@ -167,7 +167,7 @@ class Memory(nn.Module):
         """Return the state after an output.
 
         Args:
-            motion: output (B, n, 198), n at least `needed(new)`.
+            motion: output (B, n, 198), n at least `count_needed(new)`.
             past: what `recall` returned.
             state: the state before the new frames.
             new: how many of the output's last frames are new.
@@ -198,10 +198,10 @@ class NoMemory(Memory):
         self.shift = 0
         self.past_frames = frames - 1
 
-    def block(self, layer: int) -> nn.Module:
+    def make_block(self, layer: int) -> nn.Module:
         return MLPBlock(self.hidden, self.frames)
 
-    def memory_block(self) -> nn.Module:
+    def make_memory_block(self) -> nn.Module:
         """Raise InputError, since this memory has no memory blocks."""
         raise InputError("memory=none: must be a memory with blocks for this predictor, which uses them")
 
@@ -230,13 +230,13 @@ class FeatureMemory(Memory):
         self.layers, self.width, self.fusion = tuple(layers), width, FUSIONS[fusion]
         self.hidden, self.frames = hidden, frames
 
-    def block(self, layer: int) -> nn.Module:
-        return self.memory_block() if layer in self.layers else MLPBlock(self.hidden, self.frames)
+    def make_block(self, layer: int) -> nn.Module:
+        return self.make_memory_block() if layer in self.layers else MLPBlock(self.hidden, self.frames)
 
-    def memory_block(self) -> nn.Module:
+    def make_memory_block(self) -> nn.Module:
         """Make a block that takes in a memory feature."""
-        return MemoryBlock(self.feature(), self.fusion(self.hidden, self.frames, self.width))
+        return MemoryBlock(self.make_feature(), self.fusion(self.hidden, self.frames, self.width))
 
-    def feature(self) -> nn.Module:
+    def make_feature(self) -> nn.Module:
         """Make the module that computes a block's memory feature from what `recall` returns."""
         raise NotImplementedError

@@ -153,7 +153,7 @@ class OwnPastRecall(Recall):
         """Join all blocks' projections of the input with the given name: "sparse", "motion" or "codes"."""
         return JointProjections(parts)
 
-    def feature(self, past: Past) -> Tensor:
+    def compute_features(self, past: Past) -> Tensor:
         return self.whole(Past(*(part[0] for part in past)))
 
 
@@ -272,7 +272,7 @@ class OwnPastMemory(FeatureMemory):
         """Return the true motion (B, past, 198) as history, for teacher forcing."""
         return {"motion": motion}
 
-    def needed(self, new: int) -> int:
+    def count_needed(self, new: int) -> int:
         return self.frames if self.history == "latest" else new
 
     def recall(self, sparse: Tensor, state: State, new: int) -> Past:
@@ -300,7 +300,7 @@ class OwnPastMemory(FeatureMemory):
         """Return the state after an output.
 
         Args:
-            motion: output (B, n, 198), n at least `needed(new)`.
+            motion: output (B, n, 198), n at least `count_needed(new)`.
             past: not used here.
             state: the state before the new frames.
             new: how many of the output's last frames are new.
@@ -314,7 +314,7 @@ class OwnPastMemory(FeatureMemory):
 class NoCodesMemory(OwnPastMemory):
     """A memory of the network's own past without code-vectors (Table 11)."""
 
-    def feature(self) -> nn.Module:
+    def make_feature(self) -> nn.Module:
         return PastFeature(self.width, None, self.blend)
 
     def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
@@ -331,7 +331,7 @@ class VQMemory(OwnPastMemory):
     streaming_recall = CodeRecall
     codes: VQVAE
 
-    def feature(self) -> nn.Module:
+    def make_feature(self) -> nn.Module:
         return PastFeature(self.width, self.codes.width, self.blend)
 
     def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:

@@ -104,11 +104,11 @@ class RecurrentRecall(Recall):
             if isinstance(recurrence.layer, nn.GRU):
                 recurrence.layer = FrameGRU(recurrence.layer)
 
-    def feature(self, past: RecurrentPast) -> Tensor:
+    def compute_features(self, past: RecurrentPast) -> Tensor:
         newest = past.features[:, :, -1]
         return newest.index_select(1, torch.tensor(self.layers, device=newest.device))
 
-    def before(self, first: Tensor) -> Tensor:
+    def compute_earlier(self, first: Tensor) -> Tensor:
         """Return zeros, since the layers have seen nothing before the first frame."""
         return torch.zeros_like(first)
 
@@ -152,7 +152,7 @@ class RecurrentMemory(FeatureMemory):
         self.shift = frames
         self.past_frames = frames - 1
 
-    def feature(self) -> nn.Module:
+    def make_feature(self) -> nn.Module:
         """Add one more recurrent layer and make the module that looks up its output."""
         self.recurrences.append(self.recurrence(self.width))
         return RecurrentFeature(len(self.recurrences) - 1)

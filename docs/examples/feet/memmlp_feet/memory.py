@@ -70,7 +70,7 @@ class MeanMemory(FeatureMemory):
         super().__init__(layers, width, fusion, hidden=hidden, frames=frames, depth=depth)
         self.shift, self.past_frames = 0, frames - 1
 
-    def feature(self) -> nn.Module:
+    def make_feature(self) -> nn.Module:
         """Make the module that computes a block's memory feature."""
         return MeanFeature(self.width)
 
