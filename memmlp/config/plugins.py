@@ -29,7 +29,7 @@ from memmlp.common.overrides import parse_overrides
 from memmlp.common.settings import MetricSettings
 from memmlp.config.package_data import packaged
 from memmlp.evaluation.metric_facts import HIGHER, SMALLEST, UNITS
-from memmlp.runs.environment import own_code_digests
+from memmlp.runs.environment import user_code_digests
 
 GROUP = "memmlp.plugins"
 VARIABLE = "MEMMLP_PLUGINS"
@@ -108,7 +108,7 @@ def texts_outside_memmlp() -> list[tuple[str, str]]:
     """Return code and configs from outside memmlp, as (name, text), on which a plan depends."""
     found = [
         (f"{name}:{file}", text)
-        for name, files in own_code_digests(_active).items()
+        for name, files in user_code_digests(_active).items()
         for file, text in files.items()
     ]
     paths = [path for _, folder in folders() for path in sorted(folder.rglob("*.yaml"))]

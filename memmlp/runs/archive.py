@@ -1,8 +1,8 @@
 """A run as one file: a zip of its own files, with an index of their sizes and digests.
 
-An archive may come from anybody. It is unpacked into a folder beside the runs. Only names of a run's files
-are accepted, and each file must have the size and the digest in the index; nothing is executed or unpickled.
-Only a complete run is then moved among the runs.
+An archive is not trusted. It is unpacked into a folder beside the runs. Only names of a run's files are
+accepted, and each file must have the size and the digest in the index; nothing is executed or unpickled. Only
+a complete run is then moved among the runs.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import shutil
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -27,11 +27,11 @@ from memmlp.runs.run import Run
 
 FORMAT = "memmlp run 1"
 INDEX = "index.json"
-LARGEST_INDEX = 2**20  # bytes
-MOST_FILES = 1000
-LARGEST = 4 * 10**9  # bytes of all files together, unless more is allowed
+MAX_INDEX = 2**20  # bytes
+MAX_FILES = 1000
+MAX_SIZE = 4 * 10**9  # bytes of all files together, by default
 PIECE = 2**20
-PART = r"[\w.-]*[\w-]"  # a name of a folder or file: no "..", nothing that leads elsewhere
+PART = r"[\w.-]*[\w-]"  # a name of a folder or file; not ".."
 ALLOWED = re.compile(
     "|".join(
         re.escape(pattern).replace(r"\*", PART)
@@ -51,10 +51,16 @@ def export_run(run: Run, out: Path) -> str:
         InputError: if the run is not finished, or some of its files are missing or changed.
     """
     if not run.done:
-        raise InputError(f"run {run.id}: is {run.status}; allowed is a finished run")
+        raise InputError(f"run {run.id}: must be finished, but is {run.status}")
     if changed := run.verify():
         raise InputError(f"run {run.id}: changed since it was made: {', '.join(changed)}")
-    files = _files(run)
+    own = (path for pattern in run.FILES for path in sorted(run.folder.glob(pattern)))
+    names = {path.relative_to(run.folder).as_posix(): path for path in (*own, notes_path(run), run.marker)}
+    files = {
+        name: path
+        for name, path in names.items()
+        if ALLOWED.fullmatch(name) and path.is_file() and path != run.checkpoint
+    }
     index = {name: {"size": path.stat().st_size, "sha256": file_digest(path)} for name, path in files.items()}
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile(dir=out.parent, prefix=f".{out.name}.", delete=False) as temporary:
@@ -74,21 +80,11 @@ def export_run(run: Run, out: Path) -> str:
     return file_digest(out)
 
 
-def _files(run: Run) -> dict[str, Path]:
-    """Return the files of an archive by name."""
-    own = [path for pattern in run.FILES for path in sorted(run.folder.glob(pattern))]
-    every = [
-        path for path in (*own, notes_path(run), run.marker) if path.is_file() and path != run.checkpoint
-    ]
-    names = {path.relative_to(run.folder).as_posix(): path for path in every}
-    return {name: path for name, path in names.items() if ALLOWED.fullmatch(name)}
-
-
 def import_run(
     path: Path,
     outputs: Path,
     sha256: str | None = None,
-    largest: int = LARGEST,
+    largest: int = MAX_SIZE,
     tell: Callable[[str], None] = lambda line: None,
 ) -> tuple[Run, bool]:
     """Add the run in an archive to the runs of an outputs folder.
@@ -98,18 +94,18 @@ def import_run(
         outputs: the outputs folder.
         sha256: the digest that the archive must have; None for any.
         largest: the largest allowed size of all files together, bytes.
-        tell: gets a line if the run exists already, but lacks evaluations or deployments of the archive.
+        tell: gets a line if the run exists already without some evaluations or deployments of the archive.
 
     Returns:
         The run, and whether it is new; an existing run with the same weights is left unchanged.
 
     Raises:
-        InputError: if the file is no archive of a run, is too large, or a digest is wrong.
+        InputError: if the file is not an archive of a run, is too large, or a digest is wrong.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     if sha256 is not None and file_digest(path) != sha256.lower():
-        raise InputError(f"{path}: its SHA-256 is {file_digest(path)}, and not {sha256}")
+        raise InputError(f"{path}: its SHA-256 is {file_digest(path)}, not {sha256}")
     try:
         with zipfile.ZipFile(path) as archive:
             run_id, files = _index(archive, path, largest)
@@ -118,38 +114,33 @@ def import_run(
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: not an archive of a run ({error})") from None
-    if not new and (more := _missing(run, files)):
-        tell(f"{path}: has {', '.join(more)}, which run {run.id} here lacks; that is not taken in")
+    missing = (name for name in files if "/" in name and not (run.folder / name).exists())
+    if not new and (more := sorted({"/".join(name.split("/")[:2]) for name in missing})):
+        tell(f"{path}: also has {', '.join(more)}, which is not added to run {run.id}")
     return run, new
-
-
-def _missing(run: Run, files: Iterable[str]) -> list[str]:
-    """Return the evaluations and deployments among an archive's files that a run lacks."""
-    lacking = (name for name in files if "/" in name and not (run.folder / name).exists())
-    return sorted({"/".join(name.split("/")[:2]) for name in lacking})
 
 
 def _index(archive: zipfile.ZipFile, path: Path, largest: int) -> tuple[str, Mapping[str, Mapping[str, Any]]]:
     """Return the run's id and the files in the index, after a check of names and sizes."""
     names = archive.namelist()
-    if len(names) > MOST_FILES or len(set(names)) != len(names) or INDEX not in names:
-        raise InputError(f"{path}: not an archive of a run, which has an {INDEX} and each name once")
+    if len(names) > MAX_FILES or len(set(names)) != len(names) or INDEX not in names:
+        raise InputError(f"{path}: not an archive of a run: it must have {INDEX} and each name once")
     with archive.open(INDEX) as file:
-        text = file.read(LARGEST_INDEX + 1)
-    if len(text) > LARGEST_INDEX:
-        raise InputError(f"{path}: its {INDEX} is larger than {LARGEST_INDEX} bytes")
+        text = file.read(MAX_INDEX + 1)
+    if len(text) > MAX_INDEX:
+        raise InputError(f"{path}: its {INDEX} is larger than {MAX_INDEX} bytes")
     found = json.loads(text)
     if not isinstance(found, dict) or found.get("format") != FORMAT or not _sound(found.get("files")):
-        raise InputError(f"{path}: its {INDEX} is not one of format '{FORMAT}'")
+        raise InputError(f"{path}: its {INDEX} must have the format '{FORMAT}'")
     run_id, files = found.get("run"), found["files"]
     if not isinstance(run_id, str) or not ID.fullmatch(run_id):
-        raise InputError(f"{path}: its run has no id of 16 hex digits")
+        raise InputError(f"{path}: its run id must be 16 hex digits")
     if other := sorted({*names} ^ {*files, INDEX}):
-        raise InputError(f"{path}: {other[0]!r} is not both in the archive and in its index")
+        raise InputError(f"{path}: {other[0]!r} must be both in the archive and in its index")
     if bad := [name for name in files if not ALLOWED.fullmatch(name)]:
-        raise InputError(f"{path}: {bad[0]!r} is no file of a run")
+        raise InputError(f"{path}: {bad[0]!r} is not a file of a run")
     if (total := sum(one["size"] for one in files.values())) > largest:
-        raise InputError(f"{path}: {total / 1e9:.1f} GB; allowed are {largest / 1e9:.1f} (--max-gb)")
+        raise InputError(f"{path}: {total / 1e9:.1f} GB; must be at most {largest / 1e9:.1f} (--max-gb)")
     return run_id, files
 
 
@@ -203,7 +194,7 @@ def _copy(source: IO[bytes], file: IO[bytes], expected: Mapping[str, Any], what:
         digest.update(piece)
         file.write(piece)
     if left or digest.hexdigest() != expected["sha256"]:
-        raise InputError(f"{what}: its digest does not hold; ask for the archive again")
+        raise InputError(f"{what}: its digest is wrong; copy the archive again")
     file.flush()
     os.fsync(file.fileno())
 
@@ -211,11 +202,11 @@ def _copy(source: IO[bytes], file: IO[bytes], expected: Mapping[str, Any], what:
 def _check(run: Run, path: Path) -> None:
     """Raise InputError if the unpacked files are not an unchanged, finished run with that id."""
     if not run.done or run.manifest.get("id") != run.id or not run.config:
-        raise InputError(f"{path}: holds no finished run {run.id}")
+        raise InputError(f"{path}: does not contain a finished run {run.id}")
     run.metrics()
     listed = read_json(run.marker).get("artifacts")
     if not isinstance(listed, dict) or not listed:
-        raise InputError(f"{path}: its run has no digests of its artifacts")
+        raise InputError(f"{path}: its run does not have digests of its artifacts")
     if changed := run.verify():
         raise InputError(f"{path}: changed since it was made: {', '.join(changed)}")
 
@@ -224,5 +215,5 @@ def _known(place: Run, files: Mapping[str, Mapping[str, Any]], path: Path) -> Ru
     """Return the run that exists already. Raises InputError if it is not the archive's run."""
     weights = files.get(place.model.name, {}).get("sha256")
     if not place.done or not place.model.is_file() or file_digest(place.model) != weights:
-        raise InputError(f"{path}: run {place.id} is there already, {place.status}, and is another one")
+        raise InputError(f"{path}: run {place.id} exists already ({place.status}) with other weights")
     return place

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,14 +19,14 @@ ONNX_FILES = {
 }
 """The name of the ONNX file of each precision (`export.precision`)."""
 INT8_PRECISIONS = ("int8", "int8_blocks")
-"""The precisions that are used live where they are accurate enough. At the paper's sizes they are quicker."""
+"""The precisions that are used live where they are accurate enough: at the paper's sizes they are faster."""
 
-MAX_GROWTH, MAX_JITTER_GROWTH = 0.01, 0.10  # relative
-"""Of MPJPE and of Jitter, up to which less precision may stand for float32; unrest is the first to grow."""
+MAX_GROWTH, MAX_JITTER_GROWTH = 0.01, 0.10
+"""The largest relative growths of MPJPE and Jitter with which a lower precision may replace float32."""
 
 LATENCY = "latency.json"
 FILES = (LATENCY, *ONNX_FILES.values())
-"""A deployment's files, in the order in which they are removed: what was measured before what it is of."""
+"""A deployment's files, in the order in which they are removed: the measurements first."""
 
 
 class DeploymentFolder:
@@ -59,25 +58,24 @@ class DeploymentFolder:
 
     @property
     def current(self) -> bool:
-        """Whether the deployment was made with the present recipe versions."""
+        """Whether the deployment was made with the current component versions."""
         return self.folder.name == deployment_id_of(self.settings)
 
     @property
     def recipes(self) -> dict[str, int]:
-        """The recipe versions with which it was made; empty if these are not the present ones."""
+        """The component versions with which it was made; empty if these are not the current ones."""
         return deployment_recipes(self.settings) if self.current else {}
 
     def finish(self, record: Mapping[str, Any]) -> None:
         """Write the measurements, with the files' digests; this marks the deployment as complete."""
         files = map(self.file, ONNX_FILES)
         artifacts = {path.name: file_digest(path) for path in files if path.exists()}
-        made = {"made": now(), "made_by": environment(), "artifacts": artifacts}
-        write_json(self.latency, {**record, **made})
+        write_json(self.latency, {**record, "made": now(), "made_by": environment(), "artifacts": artifacts})
 
     @property
     def record(self) -> dict[str, Any]:
         """The measurements: sizes, times, accuracy of lower precision; empty if there are none."""
-        return _current(read_json(self.latency))
+        return read_json(self.latency)
 
     @property
     def made(self) -> str:
@@ -98,12 +96,12 @@ class DeploymentFolder:
 
 
 def accurate_enough(cost: Mapping[str, Any]) -> bool:
-    """Return whether a file of less precision may stand for float32, given the growth of its errors.
+    """Return whether a file of lower precision may replace float32, given the growth of its errors.
 
     Both growths have to be known: NaN, or a record without them, is not enough.
     """
-    growth, of_jitter = (cost.get(name, math.inf) for name in ("growth", "jitter_growth"))
-    return growth <= MAX_GROWTH and of_jitter <= MAX_JITTER_GROWTH
+    growth, jitter = (cost.get(name, math.inf) for name in ("growth", "jitter_growth"))
+    return growth <= MAX_GROWTH and jitter <= MAX_JITTER_GROWTH
 
 
 def deployed_precision(latency: Mapping[str, Any]) -> str:
@@ -120,24 +118,15 @@ def as_deployed(latency: Mapping[str, Any]) -> dict[str, Any]:
 def with_times_as_deployed(results: Mapping[str, Any]) -> dict[str, Any]:
     """Return a run's results, each deployment's with the numbers of the file that was asked for on top."""
 
-    def on_top(latency: Mapping[str, Any]) -> dict[str, Any]:
+    def merge(latency: Mapping[str, Any]) -> dict[str, Any]:
         deployed = as_deployed(latency)
-        numbers = {key: deployed[key] for key, value in latency.items() if isinstance(value, int | float)}
-        return {**latency, **numbers}
+        return {
+            key: deployed[key] if isinstance(value, int | float) else value for key, value in latency.items()
+        }
 
     return {
-        name: on_top(one) if name.startswith("latency") and isinstance(one, Mapping) else one
+        name: merge(one) if name.startswith("latency") and isinstance(one, Mapping) else one
         for name, one in results.items()
-    }
-
-
-def _current(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a record with the keys of this version; 0.1 called the timing yardstick "reference"."""
-    return {
-        re.sub(r"(^|_)reference(_|$)", r"\1yardstick\2", key): _current(value)
-        if isinstance(value, Mapping)
-        else value
-        for key, value in record.items()
     }
 
 

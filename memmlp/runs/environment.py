@@ -6,17 +6,19 @@ import ast
 import contextlib
 import functools
 import hashlib
+import importlib.util
 import os
 import platform
 import re
 import subprocess
-from collections.abc import Iterable, Mapping
+import sys
+from collections.abc import Iterable, Iterator, Mapping
 from importlib import metadata
+from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from typing import Any
 
 import memmlp
-from memmlp.runs.user_modules import imported_modules, imports_by_computed_names, module_spec
 
 PACKAGE = Path(memmlp.__file__).parent
 NOT_NUMBERS = (
@@ -28,10 +30,14 @@ NOT_NUMBERS = (
     "sweep",
     "tables",
 )
-"""Folders of the package on whose code no result depends; `live` alone measures one, whole poses' times."""
+"""Folders of the package whose code does not affect results; only `live` measures one, the time of a pose."""
 WIRING = ("config/build.py", "config/build_motion.py")
-"""Files of these folders that count all the same, since they decide what reaches the constructors."""
+"""Files of these folders that count nevertheless, since they decide what reaches the constructors."""
 PATCH = 1_000_000  # at most so many characters of changes are kept with a run
+INSTALLED = ("site-packages", "dist-packages")
+"""Folders of installed packages, which are identified by their versions."""
+NOT_USERS = ("memmlp", "torch", "numpy", *sys.stdlib_module_names)
+"""Modules that are not the user's, wherever they lie."""
 
 
 def environment() -> dict[str, Any]:
@@ -98,20 +104,20 @@ def changes() -> str:
 def code_digests(packages: Iterable[str] = ()) -> dict[str, str]:
     """Return a digest of the code in each file on which a run's numbers depend.
 
-    Comments and docstrings don't matter. Files of the user's own packages, and of what these import, are
-    named PACKAGE:FILE.
+    Comments and docstrings don't matter. Files of users' packages, and of what these import, are named
+    PACKAGE:FILE.
     """
-    own = own_code_digests(packages).items()
+    users = user_code_digests(packages).items()
     return _code_digests() | {
-        f"{name}:{file}": digest for name, files in own for file, digest in files.items()
+        f"{name}:{file}": digest for name, files in users for file, digest in files.items()
     }
 
 
 def changed(before: Mapping[str, str], after: Mapping[str, str]) -> list[str]:
     """Return the files whose code differs between two records (`code_digests`).
 
-    A file that is in one of them alone is not compared: what is new runs only if other code, or the config,
-    names it, and records of earlier versions lack what packages import.
+    A file that is in only one of them is not compared: new code runs only if other code, or the config, names
+    it.
     """
     return sorted(name for name in before.keys() & after.keys() if before[name] != after[name])
 
@@ -119,109 +125,10 @@ def changed(before: Mapping[str, str], after: Mapping[str, str]) -> list[str]:
 @functools.cache
 def _code_digests() -> dict[str, str]:
     """Return the digests of this package's files."""
-    files = [path for path in sorted(PACKAGE.rglob("*.py")) if _counts(path.relative_to(PACKAGE))]
-    return {path.relative_to(PACKAGE).as_posix(): code_digest(path.read_text("utf-8")) for path in files}
-
-
-def own_code_digests(packages: Iterable[str]) -> dict[str, dict[str, str]]:
-    """Return digests of the Python files of users' packages, by package and file; nothing is imported.
-
-    Modules of the user's own that these import (`imported_modules`) follow, each by itself: of a package only
-    its __init__, as PACKAGE.__init__. A package that is not found has no files.
-    """
+    files = {path.relative_to(PACKAGE): path for path in sorted(PACKAGE.rglob("*.py"))}
     return {
-        name: {file: _own_digest(path) for file, path in own.items()}
-        for name, own in _own_files(packages).items()
+        name.as_posix(): code_digest(path.read_text("utf-8")) for name, path in files.items() if _counts(name)
     }
-
-
-def _own_files(packages: Iterable[str]) -> dict[str, dict[str, Path]]:
-    """Return the files of `own_code_digests`, by package and file."""
-    files = {name: _package_files(name) for name in packages}
-    modules = {_module(name, file): path for name, own in files.items() for file, path in own.items()}
-    imported = {
-        f"{name}.__init__" if path.stem == "__init__" else name: {path.name: path}
-        for name, path in imported_modules(modules).items()
-    }
-    return {**files, **imported}
-
-
-def _package_files(name: str) -> dict[str, Path]:
-    """Return the Python files of a user's package by their paths below it; none if it is not found."""
-    spec = module_spec(name)
-    if spec is None:
-        return {}
-    if folders := [Path(folder) for folder in spec.submodule_search_locations or ()]:
-        files = {path.relative_to(root).as_posix(): path for root in folders for path in root.rglob("*.py")}
-    else:
-        files = {Path(path).name: Path(path) for path in [spec.origin] if path}
-    return dict(sorted(files.items()))
-
-
-def _module(package: str, file: str) -> str:
-    """Return the dotted name of the module in a package's file; of a package of one file, that is its own."""
-    spec = module_spec(package)
-    if spec is None or spec.submodule_search_locations is None:
-        return package
-    parts = Path(file).with_suffix("").parts
-    return ".".join([package, *(parts[:-1] if parts[-1] == "__init__" else parts)])
-
-
-@functools.cache
-def _own_digest(path: Path) -> str:
-    """Return a digest of a file's code, or of its bytes if it is not Python of this version.
-
-    It stays as it was when this process first asked: what is edited later is not what the process runs.
-    """
-    try:
-        return code_digest(path.read_text("utf-8"))
-    except (SyntaxError, ValueError):
-        return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
-
-
-def packages_of_ones_own(names: Iterable[str]) -> dict[str, dict[str, str | None]]:
-    """Return the version and a digest of the code of some packages and of what they import, by name.
-
-    One with files that import by computed names has these, with commas between, as `computed_imports`: edits
-    of what they import are not seen.
-    """
-    packages = list(names)
-
-    def digest(files: Mapping[str, str]) -> str:
-        return hashlib.sha256(repr(files).encode()).hexdigest()[:12]
-
-    def computed(name: str, files: Mapping[str, Path]) -> dict[str, str | None]:
-        modules = {file: _module(name.removesuffix(".__init__"), file) for file in files}
-        found = [f for f, path in files.items() if imports_by_computed_names(modules[f], path, packages)]
-        return {"computed_imports": ", ".join(found)} if found else {}
-
-    own, digests = _own_files(packages), own_code_digests(packages)
-    return {
-        name: {"version": _own_version(name), "digest": digest(digests[name]), **computed(name, files)}
-        for name, files in own.items()
-    }
-
-
-def computed_imports(plugins: Mapping[str, Mapping[str, str | None]]) -> str | None:
-    """Return which files of the recorded packages import by computed names, in words; None for none."""
-    found = {name: one.get("computed_imports") for name, one in plugins.items()}
-    return "; ".join(f"{name}: {files}" for name, files in found.items() if files) or None
-
-
-def _own_version(name: str) -> str | None:
-    """Return a package's own version, or that of the distribution that contains it."""
-    spec = module_spec(name)
-    text = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
-    if version := re.search(r'^__version__ = "(.+)"$', text, re.MULTILINE):
-        return version[1]
-    distributions = _distributions().get(name.split(".")[0], [])
-    return _version(distributions[0]) if distributions else None
-
-
-@functools.cache
-def _distributions() -> Mapping[str, list[str]]:
-    """Return the installed distributions by the top-level packages that they contain."""
-    return metadata.packages_distributions()
 
 
 def _counts(path: Path) -> bool:
@@ -237,6 +144,137 @@ def code_digest(text: str) -> str:
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):
             node.body = node.body[1:] or [ast.Pass()]
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:12]
+
+
+def user_code_digests(packages: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Return digests of the Python files of users' packages, by package and file; nothing is imported.
+
+    Other modules of the user that these import follow, each by itself: of a package only its __init__, as
+    PACKAGE.__init__. A package that is not found does not have files.
+    """
+    files = {name: _package_files(name) for name in packages}
+    modules = {_module(name, file): path for name, paths in files.items() for file, path in paths.items()}
+    for name, path in _imported_modules(modules).items():
+        files[f"{name}.__init__" if path.stem == "__init__" else name] = {path.name: path}
+    return {name: {file: _user_digest(path) for file, path in paths.items()} for name, paths in files.items()}
+
+
+def user_packages(names: Iterable[str]) -> dict[str, dict[str, str | None]]:
+    """Return the version and a digest of the code of users' packages and of what they import, by name."""
+    return {
+        name: {
+            "version": _user_version(name),
+            "digest": hashlib.sha256(repr(files).encode()).hexdigest()[:12],
+        }
+        for name, files in user_code_digests(names).items()
+    }
+
+
+def _user_version(name: str) -> str | None:
+    """Return a package's own version, or that of the distribution that contains it."""
+    spec = _find_spec(name)
+    text = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
+    if version := re.search(r'^__version__ = "(.+)"$', text, re.MULTILINE):
+        return version[1]
+    distributions = _distributions().get(name.split(".")[0], [])
+    return _version(distributions[0]) if distributions else None
+
+
+@functools.cache
+def _distributions() -> Mapping[str, list[str]]:
+    return metadata.packages_distributions()
+
+
+@functools.cache
+def _user_digest(path: Path) -> str:
+    """Return a digest of a file's code, or of its bytes if it is not Python of this version.
+
+    It stays as it was when this process first asked: later edits are not what the process runs.
+    """
+    try:
+        return code_digest(path.read_text("utf-8"))
+    except (SyntaxError, ValueError):
+        return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+
+
+def _package_files(name: str) -> dict[str, Path]:
+    """Return the Python files of a user's package by their paths below it; none if it is not found."""
+    spec = _find_spec(name)
+    if spec is None:
+        return {}
+    if folders := [Path(folder) for folder in spec.submodule_search_locations or ()]:
+        files = {path.relative_to(root).as_posix(): path for root in folders for path in root.rglob("*.py")}
+    else:
+        files = {Path(path).name: Path(path) for path in [spec.origin] if path}
+    return dict(sorted(files.items()))
+
+
+def _module(package: str, file: str) -> str:
+    """Return the dotted name of the module in a package's file; of a package of one file, that is its own."""
+    spec = _find_spec(package)
+    if spec is None or spec.submodule_search_locations is None:
+        return package
+    parts = Path(file).with_suffix("").parts
+    return ".".join([package, *(parts[:-1] if parts[-1] == "__init__" else parts)])
+
+
+def _imported_modules(modules: Mapping[str, Path]) -> dict[str, Path]:
+    """Return the files of further modules of the user that some modules import, directly or not.
+
+    Modules of memmlp, of the standard library and of installed packages are left out, and so is what is
+    imported by calls (`importlib.import_module`).
+
+    Args:
+        modules: the files to begin with, by the dotted names of the modules.
+    """
+    found: dict[str, Path] = {}
+    remaining = dict(modules)
+    while remaining:
+        for module in _imports(*remaining.popitem()):
+            if module not in found and module not in modules and (file := _user_file(module)):
+                found[module] = remaining[module] = file
+    return dict(sorted(found.items()))
+
+
+def _imports(module: str, file: Path) -> Iterator[str]:
+    """Yield dotted names that a module may import, with their parents; some may not be modules."""
+    names = [module]
+    package = module.split(".") if file.name == "__init__.py" else module.split(".")[:-1]
+    with contextlib.suppress(SyntaxError, ValueError):  # not Python of this version, as an extension module
+        for node in ast.walk(ast.parse(file.read_bytes())):
+            if isinstance(node, ast.Import):
+                names += [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                above = package[: len(package) - node.level + 1] if node.level else []
+                source = [*above, *([node.module] if node.module else [])]
+                names += [".".join([*source, alias.name]) for alias in node.names]
+    for name in names:
+        parts = name.split(".")
+        yield from (".".join(parts[:count]) for count in range(1, len(parts) + (name != module)))
+
+
+def _user_file(module: str) -> Path | None:
+    """Return the file of a user's module; None if it does not exist, or is not the user's."""
+    spec = _find_spec(module)
+    if spec is None or not spec.has_location or not spec.origin:  # such as a folder without __init__.py
+        return None
+    file = Path(spec.origin)
+    return file if file.is_file() and not set(INSTALLED) & set(file.parts) else None
+
+
+def _find_spec(module: str) -> ModuleSpec | None:
+    """Return where a module lies, without importing it or its parents; None if it is not the user's."""
+    top, *submodules = module.split(".")
+    try:
+        spec = None if top in NOT_USERS else importlib.util.find_spec(top)
+    except ValueError:  # a module that was made by hand
+        return None
+    for part in submodules:
+        if spec is None or spec.submodule_search_locations is None:
+            return None
+        # By its last name only: with the whole name, a folder without __init__.py needs its parent imported.
+        spec = PathFinder.find_spec(part, list(spec.submodule_search_locations))
+    return spec
 
 
 def _cpu() -> str:

@@ -15,7 +15,7 @@ from memmlp.runs.identity import belongs, evaluation_id_of, solver_of
 from memmlp.runs.recipe_versions import outdated, version_of
 
 COMBINED = "combined"
-"""The branch of the rotations after inverse kinematics; whose, the settings of the evaluation say."""
+"""The branch of the rotations after inverse kinematics, by the solver in the settings of the evaluation."""
 
 
 def write_report(path: Path, report: Mapping[str, Any]) -> None:
@@ -27,15 +27,15 @@ def write_report(path: Path, report: Mapping[str, Any]) -> None:
 
 def read_report(path: Path) -> dict[str, Any]:
     """Read the file of an evaluation. Raises InputError if it is damaged."""
-    found = read_json(path)
-    check_report(path, found)
-    return found
+    report = read_json(path)
+    check_report(path, report)
+    return report
 
 
-def check_report(path: Path, found: Mapping[str, Any]) -> None:
-    """Raise InputError if what was read from the file of an evaluation is no report."""
-    if not {"mode", "mean", "clips"} <= found.keys():
-        raise InputError(f"{path}: cannot be read; remove it, and the run's command makes it again")
+def check_report(path: Path, report: Mapping[str, Any]) -> None:
+    """Raise InputError if what was read from the file of an evaluation is not a report."""
+    if not {"mode", "mean", "clips"} <= report.keys():
+        raise InputError(f"{path}: cannot be read; remove it, and repeat the run's command to evaluate again")
 
 
 def intact(path: Path) -> bool:
@@ -47,26 +47,24 @@ def intact(path: Path) -> bool:
 
 
 def current(path: Path, report: Mapping[str, Any]) -> bool:
-    """Return whether an evaluation was made with the present recipe versions."""
+    """Return whether an evaluation was made with the current component versions."""
     settings = report.get("settings") or {}
     return {"mode", "ik"} <= settings.keys() and path.stem == evaluation_id_of(settings)
 
 
 def outdated_by(path: Path, report: Mapping[str, Any]) -> str | None:
-    """Say which recipes of an evaluation have changed since, as "mode.window 2 -> 3"; None if none has.
+    """Return which components of an evaluation have changed since, as "mode.window 2 -> 3"; None if none has.
 
-    That is not known of metrics of one's own whose package is not in use.
+    Custom metrics whose package is not in use are not compared.
     """
-    if "recipes" not in report:  # a report from before they were recorded
-        return None if current(path, report) else "of an earlier version"
-    known = {name: number for name, number in report["recipes"].items() if version_of(name)}
+    known = {name: number for name, number in report.get("recipes", {}).items() if version_of(name)}
     return ", ".join(outdated(known)) or None
 
 
 def preference(path: Path, report: Mapping[str, Any], config: Mapping[str, Any]) -> tuple[bool, bool, str]:
-    """Return what sorts a run's evaluations, the one that counts last.
+    """Return a key that sorts a run's evaluations, the one that counts last.
 
-    Today's recipes come before the inverse kinematics of the run's own config, and that before the time.
+    Current component versions matter most, then the inverse kinematics of the run's config, then the time.
     """
     settings = report.get("settings") or {}
     own = solver_of(settings) == solver_of(config.get("evaluation") or {})
@@ -75,14 +73,17 @@ def preference(path: Path, report: Mapping[str, Any], config: Mapping[str, Any])
 
 def combined_by(reports: Sequence[Mapping[str, Any]]) -> dict[str, str | None]:
     """Return by mode which inverse kinematics (`solver_of`) made the branch `combined` of the last report."""
-    having = [report for report in reports if COMBINED in report["mean"]]
-    return {str(report.get("mode")): solver_of(report.get("settings") or {}) for report in having}
+    return {
+        str(report.get("mode")): solver_of(report.get("settings") or {})
+        for report in reports
+        if COMBINED in report["mean"]
+    }
 
 
 def of_one_solver(reports: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return reports in which the branch `combined` of a mode is by one inverse kinematics, the last one's.
+    """Return reports in which the branch `combined` of a mode is by one inverse kinematics only, the last.
 
-    In reports with another it is left out, so that results that are joined never mix two.
+    Reports with another lose that branch, so that joined results never mix two.
     """
     last = combined_by(reports)
 

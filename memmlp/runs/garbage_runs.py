@@ -1,4 +1,4 @@
-"""Runs that are no longer needed: failed ones, ones with an old recipe, and orphans."""
+"""Runs that are no longer needed: failed ones, ones by older component versions, and orphans."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Garbage(NamedTuple):
     Attributes:
         run: the run.
         kind: one of REASONS.
-        reason: why it may be deleted, in words.
+        reason: why it may be deleted.
         size: bytes in its folder.
     """
 
@@ -38,8 +38,7 @@ class Garbage(NamedTuple):
 def garbage(outputs: Path, kinds: Iterable[str] = REASONS) -> list[Garbage]:
     """Find the runs that may be deleted.
 
-    Runs on which a process works, runs with a tag or a note, and runs upon which a remaining run builds are
-    never among them.
+    Runs in progress, runs with a tag or a note, and runs that a remaining run needs are never among them.
 
     Args:
         outputs: the outputs folder.
@@ -71,15 +70,15 @@ def _reason(run: Run, orphans: Mapping[str, str]) -> tuple[str, str]:
     if run.failure and not run.done:  # a trained run may have failed in an export alone
         return "failed", run.failure
     if changed := outdated({**upstream_recipes(run), **(run.manifest.get("recipes") or {})}):
-        return "old", f"older recipe: {', '.join(changed)}"
+        return "old", f"older version: {', '.join(changed)}"
     return ("orphaned", orphans[run.id]) if run.id in orphans else ("", "")
 
 
 def _orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
     """Return the orphans' ids, each with the reason why it is an orphan.
 
-    Orphans are runs of earlier versions of a sweep that are in no plan now, VQ-VAEs and parts that no run
-    uses and no plan wants, and folders of runs that never began.
+    Orphans are runs of earlier versions of a sweep, VQ-VAEs and parts that no run uses and no plan contains,
+    and folders of runs that never started.
     """
     planned = {task["id"] for path in _plans(outputs) for task in _listed(path, "tasks")}
     before = {
@@ -93,7 +92,7 @@ def _orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
     empty = [run for run in runs if not run.manifest]
     found = {run_id: reason for run_id, reason in before.items() if run_id not in planned}
     found |= {run_id: f"a {kind_words(kinds[run_id])} that no run uses" for run_id in alone}
-    return found | {run.id: "nothing began in it" for run in empty}
+    return found | {run.id: "an empty folder" for run in empty}
 
 
 def _plans(outputs: Path) -> Iterator[Path]:

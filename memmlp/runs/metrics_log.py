@@ -1,4 +1,4 @@
-"""A run's log of metrics: one JSON line for each record, only ever appended to."""
+"""A run's log of metrics: one JSON line for each record, append-only."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class MetricsLog:
     def repair(self) -> None:
         """Replace the log by a copy of it, without an incomplete last line.
 
-        If an earlier owner of the run has the old file open, what it writes there is lost.
+        What an earlier owner of the run writes to the old file is lost.
         """
         if self.path.exists():
             content = self.path.read_bytes()
@@ -89,6 +89,8 @@ class MetricsLog:
             try:
                 metrics = parsed(line)
             except (ValueError, KeyError, TypeError):
-                raise InputError(f"{self.path}: line {number} is no line of a metrics log") from None
+                raise InputError(
+                    f"{self.path}: line {number} is damaged; remove it, or repeat the run with force=true"
+                ) from None
             entries[metrics.phase, metrics.step] = metrics
         return list(entries.values())

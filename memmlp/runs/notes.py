@@ -1,4 +1,4 @@
-"""Tags and notes that users give a run: the file `notes.json` in its folder, not part of any identity."""
+"""Tags and notes that users give a run: the file `notes.json` in its folder, which does not affect its id."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from memmlp.common.files import read_json, write_json
 from memmlp.runs.run import Run
 
 TAG = re.compile(r"[\w.+/:-]{1,64}")
-LONGEST = 10_000  # characters of a note
+MAX_LENGTH = 10_000  # characters of a note
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ def read_notes(run: Run) -> Notes:
 
 
 def add_tags(run: Run, tags: Iterable[str]) -> Notes:
-    """Add tags to a run. Raises InputError for a tag that is no short word."""
+    """Add tags to a run. Raises InputError for a tag that is not a short word."""
     known = read_notes(run)
-    return _write(run, Notes(tuple(sorted({*known.tags, *map(checked, tags)})), known.note))
+    return _write(run, Notes(tuple(sorted({*known.tags, *map(_checked, tags)})), known.note))
 
 
 def remove_tags(run: Run, tags: Iterable[str]) -> Notes:
@@ -52,21 +52,20 @@ def remove_tags(run: Run, tags: Iterable[str]) -> Notes:
     known, gone = read_notes(run), set(tags)
     if missing := sorted(gone - set(known.tags)):
         has = ", ".join(known.tags) or "none"
-        raise InputError(f"tag '{missing[0]}': run {run.id} has no such tag; it has {has}")
+        raise InputError(f"tag '{missing[0]}': run {run.id} does not have it; its tags: {has}")
     return _write(run, Notes(tuple(tag for tag in known.tags if tag not in gone), known.note))
 
 
 def set_note(run: Run, note: str) -> Notes:
     """Replace a run's note; an empty one removes it. Raises InputError for one that is too long."""
-    if len(note) > LONGEST:
-        raise InputError(f"note: {len(note)} characters; allowed are {LONGEST}")
+    if len(note) > MAX_LENGTH:
+        raise InputError(f"note: must have at most {MAX_LENGTH} characters, not {len(note)}")
     return _write(run, Notes(read_notes(run).tags, note.strip()))
 
 
-def checked(tag: str) -> str:
-    """Return the tag. Raises InputError if it is no short word."""
+def _checked(tag: str) -> str:
     if not TAG.fullmatch(tag):
-        raise InputError(f"tag '{tag}': allowed are up to 64 letters, digits and . _ + / : -")
+        raise InputError(f"tag '{tag}': must be up to 64 letters, digits and . _ + / : -")
     return tag
 
 

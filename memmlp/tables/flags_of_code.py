@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 
 from memmlp.runs.environment import changed, code_digests
-from memmlp.tables.flag_words import flags_of_difference, listed, quoted, unique
+from memmlp.tables.flag_words import flags_of_difference, listed, quoted
 from memmlp.tables.measured_run import Measured
 
 FILES = 5  # names of files that a flag has at most
@@ -73,10 +73,3 @@ def own_code(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
     for name in sorted({name for _, run in every for name in run.origin.plugins}):
         having = [(run.origin.plugins[name], label) for label, run in every if name in run.origin.plugins]
         yield from flags_of_difference(f"code of {name}", having)
-
-
-def computed_imports(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Flag users' packages that import by names that they compute, so that not all of their code is known."""
-    for files in unique(words for _, run in every if (words := run.origin.computed_imports)):
-        labels = quoted(label for label, run in every if run.origin.computed_imports == files)
-        yield f"edits are not seen of what is imported by computed names ({files}): {labels}"

@@ -88,7 +88,6 @@ def flags(
     yield from flags_of_code.recipes(every)
     yield from flags_of_code.upstream_weights(every)
     yield from flags_of_code.own_code(every)
-    yield from flags_of_code.computed_imports(every)
     uncommitted = [label for label, run in every if run.origin.changed]
     if uncommitted:
         yield f"made by code with uncommitted changes: {quoted(uncommitted)}"

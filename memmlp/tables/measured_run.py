@@ -16,7 +16,6 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
 from memmlp.motion.preparing.groups import Grouping
 from memmlp.runs.deployment_folder import as_deployed, deployed_precision, timed_on
-from memmlp.runs.environment import computed_imports
 from memmlp.runs.evaluation_file import intact, of_one_solver
 from memmlp.runs.lookup import frames_seen
 from memmlp.runs.origin import recorded_upstream, upstream_recipes
@@ -61,7 +60,6 @@ class Origin:
             the run was resumed upon others.
         partial: which part of its protocol's list the data is, in words; None if it is complete.
         plugins: version and code digest of each user's package that it uses.
-        computed_imports: the files of these that import by names that they compute, in words; None for none.
         offline: whether frames are made with later ones, so that it can't run as a stream.
         deployed: the precision of the exported file that was measured for size and times.
         timed_on: the processor on which size and times were measured, and ONNX Runtime's version there.
@@ -85,7 +83,6 @@ class Origin:
     upstream: str | None = None
     partial: str | None = None
     plugins: Mapping[str, str] = field(default_factory=dict)
-    computed_imports: str | None = None
     offline: bool = False
     deployed: str = "fp32"
     timed_on: str = UNKNOWN
@@ -360,7 +357,6 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
             name: f"{one['version'] or 'no version'} ({one['digest']})"
             for name, one in (manifest.get("plugins") or {}).items()
         },
-        computed_imports=computed_imports(manifest.get("plugins") or {}),
     )
 
 
@@ -395,8 +391,6 @@ def _joined(origin: Origin, others: Sequence[Origin]) -> Origin:
     for name in ("code", "hardware", "device", "gpu", "threads", "torch"):
         known = [word for other in others if (word := getattr(other, name)) not in (UNKNOWN, "version ?")]
         found[name] = _words([getattr(origin, name), *known])
-    computed = [one.computed_imports for one in (origin, *others) if one.computed_imports]
-    found["computed_imports"] = "; ".join(dict.fromkeys(computed)) or None
     plugins = dict(origin.plugins)
     for other in others:
         plugins = _both(plugins, other.plugins)

@@ -14,7 +14,7 @@ from typing import Any
 from memmlp.common.components import chosen
 from memmlp.common.progress import announce, notify
 from memmlp.motion.motion_source import MotionSource, Prepared
-from memmlp.runs.environment import packages_of_ones_own
+from memmlp.runs.environment import user_packages
 from memmlp.runs.evaluation_file import read_report
 from memmlp.runs.identity import NETWORK, VQVAE_SHAPE, Identity, deployment_id, evaluation_id
 from memmlp.runs.run import Run
@@ -161,7 +161,7 @@ def _measured_by_other_code(request: RunRequest, report: Mapping[str, Any]) -> b
 def own_code(request: RunRequest) -> dict[str, Any]:
     """Return version and digest of the user's packages that the config uses; empty if it uses none."""
     packages = request.config.get("plugins")
-    return {"plugins": packages_of_ones_own(packages)} if packages else {}
+    return {"plugins": user_packages(packages)} if packages else {}
 
 
 def results_of(request: RunRequest, run: Run) -> dict[str, Any]:

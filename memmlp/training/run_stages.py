@@ -26,7 +26,6 @@ from memmlp.live.pose_latency import measure_pose
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.motion_source import Prepared
 from memmlp.networks.motion_model import MotionModel
-from memmlp.runs.environment import computed_imports
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.identity import (
     NETWORK,
@@ -233,8 +232,6 @@ def train_run(
     steps = experiment.training.optim.steps
     announce(f"network: train it for {steps} steps (run {run.id})")
     begin(experiment, run, experiment.identity(data.digest), experiment.config, before)
-    if files := computed_imports(run.manifest.get("plugins") or {}):
-        notify(f"plugins: edits are not noticed in modules imported by computed names ({files})")
     run.write_manifest({"body": data.manifest.body, **data_warnings(experiment.config, data)})
     run.want(experiment.stage_ids)
     run.clear_stages()

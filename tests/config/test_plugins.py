@@ -25,7 +25,7 @@ from memmlp.config.compose import composed
 from memmlp.config.compose_plan import find_sweep
 from memmlp.config.schema import restored
 from memmlp.runs import environment
-from memmlp.runs.environment import code_digest, computed_imports, packages_of_ones_own
+from memmlp.runs.environment import code_digest, user_packages
 from memmlp.runs.identity import evaluation_id, evaluation_settings
 from memmlp.runs.run import Run
 from memmlp.sweep.search.search_file import parse_search
@@ -46,7 +46,7 @@ def write(folder: Path, files: dict[str, str]) -> None:
     for name, text in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
-    environment._own_digest.cache_clear()  # as in a process that starts now
+    environment._user_digest.cache_clear()  # as in a process that starts now
 
 
 @pytest.mark.parametrize("how", ["overrides", "environment", "entry point"])
@@ -381,7 +381,7 @@ def test_code_that_a_package_imports_is_its_code_too(folder: Path):
     """Directly or not, be it imported late; what is installed, memmlp's or imported by nobody is not."""
     write(folder, IMPORTING)
     plugins.activate(["mine"])
-    run, packages = Run(folder / "run"), packages_of_ones_own(["mine"])
+    run, packages = Run(folder / "run"), user_packages(["mine"])
     imported = ["helper", "lab.__init__", "lab.constants", "lab.deep.util", "lab.later"]
     assert [*packages] == ["mine", *imported]
     run.begin("memmlp", {}, data="d", upstream=None, plugins=packages)
@@ -392,26 +392,11 @@ def test_code_that_a_package_imports_is_its_code_too(folder: Path):
     assert run.changed_sources == [f"{name}:{name.split('.')[-1]}.py" for name in imported[1:]]
     write(folder, {**IMPORTING, "helper.py": "W = 100.0\n"})
     assert run.changed_sources == ["helper:helper.py"]
-    names = [name for name, one in packages_of_ones_own(["mine"]).items() if one != packages[name]]
+    names = [name for name, one in user_packages(["mine"]).items() if one != packages[name]]
     assert names == ["helper"]
     assert any(
         name.startswith("helper:") for name, _ in plugins.texts_outside_memmlp()
     )  # a plan may depend on it
-
-
-def test_imports_by_computed_names_are_recorded_unless_their_package_is_named(folder: Path):
-    registry = "import importlib\nfor name in NAMES: importlib.import_module(f'{__name__}.{name}')\n"
-    write(folder, {"mine.py": "import lab\n", "lab/__init__.py": registry, "lab/part.py": "P = 1\n"})
-    found = packages_of_ones_own(["mine"])
-    assert "computed_imports" not in found["mine"]
-    assert found["lab.__init__"]["computed_imports"] == "__init__.py"
-    assert computed_imports(found) == "lab.__init__: __init__.py"
-    assert computed_imports(packages_of_ones_own(["mine", "lab"])) is None
-    before = packages_of_ones_own(["mine", "lab"])
-    write(folder, {"lab/part.py": "P = 2\n"})
-    assert [name for name, one in packages_of_ones_own(["mine", "lab"]).items() if one != before[name]] == [
-        "lab"
-    ]
 
 
 def test_code_that_changed_since_is_told_where_nothing_imports_it(folder: Path):
@@ -419,7 +404,7 @@ def test_code_that_changed_since_is_told_where_nothing_imports_it(folder: Path):
     write(folder, {"mine.py": "A = 1\n"})
     plugins.activate(["mine"])
     run = Run(folder / "run")
-    run.begin("memmlp", {}, data="d", upstream=None, plugins=packages_of_ones_own(["mine"]))
+    run.begin("memmlp", {}, data="d", upstream=None, plugins=user_packages(["mine"]))
     write(folder, {"mine.py": "A = 22\n"})
     assert run.changed_sources == ["mine:mine.py"]
     assert "mine" not in sys.modules

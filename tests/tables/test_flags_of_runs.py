@@ -393,20 +393,6 @@ def test_runs_from_before_code_changed_are_said(
     assert flags() == []
 
 
-def test_imports_by_computed_names_are_said(sweep: Sweep, tmp_path: Path):
-    own = {"mine": {"version": None, "digest": "d", "computed_imports": "a.py, b.py"}}
-
-    def run(variant: Variant, seed: int) -> Run:
-        return fake_run(
-            tmp_path, variant.label, seed, origin={"plugins": own if variant.label == "by position" else None}
-        )
-
-    flags = [flag for flag in table_of(sweep, run).flags if "computed names" in flag]
-    assert flags == [
-        "edits are not seen of what is imported by computed names (mine: a.py, b.py): 'by position'"
-    ]
-
-
 def test_variants_that_saw_more_in_training_are_said(sweep: Sweep, tmp_path: Path):
     """A window twice as long, or a batch twice as large, is twice the data a step."""
     settings = {"optim": {"steps": 2000, "batch": 32}, "model": {"frames": 41}}
