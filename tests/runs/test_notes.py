@@ -26,16 +26,16 @@ def test_tags_and_note_are_kept_and_survive_a_reset(tmp_path: Path):
 @pytest.mark.parametrize("tag", ["", "two words", "x" * 65, "a,b", "a\nb"])
 def test_a_tag_is_a_short_word(tmp_path: Path, tag: str):
     run = begun(tmp_path)
-    with pytest.raises(InputError, match="allowed are up to 64"):
+    with pytest.raises(InputError, match="must be up to 64"):
         add_tags(run, ["good", tag])
     assert read_notes(run) == Notes()
 
 
 def test_what_is_not_there_or_too_long_is_refused(tmp_path: Path):
     run = begun(tmp_path)
-    with pytest.raises(InputError, match="no such tag; it has none"):
+    with pytest.raises(InputError, match="tag 'good'"):
         remove_tags(run, ["good"])
-    with pytest.raises(InputError, match="10001 characters"):
+    with pytest.raises(InputError, match="note: "):
         set_note(run, "x" * 10001)
 
 

@@ -336,5 +336,5 @@ def test_metrics_of_other_code_are_measured_again(tmp_path: Path, monkeypatch: p
         assert run_stages.unmeasured(experiment, run) == []
         code.write_text("A = 2\n")
         assert run_stages.unmeasured(experiment, run) == []  # this process would measure them as before
-        environment._own_digest.cache_clear()
+        environment._user_digest.cache_clear()
         assert run_stages.unmeasured(experiment, run) == ["stream"]
