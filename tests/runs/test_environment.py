@@ -53,13 +53,6 @@ def test_a_patch_is_of_the_code_that_runs(tmp_path: Path, monkeypatch: pytest.Mo
             one.cache_clear()
 
 
-def test_code_that_decides_what_reaches_the_constructors_is_recorded():
-    folder = module.PACKAGE / "config"
-    builders = [path for path in folder.glob("build*.py") if "built(" in path.read_text()]
-    assert len(builders) > 1
-    assert {f"config/{path.name}" for path in builders} <= module.code_digests().keys()
-
-
 FILES = {
     "lab/__init__.py": "",
     "lab/mine.py": "import os, memmlp.api, site_module\nfrom . import near\nfrom ..nowhere import x\n",
