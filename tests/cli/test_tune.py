@@ -117,7 +117,7 @@ def test_a_second_owner_is_refused(home: Path):
         ("+search.space.optim.lrr={low: 0.1, high: 1.0}", "optim.lrr"),
         (
             "+search.space.optim.batch={low: -4, high: 8}",
-            "search.space: optim.batch=-4: allowed is at least 1",
+            "search.space: optim.batch=-4: must be at least 1",
         ),
         ("optim.lr=-1", "memmlp: optim.lr=-1"),
         ("loss.rotation_all=5", "loss.rotation_all=5: is searched"),

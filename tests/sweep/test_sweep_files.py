@@ -255,10 +255,9 @@ def test_the_cells_of_scaling_are_lines_through_one_point():
     assert sorted(map(tuple, away)) == sorted(
         [(), *[("optim.steps",)] * 4, *[("profile.width",)] * 3, *[("data.split.train_fraction",)] * 3]
     )
-    for cell in cells:
-        assert 8 * int(cell["profile.memory_width"]) == 3 * int(cell["profile.width"])
-    paper = composed(["profile=paper"])
-    assert 8 * paper.memory.width == 3 * paper.model.width
+    for words in (["profile=paper"], *([f"profile.width={cell['profile.width']}"] for cell in cells)):
+        cfg = composed(words)
+        assert 8 * cfg.memory.width == 3 * cfg.model.width
     for variant in sweep.variants:
         assert (
             variant.series == "Mem-MLP" or sweep.control_of(variant) == f"Mem-MLP, {', '.join(variant.cell)}"
