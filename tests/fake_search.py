@@ -31,7 +31,7 @@ def search(**changes: Any) -> Search:
 
 
 def open_study(folder: Path, **changes: Any) -> Study:
-    return Study.opened(search(**changes), "mine", folder)
+    return Study.open(search(**changes), "mine", folder)
 
 
 def compose(values: Mapping[str, Value], seeds: int = 1) -> list[list[RunTask]]:
@@ -66,7 +66,7 @@ def finish(plan: Plan) -> None:
 
 def to_the_end(study: Study, folder: Path, capacity: int = 2) -> None:
     one = director(study, folder)
-    while (plan := one.look(capacity)).tasks:
+    while (plan := one.update(capacity)).tasks:
         finish(plan)
 
 
@@ -86,10 +86,10 @@ def with_a_pruned_trial(folder: Path) -> Study:
     """Return a search in a folder with a trial that ended at 5, one that was pruned at 9, and one begun."""
     study = open_study(folder, pruner="median", prune_after=1)
     one = director(study, folder)
-    finished = begun(one.look(1))
+    finished = begun(one.update(1))
     for step in (10, STEPS):
         log(finished, step, 5.0)
     finished.finish([])
-    log(begun(one.look(1)), 10, 9.0)
-    one.look(1)
+    log(begun(one.update(1)), 10, 9.0)
+    one.update(1)
     return study

@@ -87,7 +87,7 @@ def show_in_loggers(plan: Plan, folder: Path, table: Table) -> None:
     from omegaconf import OmegaConf
 
     from memmlp.config.build import build_loggers
-    from memmlp.tables.sweep_summary import write_summary
+    from memmlp.tables.build_table import write_summary
 
     write_summary(plan, table, folder)
     if plan.tasks:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -60,16 +60,13 @@ def save_command(
 
     SWEEP and OVERRIDES are those of `memmlp sweep`. The file keeps its results of other variants and seeds.
     """
-    from memmlp.cli.shown_seeds import shown_sweep
+    from memmlp.cli.table import shown_sweep
     from memmlp.common.files import plain
     from memmlp.config.compose_plan import find_sweep, is_path
     from memmlp.report.kept_results import Kept, load_kept, overrides_of, save, shorten_paths
-    from memmlp.tables.build_table import finished_runs
-    from memmlp.tables.flag_words import listed
-    from memmlp.tables.flags_of_runs import gaps
+    from memmlp.tables.build_table import finished_runs, run_finder
+    from memmlp.tables.flags import listed, missing_seeds
     from memmlp.tables.measured_run import load
-    from memmlp.tables.runs_of_plan import run_finder
-    from memmlp.tables.seed_rounds import as_json
 
     sweep = find_sweep(name, overrides)
     shown = shown_sweep(sweep, overrides, outputs.absolute())
@@ -84,7 +81,7 @@ def save_command(
         shorten_paths(word for word in overrides if not word.startswith("seed=")),
         runs,
         overrides_of(sweep),
-        plain(as_json(shown.rounds)) if shown.rounds else None,
+        plain(asdict(shown.rounds)) if shown.rounds else None,
         flags,
     )
     if not kept.every:
@@ -103,7 +100,7 @@ def save_command(
     click.echo(f"{path}: {kept.count} runs, {added} of them from here")
     variants = shown.sweep.runnable()
     present = {variant.label: kept.runs.get(variant.label, {}) for variant in variants}
-    missing = {variant.label: gaps(shown.sweep, variant, present) for variant in variants}
+    missing = {variant.label: missing_seeds(shown.sweep, variant, present) for variant in variants}
     lines = [f"'{label}' seed {', '.join(map(str, seeds))}" for label, seeds in missing.items() if seeds]
     if lines:
         click.echo(f"missing of the sweep: {listed(lines)}; make them with: {kept.command}")
@@ -125,7 +122,7 @@ folder_option = click.option(
 @folder_option
 def show(name: str, source: str | None, together: tuple[str, ...], folder: Path) -> None:
     """Print the table of kept results, without any run; NAME is that of their page."""
-    from memmlp.cli.table import on_screen
+    from memmlp.cli.table import print_tables
     from memmlp.report.kept_results import load_kept
     from memmlp.tables.build_table import titled
 
@@ -134,7 +131,7 @@ def show(name: str, source: str | None, together: tuple[str, ...], folder: Path)
         known = ", ".join(sorted(one.stem for one in path.parent.glob("*.json")))
         raise InputError(f"{path}: no such results; must be one of: {known or '(none are kept)'}")
     table = _make_table(load_kept(path), source, together)
-    on_screen([titled(table, source) if source else table])
+    print_tables([titled(table, source) if source else table])
 
 
 @results.command("docs")
@@ -193,16 +190,16 @@ def _make_table(kept: Kept, source: str | None = None, patterns: Sequence[str] =
         source: the only source whose test clips are shown; None for all.
         patterns: test clips that match the same text of a pattern are one group.
     """
-    from memmlp.cli.shown_seeds import flag_of_other_rounds
+    from memmlp.cli.table import flag_of_other_rounds
     from memmlp.config.compose_plan import find_sweep
     from memmlp.runs.recipe_versions import outdated
     from memmlp.tables.build_table import make_table, on_source, together
-    from memmlp.tables.seed_rounds import of_json
+    from memmlp.tables.seed_rounds import Rounds
 
     # With the command line's overrides, the table warns of other data than its own.
     sweep = replace(find_sweep(kept.sweep), command_line=kept.overrides)
     flags: list[str] = []
-    rounds = of_json(kept.rounds) if kept.rounds else None
+    rounds = Rounds.of_json(kept.rounds) if kept.rounds else None
     other = flag_of_other_rounds(rounds, sweep) if rounds else None
     if rounds and not other:
         if source or patterns:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,14 +12,16 @@ from typing import TYPE_CHECKING
 import click
 
 from memmlp.cli.options import config_dir_option, outputs_option, plugins_option
-from memmlp.cli.workers import Workers, hire, worker_options
+from memmlp.cli.workers import Workers, start_fleet, worker_options
 from memmlp.common.errors import InputError
 from memmlp.runs.identity import NETWORK
 
 if TYPE_CHECKING:
-    from memmlp.cli.shown_seeds import ShownSweep
+    from memmlp.cli.table import ShownSweep
     from memmlp.sweep.definition import Sweep
     from memmlp.sweep.plan import Plan
+    from memmlp.tables.effects import RunsBySeed
+    from memmlp.tables.seed_rounds import Analysis, Rounds
 
 
 @click.command("sweep")
@@ -29,21 +32,17 @@ if TYPE_CHECKING:
     "variants",
     metavar="LABEL",
     multiple=True,
-    help="Run this variant alone, with what it builds on; may be given again.",
+    help="Run this variant alone, with its prerequisites; repeatable.",
 )
 @worker_options
-@click.option("--status", is_flag=True, help="Show how far the sweep is, and run nothing.")
+@click.option("--status", is_flag=True, help="Show the sweep's progress, and run nothing.")
 @click.option(
-    "--dry-run", is_flag=True, help="Show what would be run and how long it may take, and run nothing."
+    "--dry-run", is_flag=True, help="Show what would be run and the expected time, and run nothing."
 )
 @click.option("--retry", is_flag=True, help="Run again what failed before.")
-@click.option(
-    "--again", is_flag=True, help="Train the sweep's networks again, begun ones too; not what they build on."
-)
+@click.option("--again", is_flag=True, help="Train the sweep's networks again, but not their prerequisites.")
 @click.option("--fail-fast", is_flag=True, help="End the sweep with the first run that fails.")
-@click.option(
-    "--until-decided", is_flag=True, help="Add seeds in rounds, to variants whose verdicts are inconclusive."
-)
+@click.option("--until-decided", is_flag=True, help="Add seeds to variants with inconclusive verdicts.")
 @click.option(
     "--max-seeds", type=int, help="Most seeds that a variant may get, with --until-decided.  [default: 13]"
 )
@@ -66,66 +65,59 @@ def sweep(
     yes: bool,
     outputs: Path,
 ) -> None:
-    """Run what is missing of a sweep: NAME is a file's path, a shipped sweep, or a table's number.
+    """Run the missing runs of a sweep: NAME is a file's path, a shipped sweep, or a table's number.
 
     OVERRIDES are those of `memmlp train`, for all variants; `seed=0,1` sets the seeds. The workers are
-    processes of this machine, which share out its GPUs, jobs of Slurm (`executor=slurm slurm.partition=P
+    processes of this machine, which share its GPUs, jobs of Slurm (`executor=slurm slurm.partition=P
     slurm.time=10:00:00 slurm.gpus=1`, and any option of sbatch), or tasks of Ray (`executor=ray
     ray.num_gpus=1`) or Dask (`executor=dask`).
 
-    With --until-decided all variants get three seeds first. Then only those with open verdicts, and their
-    controls, get more, up to --max-seeds.
+    With --until-decided all variants get three seeds first. Then only those with inconclusive verdicts, and
+    their controls, get more, up to --max-seeds.
     """
-    from memmlp.cli import seed_rounds
-    from memmlp.cli.shown_seeds import ShownSweep, spent_before
+    from memmlp.cli.table import ShownSweep, flag_of_earlier_rounds
     from memmlp.config.compose_plan import find_sweep, kept_or_new_plan, sweep_folder
 
-    seed_rounds.check(overrides, until_decided, max_seeds)
+    check_rounds_options(overrides, until_decided, max_seeds)
     if again and (until_decided or status or dry_run):
-        raise InputError("--again: allowed is without --until-decided, --status and --dry-run")
+        raise InputError("--again: does not go with --until-decided, --status and --dry-run")
     if variants and until_decided:
-        raise InputError("--variant: allowed is without --until-decided, which chooses variants itself")
+        raise InputError("--variant: does not go with --until-decided, which chooses variants itself")
     chosen = find_sweep(name, overrides)
     labels = chosen.labels_of(variants)
     outputs = outputs.absolute()
-    rounds = seed_rounds.current_rounds(chosen, outputs, max_seeds) if until_decided else None
+    rounds = current_rounds(chosen, outputs, max_seeds) if until_decided else None
     spent = rounds.spent(chosen) if rounds else chosen
     plan = kept_or_new_plan(spent, outputs, prepare=not (status or dry_run))
     wanted = plan.of_variants(labels)
     if status or dry_run:
         show(spent, plan, labels)
         if rounds:
-            click.echo("\n".join([seed_rounds.schedule(rounds), *seed_rounds.progress_lines(rounds, chosen)]))
+            click.echo("\n".join([describe_schedule(rounds), *describe_progress(rounds, chosen)]))
         if dry_run:
             show_forecast(spent, wanted, labels, workers.number(workers.shares(devices(wanted))))
-            click.echo(workers.script(sweep_folder(chosen, outputs)) or "", nl=False)
+            click.echo(workers.script(sweep_folder(chosen, outputs)), nl=False)
         return
     if retry:
         for task in wanted.tasks:
             wanted.run_of(task).retry()
-    if again:
-        reset(wanted)
+    if again:  # networks, finished or started; prerequisites stay
+        for run in {task.id: wanted.run_of(task) for task in wanted.tasks if task.kind == NETWORK}.values():
+            with run.lock():
+                run.reset()
     work = partial(run_workers, workers=workers)
+    given = [name, *overrides]
     if rounds:
-        rounds, plan = seed_rounds.run_until_decided(chosen, outputs, rounds, work, fail_fast)
-        show_outcome(ShownSweep(rounds.spent(chosen), plan, rounds), [name, *overrides], chosen, labels)
+        rounds, plan = run_until_decided(chosen, outputs, rounds, work, fail_fast)
+        show_outcome(ShownSweep(rounds.spent(chosen), plan, rounds), given, chosen, labels)
         return
     wanted = replace(wanted, fail_fast=fail_fast)
     if wanted.left():
         work(chosen, wanted)
-    show_outcome(
-        ShownSweep(chosen, replace(plan, fail_fast=fail_fast), None, spent_before(chosen, outputs)),
-        [name, *overrides],
-        chosen,
-        labels,
+    shown = ShownSweep(
+        chosen, replace(plan, fail_fast=fail_fast), None, flag_of_earlier_rounds(chosen, outputs)
     )
-
-
-def reset(plan: Plan) -> None:
-    """Remove the plan's networks, finished or begun, so that they are trained again; upstream runs stay."""
-    for run in {task.id: plan.run_of(task) for task in plan.tasks if task.kind == NETWORK}.values():
-        with run.lock():
-            run.reset()
+    show_outcome(shown, given, chosen, labels)
 
 
 def run_workers(chosen: Sweep, plan: Plan, workers: Workers) -> None:
@@ -134,7 +126,7 @@ def run_workers(chosen: Sweep, plan: Plan, workers: Workers) -> None:
     from memmlp.sweep.controller import oversee
     from memmlp.sweep.progress_table import Board
 
-    _, fleet = hire(sweep_folder(chosen, plan.outputs), plan, workers, devices(plan))
+    _, fleet = start_fleet(sweep_folder(chosen, plan.outputs), plan, workers, devices(plan))
     oversee(plan, fleet, Board())
 
 
@@ -144,7 +136,7 @@ def devices(plan: Plan) -> set[str]:
 
 
 def show(chosen: Sweep, plan: Plan, labels: Collection[str]) -> None:
-    """Print the board once, what older code made, and runs left over from earlier versions of the file.
+    """Print the board once, results of older code, and orphaned runs of earlier versions of the file.
 
     Args:
         chosen: the sweep.
@@ -153,9 +145,8 @@ def show(chosen: Sweep, plan: Plan, labels: Collection[str]) -> None:
     """
     from rich.console import Console
 
-    from memmlp.config.compose_plan import orphans
     from memmlp.sweep.progress_table import render
-    from memmlp.tables.flags_of_code import older_code
+    from memmlp.tables.flags import older_code
 
     shown = plan.of_variants(labels)
     click.echo(f"overrides: {' '.join(chosen.command_line) or 'none'}")  # others are another sweep
@@ -165,13 +156,20 @@ def show(chosen: Sweep, plan: Plan, labels: Collection[str]) -> None:
         done = [(e.label, shown.run_of(e).manifest) for e in shown.entries if states[e.key] == "done"]
         for line in older_code((label, m.get("sources", {}), m.get("plugins", ())) for label, m in done):
             click.echo(line)
-    if found := unprepared(chosen, shown, labels):
-        click.echo(f"{found} runs: their data is not prepared yet; the sweep does that first")
+    if count := count_unprepared(chosen, shown, labels):
+        click.echo(f"{count} runs: their data is not prepared yet; the sweep does that first")
+    show_orphans(chosen, plan)
+
+
+def show_orphans(chosen: Sweep, plan: Plan) -> None:
+    """Print the runs of earlier versions of the sweep's file that it no longer has."""
+    from memmlp.config.compose_plan import orphans
+
     for entry in orphans(chosen, plan):
         click.echo(f"orphan: run {entry.id} was '{entry.label}' seed {entry.seed} in an earlier version")
 
 
-def unprepared(chosen: Sweep, plan: Plan, labels: Collection[str]) -> int:
+def count_unprepared(chosen: Sweep, plan: Plan, labels: Collection[str]) -> int:
     """Return how many runs of these variants their plan lacks because their data is not prepared yet."""
     return sum(one.label in labels for one in chosen.variant_seeds()) - len(plan.entries)
 
@@ -181,50 +179,211 @@ def show_forecast(chosen: Sweep, plan: Plan, labels: Collection[str], workers: i
 
     VQ-VAEs are counted only for runs whose data is prepared.
     """
-    from memmlp.sweep.forecast import forecast
+    from memmlp.sweep.plan import forecast
 
-    left, later = plan.left(), unprepared(chosen, plan, labels)
+    left, later = plan.left(), count_unprepared(chosen, plan, labels)
     besides = ", and the VQ-VAEs that they need" if later else ""
     line = f"{len(left) + later} of {len(plan.tasks) + later} runs to do{besides}, {workers} at once"
     if not later and (found := forecast(plan)):
-        line += (
-            f": about {found.seconds / workers / 60:.0f} min, judged by its {found.finished} finished runs"
-        )
+        minutes = found.seconds / workers / 60
+        line += f": about {minutes:.0f} min, estimated from {found.finished} finished runs"
         if found.unlike:
-            line += (
-                f" ({found.unlike} runs are of variants without a finished one, and judged by other variants)"
-            )
+            line += f" ({found.unlike} runs are of variants without a finished one, estimated from others)"
     click.echo(line)
 
 
-def show_outcome(shown: ShownSweep, words: Sequence[str], chosen: Sweep, labels: Collection[str]) -> None:
+def show_outcome(shown: ShownSweep, given: Sequence[str], chosen: Sweep, labels: Collection[str]) -> None:
     """Print the table, finished and failed runs, and the next command.
 
     Exits with 1 if something failed that the variants with these labels need.
+
+    Args:
+        shown: the part of the sweep that the table shows.
+        given: the sweep's name and overrides, as they were given.
+        chosen: the sweep.
+        labels: the labels of the variants that were run.
     """
     from memmlp.cli.loggers import show_in_loggers
-    from memmlp.cli.seed_rounds import closing
-    from memmlp.cli.table import SHOWN_MODES, on_screen, table_of_plan
+    from memmlp.cli.table import SHOWN_MODES, print_tables, table_of_plan
     from memmlp.config import plugins
-    from memmlp.config.compose_plan import orphans, sweep_folder
+    from memmlp.config.compose_plan import sweep_folder
     from memmlp.tables.measured_run import load
 
-    plan, rounds, words = shown.plan, shown.rounds, [*words, *plugins.config_dir_words()]
+    plan, rounds, command = shown.plan, shown.rounds, " ".join([*given, *plugins.config_dir_words()])
     states = plan.states()
     failed = [task for task in plan.of_variants(labels).tasks if states[task.key] in ("failed", "blocked")]
-    command = " ".join(["memmlp sweep", *words])
-    found = table_of_plan(shown, SHOWN_MODES["both"], command, load)
+    found = table_of_plan(shown, SHOWN_MODES["both"], f"memmlp sweep {command}", load)
     show_in_loggers(plan, sweep_folder(chosen, plan.outputs), found.table)
-    on_screen([found.table])
-    for line in closing(rounds, chosen, found.runs) if rounds else ():
+    print_tables([found.table])
+    for line in describe_end(rounds, chosen, found.runs) if rounds else ():
         click.echo(line)
     click.echo(f"{sum(state == 'done' for state in states.values())} of {len(states)} runs done")
-    for entry in orphans(chosen, plan):
-        click.echo(f"orphan: run {entry.id} was '{entry.label}' seed {entry.seed} in an earlier version")
+    show_orphans(chosen, plan)
     for task in failed:
-        reason = plan.run_of(task).failure or "what it builds upon failed"
+        reason = plan.run_of(task).failure or "a prerequisite run failed"
         click.echo(f"failed: run {task.id}: {reason}", err=True)
     if failed:
         click.echo("again with: --retry", err=True)
         raise SystemExit(1)
-    click.echo(f"next: memmlp report {' '.join(words)}")
+    click.echo(f"next: memmlp report {command}")
+
+
+def check_rounds_options(overrides: Sequence[str], wanted: bool, most: int | None) -> None:
+    """Raise InputError for options of --until-decided that don't go together."""
+    if most is None and not wanted:
+        return  # SciPy takes long to import
+    from memmlp.tables.seed_rounds import MOST
+    from memmlp.tables.statistics import analysis_schedule
+
+    if most is not None and not wanted:
+        raise InputError("--max-seeds: needs --until-decided")
+    if most is not None and most < (first := analysis_schedule(MOST)[0]):
+        raise InputError(f"--max-seeds {most}: must be at least {first}, the seeds of the first analysis")
+    for override in overrides:
+        if wanted and override.startswith("seed="):
+            raise InputError(f"{override}: does not go with --until-decided, which adds to the file's seeds")
+
+
+def current_rounds(sweep: Sweep, outputs: Path, most: int | None) -> Rounds:
+    """Return the rounds of a sweep so far; new ones if no interim analysis was done yet.
+
+    Args:
+        sweep: the sweep as it is now.
+        outputs: the folder of runs and caches.
+        most: the largest number of seeds of a variant (--max-seeds); None for that of the kept rounds, or the
+            default.
+
+    Raises:
+        InputError: if the analyses were of a sweep that has changed since, or with another maximum.
+    """
+    from memmlp.cli.table import rounds_path
+    from memmlp.tables.seed_rounds import MOST, Rounds, new_rounds
+
+    path = rounds_path(sweep, outputs)
+    kept = Rounds.read(path)
+    if kept is None or not kept.analyses:
+        return new_rounds(sweep, most or MOST)
+    wanted = new_rounds(sweep, most or len(kept.seeds))
+    if len(wanted.seeds) != len(kept.seeds):
+        raise InputError(f"--max-seeds {most}: must be {len(kept.seeds)}, as in the rounds of {path}")
+    if other := kept.difference(wanted):
+        raise InputError(f"{path}: its interim analyses were of other {other}; remove it to restart them")
+    return kept
+
+
+def run_until_decided(
+    sweep: Sweep, outputs: Path, rounds: Rounds, work: Callable[[Sweep, Plan], None], fail_fast: bool
+) -> tuple[Rounds, Plan]:
+    """Do one interim analysis after another until none can be done, and return the last rounds and plan.
+
+    Args:
+        sweep: the sweep with which the rounds began.
+        outputs: the folder of runs and caches.
+        rounds: the rounds so far.
+        work: finishes the runs of a sweep's plan.
+        fail_fast: whether the first failed run ends the rounds.
+    """
+    from memmlp.cli.table import rounds_path
+    from memmlp.config.compose_plan import kept_or_new_plan
+    from memmlp.tables.seed_rounds import check_same_runs
+
+    while True:
+        spent = rounds.spent(sweep)
+        plan = replace(kept_or_new_plan(spent, outputs, prepare=True), fail_fast=fail_fast)
+        check_same_runs(rounds, sweep, plan, rounds_path(sweep, outputs))
+        if plan.left():
+            work(spent, plan)
+        if plan.stopped:
+            return rounds, plan
+        after = analyse(sweep, outputs, rounds, plan)
+        if after == rounds:
+            return rounds, plan
+        rounds = after
+        click.echo("\n".join(describe_progress(rounds, sweep, rounds.analyses[-1])))
+
+
+def analyse(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
+    """Do the next interim analysis that can be done, record it, and return the rounds.
+
+    If another process has done one in the meantime, its rounds are returned.
+    """
+    from dataclasses import asdict
+
+    from memmlp.cli.table import rounds_path
+    from memmlp.common.files import write_json
+    from memmlp.common.lease import Lock
+    from memmlp.tables.build_table import finished_runs, run_finder
+    from memmlp.tables.measured_run import load
+    from memmlp.tables.seed_rounds import Rounds, advance, digest_of_runs
+
+    path = rounds_path(sweep, outputs)
+    with Lock(path.parent).hold():
+        kept = Rounds.read(path)
+        if kept is not None and len(kept.analyses) > len(rounds.analyses):
+            return kept
+        runs: dict[str, RunsBySeed] = finished_runs(rounds.spent(sweep), run_finder(plan, load))
+        digests = {
+            label: digest_of_runs(rounds, sweep, plan, label, rounds.schedule[number])
+            for label, number in rounds.upcoming(sweep).items()
+        }
+        after = advance(rounds, sweep, runs, digests)
+        write_json(path, asdict(after))
+    return after
+
+
+def describe_schedule(rounds: Rounds) -> str:
+    """Say at how many seeds there are interim analyses, and which share of the 5 % each one spends."""
+    parts = [
+        f"{seeds} ({100 * level:.2g} %)" for seeds, level in zip(rounds.schedule, rounds.levels, strict=True)
+    ]
+    return f"interim analyses at {', '.join(parts)} seeds; together they spend 5 %"
+
+
+def describe_progress(rounds: Rounds, sweep: Sweep, last: Analysis | None = None) -> list[str]:
+    """Describe each variant's progress: its verdicts, its seeds so far, and its next interim analysis."""
+    from memmlp.tables.seed_rounds import progress
+
+    variants = progress(rounds, sweep)
+    decided = sum(variant.decided for variant in variants)
+    head = f"analysis at {last.seeds} seeds ({100 * last.level:.2g} %): " if last else ""
+    rows = [("variant", "decided", "inconclusive", "seeds", "next")]
+    for one in variants:
+        following = f"at {one.next}" if one.next else ""
+        rows.append((one.label, str(one.decided), str(one.inconclusive), str(one.seeds), following))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)) for row in rows]
+    count = f"{head}{decided} of {len(rounds.comparisons(sweep))} comparisons decided"
+    return [count, *(line.rstrip() for line in lines)]
+
+
+def describe_end(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> list[str]:
+    """Say why the rounds ended, what more seeds could do, and how many runs were spent."""
+    from memmlp.tables.seed_rounds import forecast_seeds
+
+    latest = [finding for finding, _ in rounds.latest().values()]
+    still = [finding for finding in latest if finding.verdict == "inconclusive"]
+    evaluated = {mode for found in runs.values() for run in found.values() for mode in run.means}
+    without = Counter(key.label for key in rounds.without_findings(sweep) if key.mode in evaluated)
+    lines = [] if still or without or rounds.upcoming(sweep) else ["all verdicts are decided"]
+    lines += [
+        f"of '{label}' {number} comparisons have no verdict: the runs have nothing to compare"
+        for label, number in without.items()
+    ]
+    if any(finding.p is None for finding in still):
+        lines.append("test clips are one group, or a network diverged on one: no number of seeds decides")
+    forecasts: dict[str, list[int | None]] = {}
+    for key, seeds in forecast_seeds(rounds, sweep, runs).items():
+        forecasts.setdefault(key.label, []).append(seeds)
+    for label, numbers in forecasts.items():
+        some = [number for number in numbers if number is not None]
+        parts = [f"{len(some)} would take about {max(some)} seeds"] if some else []
+        if len(some) < len(numbers):
+            parts.append(f"{len(numbers) - len(some)} no number of seeds: the groups of clips are too few")
+        lines.append(f"inconclusive of '{label}', if its effects are as measured: {'; '.join(parts)}")
+    used, variants = sum(rounds.seed_counts(sweep).values()), len(sweep.runnable())
+    last = max((one.seeds for one in rounds.analyses), default=rounds.schedule[0])
+    fixed = [
+        f"{variants * seeds} with {seeds} seeds for every variant"
+        for seeds in sorted({last, rounds.schedule[-1]})
+    ]
+    return [*lines, f"{used} runs were spent; {', '.join(fixed)}"]

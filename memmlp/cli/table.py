@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import functools
 import gc
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -23,11 +22,11 @@ from memmlp.common.errors import InputError
 from memmlp.sweep.definition import BRANCHES
 
 if TYPE_CHECKING:
-    from memmlp.cli.shown_seeds import ShownSweep
     from memmlp.sweep.definition import Sweep
-    from memmlp.tables.effects import RunsBySeed
-    from memmlp.tables.runs_of_plan import Read
-    from memmlp.tables.seeds_needed import Need
+    from memmlp.sweep.plan import Plan
+    from memmlp.tables.build_table import Read
+    from memmlp.tables.effects import Need, RunsBySeed
+    from memmlp.tables.seed_rounds import Rounds
     from memmlp.tables.table import Table
 
 SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", "window")}
@@ -45,7 +44,7 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
 @click.option(
     "--out",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="File to write the table into; its ending tells the format.",
+    help="File to write the table into; its ending sets the format.",
 )
 @click.option(
     "--mode",
@@ -66,7 +65,7 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
     multiple=True,
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Show also what a browser measured: a file of the bench of memmlp web. For Table 17; repeatable.",
+    help="Add measurements of a browser: a file of the bench of memmlp web. For Table 17; repeatable.",
 )
 @click.option(
     "--untrained",
@@ -103,36 +102,26 @@ def table(
     from memmlp.tables.measured_run import load
 
     if seeds_needed and (form or out or add):
-        raise InputError("--seeds-needed: goes to the screen alone, without --format, --out and --add")
+        raise InputError("--seeds-needed: does not go with --format, --out and --add")
     measured = [rows_measured_in_browsers.read(path) for path in add]
     selection = TableSelection(branch, source, together, untrained)
-    with _uncollected():
+    gc.disable()  # what is read from the runs stays in use, and searching it for garbage takes a second
+    try:
         found = gathered([name], overrides, outputs, SHOWN_MODES[mode], functools.cache(load), selection)
+    finally:
+        gc.enable()
     if seeds_needed:
-        seeds_on_screen(found, SHOWN_MODES[mode])
+        print_needs(found, SHOWN_MODES[mode])
         return
     tables = [functools.reduce(rows_measured_in_browsers.with_rows, measured, one.table) for one in found]
     if form is None and out is None:
-        on_screen(tables)
+        print_tables(tables)
         return
     text = _formatted(tables, form or _form_of(out), alone=name != "all")
     if out is None:
         click.echo(text, nl=False)
     else:
         write(out, text)
-
-
-@contextmanager
-def _uncollected() -> Iterator[None]:
-    """Switch garbage collection off within the context.
-
-    Everything that is read from the runs stays in use, so searching it for garbage would waste a second.
-    """
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.enable()
 
 
 class TableSelection(NamedTuple):
@@ -186,7 +175,6 @@ def gathered(
     Raises:
         InputError: if none of them can be composed with the command line's overrides, or has that selection.
     """
-    from memmlp.cli.shown_seeds import shown_sweep
     from memmlp.common.progress import progress_bar
     from memmlp.tables.build_table import without_runs
 
@@ -219,15 +207,21 @@ def table_of_plan(
     selection: TableSelection = WHOLE,
 ) -> SweepTable:
     """Return a planned sweep's finished runs, and the table of a part of their results."""
-    from memmlp.tables.build_table import finished_runs, make_table, on_source, titled, together
-    from memmlp.tables.runs_of_plan import older_run_finder, run_finder, state_finder
+    from memmlp.tables.build_table import (
+        finished_runs,
+        make_table,
+        older_run_finder,
+        on_source,
+        run_finder,
+        state_finder,
+        titled,
+        together,
+    )
 
     sweep, plan, rounds, flags = shown
     for option, given in (("source", selection.source), ("together", " ".join(selection.together))):
         if given and rounds:
-            raise InputError(
-                f"--{option} {given}: allowed for a fixed number of seeds, not for --until-decided"
-            )
+            raise InputError(f"--{option} {given}: does not go with rounds of seeds (--until-decided)")
     runs = finished_runs(sweep, run_finder(plan, read))
     if selection.untrained:
         from memmlp.config.untrained_costs import with_costs
@@ -259,7 +253,7 @@ def find_sweeps(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sw
     ]
 
 
-def on_screen(tables: Sequence[Table]) -> None:
+def print_tables(tables: Sequence[Table]) -> None:
     """Print tables in the width of the screen."""
     from rich.console import Console
 
@@ -270,16 +264,16 @@ def on_screen(tables: Sequence[Table]) -> None:
         show(one, console)
 
 
-def seeds_on_screen(found: Sequence[SweepTable], modes: Sequence[str]) -> None:
+def print_needs(found: Sequence[SweepTable], modes: Sequence[str]) -> None:
     """Print, sweep by sweep, how many seeds the paper's effects would need."""
-    from memmlp.tables.seeds_needed import needs
+    from memmlp.tables.effects import needs
     from memmlp.tables.table_text import caption
 
     for one in found:
         wanted = needs(one.sweep, one.runs, modes)
         click.echo(caption(one.table))
         if wanted:
-            click.echo(_needed(wanted))
+            click.echo(_describe_needs(wanted))
         else:
             click.echo(
                 "no variant with an effect that the paper prints has two seeds and two groups of clips"
@@ -287,18 +281,16 @@ def seeds_on_screen(found: Sequence[SweepTable], modes: Sequence[str]) -> None:
         click.echo()
 
 
-def _needed(wanted: Sequence[Need]) -> str:
-    """Return a line for each comparison, and a note on how to read them."""
+def _describe_needs(wanted: Sequence[Need]) -> str:
     rows = [("variant", "mode", "metric", "paper", "here", "seeds", "needed")]
     for need in wanted:
-        differences = (f"{need.paper:+.2f}", f"{need.measured:+.2f}")
-        number = "no number" if need.seeds is None else str(need.seeds)
-        rows.append((need.label, need.mode, need.metric, *differences, str(need.have), number))
+        numbers = (f"{need.paper:+.2f}", f"{need.measured:+.2f}", str(need.have))
+        rows.append((need.label, need.mode, need.metric, *numbers, str(need.seeds or "no number")))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [
         "  ".join(
-            word.ljust(width) if i < 3 else word.rjust(width)
-            for i, (word, width) in enumerate(zip(row, widths, strict=True))
+            text.ljust(width) if i < 3 else text.rjust(width)
+            for i, (text, width) in enumerate(zip(row, widths, strict=True))
         )
         for row in rows
     ]
@@ -320,12 +312,11 @@ def _formatted(tables: Sequence[Table], form: str, alone: bool) -> str:
 
 
 def _form_of(out: Path | None) -> str:
-    """Return the format for a file's suffix. Raises InputError for an unknown suffix."""
     from memmlp.tables.formats import FORMATS
 
     ending = out.suffix.removeprefix(".") if out else ""
     if ending not in FORMATS:
-        raise InputError(f"--out {out}: allowed endings are {', '.join(FORMATS)}, or any with --format")
+        raise InputError(f"--out {out}: expected an ending of {', '.join(FORMATS)}, or --format")
     return ending
 
 
@@ -337,3 +328,74 @@ def write(out: Path, text: str) -> None:
     except OSError as error:
         raise InputError(f"--out {out}: {error.strerror or error}") from None
     click.echo(str(out))
+
+
+class ShownSweep(NamedTuple):
+    """The part of a sweep that a table shows, if seeds may have been spent in rounds.
+
+    Attributes:
+        sweep: the sweep with the seeds that were spent.
+        plan: the plan of its runs.
+        rounds: the rounds that decided the verdicts; None if no rounds did.
+        flags: what a reader has to know if rounds were of something else.
+    """
+
+    sweep: Sweep
+    plan: Plan
+    rounds: Rounds | None
+    flags: tuple[str, ...] = ()
+
+
+def shown_sweep(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> ShownSweep:
+    """Return the sweep with its rounds, if interim analyses were done and fit the sweep's present form.
+
+    Otherwise the sweep is shown with its own seeds; if analyses were done, a flag says so.
+    """
+    from memmlp.config.compose_plan import kept_or_new_plan
+    from memmlp.tables.seed_rounds import Rounds, check_same_runs
+
+    path = rounds_path(sweep, outputs)
+    kept = Rounds.read(path)
+    if kept is None or not kept.analyses:
+        return ShownSweep(sweep, kept_or_new_plan(sweep, outputs), None)
+    seeds_given = any(override.startswith("seed=") for override in overrides)
+    if flag := flag_of_other_rounds(kept, sweep, seeds_given):
+        return ShownSweep(sweep, kept_or_new_plan(sweep, outputs), None, (flag,))
+    spent = kept.spent(sweep)
+    plan = kept_or_new_plan(spent, outputs)
+    try:
+        check_same_runs(kept, sweep, plan, path)
+    except InputError as error:
+        return ShownSweep(spent, plan, None, (f"seeds were spent in rounds, but not of these runs: {error}",))
+    return ShownSweep(spent, plan, kept)
+
+
+def flag_of_other_rounds(kept: Rounds, sweep: Sweep, seeds_given: bool = False) -> str | None:
+    """Return a flag if the sweep has changed since its interim analyses; else None.
+
+    `seeds_given` says that the sweep's seeds were given on the command line.
+    """
+    from memmlp.tables.seed_rounds import new_rounds
+
+    other = "seeds" if seeds_given else kept.difference(new_rounds(sweep, len(kept.seeds)))
+    if other is None:
+        return None
+    return f"seeds were spent in rounds with other {other}: these verdicts do not keep the 5 %"
+
+
+def flag_of_earlier_rounds(sweep: Sweep, outputs: Path) -> tuple[str, ...]:
+    """Return a flag for a table with a fixed number of seeds if interim analyses were done before."""
+    from memmlp.tables.seed_rounds import Rounds
+
+    kept = Rounds.read(rounds_path(sweep, outputs))
+    if kept is None or not kept.analyses:
+        return ()
+    return ("seeds were spent in rounds before; memmlp table has their verdicts, these do not keep the 5 %",)
+
+
+def rounds_path(sweep: Sweep, outputs: Path) -> Path:
+    """Return the file in which a sweep's rounds are kept."""
+    from memmlp.config.compose_plan import sweep_folder
+    from memmlp.tables.seed_rounds import ROUNDS_FILE
+
+    return sweep_folder(sweep, outputs) / ROUNDS_FILE

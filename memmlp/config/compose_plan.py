@@ -19,10 +19,9 @@ from memmlp.common.files import digest, read_json, write_json
 from memmlp.common.overrides import Override
 from memmlp.config.package_data import packaged
 from memmlp.config.plugins import activate, named, texts_outside_memmlp
-from memmlp.sweep.definition import Sweep, Variant, key_of
+from memmlp.sweep.definition import Sweep, Variant, keep_sweep, key_of
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
 from memmlp.sweep.sweep_file import load_sweep
-from memmlp.sweep.sweep_json import keep_sweep
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

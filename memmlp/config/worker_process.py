@@ -10,7 +10,7 @@ from pathlib import Path
 
 from memmlp.common.errors import InputError
 from memmlp.sweep.plan import Plan, RunTask
-from memmlp.sweep.worker import Cancelled, Presence, directed, work_off
+from memmlp.sweep.worker import Cancelled, Presence, has_controller, work_off
 from memmlp.training.request import RunRequest
 
 
@@ -47,7 +47,7 @@ def work_alone(path: str, gpu: bool) -> str | None:
     """
     if gpu and (line := missing_gpu()):
         return line
-    work_off(Path(path), partial(perform, Path(path), 0), lambda: directed(Path(path)))
+    work_off(Path(path), partial(perform, Path(path), 0), lambda: has_controller(Path(path)))
     return None
 
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 import time
 from pathlib import Path
 
 from memmlp.common.errors import InputError
-from memmlp.sweep.executors.executor import Executor, Handle, Work
+from memmlp.sweep.executors import Executor, Handle, Work
 from memmlp.sweep.plan import Plan
 from memmlp.sweep.progress_table import Board
 from memmlp.sweep.worker import Presence
@@ -25,7 +24,7 @@ class Fleet:
         work: what a worker does.
         size: the largest number of workers.
         logs: the folder of the workers' logs, for error messages.
-        presence: tells the workers that the controller is alive, for as long as the fleet exists.
+        presence: shows the workers that the controller is alive, for as long as the fleet exists.
     """
 
     def __init__(
@@ -39,7 +38,7 @@ class Fleet:
         self.executor, self.work, self.size, self.logs = executor, work, size, logs
         self.presence = presence
         self.handles: list[tuple[Handle, float]] = []
-        self.stillborn = 0
+        self.failed_starts = 0
         self.complaint: str | None = None
 
     def keep(self, wanted: int) -> None:
@@ -49,23 +48,21 @@ class Fleet:
             InputError: if workers, one after another, end as soon as they are started.
         """
         now = time.monotonic()
-        self._count_stillborn(now)
-        if self.stillborn >= PATIENCE * self.size:
+        living = []
+        for handle, started in self.handles:
+            if handle.alive():
+                living.append((handle, started))
+                continue
+            complaint = handle.complaint()
+            self.complaint = complaint or self.complaint
+            quick = complaint is not None or now - started < QUICK
+            self.failed_starts = self.failed_starts + 1 if quick else 0
+        self.handles = living
+        if self.failed_starts >= PATIENCE * self.size:
             reason = self.complaint or "the reason"
             raise InputError(f"workers end as soon as they are started: {reason}; see {self.logs}")
         if (missing := min(wanted, self.size) - len(self.handles)) > 0:
             self.handles += [(handle, now) for handle in self.executor.submit(self.work, missing)]
-
-    def _count_stillborn(self, now: float) -> None:
-        """Remove workers that ended, and count how many in a row ended right after their start."""
-        dead = [not handle.alive() for handle, _ in self.handles]
-        ended = list(itertools.compress(self.handles, dead))
-        self.handles = [worker for worker in self.handles if worker not in ended]
-        for handle, started in ended:
-            complaint = handle.complaint()
-            self.complaint = complaint or self.complaint
-            quick = complaint is not None or now - started < QUICK
-            self.stillborn = self.stillborn + 1 if quick else 0
 
     def cancel(self) -> None:
         """End all workers."""

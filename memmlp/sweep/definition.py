@@ -1,22 +1,30 @@
-"""A sweep: variants, seeds, and the overrides that train each variant (files: memmlp.sweep.sweep_file)."""
+"""A sweep: variants, seeds, the overrides that train each variant, and its copy beside its plan.
+
+`memmlp.sweep.sweep_file` reads sweep files.
+"""
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
+from memmlp.common.files import plain, read_json, write_json
 from memmlp.common.overrides import Override
 from memmlp.evaluation.metric_facts import SMALLEST
 
+SWEEP_FILE = "sweep.json"
+"""The copy of a sweep in its folder: its table can be shown without composing it."""
 MODES = ("stream", "window")
 BRANCHES = ("rotation", "position", "combined")
 SIZES = ("FLOPs", "MACs", "parameters", "size")
 """The costs that a network has before it is trained, on any machine."""
 TIMES = ("ms", "network ms", "pose ms", "ratio", "FPS")
-"""The costs that are measured in time, and so differ a little each time, even with nothing else at work."""
+"""The costs that are measured in time, so they differ a little each time."""
 COSTS = (*SIZES, *TIMES)
 """Metrics that are costs, not errors.
 
@@ -57,7 +65,7 @@ class Variant:
     @property
     def own_overrides(self) -> tuple[str, ...]:
         """The variant's overrides without those of its cell."""
-        return tuple(word for word in self.overrides or () if word not in self.cell)
+        return tuple(text for text in self.overrides or () if text not in self.cell)
 
 
 @dataclass(frozen=True)
@@ -110,16 +118,15 @@ class Sweep:
         Raises:
             InputError: for an unknown branch.
         """
-        name = parse_branch(branch, "branch")
+        parse_branch(branch, "branch")
         variants = tuple(
-            variant if variant.fixed or variant.branch == name else replace(variant, branch=name, paper={})
-            for variant in self.variants
+            one if one.fixed or one.branch == branch else replace(one, branch=branch, paper={})
+            for one in self.variants
         )
         return self if variants == self.variants else replace(self, variants=variants, branch_source=None)
 
     def control_of(self, variant: Variant) -> str | None:
-        """Return the label of a variant's control variant: the variant's own `against`, or else the sweep's
-        control.
+        """Return the label of a variant's control: its own `against`, or else the sweep's control.
 
         It is None for the sweep's control itself, unless that variant has an `against`, too.
         """
@@ -138,35 +145,32 @@ class Sweep:
             InputError: for an override of the outputs folder, which an option of the command sets, and for a
                 key that a variant sets itself, since the variant's value would win.
         """
-        if any(key_of(word) == "paths.outputs" for word in overrides):
-            raise InputError("paths.outputs: allowed here is --outputs FOLDER, or MEMMLP_OUTPUTS")
-        if any(key_of(word) == "save_predictions" for word in overrides):
+        keys = [key_of(text) for text in overrides]
+        if "paths.outputs" in keys:
+            raise InputError("paths.outputs: expected --outputs FOLDER, or MEMMLP_OUTPUTS")
+        if "save_predictions" in keys:
             raise InputError(
-                "save_predictions: a sweep's runs would write over each other's; allowed is memmlp eval RUN "
+                "save_predictions: a sweep's runs would overwrite each other's; use memmlp eval RUN "
                 "--save-predictions FOLDER"
             )
-        seeds = [one.value or "" for one in map(Override.parse, overrides) if one.key == "seed"]
-        others = tuple(word for word in overrides if key_of(word) != "seed")
-        self._check_keys_of_variants(others)
-        chosen = parse_seeds(seeds[-1].split(","), "seed") if seeds else self.seeds
-        return replace(self, command_line=(*self.command_line, *others), seeds=chosen)
-
-    def _check_keys_of_variants(self, overrides: Iterable[str]) -> None:
-        """Raise InputError for an override of a key that a variant sets itself."""
-        setters = {
-            key_of(word): variant.label for variant in self.runnable() for word in variant.overrides or ()
-        }
-        for word in overrides:
-            if (key := key_of(word)) in setters:
+        setters = {key_of(text): one.label for one in self.runnable() for text in one.overrides or ()}
+        others, seeds = [], self.seeds
+        for text, key in zip(overrides, keys, strict=True):
+            if key == "seed":
+                seeds = parse_seeds((Override.parse(text).value or "").split(","), "seed")
+                continue
+            others.append(text)
+            if key in setters:
                 raise InputError(
-                    f"{word}: variant '{setters[key]}' of sweep {self.name} sets {key} itself; "
-                    "allowed are keys that no variant sets"
+                    f"{text}: variant '{setters[key]}' of sweep {self.name} sets {key} itself; "
+                    "expected a key that no variant sets"
                 )
+        return replace(self, command_line=(*self.command_line, *others), seeds=seeds)
 
     def all_overrides(self, variant: Variant) -> tuple[str, ...]:
         """Return a variant's overrides: base, command line, its own; the last one of a key wins."""
-        words = (*self.base, *self.command_line, *(variant.overrides or ()))
-        return tuple({key_of(word): word for word in words}.values())
+        texts = (*self.base, *self.command_line, *(variant.overrides or ()))
+        return tuple({key_of(text): text for text in texts}.values())
 
     def runnable(self) -> tuple[Variant, ...]:
         """Return the variants that can be run: all except those with only the paper's values."""
@@ -202,15 +206,41 @@ def key_of(override: str) -> str:
 def parse_branch(value: Any, name: str) -> str:
     """Return the name of a branch. Raises InputError, naming the key, for an unknown one."""
     if value not in BRANCHES:
-        raise InputError(f"{name}: '{value}'; allowed are {', '.join(BRANCHES)}")
+        raise InputError(f"{name}: '{value}'; expected one of {', '.join(BRANCHES)}")
     return value
 
 
 def parse_seeds(value: Any, name: str) -> tuple[int, ...]:
     """Return the seeds, after a check that they are different whole numbers."""
-    if not isinstance(value, list):  # a number may be meant as how many
-        raise InputError(f"{name}: {value}; allowed is a list of whole numbers, each once, such as [0, 1, 2]")
-    words = [str(item).strip() for item in value]
-    if not words or not all(re.fullmatch(r"\d+", word) for word in words) or len(set(words)) < len(words):
-        raise InputError(f"{name}: {value}; allowed is a list of whole numbers, each once")
-    return tuple(map(int, words))
+    texts = [str(item).strip() for item in value] if isinstance(value, list) else []
+    if not texts or not all(re.fullmatch(r"\d+", text) for text in texts) or len(set(texts)) < len(texts):
+        raise InputError(f"{name}: {value}; expected a list of whole numbers, each once, such as [0, 1, 2]")
+    return tuple(map(int, texts))
+
+
+def keep_sweep(sweep: Sweep, folder: Path) -> None:
+    """Write the sweep into its folder, unless the folder has the same content already."""
+    content = plain(asdict(sweep))
+    if read_json(folder / SWEEP_FILE) != content:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / SWEEP_FILE, content)
+
+
+def kept_sweep(folder: Path) -> Sweep | None:
+    """Return the sweep kept in a folder; None if there is none. Raises InputError if it is damaged."""
+    path = folder / SWEEP_FILE
+    if not path.exists():
+        return None
+    try:
+        content = json.loads(path.read_bytes())
+        content["variants"] = [
+            Variant(**_with_tuples(fields, "overrides", "seeds", "cell")) for fields in content["variants"]
+        ]
+        names = ("notes", "base", "seeds", "variants", "metrics", "command_line")
+        return Sweep(**_with_tuples(content, *names))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: not a sweep ({error}); start the sweep again") from None
+
+
+def _with_tuples(fields: dict[str, Any], *names: str) -> dict[str, Any]:
+    return {**fields, **{name: tuple(fields[name]) for name in names if fields.get(name) is not None}}

@@ -1,4 +1,4 @@
-"""A plan: the runs that a sweep's variants and seeds need, and their progress.
+"""A plan: the runs that a sweep's variants and seeds need, their progress, and the remaining time.
 
 A plan holds only the runs' identities; their progress is read from the run folders. Plans are made in
 `config/compose_plan.py`, since that composes configs.
@@ -7,12 +7,13 @@ A plan holds only the runs' identities; their progress is read from the run fold
 from __future__ import annotations
 
 import json
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from statistics import fmean
+from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
@@ -111,24 +112,24 @@ class Plan:
         return run.done and all(map(run.has, task.stages))
 
     def states(self, before: Mapping[str, str] | None = None) -> dict[str, str]:
-        """Return the state of every task by its key: its run's, or "blocked" if an upstream run failed.
+        """Return the state of every task by its key: its run's, or "blocked" if a prerequisite run failed.
 
         Args:
             before: states found earlier; tasks that were done then are taken to be done, without a look at
                 their runs.
         """
         known = {key for key, state in (before or {}).items() if state == "done"}
-        own = {task.key: "done" if task.key in known else self._state(task) for task in self.tasks}
-        return self.with_blocked(own)
-
-    def _state(self, task: RunTask) -> str:
-        """Return the state of a task's run."""
-        return self.run_of(task).state(self.complete(task))
+        return self.with_blocked(
+            {
+                task.key: "done" if task.key in known else self.run_of(task).state(self.complete(task))
+                for task in self.tasks
+            }
+        )
 
     def with_blocked(self, states: Mapping[str, str]) -> dict[str, str]:
-        """Return the states with "blocked" for tasks that have a failed run upstream of them."""
+        """Return the states with "blocked" for tasks that have a failed prerequisite."""
         found = dict(states)
-        for task in self.tasks:  # those upstream come first
+        for task in self.tasks:  # prerequisites come first
             if found[task.key] != "done" and found.get(task.upstream or "") in ("failed", "blocked"):
                 found[task.key] = "blocked"
         return found
@@ -152,10 +153,6 @@ class Plan:
         """Whether a run failed in a plan that ends with the first failure."""
         return self.fail_fast and "failed" in self.states().values()
 
-    def counts(self) -> Counter[str]:
-        """Count the tasks in each state."""
-        return Counter(self.states().values())
-
     def save(self, path: Path) -> None:
         """Write the plan to a file, completely or not at all."""
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -163,24 +160,76 @@ class Plan:
 
     @classmethod
     def load(cls, path: Path) -> Plan:
-        """Read a saved plan. Raises InputError if the file is no plan."""
+        """Read a saved plan. Raises InputError if the file is not a plan."""
         try:
             content = json.loads(path.read_bytes())
-            content["entries"] = tuple(Entry(**_stages(entry)) for entry in content["entries"])
-            content["tasks"] = tuple(RunTask(**_stages(task)) for task in content["tasks"])
+            for name, kind in (("entries", Entry), ("tasks", RunTask)):
+                content[name] = tuple(
+                    kind(**{**fields, "stages": tuple(fields.get("stages", ()))}) for fields in content[name]
+                )
             content["cancelled"] = tuple(content["cancelled"])
             return cls(**{**content, "outputs": Path(content["outputs"])})
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(f"{path}: not a sweep's plan ({error}); start the sweep again") from None
 
 
-def _stages(fields: dict[str, Any]) -> dict[str, Any]:
-    """Return the fields of a task or entry with its stages as a tuple, which JSON turned into a list."""
-    return fields | {"stages": tuple(fields.get("stages", ()))}
-
-
 def unique(tasks: Iterable[RunTask]) -> tuple[RunTask, ...]:
-    """Return each task once, in the given order, and upstream runs right before the first that needs them."""
+    """Return each task once, in the given order, and prerequisites right before the first that needs them."""
     known = {task.key: task for task in tasks}
     order = (key for task in known.values() for key in (task.upstream, task.key) if key in known)
     return tuple(known[key] for key in dict.fromkeys(order))
+
+
+class Forecast(NamedTuple):
+    """The time that one worker would need for the remaining runs.
+
+    Attributes:
+        seconds: the time, seconds.
+        finished: how many finished runs the estimate comes from.
+        unlike: how many remaining runs belong to variants without a finished run, and are estimated from
+            other variants.
+    """
+
+    seconds: float
+    finished: int
+    unlike: int
+
+
+def forecast(plan: Plan) -> Forecast | None:
+    """Estimate each remaining run from the finished runs of its variant, else from those of its kind.
+
+    Returns:
+        None if nothing is left, or if no run of the kinds that are left has finished.
+    """
+    left = plan.left()
+    unfinished = {
+        task.id for task in left
+    }  # a trained run may lack an evaluation, so its time says too little
+    times: dict[str, float] = {}
+    kinds: dict[str, list[str]] = defaultdict(list)
+    for task in plan.tasks:
+        if task.id not in unfinished and (seconds := run_seconds(plan.run_of(task))) is not None:
+            times[task.id] = seconds
+            kinds[task.kind].append(task.id)
+    if not left or not all(kinds[task.kind] for task in left):
+        return None
+    total, used, unlike = 0.0, set(), 0
+    for task in left:
+        labels = {entry.label for entry in plan.entries if entry.id == task.id}
+        same = {entry.id for entry in plan.entries if entry.label in labels}
+        names = same & times.keys() or set(kinds[task.kind])
+        unlike += bool(same) and not same & times.keys()
+        total += fmean(times[name] for name in names)
+        used |= names
+    return Forecast(total, len(used), unlike)
+
+
+def run_seconds(run: Run) -> float | None:
+    """Return how long a finished run took, all stages together; None if it has not finished."""
+    found = run.manifest.get("seconds") if run.done else None
+    return sum(found.values()) if isinstance(found, dict) else found
+
+
+def count_states(plan: Plan) -> Counter[str]:
+    """Count a plan's tasks in each state."""
+    return Counter(plan.states().values())

@@ -23,22 +23,18 @@ COLOURS = {
     "done": "green", "running": "cyan", "failed": "red", "blocked": "red", "lost": "yellow",
     "trained": "yellow",
 }  # fmt: skip
-WORDS = {
+STATE_NAMES = {
     "new": "waiting", "trained": "trained, unfinished",
-    "stopped": "waiting, begun", "lost": "lost, to be taken over",
+    "stopped": "waiting, started", "lost": "lost, to be taken over",
 }  # fmt: skip
-
-
 VARIANT_WIDTH = 20  # columns that a variant's name has at least, or as many as it needs
-
-
-QUIET = 300.0  # seconds without a line, in a log, after which the progress of what runs is told
+QUIET = 300.0  # seconds without a line, in a log, after which the progress of the running runs is printed
 
 
 class Screen:
     """Shows content that changes: in place on a terminal, elsewhere as one line for every change.
 
-    Where nothing changes for long, and at the beginning, there are lines of the progress of what runs.
+    At the beginning, and where nothing changes for long, it prints lines about the running runs.
     """
 
     last_line: float | None = None
@@ -85,49 +81,42 @@ class Board(Screen):
 
     def update(self, plan: Plan, states: Mapping[str, str]) -> None:
         """Show the plan with its tasks in these states."""
-        self.show(lambda: render(plan, states), self._changes(plan, states), lambda: progress(plan, states))
+        done = f"{sum(state == 'done' for state in states.values())} of {len(states)} done"
+        changed = [
+            task for task in plan.tasks if self.before and self.before.get(task.key) != states[task.key]
+        ]
+        changes = [f"{done}; {_describe_change(plan, task, states[task.key])}" for task in changed]
+
+        def progress() -> list[str]:
+            lines = [
+                f"{task_name(plan, task)}: {progress_text(plan.run_of(task), total_steps(task))}"
+                for task in plan.tasks
+                if states[task.key] == "running"
+            ]
+            return [f"{done}; {line}" for line in lines or ["workers are starting"]]
+
+        self.show(lambda: render(plan, states), changes, progress)
         self.before = states
 
-    def _changes(self, plan: Plan, states: Mapping[str, str]) -> list[str]:
-        """Return a line for each task whose state changed since the last update."""
-        if self.before is None:
-            return []
-        changed = [task for task in plan.tasks if self.before.get(task.key) != states[task.key]]
-        return [f"{_done(states)}; {_change(plan, task, states[task.key])}" for task in changed]
 
-
-def progress(plan: Plan, states: Mapping[str, str]) -> list[str]:
-    """Return a line about each running run, or one that none runs yet."""
-    running = [task for task in plan.tasks if states[task.key] == "running"]
-    lines = [f"{name(plan, task)}: {progress_text(plan.run_of(task), total_steps(task))}" for task in running]
-    return [f"{_done(states)}; {line}" for line in lines or ["workers are starting"]]
-
-
-def _done(states: Mapping[str, str]) -> str:
-    return f"{sum(state == 'done' for state in states.values())} of {len(states)} done"
-
-
-def _change(plan: Plan, task: RunTask, state: str) -> str:
-    """Describe a task's new state, and the reason if it failed."""
+def _describe_change(plan: Plan, task: RunTask, state: str) -> str:
     run = plan.run_of(task)
     reason = run.failure if state == "failed" else None
     where = f" on {device_name(run)}" if state == "done" else ""
-    return f"{name(plan, task)}: {WORDS.get(state, state)}{where}{f', {reason}' if reason else ''}"
+    return f"{task_name(plan, task)}: {STATE_NAMES.get(state, state)}{where}{f', {reason}' if reason else ''}"
 
 
-def name(plan: Plan, task: RunTask) -> str:
+def task_name(plan: Plan, task: RunTask) -> str:
     """Return the task's readable name: variant and seed, or kind of run and the seeds that need it."""
-    names = [f"{entry.label} seed {entry.seed}" for entry in plan.entries if entry.key == task.key]
-    return names[0] if names else f"{kind_words(task.kind)} {task.id}{_seeds(plan, task)}"
-
-
-def _seeds(plan: Plan, upstream: RunTask) -> str:
-    """Name the seeds of the entries that need an upstream run."""
-    users = {upstream.id}
-    for task in plan.tasks:  # each after those that it needs
-        users |= {task.id} if task.upstream in users else set()
+    for entry in plan.entries:
+        if entry.key == task.key:
+            return f"{entry.label} seed {entry.seed}"
+    users = {task.id}
+    for other in plan.tasks:  # each after those that it needs
+        users |= {other.id} if other.upstream in users else set()
     seeds = sorted({entry.seed for entry in plan.entries if entry.id in users})
-    return f" of seed {', '.join(map(str, seeds))}" if seeds else ""
+    of_seeds = f" of seed {', '.join(map(str, seeds))}" if seeds else ""
+    return f"{kind_words(task.kind)} {task.id}{of_seeds}"
 
 
 def render(plan: Plan, states: Mapping[str, str]) -> Group:
@@ -136,9 +125,8 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
     seeds = sorted({entry.seed for entry in plan.entries})
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=f"sweep {plan.name}", title_justify="left")
     labels = list(dict.fromkeys(entry.label for entry in plan.entries))
-    table.add_column(
-        "variant", overflow="fold", min_width=min(VARIANT_WIDTH, max(map(len, labels), default=0))
-    )
+    width = min(VARIANT_WIDTH, max(map(len, labels), default=0))
+    table.add_column("variant", overflow="fold", min_width=width)
     for seed in seeds:
         table.add_column(f"seed {seed}")
     for label in labels:
@@ -146,13 +134,18 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
             e.seed: state_text(plan, tasks[e.key], states[e.key]) for e in plan.entries if e.label == label
         }
         table.add_row(Text(label), *(cells.get(seed, Text("-")) for seed in seeds))
-    below = [_upstream(plan, task, states[task.key]) for task in plan.tasks if task.kind != NETWORK]
-    running = [plan.run_of(task) for task in plan.tasks if states[task.key] == "running"]
-    below += [Text(_counts(states)), *map(Text, devices(running))]
+    below = [
+        Text(f"{task_name(plan, task)}: ") + state_text(plan, task, states[task.key])
+        for task in plan.tasks
+        if task.kind != NETWORK
+    ]
+    counts = Counter(STATE_NAMES.get(state, state).partition(",")[0] for state in states.values())
+    below.append(Text(", ".join(f"{count} {state}" for state, count in counts.items())))
+    below += map(Text, devices(plan.run_of(task) for task in plan.tasks if states[task.key] == "running"))
     if any(states[task.key] == "done" and result(plan.run_of(task)) for task in plan.tasks):
         below.append(Text("cm: done; MPJPE in stream mode of the rotation branch, a table may show another"))
     below += [
-        Text(f"{name(plan, task)}: {plan.run_of(task).failure}", style="red")
+        Text(f"{task_name(plan, task)}: {plan.run_of(task).failure}", style="red")
         for task in plan.tasks
         if states[task.key] == "failed"
     ]
@@ -161,16 +154,12 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
 
 def state_text(plan: Plan, task: RunTask, state: str) -> Text:
     """Describe a run in a few characters."""
-    run = plan.run_of(task)
+    run, style = plan.run_of(task), COLOURS.get(state, "")
     if state == "running":
-        return Text(progress_text(run, total_steps(task)), style=COLOURS[state])
+        return Text(progress_text(run, total_steps(task)), style=style)
     if state == "done":
-        return Text(result(run) or state, style=COLOURS[state])
-    return Text(WORDS.get(state, state), style=COLOURS.get(state, ""))
-
-
-def _upstream(plan: Plan, task: RunTask, state: str) -> Text:
-    return Text(f"{name(plan, task)}: ") + state_text(plan, task, state)
+        return Text(result(run) or state, style=style)
+    return Text(STATE_NAMES.get(state, state), style=style)
 
 
 def result(run: Run) -> str:
@@ -185,7 +174,7 @@ def total_steps(task: RunTask) -> int:
 
 
 def progress_text(run: Run, total: int) -> str:
-    """Describe a run that a process is working on: steps of its training, time left and loss."""
+    """Describe a run that a process is working on: steps of its training, remaining time and loss."""
     if (doing := run.doing) in ("evaluating", "exporting"):
         return doing
     log = [entry for entry in run.metrics() if entry.phase == "train"]
@@ -193,15 +182,11 @@ def progress_text(run: Run, total: int) -> str:
         return "starting"
     if log[-1].step >= total:
         return "evaluating"
-    left = time_left(log, total)
-    return f"{log[-1].step}/{total}{_words(left)} loss {log[-1].values['loss']:.3g}"
-
-
-def _words(seconds: float | None) -> str:
-    """Return a remaining time as text, in minutes if it is long; empty for None."""
-    if seconds is None:
-        return ""
-    return f" {seconds / 60:.0f} min" if seconds >= 90 else f" {seconds:.0f} s"
+    seconds = time_left(log, total)
+    left = ""
+    if seconds is not None:
+        left = f" {seconds / 60:.0f} min" if seconds >= 90 else f" {seconds:.0f} s"
+    return f"{log[-1].step}/{total}{left} loss {log[-1].values['loss']:.3g}"
 
 
 def time_left(log: list[LogRecord], total: int) -> float | None:
@@ -228,9 +213,3 @@ def device_name(run: Run) -> str:
     if not manifest.get("gpu"):
         return str(manifest.get("device") or "")
     return f"GPU {manifest.get('gpu_index', '?')} ({manifest['gpu']})"
-
-
-def _counts(states: Mapping[str, str]) -> str:
-    """Say how many runs are in each state."""
-    counts = Counter(WORDS.get(state, state).partition(",")[0] for state in states.values())
-    return ", ".join(f"{count} {word}" for word, count in counts.items())

@@ -76,12 +76,12 @@ def load_sweep(path: Path, prepare: Callable[[list[str]], None] = lambda base: N
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), UniqueKeys)
     except OSError as error:
-        raise InputError(f"{path}: {why_unreadable(error)}; allowed: a readable sweep file") from None
+        raise InputError(f"{path}: {why_unreadable(error)}; expected a readable sweep file") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not YAML: {why_unreadable(error)}") from None
     try:
         base = content.get("base") if isinstance(content, Mapping) else None
-        prepare([word for word in base if isinstance(word, str)] if isinstance(base, list) else [])
+        prepare([text for text in base if isinstance(text, str)] if isinstance(base, list) else [])
         return parse_sweep(path.stem, content)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -91,38 +91,60 @@ def parse_sweep(name: str, content: Any) -> Sweep:
     """Return the sweep that a file's content describes. Raises InputError, which names the key."""
     content = _mapping(content, "the file", KEYS)
     branch = parse_branch(content.get("branch", BRANCHES[0]), "branch")
-    variants = [
-        _variant(label, value, branch) for label, value in _labelled(content.get("variants", {})).items()
-    ]
+    variants = _variants(content.get("variants", {}), branch)
     grids, seeds = _axes(content)
     if "axes" in content and not variants:
         variants = [Variant("" if grids else BASE, branch=branch)]  # axes of seeds alone
     variants = list(_over_cells(variants, _cells(grids))) if grids else variants
     runnable = [variant.label for variant in variants if variant.overrides is not None]
     if not runnable:
-        raise InputError("variants: none to run; allowed is at least one variant with overrides, or axes")
+        raise InputError("variants: expected at least one with overrides, or axes")
     control = str(content.get("control", runnable[0]))
     if control not in runnable:
-        raise InputError(f"control: '{control}' is no variant; allowed are {', '.join(map(repr, runnable))}")
-    _check_controls(variants, runnable)
+        raise InputError(f"control: '{control}'; expected one of {', '.join(map(repr, runnable))}")
+    for variant in variants:
+        if variant.against is not None and variant.against not in {*runnable} - {variant.label}:
+            raise InputError(
+                f"variants.{variant.label}.against: '{variant.against}'; expected another one with overrides"
+            )
+    table = content.get("table")
+    if table is not None and (isinstance(table, bool) or not isinstance(table, int) or table < 1):
+        raise InputError(f"table: {table!r}; expected the number of a table of the paper")
+    metrics = _texts(content.get("metrics", ["MPJRE", "MPJPE", "MPJVE", "Jitter"]), "metrics")
+    if not metrics or not {*metrics} <= {*UNITS, *COSTS}:
+        raise InputError(f"metrics: {metrics}; expected a list of {', '.join([*UNITS, *COSTS])}")
+    smallest = _numbers(content.get("smallest", {}), "smallest", [*UNITS])
+    for metric, number in smallest.items():
+        if not 0 < number < math.inf:
+            raise InputError(f"smallest.{metric}: {number!r}; must be above 0")
     source = content.get("branch_source")
     return Sweep(
         name=name,
         title=_text(content.get("title", name), "title"),
-        table=_table(content.get("table")),
+        table=table,
         notes=tuple(_texts(content.get("notes", []), "notes")),
         base=tuple(_overrides(content.get("base", []), "base")),
         seeds=seeds,
         variants=tuple(variants),
         control=control,
-        metrics=_metrics(content.get("metrics", ["MPJRE", "MPJPE", "MPJVE", "Jitter"])),
+        metrics=tuple(metrics),
         branch_source=None if source is None else _text(source, "branch_source"),
-        smallest=SMALLEST | _smallest(content.get("smallest", {})),
+        smallest=SMALLEST | smallest,
     )
 
 
+def _variants(value: Any, branch: str) -> list[Variant]:
+    # A label that YAML reads as a number becomes text.
+    variants = [_variant(str(label), fields, branch) for label, fields in _mapping(value, "variants").items()]
+    if len({variant.label for variant in variants}) < len(variants):
+        raise InputError("variants: two have the same label")
+    for variant in variants:
+        if not variant.label.isprintable():
+            raise InputError(f"variants: {variant.label!r}; expected a label of one line")
+    return variants
+
+
 def _variant(label: str, value: Any, branch: str) -> Variant:
-    """Return a variant from its mapping, or from a bare list of its overrides; `branch` is the sweep's."""
     name = f"variants.{label}"
     if isinstance(value, list):
         return Variant(label, tuple(_overrides(value, name)), branch)
@@ -132,22 +154,11 @@ def _variant(label: str, value: Any, branch: str) -> Variant:
         label,
         None if overrides is None else tuple(_overrides(overrides, f"{name}.overrides")),
         parse_branch(value.get("branch", branch), f"{name}.branch"),
-        _paper(value.get("paper", {}), f"{name}.paper"),
+        _numbers(value.get("paper", {}), f"{name}.paper", [*UNITS, *COSTS]),
         value.get("note"),
         str(value["against"]) if value.get("against") is not None else None,
         "branch" in value,
     )
-
-
-def _check_controls(variants: Sequence[Variant], runnable: Sequence[str]) -> None:
-    """Raise InputError for a variant that is compared with itself, or with a variant that is not run."""
-    for variant in variants:
-        others = [label for label in runnable if label != variant.label]
-        if variant.against is not None and variant.against not in others:
-            raise InputError(
-                f"variants.{variant.label}.against: '{variant.against}' is no other variant; "
-                f"allowed are {', '.join(map(repr, others))}"
-            )
 
 
 def _axes(content: Mapping[str, Any]) -> tuple[list[dict[str, list[Any]]], tuple[int, ...]]:
@@ -158,165 +169,106 @@ def _axes(content: Mapping[str, Any]) -> tuple[list[dict[str, list[Any]]], tuple
     axes = content.get("axes", {})
     several = isinstance(axes, list)
     if several and not axes:
-        raise InputError("axes: an empty list; allowed is a mapping of keys, or a list of such mappings")
+        raise InputError("axes: empty; expected a mapping of keys, or a list of such mappings")
     named = [(f"axes[{place}]", grid) for place, grid in enumerate(axes)] if several else [("axes", axes)]
-    grids = [dict(_mapping(grid, name)) for name, grid in named]
-    own = {} if several else grids[0]
-    seeds = parse_seeds(own.pop("seed", content.get("seeds", [0])), "seeds")
-    for (name, _), grid in zip(named, grids, strict=True):
-        _check_grid(grid, name, several)
-    return [grid for grid in grids if grid], seeds
-
-
-def _check_grid(grid: Mapping[str, Any], name: str, several: bool) -> None:
-    """Raise InputError for a grid without cells, or for seeds in one of several grids."""
-    if several and not grid:
-        raise InputError(f"{name}: empty; allowed is a mapping of at least one key")
-    for key, values in grid.items():
-        if several and str(key) == "seed":
-            raise InputError(f"{name}.seed: allowed in a single grid; the seeds of several are set by seeds")
-        if not isinstance(values, list) or not values:
-            raise InputError(f"{name}.{key}: allowed is a list of values, not empty")
+    grids = [(name, dict(_mapping(grid, name))) for name, grid in named]
+    seeds = content.get("seeds", [0])
+    if not several:
+        seeds = grids[0][1].pop("seed", seeds)
+    for name, grid in grids:
+        if several and not grid:
+            raise InputError(f"{name}: empty; expected a mapping of at least one key")
+        for key, values in grid.items():
+            if several and str(key) == "seed":
+                raise InputError(f"{name}.seed: the seeds of several grids are set by the key seeds")
+            if not isinstance(values, list) or not values:
+                raise InputError(f"{name}.{key}: expected a list of values")
+    return [grid for _, grid in grids if grid], parse_seeds(seeds, "seeds")
 
 
 def _cells(grids: Sequence[Mapping[str, Sequence[Any]]]) -> list[tuple[str, ...]]:
-    """Return the cells of all grids as overrides, each cell once, whatever the order of its keys."""
     found: dict[frozenset[str], tuple[str, ...]] = {}
     for grid in grids:
         for values in itertools.product(*grid.values()):
-            words = tuple(f"{key}={_word(value)}" for key, value in zip(grid, values, strict=True))
-            found.setdefault(frozenset(words), words)
+            cell = tuple(f"{key}={_typed(value)}" for key, value in zip(grid, values, strict=True))
+            found.setdefault(frozenset(cell), cell)
     return list(found.values())
 
 
 def _over_cells(variants: Sequence[Variant], cells: Sequence[tuple[str, ...]]) -> Iterable[Variant]:
     """Yield every variant in every cell.
 
-    The paper's own variants stay as they are. A variant without a label gets its cell's overrides as label. A
-    variant with a control of its own is compared with that control in the same cell.
+    Rows with only the paper's values stay as they are. A variant without a label gets its cell's overrides as
+    label. A variant with a control of its own is compared with that control in the same cell.
     """
+    axes = {key_of(text) for cell in cells for text in cell}
     for variant in variants:
         if variant.overrides is None:
             yield variant
             continue
-        _check_free(variant, cells)
-        for words in cells:
-            label = ", ".join([variant.label, *words] if variant.label else words)
-            control = f"{variant.against}, {', '.join(words)}" if variant.against else None
-            overrides = (*variant.overrides, *words)
+        if both := sorted(axes & {key_of(text) for text in variant.overrides}):
+            raise InputError(f"variant '{variant.label}': sets {both[0]}, which is an axis; keep one of both")
+        for cell in cells:
             yield replace(
-                variant, label=label, overrides=overrides, against=control, series=variant.label, cell=words
+                variant,
+                label=", ".join([variant.label, *cell] if variant.label else cell),
+                overrides=(*variant.overrides, *cell),
+                against=f"{variant.against}, {', '.join(cell)}" if variant.against else None,
+                series=variant.label,
+                cell=cell,
             )
 
 
-def _check_free(variant: Variant, cells: Iterable[Sequence[str]]) -> None:
-    """Raise InputError if a variant sets a key of an axis, whose values would win over the variant's."""
-    own = {key_of(word) for word in variant.overrides or ()}
-    axes = {key_of(word) for words in cells for word in words}
-    if both := sorted(own & axes):
-        raise InputError(
-            f"variant '{variant.label}': sets {both[0]}, which is an axis; allowed is one of both"
-        )
-
-
-def _positive(number: Any) -> bool:
-    """Return whether a value is a finite number above 0."""
-    return isinstance(number, int | float) and not isinstance(number, bool) and 0 < number < math.inf
-
-
-def _word(value: Any) -> str:
-    """Return a value as the text that an override has for it."""
+def _typed(value: Any) -> str:
     if value is None:
         return "null"
-    if isinstance(value, bool):
-        return str(value).lower()
     if isinstance(value, list):
-        return f"[{','.join(map(_word, value))}]"
-    return str(value)
+        return f"[{','.join(map(_typed, value))}]"
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _mapping(value: Any, name: str, keys: Sequence[str] = ()) -> Mapping[str, Any]:
-    """Return the value, after a check that it is a mapping with known keys only."""
     if not isinstance(value, Mapping):
-        raise InputError(f"{name}: {_kind(value)}; allowed is a mapping")
+        raise InputError(f"{name}: {_shown(value)}; expected a mapping")
     for key in value:
         if keys and key not in keys:
             near = difflib.get_close_matches(str(key), keys, n=1)
             hint = f"did you mean {near[0]}? " if near else ""
             where = "" if name == "the file" else f"{name}."
-            raise InputError(f"{where}{key}: no such key; {hint}allowed are {', '.join(keys)}")
+            raise InputError(f"{where}{key}: no such key; {hint}expected one of {', '.join(keys)}")
     return value
-
-
-def _labelled(value: Any) -> dict[str, Any]:
-    """Return the variants by label; a label that YAML reads as a number becomes text."""
-    variants = {str(label): variant for label, variant in _mapping(value, "variants").items()}
-    if len(variants) < len(value):
-        raise InputError("variants: two have the same label")
-    for label in variants:
-        if not label.isprintable():
-            raise InputError(f"variants: {label!r}; allowed is a label of one line")
-    return variants
 
 
 def _overrides(value: Any, name: str) -> list[str]:
     """Return a list of Hydra overrides, checked for their form only; composing them checks their meaning."""
-    words = _texts(value, name)
-    for word in words:
-        if not re.match(r"[+~]*[\w./@]+(=|$)", word):
-            raise InputError(f"{name}: '{word}'; allowed is KEY=VALUE or GROUP=OPTION")
-        if re.match(r"[+~]*seed(=|$)", word):
-            raise InputError(f"{name}: '{word}'; the seeds are set by the key seeds")
-    return words
+    texts = _texts(value, name)
+    for text in texts:
+        if not re.match(r"[+~]*[\w./@]+(=|$)", text):
+            raise InputError(f"{name}: '{text}'; expected KEY=VALUE or GROUP=OPTION")
+        if key_of(text) == "seed":
+            raise InputError(f"{name}: '{text}'; the seeds are set by the key seeds")
+    return texts
 
 
 def _texts(value: Any, name: str) -> list[str]:
     if not isinstance(value, list):
-        raise InputError(f"{name}: {_kind(value)}; allowed is a list of words")
+        raise InputError(f"{name}: {_shown(value)}; expected a list of texts")
     return [_text(item, name) for item in value]
 
 
 def _text(value: Any, name: str) -> str:
     if not isinstance(value, str) or not value.strip():
-        raise InputError(f"{name}: {_kind(value)}; allowed is text that is not empty")
+        raise InputError(f"{name}: {_shown(value)}; expected text")
     return value
 
 
-def _table(value: Any) -> int | None:
-    if value is None or (isinstance(value, int) and not isinstance(value, bool) and value > 0):
-        return value
-    raise InputError(f"table: {value!r}; allowed is the number of a table of the paper")
-
-
-def _metrics(value: Any) -> tuple[str, ...]:
-    """Return the names of the columns, after a check that they are metrics or costs."""
-    names = _texts(value, "metrics")
-    if not names:
-        raise InputError("metrics: empty; allowed is at least one")
-    for name in names:
-        if name not in UNITS and name not in COSTS:
-            raise InputError(f"metrics: '{name}'; allowed are {', '.join([*UNITS, *COSTS])}")
-    return tuple(names)
-
-
-def _paper(value: Any, name: str) -> dict[str, float]:
-    """Return the paper's values by metric."""
-    values = dict(_mapping(value or {}, name, [*UNITS, *COSTS]))
+def _numbers(value: Any, name: str, keys: Sequence[str]) -> dict[str, float]:
+    values = dict(_mapping(value or {}, name, keys))
     for metric, number in values.items():
         if not isinstance(number, int | float) or isinstance(number, bool):
-            raise InputError(f"{name}.{metric}: {number!r}; allowed is a number")
+            raise InputError(f"{name}.{metric}: {number!r}; expected a number")
     return values
 
 
-def _smallest(value: Any) -> dict[str, float]:
-    """Return the smallest effects of interest by metric."""
-    values = dict(_mapping(value or {}, "smallest", [*UNITS]))
-    for metric, number in values.items():
-        if not _positive(number):
-            raise InputError(f"smallest.{metric}: {number!r}; allowed is a number above 0")
-    return values
-
-
-def _kind(value: Any) -> str:
-    """Describe a value of the wrong kind for an error message."""
+def _shown(value: Any) -> str:
     return "nothing" if value is None else f"{value!r}"[:60]

@@ -19,7 +19,7 @@ from memmlp.common.lease import Changes, current_process, is_alive
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan, RunTask
 
-PAUSE = 0.5  # seconds before another look at a plan whose tasks others are at
+PAUSE = 0.5  # seconds before another look at a plan whose tasks other workers do
 ABANDONED = 600.0  # seconds without a sign of life after which an open plan's controller counts as dead
 DEATHS = 10  # workers that died at the same step of a run before it counts as failed
 
@@ -53,7 +53,7 @@ def work_off(path: Path, perform: Perform, wanted: Callable[[], bool] = lambda: 
             time.sleep(PAUSE)
 
 
-def directed(path: Path) -> bool:
+def has_controller(path: Path) -> bool:
     """Return whether the plan in a file is closed, or is open and has a living controller.
 
     A living controller touches the file repeatedly. The time for which this process has seen the file
@@ -65,10 +65,15 @@ def directed(path: Path) -> bool:
 
 
 def attempt(plan: Plan, task: RunTask, perform: Perform) -> bool:
-    """Finish a task's run, if its upstream run is done and no other process works on it.
+    """Finish a task's run, if its prerequisite is done and no other process works on it.
+
+    A failure is recorded with the run, and does not affect the other tasks.
 
     Returns:
-        False if the task has to wait for its upstream run or for another worker; else True.
+        False if the task has to wait for its prerequisite or for another worker; else True.
+
+    Raises:
+        OSError: if the disk is full or read-only, which affects every task.
     """
     run = plan.run_of(task)
     if task.upstream and not Run.of(plan.outputs, task.upstream).done:
@@ -77,29 +82,17 @@ def attempt(plan: Plan, task: RunTask, perform: Perform) -> bool:
         if not mine:
             return False
         try:
-            _attempt_locked(plan, task, run, perform)
+            if not plan.complete(task) and not run.failure:  # no other process ended it meanwhile
+                _perform(plan, task, run, perform)
         except LeaseLost as lost:
             print(f"memmlp: {lost}", file=sys.stderr, flush=True)
     return True
 
 
-def _attempt_locked(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
-    """Perform the task, unless another process ended it since the plan was read."""
-    if plan.complete(task) or run.failure:
-        return
+def _perform(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
     if deaths(run) >= DEATHS:
         run.fail(f"{DEATHS} processes died at step {run.step} of it, one after another")
         return
-    _perform(plan, task, run, perform)
-
-
-def _perform(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
-    """Perform the task. A failure is recorded with the run, and does not affect the other tasks.
-
-    Raises:
-        LeaseLost: if another worker took over the run.
-        OSError: if the disk is full or read-only, which affects every task.
-    """
     try:
         perform(plan, task)
     except Cancelled:
@@ -115,13 +108,13 @@ def _perform(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
 
 
 def deaths(run: Run) -> int:
-    """Count how many processes, one after another, most recently began the run at its present step.
+    """Count how many processes, one after another, most recently started the run at its present step.
 
     Those before work that ended well, or before the last --retry, don't count.
     """
     step, count, manifest = run.step, 0, run.manifest
-    for begun in reversed(manifest.get("attempts", [])[manifest.get("forgiven", 0) :]):
-        if begun.get("step") != step:
+    for start in reversed(manifest.get("attempts", [])[manifest.get("forgiven", 0) :]):
+        if start.get("step") != step:
             break
         count += 1
     return count

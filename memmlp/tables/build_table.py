@@ -1,23 +1,90 @@
-"""Makes the numbers of a table from a sweep and its finished runs."""
+"""Makes the table of a sweep from its runs, and the summary that the sweep leaves in its folder.
+
+A table never trains. It knows from the plan which identity the run of each variant and seed has, and reads
+the folder outputs/runs/<id>/, whichever command made it.
+"""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from memmlp.common.errors import InputError
+from memmlp.common.files import atomic_write, write_json
+from memmlp.runs.lookup import list_runs
+from memmlp.runs.recipe_versions import outdated
+from memmlp.runs.run import Run
 from memmlp.sweep.definition import COSTS, MODES, Sweep, Variant
-from memmlp.tables.effects import RunsBySeed, control_variant, effects, paper_effect, with_existing_branches
-from memmlp.tables.flags_of_runs import DescribeRun, early_looks, flags, silent
-from memmlp.tables.measured_run import Measured
+from memmlp.sweep.plan import Plan, count_states
+from memmlp.tables.effects import (
+    RunsBySeed,
+    control_variant,
+    effects,
+    paper_effect,
+    with_existing_branches,
+)
+from memmlp.tables.flags import DescribeRun, early_tables, find_flags, no_description
+from memmlp.tables.formats import FORMATS
+from memmlp.tables.measured_run import Measured, measured_for
 from memmlp.tables.table import Cell, Effect, Key, Row, Table
-from memmlp.tables.undisturbed_times import measured_for
 
 if TYPE_CHECKING:
     from memmlp.tables.seed_rounds import Rounds
 
 Find = Callable[[Variant, int], Measured | None]
+Read = Callable[[Path, tuple[str, ...]], Measured]
+
+
+def run_finder(plan: Plan, read: Read) -> Find:
+    """Return a function that finds the results of the plan's finished run for a variant and a seed."""
+    entries = {(entry.label, entry.seed): entry for entry in plan.entries}
+
+    def find(variant: Variant, seed: int) -> Measured | None:
+        entry = entries.get((variant.label, seed))
+        complete = entry is not None and plan.complete(entry)
+        return read(plan.run_of(entry).folder, entry.stages) if entry and complete else None
+
+    return find
+
+
+def state_finder(plan: Plan) -> DescribeRun:
+    """Return a function that describes the state of an unfinished run of the plan, once it has started."""
+    entries = {(entry.label, entry.seed): entry for entry in plan.entries}
+
+    def describe(variant: Variant, seed: int) -> str | None:
+        entry = entries.get((variant.label, seed))
+        if entry is None:
+            return None
+        run = plan.run_of(entry)
+        state = run.doing or run.state(plan.complete(entry))
+        if state == "trained":
+            return "trained, an evaluation or export is missing"
+        return state if state not in ("new", "done") else None
+
+    return describe
+
+
+def older_run_finder(plan: Plan) -> DescribeRun:
+    """Return a function that names a finished run that differs from a planned one only in recipe versions."""
+    whats = {task.key: task.what for task in plan.tasks}
+    entries = {(entry.label, entry.seed): entry for entry in plan.entries}
+
+    @functools.cache
+    def known() -> dict[str, Run]:
+        return {run.manifest.get("what", ""): run for run in list_runs(plan.outputs) if run.done}
+
+    def describe(variant: Variant, seed: int) -> str | None:
+        entry = entries.get((variant.label, seed))
+        run = known().get(whats.get(entry.key, "?")) if entry else None
+        if entry is None or run is None or run.id == entry.id:
+            return None
+        changed = ", ".join(outdated(run.manifest.get("recipes", {}))) or "its VQ-VAE's"
+        return f"run {run.id}: {changed}"
+
+    return describe
 
 
 def finished_runs(sweep: Sweep, find: Find) -> dict[str, RunsBySeed]:
@@ -35,8 +102,8 @@ def make_table(
     runs: Mapping[str, RunsBySeed],
     modes: Sequence[str] = MODES,
     command: str | None = None,
-    state: DescribeRun = silent,
-    older: DescribeRun = silent,
+    state: DescribeRun = no_description,
+    older: DescribeRun = no_description,
     rounds: Rounds | None = None,
 ) -> Table:
     """Make the table of a sweep.
@@ -51,154 +118,37 @@ def make_table(
         older: names the run with an earlier recipe that exists in place of a missing one, or returns None.
         rounds: the rounds that decided the verdicts; None for verdicts from a fixed number of seeds.
     """
-    shown = _shown(modes, runs) if set(sweep.metrics) - set(COSTS) else tuple(modes)[:1]
-    seen = with_existing_branches(sweep, runs)
+    has_errors = bool(set(sweep.metrics) - set(COSTS))
+    evaluated = {mode for found in runs.values() for run in found.values() for mode in run.means}
+    existing = tuple(mode for mode in modes if mode in evaluated) or tuple(modes)
+    shown_modes = existing if has_errors else tuple(modes)[:1]
+    shown = with_existing_branches(sweep, runs)
     # The correction is over both modes, whichever of them are shown.
-    every = MODES if set(sweep.metrics) - set(COSTS) else shown
-    found = effects(seen, runs, every)
-    compared = sum(effect.p is not None for effect in found.values())
+    found = effects(shown, runs, MODES if has_errors else shown_modes)
+    comparisons = sum(effect.p is not None for effect in found.values())
     if rounds:
-        found, compared = rounds.judged(found), len(rounds.family(sweep))
-    flagged = flags(seen, sweep, runs, command or f"memmlp sweep {sweep.name}", state, older)
+        found, comparisons = rounds.apply_verdicts(found), len(rounds.comparisons(sweep))
+    flags = find_flags(shown, sweep, runs, command or f"memmlp sweep {sweep.name}", state, older)
     return Table(
         name=sweep.name,
         title=sweep.title,
         number=sweep.table,
-        modes=shown,
+        modes=shown_modes,
         metrics=sweep.metrics,
         control=sweep.control,
         branch_source=sweep.branch_source,
         smallest=dict(sweep.smallest),
-        comparisons=compared,
-        rows=tuple(_row(seen, variant, runs.get(variant.label), shown, found) for variant in seen.variants),
-        notes=(
-            *sweep.notes,
-            *(f"{variant.label}: {variant.note}" for variant in sweep.variants if variant.note),
-        ),
-        flags=(*flagged, *(() if rounds else early_looks(seen, runs))),
-        looks=tuple((look.seeds, look.level) for look in rounds.taken) if rounds else (),
-    )
-
-
-def _shown(modes: Sequence[str], runs: Mapping[str, RunsBySeed]) -> tuple[str, ...]:
-    """Return those of the modes in which runs were evaluated; all modes if there are no evaluations."""
-    measured = {mode for found in runs.values() for run in found.values() for mode in run.means}
-    return tuple(mode for mode in modes if mode in measured) or tuple(modes)
-
-
-class OnSource(NamedTuple):
-    """A sweep and its finished runs on the test clips of one source of motion.
-
-    Attributes:
-        sweep: the sweep without the variants whose runs have no test clip from the source.
-        runs: the runs of the remaining variants, by seed, evaluated on these clips alone.
-        flags: a line that names the variants left out.
-    """
-
-    sweep: Sweep
-    runs: dict[str, RunsBySeed]
-    flags: tuple[str, ...]
-
-
-def on_source(sweep: Sweep, runs: Mapping[str, RunsBySeed], source: str) -> OnSource:
-    """Restrict a sweep and its finished runs to one source's test clips.
-
-    If the control has no such clips, the first variant that has some becomes the control.
-
-    Raises:
-        InputError: if no run has a test clip from the source.
-    """
-    own: dict[str, RunsBySeed] = {
-        label: {seed: parts[source] for seed, run in seeds.items() if source in (parts := run.by_source())}
-        for label, seeds in runs.items()
-    }
-    if not any(own.values()):
-        known = sorted(
-            {name for seeds in runs.values() for run in seeds.values() for name in run.by_source()}
-        )
-        allowed = f"allowed is {', '.join(known)}" if known else "allowed with several sources"
-        raise InputError(f"--source {source}: no finished run has a test clip of it; {allowed}")
-    without = {label for label, seeds in runs.items() if seeds and not own[label]}
-    variants = [variant for variant in sweep.variants if variant.label not in without]
-    variants = [
-        replace(variant, against=None) if variant.against in without else variant for variant in variants
-    ]
-    left = {label: seeds for label, seeds in own.items() if label not in without}
-    control = (
-        next(label for label, seeds in left.items() if seeds) if sweep.control in without else sweep.control
-    )
-    quoted = ", ".join(f"'{variant.label}'" for variant in sweep.variants if variant.label in without)
-    flags = (f"no test clip of {source}, so left out: {quoted}",) if without else ()
-    return OnSource(replace(sweep, variants=tuple(variants), control=control), left, flags)
-
-
-def titled(table: Table, source: str) -> Table:
-    """Return a table of one source's test clips with a title that names the source."""
-    return replace(table, title=f"{table.title} (test clips of {source} alone)")
-
-
-class Together(NamedTuple):
-    """Finished runs whose test clips are in coarser groups than their data's.
-
-    Attributes:
-        runs: the runs of the variants, by seed.
-        flags: a line that says which clips are together, and how many groups there are.
-    """
-
-    runs: dict[str, RunsBySeed]
-    flags: tuple[str, ...]
-
-
-def together(runs: Mapping[str, RunsBySeed], patterns: Sequence[str]) -> Together:
-    """Put test clips into one group, too, whose names match a pattern alike.
-
-    Statistics count groups, so this shows what of a table hangs on their choice.
-
-    Args:
-        runs: the finished runs of a sweep's variants, by seed.
-        patterns: regular expressions, as those of `data.split.groups`.
-
-    Raises:
-        InputError: for a pattern that is no regular expression, or puts nothing together.
-    """
-    for pattern in patterns:
-        try:
-            tied = _regrouped(runs, [pattern])
-        except InputError as error:
-            raise InputError(f"--together {str(error).partition(': ')[2]}") from None
-        if _group_count(tied) == _group_count(runs):
-            raise InputError(f"--together {pattern}: puts no test clips together; allowed is one that does")
-    if not patterns:
-        return Together(dict(runs), ())
-    own = _regrouped(runs, patterns)
-    words = f"{_group_count(own)} groups of test clips in place of {_group_count(runs)}"
-    quoted = ", ".join(f"'{pattern}'" for pattern in patterns)
-    return Together(own, (f"{words}: those whose names match {quoted} alike are together (--together)",))
-
-
-def _regrouped(runs: Mapping[str, RunsBySeed], patterns: Sequence[str]) -> dict[str, RunsBySeed]:
-    return {
-        label: {seed: run.together(patterns) for seed, run in seeds.items()} for label, seeds in runs.items()
-    }
-
-
-def _group_count(runs: Mapping[str, RunsBySeed]) -> int:
-    """Return how many groups the test clips of all runs are in."""
-    every = (run for seeds in runs.values() for run in seeds.values())
-    return len({run.group(clip) for run in every for clip in run.clips})
-
-
-def without_runs(sweep: Sweep, modes: Sequence[str], reason: str) -> Table:
-    """Make the table of a sweep whose runs can't be identified: the paper's values, and the reason."""
-    return replace(
-        make_table(sweep, {variant.label: {} for variant in sweep.runnable()}, modes), flags=(reason,)
+        comparisons=comparisons,
+        rows=tuple(_row(shown, one, runs.get(one.label), shown_modes, found) for one in shown.variants),
+        notes=(*sweep.notes, *(f"{one.label}: {one.note}" for one in sweep.variants if one.note)),
+        flags=(*flags, *(() if rounds else early_tables(shown, runs))),
+        analyses=tuple((one.seeds, one.level) for one in rounds.analyses) if rounds else (),
     )
 
 
 def _row(
     sweep: Sweep, variant: Variant, runs: RunsBySeed | None, modes: Sequence[str], found: Mapping[Key, Effect]
 ) -> Row:
-    """Return a variant's row; `runs` is None for a row with only the paper's values."""
 
     def cell(mode: str, metric: str) -> Cell:
         counted = measured_for(metric, runs or {})
@@ -207,10 +157,145 @@ def _row(
         effect = found.get(Key(variant.label, mode, metric))
         return Cell(values, (variant.paper or {}).get(metric), effect, paper_effect(sweep, variant, metric))
 
-    cells = {mode: {metric: cell(mode, metric) for metric in sweep.metrics} for mode in modes}
-    wanted = sweep.seeds_of(variant) if runs is not None else ()
-    against = control_variant(sweep, variant)
-    other = against.label if against else None
-    in_cell = against is not None and variant.cell and against.cell == variant.cell
-    pairing = f"'{variant.series}' from '{against.series}' in the same cell" if against and in_cell else ""
-    return Row(variant.label, variant.branch, other, variant.note, tuple(runs or ()), wanted, cells, pairing)
+    control = control_variant(sweep, variant)
+    pairing = ""
+    if control and variant.cell and control.cell == variant.cell:
+        pairing = f"'{variant.series}' from '{control.series}' in the same cell"
+    return Row(
+        label=variant.label,
+        branch=variant.branch,
+        against=control.label if control else None,
+        note=variant.note,
+        found=tuple(runs or ()),
+        wanted=sweep.seeds_of(variant) if runs is not None else (),
+        cells={mode: {metric: cell(mode, metric) for metric in sweep.metrics} for mode in modes},
+        pairing=pairing,
+    )
+
+
+def without_runs(sweep: Sweep, modes: Sequence[str], reason: str) -> Table:
+    """Make the table of a sweep whose runs can't be identified: the paper's values, and the reason."""
+    runs: dict[str, RunsBySeed] = {variant.label: {} for variant in sweep.runnable()}
+    return replace(make_table(sweep, runs, modes), flags=(reason,))
+
+
+def titled(table: Table, source: str) -> Table:
+    """Return a table of one source's test clips with a title that names the source."""
+    return replace(table, title=f"{table.title} (test clips of {source} alone)")
+
+
+def on_source(
+    sweep: Sweep, runs: Mapping[str, RunsBySeed], source: str
+) -> tuple[Sweep, dict[str, RunsBySeed], tuple[str, ...]]:
+    """Restrict a sweep and its finished runs to one source's test clips.
+
+    If the control has no such clips, the first variant that has some becomes the control.
+
+    Returns:
+        The sweep without the variants whose runs have no test clip from the source; the runs of the remaining
+        variants, by seed, evaluated on these clips alone; and a flag that names the variants left out.
+
+    Raises:
+        InputError: if no run has a test clip from the source.
+    """
+    parts = {label: {seed: run.by_source() for seed, run in seeds.items()} for label, seeds in runs.items()}
+    own: dict[str, RunsBySeed] = {
+        label: {seed: found[source] for seed, found in seeds.items() if source in found}
+        for label, seeds in parts.items()
+    }
+    if not any(own.values()):
+        known = sorted({name for seeds in parts.values() for found in seeds.values() for name in found})
+        expected = f"expected {', '.join(known)}" if known else "the data has a single source"
+        raise InputError(f"--source {source}: no finished run has a test clip of it; {expected}")
+    without = {label for label, seeds in runs.items() if seeds and not own[label]}
+    variants = [
+        replace(one, against=None) if one.against in without else one
+        for one in sweep.variants
+        if one.label not in without
+    ]
+    left = {label: seeds for label, seeds in own.items() if label not in without}
+    control = sweep.control
+    if control in without:
+        control = next(label for label, seeds in left.items() if seeds)
+    quoted = ", ".join(f"'{one.label}'" for one in sweep.variants if one.label in without)
+    flags = (f"no test clip of {source}, so left out: {quoted}",) if without else ()
+    return replace(sweep, variants=tuple(variants), control=control), left, flags
+
+
+def together(
+    runs: Mapping[str, RunsBySeed], patterns: Sequence[str]
+) -> tuple[dict[str, RunsBySeed], tuple[str, ...]]:
+    """Put test clips whose names match a pattern alike into one group, beside the groups of the data.
+
+    Statistics count groups, so this shows how much of a table depends on their choice.
+
+    Args:
+        runs: the finished runs of a sweep's variants, by seed.
+        patterns: regular expressions, as those of `data.split.groups`.
+
+    Returns:
+        The runs of the variants, by seed, and a flag that says which clips are together.
+
+    Raises:
+        InputError: for a pattern that is not a regular expression, or puts nothing together.
+    """
+
+    def regroup(patterns: Sequence[str]) -> dict[str, RunsBySeed]:
+        return {
+            label: {seed: run.together(patterns) for seed, run in seeds.items()}
+            for label, seeds in runs.items()
+        }
+
+    def count_groups(runs: Mapping[str, RunsBySeed]) -> int:
+        every = (run for seeds in runs.values() for run in seeds.values())
+        return len({run.group(clip) for run in every for clip in run.clips})
+
+    before = count_groups(runs)
+    for pattern in patterns:
+        try:
+            tied = regroup([pattern])
+        except InputError as error:
+            raise InputError(f"--together {pattern}: {str(error).partition(': ')[2]}") from None
+        if count_groups(tied) == before:
+            raise InputError(f"--together {pattern}: puts no test clips together")
+    if not patterns:
+        return dict(runs), ()
+    own = regroup(patterns)
+    counts = f"{count_groups(own)} groups of test clips in place of {before}"
+    quoted = ", ".join(f"'{pattern}'" for pattern in patterns)
+    return own, (f"{counts}: those whose names match {quoted} alike are together (--together)",)
+
+
+def write_summary(plan: Plan, table: Table, folder: Path) -> None:
+    """Write table.md, table.html and summary.json of a sweep, whose runs need not all be done."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for form in ("md", "html"):
+        atomic_write(folder / f"table.{form}", FORMATS[form](table))
+    write_json(folder / "summary.json", summarize(plan, table))
+
+
+def summarize(plan: Plan, table: Table) -> dict[str, Any]:
+    """Return a sweep's status and runs' labels, and means over seeds and verdicts by LABEL/MODE/METRIC."""
+    cells = {
+        f"{row.label}/{mode}/{metric}": cell
+        for row in table.rows
+        for mode, metrics in row.cells.items()
+        for metric, cell in metrics.items()
+    }
+    states = count_states(plan)
+    status = next((name for name in ("failed", "running") if states[name]), "")
+    labels: dict[str, dict[str, None]] = {}  # all variants of each started run
+    for entry in plan.entries:
+        if plan.run_of(entry).manifest:
+            labels.setdefault(entry.id, {})[entry.label] = None
+    return {
+        "name": plan.name,
+        "status": status or ("stopped" if plan.left() else "done"),
+        "labels": {run: ", ".join(found) for run, found in labels.items()},
+        "aggregates": {key: cell.mean for key, cell in cells.items() if cell.mean is not None},
+        "verdicts": {
+            key: str(cell.effect.verdict)
+            for key, cell in cells.items()
+            if cell.effect and cell.effect.verdict
+        },
+    }

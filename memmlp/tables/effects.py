@@ -12,29 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from memmlp.sweep.definition import COSTS, TIMES, Sweep, Variant
-from memmlp.tables.measured_run import SHARED, Measured
-from memmlp.tables.statistics import detectable, equivalence_p, holm, paired_effects, verdict
+from memmlp.sweep.definition import COSTS, MODES, TIMES, Sweep, Variant
+from memmlp.tables.measured_run import SHARED, Measured, measured_for
+from memmlp.tables.statistics import detectable, equivalence_p, holm, paired_effects, seeds_needed, verdict
 from memmlp.tables.table import STEADY, Effect, Key
-from memmlp.tables.undisturbed_times import measured_for
 
 RunsBySeed = Mapping[int, Measured]  # a variant's finished runs by seed
-
-
-class SharedClips(NamedTuple):
-    """The seeds and clips that a variant's runs share with those of its control.
-
-    Attributes:
-        seeds: the seeds that both variants have (S).
-        clips: the names of the clips that all runs have (C).
-        group_names: the names of the clips' groups (C).
-        groups: the groups' numbers (C,).
-    """
-
-    seeds: list[int]
-    clips: list[str]
-    group_names: list[str]
-    groups: np.ndarray
 
 
 class Paired(NamedTuple):
@@ -43,15 +26,11 @@ class Paired(NamedTuple):
     Attributes:
         matrix: the variant's errors minus the control's (S, C), by seed and clip.
         groups: the number of each clip's group (C,).
-        clips: the names of these clips (C).
-        group_names: the names of their groups (C).
         diverged: whether further clips were lost because a network diverged on them.
     """
 
     matrix: np.ndarray
     groups: np.ndarray
-    clips: tuple[str, ...] = ()
-    group_names: tuple[str, ...] = ()
     diverged: bool = False
 
     @property
@@ -69,6 +48,14 @@ def control_variant(sweep: Sweep, variant: Variant) -> Variant | None:
     return next((other for other in sweep.variants if other.label == label), None)
 
 
+def compared(sweep: Sweep) -> Iterator[tuple[Variant, Variant]]:
+    """Yield each variant that has a control, with its control."""
+    for variant in sweep.runnable():
+        other = control_variant(sweep, variant)
+        if other is not None:
+            yield variant, other
+
+
 def paper_effect(sweep: Sweep, variant: Variant, metric: str) -> float | None:
     """Return the paper's difference from the control, from printed values; None if one is not printed."""
     other = control_variant(sweep, variant)
@@ -82,27 +69,25 @@ def paired(
 ) -> dict[Key, Paired]:
     """Return the differences in all error metrics for all variants, or for those with the given labels."""
     found = {}
-    for variant, other in _compared(sweep):
-        if labels is not None and variant.label not in labels:
-            continue
+    for variant, other in compared(sweep):
         ours, theirs = runs[variant.label], runs[other.label]
+        seeds = [seed for seed in ours if seed in theirs]
+        if (labels is not None and variant.label not in labels) or not seeds:
+            continue
         if one_and_the_same(variant, other, ours, theirs):
             continue
-        shared = _shared(ours, theirs)
-        every = [runs[seed] for runs in (ours, theirs) for seed in shared.seeds]
-        seen = [mode for mode in modes if all(_has_mode(run, mode) for run in every)]
-        for mode, metric in itertools.product(seen, sweep.metrics):
-            if metric not in COSTS:
+        sides = [[side[seed] for seed in seeds] for side in (ours, theirs)]
+        every = [*sides[0], *sides[1]]
+        clips = [name for name in every[0].clips if all(name in run.clips for run in every)]
+        names = np.array([every[0].group(clip) for clip in clips], dtype=str)
+        groups = np.unique(names, return_inverse=True)[1]
+        for mode, metric in itertools.product(modes, sweep.metrics):
+            evaluated = all(any(mode in errors for errors in run.clips.values()) for run in every)
+            if metric not in COSTS and evaluated:
                 branches = (variant.branch, other.branch)
-                found[Key(variant.label, mode, metric)] = _paired(
-                    ours, theirs, shared, branches, mode, metric
-                )
+                pair = _paired(sides, clips, groups, branches, mode, metric)
+                found[Key(variant.label, mode, metric)] = pair
     return {key: pair for key, pair in found.items() if pair.matrix.size}
-
-
-def _has_mode(run: Measured, mode: str) -> bool:
-    """Return whether a run was evaluated in a mode, on any clip."""
-    return any(mode in errors for errors in run.clips.values())
 
 
 def effects(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -> dict[Key, Effect]:
@@ -134,39 +119,36 @@ def one_and_the_same(variant: Variant, other: Variant, ours: RunsBySeed, theirs:
     return shared and variant.branch == other.branch
 
 
-def _compared(sweep: Sweep) -> Iterator[tuple[Variant, Variant]]:
-    """Yield each variant that has a control, with its control."""
-    for variant in sweep.runnable():
-        other = control_variant(sweep, variant)
-        if other is not None:
-            yield variant, other
-
-
 def _paired(
-    ours: RunsBySeed,
-    theirs: RunsBySeed,
-    shared: SharedClips,
+    sides: Sequence[Sequence[Measured]],
+    clips: Sequence[str],
+    groups: np.ndarray,
     branches: tuple[str, str],
     mode: str,
     metric: str,
 ) -> Paired:
-    """Return ours minus theirs, over the shared seeds and the clips for which all runs have a number."""
-    seeds, clips, group_names, groups = shared
+    """Return ours minus theirs over the clips for which all runs have a number.
+
+    Args:
+        sides: the runs of both variants, by seed.
+        clips: the clips that all runs have (C).
+        groups: their groups (C,).
+        branches: the branches of both variants.
+    """
 
     def errors(metric: str) -> np.ndarray:
         """Return a metric of both sides (2, S, C)."""
         found = [
-            [runs[seed].by_clip(clips, mode, branch, metric) for seed in seeds]
-            for runs, branch in zip((ours, theirs), branches, strict=True)
+            [run.by_clip(clips, mode, branch, metric) for run in side]
+            for side, branch in zip(sides, branches, strict=True)
         ]
-        return np.array(found).reshape(2, len(seeds), len(clips))
+        return np.array(found).reshape(2, len(sides[0]), len(clips))
 
     values = errors(metric)
     known = np.isfinite(values).all((0, 1))
     diverged = not known.all() and _diverged(values, errors(SHARED))
     own, others = values[:, :, known]
-    left, their_groups = (tuple(itertools.compress(words, known)) for words in (clips, group_names))
-    return Paired(own - others, groups[known], left, their_groups, diverged)
+    return Paired(own - others, groups[known], diverged)
 
 
 def _diverged(values: np.ndarray, positions: np.ndarray) -> bool:
@@ -184,28 +166,6 @@ def _diverged(values: np.ndarray, positions: np.ndarray) -> bool:
     return bool((lost & ~known.all((0, 1))).any())
 
 
-def _shared(ours: RunsBySeed, theirs: RunsBySeed) -> SharedClips:
-    """Return the seeds and clips that a variant and its control share."""
-    seeds = [seed for seed in ours if seed in theirs]
-    known = [runs[seed].clips for runs in (ours, theirs) for seed in seeds]
-    clips = [name for name in known[0] if all(name in other for other in known)] if known else []
-    names = [ours[seeds[0]].group(clip) for clip in clips]
-    return SharedClips(seeds, clips, names, np.unique(np.array(names, dtype=str), return_inverse=True)[1])
-
-
-def alike(pairs: Mapping[Key, Paired]) -> Iterator[tuple[list[Key], np.ndarray, np.ndarray]]:
-    """Group comparisons with the same number of seeds and the same groups of clips, to be computed at once.
-
-    Yields:
-        Keys (K), differences (K, S, C), and the clips' groups (C,), which the comparisons share.
-    """
-    batches: dict[tuple[int, bytes], list[Key]] = defaultdict(list)
-    for key, pair in pairs.items():
-        batches[len(pair.matrix), pair.groups.tobytes()].append(key)
-    for keys in batches.values():
-        yield keys, np.stack([pairs[key].matrix for key in keys]), pairs[keys[0]].groups
-
-
 def tested(
     pairs: Mapping[Key, Paired], smallest: Mapping[str, float], sensitivity: bool
 ) -> dict[Key, Effect]:
@@ -219,7 +179,13 @@ def tested(
     """
     found: dict[Key, Effect] = {}
     comparisons = max(1, testable(pairs))  # with none, nothing computed by it is shown
-    for keys, differences, groups in alike(pairs):
+    batches: dict[tuple[int, bytes], list[Key]] = defaultdict(
+        list
+    )  # of equal seeds and groups, computed at once
+    for key, pair in pairs.items():
+        batches[len(pair.matrix), pair.groups.tobytes()].append(key)
+    for keys in batches.values():
+        differences, groups = np.stack([pairs[key].matrix for key in keys]), pairs[keys[0]].groups
         size = {"seeds": differences.shape[1], "clips": differences.shape[2], "groups": len(set(groups))}
         margins = np.array([smallest.get(key.metric, np.nan) for key in keys])
         same = equivalence_p(differences, margins, groups)
@@ -228,9 +194,9 @@ def tested(
         numbers = paired_effects(differences, groups)
         columns = zip(keys, numbers.mean, numbers.low, numbers.high, numbers.p, same, seen, strict=True)
         for key, mean, low, high, p, equal, least in columns:
-            words = {"low": low, "high": high}
-            words |= {"p": p, "equal": equal, "detectable": least} if pairs[key].testable else {}
-            known: dict[str, Any] = {name: or_none(number) for name, number in words.items()}
+            values = {"low": low, "high": high}
+            values |= {"p": p, "equal": equal, "detectable": least} if pairs[key].testable else {}
+            known: dict[str, Any] = {name: or_none(number) for name, number in values.items()}
             found[key] = Effect(float(mean), **known, **size)
     return {key: found[key] for key in pairs}
 
@@ -261,21 +227,23 @@ def _judged(
 def _costs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -> dict[Key, Effect]:
     """Return the differences of mean costs, without intervals: costs are exact, or hold for this machine.
 
-    Of times it is said whether they differ beyond what they do by themselves.
+    A time's effect says whether it differs beyond the noise of times.
     """
+
     found = {}
-    for variant, other in _compared(sweep):
+    for variant, other in compared(sweep):
         for mode, metric in itertools.product(modes, set(sweep.metrics) & set(COSTS)):
-            sides = [_mean_cost(runs[one.label], metric) for one in (variant, other)]
+            sides = [mean_cost(runs[one.label], metric) for one in (variant, other)]
             if not any(math.isnan(side) for side in sides):
                 noise = metric in TIMES and max(sides) < STEADY * min(sides)
                 found[Key(variant.label, mode, metric)] = Effect(sides[0] - sides[1], within_noise=noise)
     return found
 
 
-def _mean_cost(runs: RunsBySeed, metric: str) -> float:
+def mean_cost(runs: RunsBySeed, metric: str) -> float:
+    """Return a cost's mean over the runs that count for it; NaN if none has it."""
     costs = [run.costs[metric] for run in measured_for(metric, runs).values() if metric in run.costs]
-    return statistics.mean(costs) if costs else math.nan  # equal costs have themselves as their mean
+    return statistics.mean(costs) if costs else math.nan  # the mean of equal costs is exactly their value
 
 
 def or_none(number: float) -> float | None:
@@ -303,3 +271,45 @@ def with_existing_branches(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Swee
         replace(variant, branch="rotation") if single(variant) else variant for variant in sweep.variants
     )
     return replace(sweep, variants=variants)
+
+
+class Need(NamedTuple):
+    """The seeds that a comparison needs for an effect of the paper's size to be seen with 80 % power.
+
+    Attributes:
+        label, mode, metric: which comparison it is.
+        paper: the paper's difference.
+        measured: the measured mean difference.
+        have: the number of seeds so far.
+        seeds: the number of seeds needed; None if no number of seeds would be enough with these clips.
+    """
+
+    label: str
+    mode: str
+    metric: str
+    paper: float
+    measured: float
+    have: int
+    seeds: int | None
+
+
+def needs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str] = MODES) -> list[Need]:
+    """Return the needs of all variants and metrics whose effects the paper prints, in the table's order.
+
+    The correction is over the comparisons that the present runs allow, in both modes, as a table's is. A
+    comparison without a p-value, such as that of a variant with one seed, is left out.
+
+    Args:
+        sweep: the sweep.
+        runs: the finished runs of every runnable variant, by seed.
+        modes: the modes of evaluation whose comparisons are returned.
+    """
+    shown = with_existing_branches(sweep, runs)
+    pairs, variants = paired(shown, runs, MODES), {variant.label: variant for variant in shown.variants}
+    found, comparisons = [], testable(pairs)
+    for key, pair in pairs.items():
+        effect = paper_effect(shown, variants[key.label], key.metric)
+        if effect and key.mode in modes and pair.testable:
+            number = seeds_needed(pair.matrix, effect, comparisons, pair.groups)
+            found.append(Need(*key, effect, float(pair.matrix.mean()), len(pair.matrix), number))
+    return found

@@ -1,4 +1,8 @@
-"""The errors behind a table's means, as distributions over seeds and clips."""
+"""The errors behind a table's means, as distributions over seeds and clips.
+
+A few extreme clips can't dominate these descriptions. Source: Agarwal et al. 2021, "Deep reinforcement
+learning at the edge of the statistical precipice" (the library rliable).
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,6 @@ import numpy as np
 from memmlp.evaluation.metric_facts import HIGHER
 from memmlp.sweep.definition import COSTS, Sweep, Variant
 from memmlp.tables.effects import RunsBySeed, control_variant, with_existing_branches
-from memmlp.tables.statistics import interquartile_mean, probability_of_improvement
 
 
 class Distribution(NamedTuple):
@@ -86,3 +89,24 @@ def _distribution(
         return Distribution(label, ours, middle, None)
     improvement = probability_of_improvement(*(np.nan_to_num(sign * side) for side in (ours, theirs)))
     return Distribution(label, ours, middle, improvement)
+
+
+def probability_of_improvement(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """Return how often one of our runs (S, C) has a smaller error than one of theirs (T, C) on a clip.
+
+    All pairs of seeds are compared on each clip; a tie counts half.
+    """
+    difference = theirs[None] - ours[:, None]
+    return float(((np.sign(difference) + 1) / 2).mean())
+
+
+def interquartile_mean(errors: np.ndarray) -> float:
+    """Return the mean of the middle half of all errors (S, C)."""
+    from scipy.stats import trim_mean  # slow to import
+
+    return float(trim_mean(errors, 0.25, axis=None))
+
+
+def performance_profile(errors: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
+    """Return, for each threshold (N,), the fraction of errors (S, C) that are at most as large."""
+    return (errors.reshape(-1, 1) <= thresholds).mean(0)

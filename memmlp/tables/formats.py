@@ -102,7 +102,6 @@ def _all(grid: Grid) -> Iterator[VariantLine]:
 
 
 def _remarks(table: Table) -> list[str]:
-    """Return the lines below a table."""
     return [*legend(table), *table.flags, *table.notes]
 
 
@@ -120,13 +119,11 @@ def _html(text: str | None) -> str:
 
 
 def _html_head(name: str) -> str:
-    """Return the HTML of a column's head, with the unit in a line of its own."""
     metric, *unit = map(_html, _header(name))
     return "<br>".join([metric, *(f"<small>{word}</small>" for word in unit)])
 
 
 def _html_group(group: Sequence[VariantLine]) -> str:
-    """Return the HTML of a variant's rows, headed by its label."""
     label = f'<th scope="rowgroup" rowspan="{len(group)}">{_html(group[0].head[0])}</th>'
     heads = [label, *[""] * (len(group) - 1)]
     rows = [
@@ -194,12 +191,10 @@ def _width(parts: Iterable[Sequence[str]]) -> int:
 
 
 def _blocks(grid: Grid) -> list[list[Sequence[str]]]:
-    """Return the head and each variant as a block: the lines of each of its columns."""
     return [[*map(_header, grid.header)], *map(_block, grid.groups)]
 
 
 def _block(group: Sequence[VariantLine]) -> list[Sequence[str]]:
-    """Return a variant's columns as lines, with its label wrapped beside them."""
     columns: list[list[str]] = [[] for _ in (0, *group[0].cells)]
     for line in group:
         height = max(map(len, line.cells))
@@ -209,14 +204,12 @@ def _block(group: Sequence[VariantLine]) -> list[Sequence[str]]:
 
 
 def _header(name: str) -> list[str]:
-    """Split a column's head into two lines: the name with its direction, and the unit."""
     metric, _, rest = name.partition(" [")
     unit, _, arrow = rest.partition("] ")
     return [f"{metric} {arrow}", unit] if rest else [name]
 
 
 def _with_summaries(table: Table) -> dict[str, Any]:
-    """Return the table's fields, with each cell's mean, standard deviation and agreement added."""
     fields = asdict(table)
     for row, words in zip(table.rows, fields["rows"], strict=True):
         for mode, cells in row.cells.items():

@@ -14,12 +14,14 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
+from memmlp.common.processes import MIN_CORE_SHARE
 from memmlp.motion.preparing.groups import Grouping
 from memmlp.runs.deployment_folder import as_deployed, deployed_precision, timed_on
 from memmlp.runs.evaluation_file import intact, of_one_solver
 from memmlp.runs.lookup import frames_seen
 from memmlp.runs.origin import recorded_upstream, upstream_recipes
 from memmlp.runs.run import Run
+from memmlp.sweep.definition import TIMES
 
 Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # values by mode, branch and metric
 UNKNOWN = "?"
@@ -214,7 +216,6 @@ def _means(values: Mapping[str, np.ndarray]) -> dict[str, float]:
 
 
 def _known_mean(values: np.ndarray) -> float:
-    """Return the mean over the clips that have a number; NaN if no clip has one."""
     known = values[~np.isnan(values)]
     return float(known.mean()) if len(known) else math.nan
 
@@ -270,7 +271,6 @@ def of_untrained(
 
 
 def _training(run: Run, manifest: Mapping[str, Any]) -> dict[str, float]:
-    """Return what a training took, as far as it is known."""
     seconds, frames = (manifest.get("seconds") or {}).get("train"), frames_seen(run)
     took = {"seconds": float(seconds)} if seconds is not None else {}
     return took | ({"frames": frames} if frames else {})
@@ -327,7 +327,6 @@ def _costs(latency: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _origin(manifest: Mapping[str, Any]) -> Origin:
-    """Return the origin that a run's manifest records."""
 
     def of(key: str) -> str:
         return str(manifest.get(key) or UNKNOWN)
@@ -361,13 +360,11 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
 
 
 def _code(manifest: Mapping[str, Any]) -> dict[str, str]:
-    """Return the digests of a training's code by file, with other ones of its upstream runs."""
     own, *others = [one.get("sources") or {} for one in (manifest, *recorded_upstream(manifest))]
     return {name: _words([own[name], *(one[name] for one in others if name in one)]) for name in own}
 
 
 def _with_upstream(origin: Origin, run: Run) -> Origin:
-    """Return the origin of a run, joined with the origins of its upstream runs where these differ."""
     upstream = recorded_upstream(run.manifest)
     digests: dict[str, list[str]] = defaultdict(list)
     for one in upstream:
@@ -378,7 +375,6 @@ def _with_upstream(origin: Origin, run: Run) -> Origin:
 
 
 def _evaluated(origin: Origin, reports: Sequence[Mapping[str, Any]]) -> Origin:
-    """Return the origin of a run, joined with the origins of its evaluations where these differ."""
     others = [_origin({**report.get("made_by", {}), **report}) for report in reports]
     recipes = {name: number for one in (origin, *others) for name, number in one.recipes.items()}
     offline = any(report.get("offline") for report in reports)
@@ -386,7 +382,6 @@ def _evaluated(origin: Origin, reports: Sequence[Mapping[str, Any]]) -> Origin:
 
 
 def _joined(origin: Origin, others: Sequence[Origin]) -> Origin:
-    """Return an origin with the code and the machines of others, where these differ."""
     found: dict[str, Any] = {"changed": origin.changed or any(other.changed for other in others)}
     for name in ("code", "hardware", "device", "gpu", "threads", "torch"):
         known = [word for other in others if (word := getattr(other, name)) not in (UNKNOWN, "version ?")]
@@ -403,7 +398,6 @@ def _words(parts: Iterable[str]) -> str:
 
 
 def _both(known: Mapping[str, str], more: Mapping[str, str]) -> dict[str, str]:
-    """Return the code of packages by name; if two versions differ, both."""
     words = {name: dict.fromkeys([*([known[name]] if name in known else []), more[name]]) for name in more}
     return {**known, **{name: ", ".join(each) for name, each in words.items()}}
 
@@ -412,3 +406,22 @@ def _number(errors: Errors, mode: str, branch: str, metric: str) -> float | None
     """Return a value of nested errors as a number; None if it is missing. (Files hold NaN as a word.)"""
     value = errors.get(mode, {}).get(branch, {}).get(metric)
     return None if value is None else float(value)
+
+
+def core_share(run: Measured) -> float | None:
+    """Return the least share of a run's measured times in which the thread had a core; None if unknown."""
+    return min((run.costs[name] for name in CORE_SHARES if name in run.costs), default=None)
+
+
+def undisturbed(runs: Mapping[int, Measured]) -> Mapping[int, Measured]:
+    """Return the runs whose thread had a core while it was timed; all of them if that is known of none.
+
+    A time does not depend on the seed, so one undisturbed measurement says more than a mean with others.
+    """
+    alone = {seed: run for seed, run in runs.items() if (core_share(run) or 0) >= MIN_CORE_SHARE}
+    return alone or runs
+
+
+def measured_for(metric: str, runs: Mapping[int, Measured]) -> Mapping[int, Measured]:
+    """Return the runs whose values of a metric count: of a time the undisturbed ones, else every run."""
+    return undisturbed(runs) if metric in TIMES else runs

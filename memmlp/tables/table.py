@@ -39,7 +39,7 @@ class Effect:
         detectable: the smallest difference that this comparison would have found with 80 % power.
         seeds, clips, groups: how many of each were paired.
         level: the level with which the corrected p-values are compared.
-        decided: the number of seeds of the look that decided the verdict; None without such a look.
+        decided: the number of seeds of the interim analysis that decided the verdict; None without one.
         within_noise: whether it is between times that differ by no more than STEADY times.
     """
 
@@ -148,7 +148,8 @@ class Table:
         rows: the variants.
         notes: remarks on the paper's values.
         flags: what a reader has to know about these runs.
-        looks: pairs of the number of seeds and the level of each look; empty for a fixed number of seeds.
+        analyses: the number of seeds and the level of each interim analysis; empty for a fixed number of
+            seeds.
     """
 
     name: str
@@ -163,7 +164,7 @@ class Table:
     rows: tuple[Row, ...]
     notes: tuple[str, ...]
     flags: tuple[str, ...]
-    looks: tuple[tuple[int, float], ...] = ()
+    analyses: tuple[tuple[int, float], ...] = ()
 
     @property
     def measured_metrics(self) -> tuple[str, ...]:

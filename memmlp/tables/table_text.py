@@ -106,7 +106,15 @@ def legend(table: Table) -> list[str]:
     if table.measured_metrics:
         lines.append("mean ± sd over seeds of the means over test clips")
     if any(True for mode in table.modes for _ in table.effects(mode)):
-        lines += [_differences(table), _meanings(table), *_looks(table), *_power(table)]
+        lines += [_differences(table), _meanings(table)]
+        if table.analyses:
+            parts = [f"{seeds} ({100 * level:.2g} %)" for seeds, level in sorted(set(table.analyses))]
+            lines.append(
+                f"seeds were added where verdicts were inconclusive, with interim analyses at "
+                f"{', '.join(parts)} seeds, which share the 5 %; (3): decided at 3 seeds, and final; means "
+                "and intervals use all seeds"
+            )
+        lines += _power(table)
     if any(cell.agrees is not None for row in table.rows for c in row.cells.values() for cell in c.values()):
         lines.append(_agreement(table))
     return lines
@@ -114,30 +122,23 @@ def legend(table: Table) -> list[str]:
 
 def _branch(table: Table) -> str:
     """Say which branch the rows show, and how we know that the paper's values belong to it."""
-    rows = {branch: [row for row in table.rows if row.branch == branch] for branch in _branches(table)}
-    if len(rows) == 1:
-        words = next(iter(rows))
-    else:
-        most = max(rows, key=lambda branch: len(rows[branch]))
-        others = [f"'{row.label}' {row.branch}" for row in table.rows if row.branch != most]
-        words = f"{most}; {', '.join(others)}"
+    branches = [row.branch for row in table.rows if not row.paper_only]
+    # The most frequent branch of all rows, the first of several.
+    most = max(dict.fromkeys(branches), key=lambda branch: sum(row.branch == branch for row in table.rows))
+    others = [f"'{row.label}' {row.branch}" for row in table.rows if row.branch != most]
+    parts = [most, ", ".join(others)] if len(set(branches)) > 1 else [most]
     source = f" ({table.branch_source})" if table.branch_source else ""
-    return f"errors of the branch: {words}{source}"
-
-
-def _branches(table: Table) -> list[str]:
-    return list(dict.fromkeys(row.branch for row in table.rows if not row.paper_only))
+    return f"errors of the branch: {'; '.join(parts)}{source}"
 
 
 def _differences(table: Table) -> str:
-    """Explain the lines of differences, and which control each variant has."""
     own = [
         row.pairing or f"'{row.label}' from '{row.against}'"
         for row in table.rows
         if row.pairing or row.against not in (None, table.control)
     ]
-    others = "".join(f", of {words}" for words in dict.fromkeys(own))
-    least = "its look's level" if table.looks else "0.05"
+    others = "".join(f", of {text}" for text in dict.fromkeys(own))
+    least = "the analysis' level" if table.analyses else "0.05"
     star = f"; * p < {least} by Holm's correction over the table's {table.comparisons} comparisons"
     return (
         f"diff.: from '{table.control}'{others} [95 % interval, paired by seed and test clip]"
@@ -146,7 +147,6 @@ def _differences(table: Table) -> str:
 
 
 def _meanings(table: Table) -> str:
-    """Explain the verdicts, and give the smallest effects of interest."""
     margins = [
         f"{metric} {number_words(table.smallest[metric])} {unit(metric)}"
         for metric in table.measured_metrics
@@ -159,61 +159,40 @@ def _meanings(table: Table) -> str:
     )
 
 
-def _looks(table: Table) -> list[str]:
-    """Say at how many seeds looks were taken, and which part of the 5 % each of them spent."""
-    words = [f"{seeds} ({100 * level:.2g} %)" for seeds, level in sorted(set(table.looks))]
-    if not words:
-        return []
-    return [
-        f"seeds were added where verdicts were inconclusive, with interim analyses at {', '.join(words)} "
-        "seeds, which share the 5 %; (3): decided at 3 seeds, and final; means and intervals use all seeds"
-    ]
-
-
 def _power(table: Table) -> list[str]:
-    """Say which differences this table could have found, one line for each metric."""
     lines = []
     for metric in table.measured_metrics:
-        seen = {mode: least for mode in table.modes if (least := table.detectable(mode, metric)) is not None}
-        words = [
-            f"{number_words(least)} ({mode})"
-            for mode, least in seen.items()
-            if least <= _largest(table, mode, metric)
-        ]
-        if words:
-            what = f"{' or '.join(words)} {unit(metric)}"
-            blind = dict.fromkeys(label for mode in seen for label in table.blind(mode, metric))
+        least = {mode: value for mode in table.modes if (value := table.detectable(mode, metric)) is not None}
+        parts = []
+        for mode, value in least.items():
+            means = [cell.mean for _, name, cell, _ in table.effects(mode) if name == metric]
+            finite = [mean for mean in means if mean is not None and math.isfinite(mean)]
+            if value <= max(finite, default=0.0):
+                parts.append(f"{number_words(value)} ({mode})")
+        if parts:
+            blind = dict.fromkeys(label for mode in least for label in table.blind(mode, metric))
             but = f" but {', '.join(repr(label) for label in blind)}" if blind else ""
-            found = f"{metric}: a true difference of {what} would have been found in every variant{but}"
-            lines.append(f"{found} with 80 % power, a smaller one perhaps not")
-        elif seen:
+            lines.append(
+                f"{metric}: a true difference of {' or '.join(parts)} {unit(metric)} would have been found "
+                f"in every variant{but} with 80 % power, a smaller one perhaps not"
+            )
+        elif least:
             lines.append(
                 f"{metric}: too few seeds, a difference as large as the values can be missed in some variant"
             )
     return lines
 
 
-def _largest(table: Table, mode: str, metric: str) -> float:
-    """Return the largest finite mean of a metric among the variants that are compared; 0 without one."""
-    means = [cell.mean for _, name, cell, _ in table.effects(mode) if name == metric]
-    return max((mean for mean in means if mean is not None and math.isfinite(mean)), default=0.0)
-
-
 def _agreement(table: Table) -> str:
-    """Explain the paper's rows below a table, and count their effects by verdict."""
     mode, costs = table.modes[0], set(table.metrics) & set(COSTS)
     found = table.verdicts(mode)
     counts = ", ".join(f"{found[verdict]} {verdict}" for verdict in Verdict if found[verdict])
-    said = f"; of {sum(found.values())} effects in {mode} mode: {counts}" if found else ""
+    summary = f"; of {sum(found.values())} effects in {mode} mode: {counts}" if found else ""
     signs = "; of a cost by its sign" if costs else ""
-    signs += f", of a time from x {STEADY:g} on" if _has_noise(table) else ""
-    return f"paper: value (difference; ✓ it holds here, ✗ the opposite does{signs}){said}"
-
-
-def _has_noise(table: Table) -> bool:
-    """Return whether the paper has an effect on a time for which ours is no more than noise."""
     cells = [cell for row in table.rows for cells in row.cells.values() for cell in cells.values()]
-    return any(cell.paper_effect and cell.effect and cell.effect.within_noise for cell in cells)
+    if any(cell.paper_effect and cell.effect and cell.effect.within_noise for cell in cells):
+        signs += f", of a time from x {STEADY:g} on"
+    return f"paper: value (difference; ✓ it holds here, ✗ the opposite does{signs}){summary}"
 
 
 def _lines(table: Table, row: Row, mode: str) -> Iterable[VariantLine]:
@@ -286,7 +265,6 @@ def significant(value: float, digits: int, sign: str = "") -> str:
 
 
 def _ratio(value: float | None, difference: float) -> tuple[str, ...]:
-    """Return the ratio of a cost to the control's, given their difference."""
     if value is None or value == difference:
         return ()
     return (f"(x {significant(value / (value - difference), 3)})",)

@@ -21,9 +21,8 @@ from scipy.special import ndtri
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.common.progress import progress_bar
-from memmlp.tables.statistics.crossed_seeds_and_groups import Error, by_group
-from memmlp.tables.statistics.paired_differences import LEVEL
-from memmlp.tables.statistics.verdicts import holm, looks, sequential, spending
+from memmlp.tables.statistics.paired_differences import LEVEL, Error, by_group
+from memmlp.tables.statistics.verdicts import analysis_schedule, holm, sequential, spending
 
 
 class Shares(NamedTuple):
@@ -118,7 +117,9 @@ class Simulated:
         fixed, noise, self.weights = draw(rng, cell, comparisons)
         self.means = fixed @ self.weights  # (K, 3)
         variances = noise.var(2, ddof=1)
-        self.looks = {n: self._look(fixed, noise[:, :n], variances[:, :n]) for n in looks(cell.seeds)}
+        self.looks = {
+            n: self._look(fixed, noise[:, :n], variances[:, :n]) for n in analysis_schedule(cell.seeds)
+        }
 
     def _look(self, fixed: np.ndarray, noise: np.ndarray, variances: np.ndarray) -> SimulatedLook:
         """Return what is needed for a look at its seeds.

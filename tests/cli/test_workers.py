@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from memmlp.cli import workers as workers_module
-from memmlp.cli.workers import Workers, check_devices, hire, split_executor
+from memmlp.cli.workers import Workers, split_executor, start_fleet
 from memmlp.common.errors import InputError
 from memmlp.config import worker_process
 from memmlp.sweep.plan import Plan
@@ -42,27 +41,24 @@ def test_gpus_of_workers(found, monkeypatch, visible, options, wanted, shares, n
 
 
 @pytest.mark.parametrize(
-    ("wanted", "gpus", "executor", "line"),
+    ("wanted", "visible", "executor", "line"),
     [
-        (["cuda:1"], ("0", "1"), "local", "device=cuda:1: allowed is auto, cuda, cpu or mps"),
-        (["cuda:1"], (), "slurm", "device=cuda:1: allowed is"),
-        (["cuda"], (), "local", "device=cuda: no GPU is visible here"),
-        (["auto"], ("0",), "local", "a worker is to have a GPU; torch .* finds none"),
+        ("cuda:1", "0,1", "local", "device=cuda:1"),
+        ("cuda:1", "", "slurm", "device=cuda:1"),
+        ("cuda", "", "local", "device=cuda: no GPU is visible here"),
+        ("auto", "0", "local", "torch .* finds none"),
     ],
 )
-def test_runs_that_could_not_have_their_gpu_are_refused(monkeypatch, wanted, gpus, executor, line):
+def test_runs_that_could_not_have_their_gpu_are_refused(monkeypatch, wanted, visible, executor, line):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
     with pytest.raises(InputError, match=line):
-        check_devices(wanted, gpus, executor)
-
-
-def test_a_cluster_has_the_gpus_that_this_machine_lacks():
-    check_devices(["cuda"], (), "slurm")
+        Workers(executor).shares([wanted])
 
 
 @pytest.mark.parametrize("option", ["gpus_per_worker", "workers_per_gpu"])
 def test_options_of_local_workers_are_refused_elsewhere(option: str):
-    with pytest.raises(InputError, match=f"--{option.replace('_', '-')}: goes with workers of this machine"):
+    with pytest.raises(InputError, match=f"--{option.replace('_', '-')}: is for workers of this machine"):
         Workers("ray", **{option: 1})
 
 
@@ -71,8 +67,8 @@ def test_words_of_an_executor_are_its_own(name: str):
     words = (f"executor={name}", f"{name}.address=head:1", f"{name}.resources.big=2", "seed=1")
     executor, own, rest = split_executor(words)
     assert (executor, rest) == (name, ("seed=1",))
-    assert Workers(executor, own).settings().address == "head:1"
-    with pytest.raises(InputError, match=f"{name}.address: goes with executor={name}"):
+    assert Workers(executor, own).options().address == "head:1"
+    with pytest.raises(InputError, match=f"{name}.address: is for executor={name}"):
         split_executor(words[1:])
 
 
@@ -95,8 +91,8 @@ def test_workers_know_whether_they_are_to_have_a_gpu(
     found, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, executor, gives, wanted, gpu
 ):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0" if gives else "")
-    monkeypatch.setattr(workers_module, "executor", lambda *_, **__: Shelf(gives))
-    path, fleet = hire(tmp_path, Plan("s", tmp_path, (), ()), Workers(executor, count=1), wanted)
+    monkeypatch.setattr(Workers, "start_executor", lambda *_, **__: Shelf(gives))
+    path, fleet = start_fleet(tmp_path, Plan("s", tmp_path, (), ()), Workers(executor, count=1), wanted)
     assert fleet.work.args[-1] is gpu
     monkeypatch.setattr(devices, "missing_gpu", lambda: "none is there")
     monkeypatch.setattr(worker_process, "work_off", lambda *_: None)

@@ -23,7 +23,7 @@ from memmlp.common.processes import (
     import_environment,
     termination_interrupts,
 )
-from memmlp.sweep.executors.submitit_jobs import Requeued
+from memmlp.sweep.executors.slurm import Requeued
 
 FILE = "import memmlp; print(memmlp.__file__)"
 

@@ -156,7 +156,7 @@ def test_metrics_of_ones_own_are_those_of_sweeps_and_searches(on_path: Path):
     plugins.HIGHER.add("FootSkate")
     assert heading("FootSkate") == "FootSkate [cm/s] ↑"
     content = yaml.safe_load((Path(__file__).parents[2] / "conf/search/loss_weights.yaml").read_text())
-    with pytest.raises(InputError, match=r"of FootSkate more is better"):
+    with pytest.raises(InputError, match=r"FootSkate is better if higher"):
         parse_search({"storage": None, **content, "objectives": ["FootSkate"]})
     plugins.HIGHER.clear()
     assert parse_search({"storage": None, **content, "objectives": ["FootSkate"]}).objectives
@@ -306,14 +306,14 @@ def test_a_new_version_of_a_data_source_makes_its_clips_again(folder: Path):
 
 
 def test_an_executor_of_ones_own(folder: Path):
-    from memmlp.cli.workers import Workers, executor
+    from memmlp.cli.workers import Workers
 
     write(folder, {"mine.py": "class Mine:\n    def __init__(self, *given):\n        self.given = given\n"})
     engine, words, rest = split_executor(["executor=mine.Mine", "executor.queue=long", "seed=1"])
     assert (engine, words, rest) == ("mine.Mine", {"queue": "long"}, ("seed=1",))
-    made = executor(Workers(engine, words), folder, [], gpus=False)
+    made = Workers(engine, words).start_executor(folder, [], gpus=False)
     assert made.given == (folder / "workers/%j", {"queue": "long"})  # type: ignore[attr-defined]
-    with pytest.raises(InputError, match=r"executor.queue: goes with a class of your own"):
+    with pytest.raises(InputError, match=r"executor.queue: is for executor=PATH"):
         split_executor(["executor.queue=long"])
 
 

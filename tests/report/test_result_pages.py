@@ -21,7 +21,7 @@ from memmlp.report.result_pages import KeptTable, Placeholders, _reverse, descri
 from memmlp.sweep.definition import Sweep
 from memmlp.tables.build_table import make_table, together
 from memmlp.tables.statistics import Verdict, holm
-from memmlp.tables.statistics.crossed_seeds_and_groups import error
+from memmlp.tables.statistics.paired_differences import error
 from memmlp.tables.table import Cell, Effect
 from memmlp.tables.table_text import MINUS
 
@@ -74,7 +74,7 @@ def test_significant_differences_are_counted_with_coarser_groups_too(sweep: Swee
 
     def coarser(patterns: Sequence[str]):
         assert patterns == ("a", "b")
-        return make_table(sweep, together(kept.of(sweep), ["."]).runs)
+        return make_table(sweep, together(kept.of(sweep), ["."])[0])
 
     made = made._replace(regroup=coarser)
     words = '{{ decided("t") }}, {{ decided("t", "a", "b") }}'

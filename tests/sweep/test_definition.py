@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
 
 from memmlp.common.errors import InputError
+from memmlp.sweep.definition import SWEEP_FILE as NAME
+from memmlp.sweep.definition import keep_sweep, kept_sweep
 from memmlp.sweep.sweep_file import parse_sweep
 
 VARIANTS = {"full": [], "none": {"overrides": ["memory=none"], "paper": {"MPJPE": 4.13}}}
@@ -27,18 +32,14 @@ def test_the_command_line_stands_over_the_base_and_beside_the_variant():
     assert set(sweep.all_overrides(sweep.variants[1])) == {"model.depth=4", "optim.lr=1"}
 
 
-@pytest.mark.parametrize("word", ["memory.layers=[2]", "+memory.layers=[9]", "~hand"])
-def test_a_key_that_an_variant_sets_is_refused_on_the_command_line(word: str):
-    """The variant's own value would stand, and the override would be lost without a word."""
+def test_a_key_that_a_variant_sets_is_refused_on_the_command_line():
+    """The variant's own value would win, and the override would be lost silently."""
     content = {"variants": {"two": ["memory.layers=[2]"], "no hand": ["hand=off"], "all": []}}
-    with pytest.raises(
-        InputError, match=r"variant '(two|no hand)' of sweep s sets .* itself; allowed are keys"
-    ):
-        parse_sweep("s", content).with_overrides(["profile=tiny", word])
-    content["variants"]["two"] = content["variants"]["no hand"] = {
-        "overrides": None
-    }  # rows of the paper alone
-    assert parse_sweep("s", content).with_overrides([word]).command_line == (word,)
+    for override in ("memory.layers=[2]", "+memory.layers=[9]", "~hand"):
+        with pytest.raises(InputError, match=r"variant '(two|no hand)' of sweep s sets .* itself"):
+            parse_sweep("s", content).with_overrides(["profile=tiny", override])
+    content["variants"]["two"] = content["variants"]["no hand"] = {"overrides": None}  # the paper's rows
+    assert parse_sweep("s", content).with_overrides(["~hand"]).command_line == ("~hand",)
 
 
 def test_seeds_of_the_command_line_replace_the_files():
@@ -49,28 +50,17 @@ def test_seeds_of_the_command_line_replace_the_files():
     assert sweep.command_line == ("profile=tiny",)
 
 
-def test_the_outputs_folder_is_an_option_and_no_override():
+def test_keys_that_no_sweep_takes_are_refused():
     sweep = parse_sweep("s", {"seeds": [0], "variants": VARIANTS})
-    with pytest.raises(InputError, match=r"paths\.outputs: allowed here is --outputs"):
-        sweep.with_overrides(["profile=tiny", "paths.outputs=elsewhere"])
+    for override in ("paths.outputs=elsewhere", "save_predictions=all"):
+        with pytest.raises(InputError, match=override.partition("=")[0]):
+            sweep.with_overrides(["profile=tiny", override])
 
 
-@pytest.mark.parametrize("word", ["++seed=7", "+seed=7"])
-def test_a_seed_that_is_added_is_one(word: str):
-    assert parse_sweep("s", {"seeds": [0, 1], "variants": VARIANTS}).with_overrides([word]).seeds == (7,)
-
-
-def test_runs_of_a_sweep_do_not_write_predictions_over_each_other():
-    sweep = parse_sweep("s", {"seeds": [0], "variants": VARIANTS})
-    with pytest.raises(InputError, match="save_predictions: a sweep's runs would write over each other's"):
-        sweep.with_overrides(["save_predictions=all"])
-
-
-def test_an_axis_over_what_an_variant_sets_is_refused():
-    """Its values would win, and the variant's label be wrong."""
-    content = {"variants": {"slow": ["optim.lr=1e-4"], "none": []}, "axes": {"optim.lr": [1e-3, 2e-3]}}
-    with pytest.raises(InputError, match=r"variant 'slow': sets optim\.lr, which is an axis; allowed is one"):
-        parse_sweep("s", content)
+def test_a_seed_that_is_added_is_one():
+    for override in ("++seed=7", "+seed=7"):
+        sweep = parse_sweep("s", {"seeds": [0, 1], "variants": VARIANTS}).with_overrides([override])
+        assert sweep.seeds == (7,)
 
 
 def test_axes_are_a_grid_over_every_variant():
@@ -107,3 +97,38 @@ def test_a_list_of_grids_gives_each_of_their_cells_once():
         parse_sweep("s", {"variants": variants, "axes": axes[0]}).variants
         == sweep.variants[:2] + sweep.variants[3:5]
     )
+
+
+CONTENT = {
+    "title": "Mine",
+    "notes": ["of two variants"],
+    "base": ["data=synthetic"],
+    "control": "none",
+    "variants": {"none": ["memory=none"], "gru": ["memory=gru"]},
+}
+
+
+def test_what_is_read_is_what_was_kept(tmp_path: Path):
+    sweep = parse_sweep("mine", CONTENT)
+    changed = replace(
+        sweep.with_overrides(["seed=4,5", "optim.lr=0.1"]),
+        variants=(*sweep.variants[1:], replace(sweep.variants[0], series="a", cell=("b=1", "c=2"))),
+    )
+    assert kept_sweep(tmp_path) is None
+    for each in (sweep, changed):
+        keep_sweep(each, tmp_path)
+        assert kept_sweep(tmp_path) == each
+
+
+def test_a_copy_of_the_same_content_is_not_written_again(tmp_path: Path):
+    keep_sweep(parse_sweep("mine", CONTENT), tmp_path)
+    before = (tmp_path / NAME).stat().st_mtime_ns
+    keep_sweep(parse_sweep("mine", CONTENT), tmp_path)
+    assert (tmp_path / NAME).stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"variants": [{"no": 1}]}'])
+def test_a_damaged_copy_is_named(tmp_path: Path, text: str):
+    (tmp_path / NAME).write_text(text)
+    with pytest.raises(InputError, match=f"{NAME}: not a sweep"):
+        kept_sweep(tmp_path)

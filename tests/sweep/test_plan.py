@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
-from memmlp.sweep.plan import Entry, Plan, RunTask, unique
+import pytest
+
+from memmlp.sweep.plan import Entry, Forecast, Plan, RunTask, forecast, unique
 
 
 def a_plan() -> Plan:
@@ -35,3 +38,72 @@ def test_variants_need_their_runs_and_those_upstream():
     assert needed("refined") == ["vqvae", "net", "refined stream"]
     assert needed() == []
     assert a_plan().of_variants(VARIANTS) == a_plan()
+
+
+CODES, QUICK, SLOW = ("c" * 16,), ("a" * 16, "b" * 16), ("d" * 16, "e" * 16)
+
+
+@pytest.fixture
+def plan(tmp_path: Path) -> Plan:
+    """Two variants of two seeds each, and what is upstream of them."""
+    variants = {"quick": QUICK, "slow": SLOW}
+    entries = [
+        Entry(variant, seed, name) for variant, names in variants.items() for seed, name in enumerate(names)
+    ]
+    tasks = [RunTask(CODES[0], "vqvae", {})]
+    tasks += [RunTask(entry.id, "memmlp", {}, CODES[0]) for entry in entries]
+    return Plan("trial", tmp_path, tuple(entries), tuple(tasks))
+
+
+def finish(plan: Plan, name: str, seconds: object) -> None:
+    """End a run that took so long."""
+    task = next(task for task in plan.tasks if task.id == name)
+    run = plan.run_of(task)
+    run.begin(task.kind, {}, data="d", upstream=task.upstream)
+    run.write_manifest({"seconds": seconds})
+    run.results_path.write_text("{}")
+    run.finish(["results.json"])
+
+
+def test_nothing_is_foretold_of_a_kind_of_which_nothing_has_finished(plan: Plan):
+    assert forecast(plan) is None
+    finish(plan, CODES[0], 10.0)
+    assert forecast(plan) is None
+
+
+def test_a_run_is_judged_by_its_variant(plan: Plan):
+    finish(plan, CODES[0], 10.0)
+    finish(plan, QUICK[0], {"train": 50.0, "evaluate": 10.0})
+    finish(plan, SLOW[0], {"train": 1000.0, "evaluate": 200.0})
+    assert forecast(plan) == Forecast(60.0 + 1200.0, finished=2, unlike=0)
+
+
+def test_a_trained_run_without_what_the_plan_wants_of_it_judges_none(plan: Plan):
+    """Its time lacks an evaluation, and would be a quarter of what the others take."""
+    finish(plan, CODES[0], 10.0)
+    finish(plan, SLOW[0], 60.0)
+    task = next(task for task in plan.tasks if task.id == QUICK[0])
+    finish(plan, QUICK[0], 15.0)
+    wanting = replace(task, stages=("e" * 16,))
+    again = replace(plan, tasks=tuple(wanting if one.id == task.id else one for one in plan.tasks))
+    assert wanting in again.left()
+    assert forecast(again) == Forecast(3 * 60.0, finished=1, unlike=2)
+
+
+def test_an_variant_without_a_finished_run_is_judged_by_the_others_and_counted(plan: Plan):
+    finish(plan, CODES[0], 10.0)
+    finish(plan, QUICK[0], 60.0)
+    assert forecast(plan) == Forecast(60.0 + 2 * 60.0, finished=1, unlike=2)
+
+
+def test_of_a_finished_plan_nothing_is_foretold(plan: Plan):
+    for name in (*CODES, *QUICK, *SLOW):
+        finish(plan, name, 1.0)
+    assert forecast(plan) is None
+
+
+def test_a_run_too_short_for_the_clock_counts_as_finished(plan: Plan):
+    finish(plan, CODES[0], {"vqvae": 0.0})
+    finish(plan, QUICK[0], {"train": 0.0})
+    finish(plan, SLOW[0], 20.0)
+    assert forecast(plan) == Forecast(20.0, finished=2, unlike=0)

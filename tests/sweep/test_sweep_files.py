@@ -21,7 +21,7 @@ from memmlp.config.build import build_experiment, untrained
 from memmlp.config.compose import composed
 from memmlp.motion.normalizer import Normalizer
 from memmlp.runs.identity import flatten
-from memmlp.sweep.definition import Sweep, Variant
+from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import load_sweep
 from memmlp.training.loop import train_step
 from memmlp.training.train_network import MotionTask
@@ -69,70 +69,72 @@ def row(table: int, label: str) -> dict[str, Any]:
     return next(found for found in rows(table) if found["label"].lower() == label.lower())
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_variants_differ(path: Path):
-    sweep = load_sweep(path)
-    alike = (
-        {"MANIKIN-LN"} if sweep.table == 16 else set()
-    )  # its size is that of MANIKIN-L's network, as its note says
-    variants = [
-        variant for variant in sweep.variants if variant.overrides is not None and variant.label not in alike
-    ]
-    runnable = [(variant.overrides, variant.branch) for variant in variants]
-    assert len(set(runnable)) == len(runnable)
-    assert path.stem != sweep.title
+def test_variants_differ():
+    for path in FILES:
+        sweep = load_sweep(path)
+        alike = (
+            {"MANIKIN-LN"} if sweep.table == 16 else set()
+        )  # its size is that of MANIKIN-L's network, as its note says
+        variants = [
+            variant
+            for variant in sweep.variants
+            if variant.overrides is not None and variant.label not in alike
+        ]
+        runnable = [(variant.overrides, variant.branch) for variant in variants]
+        assert len(set(runnable)) == len(runnable)
+        assert path.stem != sweep.title
 
 
-@pytest.mark.parametrize("path", TABLES, ids=lambda path: path.stem)
-def test_tables_carry_their_number_and_values(path: Path):
-    sweep = load_sweep(path)
-    assert path.stem == f"table{sweep.table:02}"
-    assert all(variant.paper for variant in sweep.variants if variant.label not in OURS)
-    assert len(sweep.variants) > len(OURS)
-    assert all(metric in sweep.metrics for variant in sweep.variants for metric in variant.paper or {})
+def test_tables_carry_their_number_and_values():
+    for path in TABLES:
+        sweep = load_sweep(path)
+        assert path.stem == f"table{sweep.table:02}"
+        assert all(variant.paper for variant in sweep.variants if variant.label not in OURS)
+        assert len(sweep.variants) > len(OURS)
+        assert all(metric in sweep.metrics for variant in sweep.variants for metric in variant.paper or {})
 
 
 def test_every_table_of_the_paper_is_there():
     assert [load_sweep(path).table for path in TABLES] == list(range(1, 18)) == list(PRINTED)
 
 
-@pytest.mark.parametrize("path", TABLES, ids=lambda path: path.stem)
-def test_values_are_those_printed(path: Path):
+def test_values_are_those_printed():
     """Each row has the printed values, and none beside them."""
-    sweep = load_sweep(path)
-    assert sweep.table
-    variants = [(variant.label, dict(variant.paper)) for variant in sweep.variants if variant.paper]
-    printed = rows(sweep.table)
-    labels = [found.pop("label") for found in printed]
-    assert [values for _, values in variants] == printed
-    if sweep.table in LABELLED:
-        assert [label for label, _ in variants] == labels
+    for path in TABLES:
+        sweep = load_sweep(path)
+        assert sweep.table
+        variants = [(variant.label, dict(variant.paper)) for variant in sweep.variants if variant.paper]
+        printed = rows(sweep.table)
+        labels = [found.pop("label") for found in printed]
+        assert [values for _, values in variants] == printed
+        if sweep.table in LABELLED:
+            assert [label for label, _ in variants] == labels
 
 
-@pytest.mark.parametrize("table", [12, 13])
-def test_wrong_heads_are_noted(table: int):
-    sweep: Sweep = load_sweep(FOLDER / f"table{table}.yaml")
-    assert sweep.metrics == ("MPJRE", "MPJPE", "MPJVE", "Jitter")
-    assert any("printed heads" in note for note in sweep.notes)
+def test_wrong_heads_are_noted():
+    for table in (12, 13):
+        sweep: Sweep = load_sweep(FOLDER / f"table{table}.yaml")
+        assert sweep.metrics == ("MPJRE", "MPJPE", "MPJVE", "Jitter")
+        assert any("printed heads" in note for note in sweep.notes)
 
 
 AFTER_IK = {"MPJPE": 3.08, "Jitter": 6.03}  # Table 6, "Rotation + Position Branch"
 
 
-@pytest.mark.parametrize("path", TABLES[:15], ids=lambda path: path.stem)
-def test_rows_with_table_6s_combined_values_show_the_combined_branch(path: Path):
+def test_rows_with_table_6s_combined_values_show_the_combined_branch():
     """The file also says how we know the branch. A network with rotations alone shows these."""
-    sweep = load_sweep(path)
-    assert sweep.branch_source
-    full = [variant for variant in sweep.variants if AFTER_IK.items() <= (variant.paper or {}).items()]
-    assert bool(full) == (sweep.table not in (2, 3))
-    assert {variant.branch for variant in full} <= {"combined"}
-    for variant in sweep.runnable():
-        words = sweep.all_overrides(variant)
-        single = any(word.startswith(("model=", "predictor=rotation_only")) for word in words)
-        assert (variant.branch == "rotation") == (single or variant.label == "Rotation Branch")
-        assert ("evaluation.ik=off" in words) == single
-        assert ("evaluation.ik=lbfgs" in words) != single
+    for path in TABLES[:15]:
+        sweep = load_sweep(path)
+        assert sweep.branch_source
+        full = [variant for variant in sweep.variants if AFTER_IK.items() <= (variant.paper or {}).items()]
+        assert bool(full) == (sweep.table not in (2, 3))
+        assert {variant.branch for variant in full} <= {"combined"}
+        for variant in sweep.runnable():
+            words = sweep.all_overrides(variant)
+            single = any(word.startswith(("model=", "predictor=rotation_only")) for word in words)
+            assert (variant.branch == "rotation") == (single or variant.label == "Rotation Branch")
+            assert ("evaluation.ik=off" in words) == single
+            assert ("evaluation.ik=lbfgs" in words) != single
 
 
 def test_the_first_row_of_table_4_is_agrols():
@@ -208,21 +210,21 @@ def test_the_backbone_is_agrols_mlp_of_ten_blocks():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("variant", DECOMPOSITION.variants, ids=lambda variant: variant.label)
-def test_an_variant_of_the_decomposition_trains(variant: Variant):
+def test_every_variant_of_the_decomposition_trains():
     """A step of each variant changes the weights, under the loss that its label names."""
-    experiment = build_experiment(composed([*DECOMPOSITION.all_overrides(variant), "profile=tiny"]))
-    torch.manual_seed(0)
-    architecture, frames = experiment.architecture, tiny.frames((60, 70))
-    normalizer = Normalizer.raw(architecture.coordinates, tiny.REST)
-    model = architecture.build(normalizer, architecture.vqvae() if architecture.uses_codes else None)
-    before = model.stem.weight.clone()
-    loss, rollout = experiment.training.loss(model.branches), experiment.training.rollout
-    optim = replace(experiment.training.optim, steps=1)
-    task = MotionTask(model, loss, rollout, frames, optim, 0, lambda network: {})
-    result = train_step(task, optim, optim.build(task.parameter_groups()), 0)
-    assert not torch.equal(model.stem.weight, before)
-    assert set(result.terms) == set(TERMS.get(variant.label, TERMS["rest"]))
+    for variant in DECOMPOSITION.variants:
+        experiment = build_experiment(composed([*DECOMPOSITION.all_overrides(variant), "profile=tiny"]))
+        torch.manual_seed(0)
+        architecture, frames = experiment.architecture, tiny.frames((60, 70))
+        normalizer = Normalizer.raw(architecture.coordinates, tiny.REST)
+        model = architecture.build(normalizer, architecture.vqvae() if architecture.uses_codes else None)
+        before = model.stem.weight.clone()
+        loss, rollout = experiment.training.loss(model.branches), experiment.training.rollout
+        optim = replace(experiment.training.optim, steps=1)
+        task = MotionTask(model, loss, rollout, frames, optim, 0, lambda network: {})
+        result = train_step(task, optim, optim.build(task.parameter_groups()), 0)
+        assert not torch.equal(model.stem.weight, before)
+        assert set(result.terms) == set(TERMS.get(variant.label, TERMS["rest"]))
 
 
 TERMS = {
@@ -264,11 +266,11 @@ def test_the_cells_of_scaling_are_lines_through_one_point():
         )
 
 
-@pytest.mark.parametrize("table", FULL)
-def test_the_full_model_is_the_same_in_every_table(table: int):
-    headline = row(1, "Mem-MLP-41") | ({"MPJVE": 15.08} if table in OTHER_MPJVE else {})
-    found = {key: value for key, value in rows(table)[FULL[table]].items() if key != "label"}
-    assert found == {key: headline[key] for key in found}
+def test_the_full_model_is_the_same_in_every_table():
+    for table in FULL:
+        headline = row(1, "Mem-MLP-41") | ({"MPJVE": 15.08} if table in OTHER_MPJVE else {})
+        found = {key: value for key, value in rows(table)[FULL[table]].items() if key != "label"}
+        assert found == {key: headline[key] for key in found}
 
 
 def test_rows_that_stand_in_two_tables_are_the_same():
@@ -286,13 +288,13 @@ def test_rows_that_stand_in_two_tables_are_the_same():
         assert {key: first[key] for key in shared} == {key: second[key] for key in shared}, (one, two)
 
 
-@pytest.mark.parametrize("table", [1, 3, 6])
-def test_a_mean_over_the_body_lies_between_its_halves(table: int):
+def test_a_mean_over_the_body_lies_between_its_halves():
     """MPJPE is the mean over 13 upper and 9 lower joints, up to rounding (0.015 in one row)."""
-    for found in rows(table):
-        if "Upper PE" in found and found["label"] not in OTHERS_JOINTS:
-            both = (UPPER_JOINTS * found["Upper PE"] + LOWER_JOINTS * found["Lower PE"]) / 22
-            assert both == pytest.approx(found["MPJPE"], abs=0.015), found["label"]
+    for table in (1, 3, 6):
+        for found in rows(table):
+            if "Upper PE" in found and found["label"] not in OTHERS_JOINTS:
+                both = (UPPER_JOINTS * found["Upper PE"] + LOWER_JOINTS * found["Lower PE"]) / 22
+                assert both == pytest.approx(found["MPJPE"], abs=0.015), found["label"]
 
 
 def test_sizes_are_four_bytes_a_parameter():

@@ -26,7 +26,7 @@ from memmlp.config.worker_process import check_wanted
 from memmlp.runs.run import Run
 from memmlp.sweep import worker
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
-from memmlp.sweep.worker import Cancelled, Presence, attempt, directed, work_off
+from memmlp.sweep.worker import Cancelled, Presence, attempt, has_controller, work_off
 
 CODES = RunTask("c" * 16, "vqvae", {})
 ONE, TWO, ALONE = (
@@ -351,12 +351,12 @@ def test_a_controller_elsewhere_is_dead_once_it_has_not_been_seen_for_long(tmp_p
     path = saved(tmp_path, open=True)
     for moment in (0.0, 2e9, 1e9):
         os.utime(path, (moment, moment))
-        assert directed(path)
+        assert has_controller(path)
         clock.now += worker.ABANDONED - 1
-        assert directed(path)
+        assert has_controller(path)
     clock.now += 1
-    assert not directed(path)
-    assert directed(saved(tmp_path))
+    assert not has_controller(path)
+    assert has_controller(saved(tmp_path))
 
 
 def test_presence_ends_with_its_process(tmp_path: Path):

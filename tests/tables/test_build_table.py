@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import functools
+import json
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from fake_runs import CLIPS, fake_sweep, runs_of
+from fake_runs import CLIPS, fake_run, fake_sweep, runs_of, table_of
 from fake_table import SHIPPED, printed
 from processes import finished
 
 from memmlp.common.errors import InputError
+from memmlp.common.files import read_json
+from memmlp.runs.loggers.facts import SweepFacts
 from memmlp.sweep.definition import Sweep
+from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.sweep_file import load_sweep, parse_sweep
-from memmlp.tables.build_table import make_table, on_source, together, without_runs
+from memmlp.tables.build_table import make_table, on_source, together, without_runs, write_summary
 from memmlp.tables.measured_run import load
 
 
@@ -71,20 +75,18 @@ def test_variants_without_a_sources_clips_are_left_out_and_named(tmp_path: Path)
         return {seed: replace(run, clip_sources=sources) for seed, run in runs[label].items()}
 
     runs = {label: mixed(label) for label in runs}
-    part = on_source(sweep, runs, "new")
-    assert (list(part.runs), part.sweep.control) == (["both", "more"], "both")
-    assert part.flags == ("no test clip of new, so left out: 'one'",)
-    waiting = on_source(
-        sweep, runs | {"both": {}}, "new"
-    )  # a variant without a run is nothing to compare with
-    assert (list(waiting.runs), waiting.sweep.control) == (["both", "more"], "more")
-    table = make_table(part.sweep, part.runs)
+    part, part_runs, flags = on_source(sweep, runs, "new")
+    assert (list(part_runs), part.control) == (["both", "more"], "both")
+    assert flags == ("no test clip of new, so left out: 'one'",)
+    waiting, left, _ = on_source(sweep, runs | {"both": {}}, "new")  # a variant without a run is no control
+    assert (list(left), waiting.control) == (["both", "more"], "more")
+    table = make_table(part, part_runs)
     assert [row.label for row in table.rows] == ["both", "more"]
     assert not any("missing" in flag for flag in table.flags)
-    old = on_source(sweep, runs, "old")
-    assert (list(old.runs), old.sweep, old.flags) == (["one", "both", "more"], sweep, ())
-    assert all(len(run.clips) == len(clips) // 2 for run in old.runs["both"].values())
-    with pytest.raises(InputError, match=r"--source third: no finished run .* allowed is new, old"):
+    old, old_runs, flags = on_source(sweep, runs, "old")
+    assert (list(old_runs), old, flags) == (["one", "both", "more"], sweep, ())
+    assert all(len(run.clips) == len(clips) // 2 for run in old_runs["both"].values())
+    with pytest.raises(InputError, match=r"--source third: no finished run .* expected new, old"):
         on_source(sweep, runs, "third")
 
 
@@ -96,18 +98,18 @@ def test_clips_that_are_put_together_count_as_those_that_the_data_has_together(t
     effects = {"other": 1.1}
     own = runs_of(sweep, fake_sweep(tmp_path / "own", sweep, effects, groups=pairs))
     coarser = runs_of(sweep, fake_sweep(tmp_path / "coarser", sweep, effects, groups=wanted))
-    found = together(own, ["^(kicks)/"])
-    assert found.flags == (
+    found, flags = together(own, ["^(kicks)/"])
+    assert flags == (
         "7 groups of test clips in place of 8: those whose names match '^(kicks)/' alike are together "
         "(--together)",
     )
     cells = [row.cells for row in make_table(sweep, coarser).rows]
-    assert [row.cells for row in make_table(sweep, found.runs).rows] == cells
+    assert [row.cells for row in make_table(sweep, found).rows] == cells
     assert [row.cells for row in make_table(sweep, own).rows] != cells
-    assert together(own, []).runs == own
+    assert together(own, []) == (own, ())
     with pytest.raises(InputError, match=r"^--together nothing: puts no test clips together"):
         together(own, ["^(kicks)/", "nothing"])
-    with pytest.raises(InputError, match=r"^--together '\(' is no regular expression"):
+    with pytest.raises(InputError, match=r"^--together \(: .*regular expression"):
         together(own, ["("])
 
 
@@ -122,3 +124,65 @@ def test_a_mode_in_which_nothing_was_measured_is_left_out(tmp_path: Path):
     assert make_table(sweep, streamed).modes == ("stream",)
     assert make_table(sweep, {**streamed, "both": runs["both"]}).modes == ("stream", "window")
     assert make_table(sweep, streamed, ["window"]).modes == ("window",)
+
+
+def written(folder: Path) -> Path:
+    """A sweep's file: two variants, three seeds."""
+    path = folder / "mine.yaml"
+    path.write_text(
+        "title: Mine\nseeds: [0, 1, 2]\ncontrol: full\nmetrics: [MPJPE]\n"
+        "variants:\n  full: []\n  none: ['memory=none']\n"
+    )
+    return path
+
+
+def test_table_means_verdicts_labels_and_status(tmp_path: Path):
+    sweep = load_sweep(written(tmp_path))
+    find = fake_sweep(tmp_path, sweep, {"none": 1.5})
+    runs = {(variant.label, seed): find(variant, seed) for variant in sweep.variants for seed in sweep.seeds}
+    entries = tuple(Entry(label, seed, run.id) for (label, seed), run in runs.items() if run)
+    tasks = tuple(RunTask(entry.id, "memmlp", {}) for entry in entries)
+    plan, folder = Plan("mine", tmp_path, entries, tasks), tmp_path / "sweeps" / "mine"
+    table = table_of(sweep, find)
+    write_summary(plan, table, folder)
+    facts = SweepFacts.read(folder)
+    assert facts is not None
+    assert (facts.name, facts.status) == ("mine", "done")
+    assert facts.variants == {entry.id: entry.label for entry in entries}
+    cell = next(row for row in table.rows if row.label == "none").cells["stream"]["MPJPE"]
+    assert cell.effect is not None
+    assert facts.aggregates["none/stream/MPJPE"] == cell.mean
+    assert facts.verdicts["none/stream/MPJPE"] == cell.effect.verdict
+    assert [path.name for path in facts.files] == ["table.md", "table.html"]
+    assert "Mine" in facts.files[0].read_text()
+
+
+def test_a_run_of_two_variants_has_both_labels_and_means_that_are_no_numbers_are_left_out(tmp_path: Path):
+    sweep = load_sweep(written(tmp_path))
+    run, table = fake_run(tmp_path, "one"), table_of(sweep, fake_sweep(tmp_path, sweep))
+    entries = tuple(Entry(label, 0, run.id) for label in ("full", "none"))
+    write_summary(Plan("mine", tmp_path, entries, (RunTask(run.id, "memmlp", {}),)), table, tmp_path)
+    content = read_json(tmp_path / "summary.json")
+    assert content["labels"] == {run.id: "full, none"}
+    content["aggregates"]["full/stream/MPJPE"] = "nan"
+    (tmp_path / "summary.json").write_text(json.dumps(content))
+    facts = SweepFacts.read(tmp_path)
+    assert facts is not None
+    assert "full/stream/MPJPE" not in facts.aggregates
+    assert "none/stream/MPJPE" in facts.aggregates
+
+
+def test_a_sweep_with_a_failed_run_failed_and_one_with_a_missing_run_stopped(tmp_path: Path):
+    sweep = load_sweep(written(tmp_path))
+    table, run = table_of(sweep, fake_sweep(tmp_path, sweep)), fake_run(tmp_path, "other")
+    entry, task = Entry("full", 0, run.id), RunTask(run.id, "memmlp", {})
+    plan = Plan("mine", tmp_path, (entry,), (task,))
+    run.marker.unlink()
+    write_summary(plan, table, tmp_path)
+    assert read_json(tmp_path / "summary.json")["status"] == "stopped"
+    with run.lock():
+        write_summary(plan, table, tmp_path)
+    assert read_json(tmp_path / "summary.json")["status"] == "running"
+    run.fail("why")
+    write_summary(plan, table, tmp_path)
+    assert read_json(tmp_path / "summary.json")["status"] == "failed"

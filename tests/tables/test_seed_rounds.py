@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from memmlp.tables.build_table import make_table
 from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.formats import markdown
 from memmlp.tables.measured_run import Measured, Origin
-from memmlp.tables.seed_rounds import Rounds, advanced, as_json, new_rounds, of_json, outlook
+from memmlp.tables.seed_rounds import Rounds, advance, forecast_seeds, new_rounds
 from memmlp.tables.statistics import Verdict
 
 ORIGIN = Origin("c", False, "d", "cpu")
@@ -83,8 +83,8 @@ class World:
         return rounds
 
     def look(self, rounds: Rounds) -> Rounds:
-        names = {label: f"{label} {number}" for label, number in rounds.next_looks(self.sweep).items()}
-        return advanced(rounds, self.sweep, self.spend(rounds), names)
+        names = {label: f"{label} {number}" for label, number in rounds.upcoming(self.sweep).items()}
+        return advance(rounds, self.sweep, self.spend(rounds), names)
 
 
 def verdicts(rounds: Rounds, mode: str = "stream") -> dict[str, tuple[str, int]]:
@@ -98,15 +98,15 @@ def verdicts(rounds: Rounds, mode: str = "stream") -> dict[str, tuple[str, int]]
 def test_the_schedule_is_fixed_at_the_start():
     rounds = new_rounds(SWEEP, 6)
     assert rounds.seeds == (4, 2, 5, 6, 7, 8)  # the sweep's own, then those that follow
-    assert rounds.looks == (3, 5, 6)
+    assert rounds.schedule == (3, 5, 6)
     assert sum(rounds.levels) == pytest.approx(0.05)
-    assert rounds.next_looks(SWEEP) == {"worse": 0, "same": 0, "unsure": 0}
+    assert rounds.upcoming(SWEEP) == {"worse": 0, "same": 0, "unsure": 0}
     spent = rounds.spent(SWEEP)
     assert {variant.label: spent.seeds_of(variant) for variant in spent.runnable()} == dict.fromkeys(
         TRUTH, (4, 2, 5)
     )
     assert len(spent.variant_seeds()) == 12
-    assert new_rounds(SWEEP, 1 + 2).looks == (3,)
+    assert new_rounds(SWEEP, 1 + 2).schedule == (3,)
 
 
 def test_open_variants_and_their_control_alone_go_on():
@@ -117,16 +117,16 @@ def test_open_variants_and_their_control_alone_go_on():
         "same": ("equivalent", 3),
         "unsure": ("inconclusive", 3),
     }
-    assert rounds.next_looks(SWEEP) == {"unsure": 1}
-    assert rounds.counts(SWEEP) == {"full": 5, "worse": 3, "same": 3, "unsure": 5}
+    assert rounds.upcoming(SWEEP) == {"unsure": 1}
+    assert rounds.seed_counts(SWEEP) == {"full": 5, "worse": 3, "same": 3, "unsure": 5}
     rounds = world.to_the_end(rounds)
-    assert [look.seeds for look in rounds.taken] == [3, 5, 8, 13]
+    assert [look.seeds for look in rounds.analyses] == [3, 5, 8, 13]
     assert verdicts(rounds)["unsure"] == ("inconclusive", 13)
     assert {label: len(runs) for label, runs in world.runs.items()} == {
         "full": 13, "worse": 3, "same": 3, "unsure": 13
     }  # fmt: skip
-    assert rounds.next_looks(SWEEP) == {}
-    assert {key.label for key in outlook(rounds, SWEEP, world.runs)} == {"unsure"}
+    assert rounds.upcoming(SWEEP) == {}
+    assert {key.label for key in forecast_seeds(rounds, SWEEP, world.runs)} == {"unsure"}
 
 
 def test_what_is_decided_stays_though_later_data_would_reverse_it():
@@ -141,9 +141,12 @@ def test_what_is_decided_stays_though_later_data_would_reverse_it():
 
     world = World(sweep, draw)
     rounds = world.to_the_end(new_rounds(sweep, 5))
-    assert rounds.counts(sweep) == {"full": 3, "other": 5, "unsure": 5}
+    assert rounds.seed_counts(sweep) == {"full": 3, "other": 5, "unsure": 5}
     assert verdicts(rounds)["other"] == ("higher", 3)
-    assert [f.label for f in rounds.taken[1].found] == ["unsure", "unsure"]  # it was not looked at again
+    assert [f.label for f in rounds.analyses[1].findings] == [
+        "unsure",
+        "unsure",
+    ]  # it was not looked at again
     table = make_table(rounds.spent(sweep), world.runs, rounds=rounds)
     cell = next(row for row in table.rows if row.label == "other").cells["stream"]["MPJPE"]
     assert (cell.effect.verdict, cell.effect.decided) == (Verdict.HIGHER, 3)
@@ -163,8 +166,8 @@ def test_a_decided_comparison_of_an_open_variant_is_not_looked_at_again():
 
     rounds = World(sweep, draw).to_the_end(new_rounds(sweep))
     assert verdicts(rounds) == {"other": ("higher", 3)}
-    assert len(rounds.taken) > 1
-    assert {finding.mode for look in rounds.taken[1:] for finding in look.found} == {"window"}
+    assert len(rounds.analyses) > 1
+    assert {finding.mode for look in rounds.analyses[1:] for finding in look.findings} == {"window"}
 
 
 def test_a_look_uses_its_seeds_alone_whatever_other_runs_there_are():
@@ -179,44 +182,46 @@ def test_a_look_uses_its_seeds_alone_whatever_other_runs_there_are():
 def test_one_group_of_clips_ends_it_at_once():
     world = World(groups=dict.fromkeys(CLIPS, "one take"))
     rounds = world.to_the_end(new_rounds(SWEEP))
-    assert len(rounds.taken) == 1
+    assert len(rounds.analyses) == 1
     assert {verdict for verdict, _ in verdicts(rounds).values()} == {"inconclusive"}
-    assert rounds.next_looks(SWEEP) == {}
+    assert rounds.upcoming(SWEEP) == {}
 
 
 def test_an_variant_whose_runs_failed_is_late_and_others_do_not_wait():
     world = World()
     world.failing = {("worse", 2)}
     rounds = world.to_the_end(new_rounds(SWEEP, 5))
-    assert [sorted(look.runs) for look in rounds.taken] == [["same", "unsure"], ["unsure"]]
-    assert rounds.next_looks(SWEEP) == {"worse": 0}
-    assert len(rounds.family(SWEEP)) == 6  # its comparisons count although they were not looked at
+    assert [sorted(look.runs) for look in rounds.analyses] == [["same", "unsure"], ["unsure"]]
+    assert rounds.upcoming(SWEEP) == {"worse": 0}
+    assert len(rounds.comparisons(SWEEP)) == 6  # its comparisons count although they were not looked at
     world.failing = set()
     rounds = world.to_the_end(rounds)
     assert verdicts(rounds)["worse"] == ("higher", 3)
-    assert [look.level for look in rounds.taken] == [rounds.levels[0], rounds.levels[1], rounds.levels[0]]
+    assert [look.level for look in rounds.analyses] == [rounds.levels[0], rounds.levels[1], rounds.levels[0]]
 
 
 def test_a_control_that_failed_stops_what_needs_it():
     world = World()
     world.failing = {("full", 5)}
-    assert world.to_the_end(new_rounds(SWEEP)).taken == ()
+    assert world.to_the_end(new_rounds(SWEEP)).analyses == ()
 
 
 def test_a_file_holds_all_of_it():
     rounds = World().to_the_end(new_rounds(SWEEP))
-    assert of_json(json.loads(json.dumps(as_json(rounds)))) == rounds
+    assert Rounds.of_json(json.loads(json.dumps(asdict(rounds)))) == rounds
 
 
 def test_corrections_are_over_all_that_nobody_has_claimed():
     """Of 6 comparisons, 2 differences are claimed at the first look; the next corrects by 4."""
     rounds = World().look(World().look(new_rounds(SWEEP)))
-    first, second = rounds.taken
-    plain = {finding.key: finding for finding in first.found}
-    unsure = [f for f in second.found if f.mode == "stream"]
+    first, second = rounds.analyses
+    plain = {finding.key: finding for finding in first.findings}
+    unsure = [f for f in second.findings if f.mode == "stream"]
     assert len(plain) == 6
     assert unsure[0].holm == pytest.approx(min(1, 4 * unsure[0].p))
-    assert all(f.holm == 1 for f in first.found if f.verdict is Verdict.EQUIVALENT)  # closed to differences
+    assert all(
+        f.holm == 1 for f in first.findings if f.verdict is Verdict.EQUIVALENT
+    )  # closed to differences
 
 
 def test_the_table_shows_rounds(tmp_path):
@@ -230,7 +235,7 @@ def test_the_table_shows_rounds(tmp_path):
     assert "higher (3)" in text
     assert "equivalent (3)" in text
     assert "analyses at 3 (1.7 %), 5 (3.3 %) seeds" in text
-    assert "p \\< its look's level by Holm's correction over the table's 6 comparisons" in text
+    assert "p \\< the analysis' level by Holm's correction over the table's 6 comparisons" in text
     assert "missing" not in text
     del world.runs["unsure"][6]
     assert "'unsure' seed 6; fill with" in markdown(
@@ -269,7 +274,7 @@ def false_claims(truth: float, noise: float, spend: Callable[[Rounds], Rounds], 
 
 def wasteful(rounds: Rounds) -> Rounds:
     """Spend the whole 5 % at every look."""
-    return replace(rounds, levels=(0.05,) * len(rounds.looks))
+    return replace(rounds, levels=(0.05,) * len(rounds.schedule))
 
 
 @pytest.mark.slow

@@ -93,7 +93,7 @@ def _describe(folder: Path) -> dict[str, Any]:
 def _describe_study(study: optuna.Study) -> dict[str, Any]:
     from optuna.trial import TrialState
 
-    from memmlp.sweep.search.results import IMPORTANCE, at_an_end, study_importances, too_few_trials
+    from memmlp.sweep.search.results import IMPORTANCE, boundary_warnings, importances, too_few_trials
 
     trials = [trial for trial in study.get_trials(deepcopy=False) if trial.state != TrialState.WAITING]
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
@@ -109,10 +109,10 @@ def _describe_study(study: optuna.Study) -> dict[str, Any]:
         "front": front,
         "best": [_describe_trial(trial) for trial in complete if trial.number in front][:1],
         "trials": [_describe_trial(trial) for trial in trials],
-        "ends": at_an_end(study),
+        "ends": boundary_warnings(study),
         "importance_is": IMPORTANCE,
         "too_few": too_few_trials(study),
-        "importance": [[key, round(share, 4)] for key, share in study_importances(study)],
+        "importance": [[key, round(share, 4)] for key, share in importances(study)],
     }
 
 

@@ -21,21 +21,16 @@ from memmlp.evaluation.metric_facts import UNITS
 from memmlp.report.ui.run_index import RunIndex
 from memmlp.runs.identity import NETWORK, training_settings
 from memmlp.runs.run import STAGE_WORDS
-from memmlp.sweep.definition import Sweep, Variant
+from memmlp.sweep.definition import SWEEP_FILE, Sweep, Variant, kept_sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask
-from memmlp.sweep.progress_table import name as task_name
-from memmlp.sweep.sweep_json import NAME as SWEEP_FILE
-from memmlp.sweep.sweep_json import kept_sweep
+from memmlp.sweep.progress_table import task_name
 from memmlp.tables.build_table import finished_runs, make_table
 from memmlp.tables.effects import RunsBySeed
-from memmlp.tables.error_distributions import distributions
+from memmlp.tables.error_distributions import distributions, performance_profile
 from memmlp.tables.formats import as_json
 from memmlp.tables.measured_run import Measured, load
-from memmlp.tables.seed_rounds import Rounds, standings, subject
-from memmlp.tables.seed_rounds_file import NAME as ROUNDS_FILE
-from memmlp.tables.seed_rounds_file import read as read_rounds
-from memmlp.tables.seed_rounds_file import same_runs
-from memmlp.tables.statistics import Verdict, performance_profile
+from memmlp.tables.seed_rounds import ROUNDS_FILE, Rounds, check_same_runs, progress, subject
+from memmlp.tables.statistics import Verdict
 from memmlp.tables.table import Table
 from memmlp.tables.table_text import better, caption, heading, legend
 
@@ -238,8 +233,8 @@ class Sweeps:
         runs = finished_runs(sweep, find)
         table = make_table(sweep, runs, rounds=rounds)
         table = replace(table, flags=(*table.flags, *flag, *flags))
-        progress = describe_rounds(rounds, sweep) if rounds else None
-        return describe_results(sweep, runs, table) | {"rounds": progress, "values": values}
+        described = describe_rounds(rounds, sweep) if rounds else None
+        return describe_results(sweep, runs, table) | {"rounds": described, "values": values}
 
 
 def name_sweep(name: str, sweep: Sweep) -> dict[str, Any]:
@@ -293,12 +288,12 @@ def find_rounds(sweep: Sweep, plan: Plan) -> tuple[Rounds | None, list[str]]:
     """Return the rounds that decided a sweep's verdicts, or None with a flag if other rounds were taken."""
     path = plan.outputs / "sweeps" / plan.name / ROUNDS_FILE
     try:
-        rounds = read_rounds(path)
-        if rounds is None or not rounds.taken:
+        rounds = Rounds.read(path)
+        if rounds is None or not rounds.analyses:
             return None, []
         if rounds.subject != plain(subject(sweep)):
             return None, [OTHER_ROUNDS]
-        same_runs(rounds, sweep, plan, path)
+        check_same_runs(rounds, sweep, plan, path)
     except InputError:
         return None, [DAMAGED_ROUNDS]
     return rounds, []
@@ -307,12 +302,12 @@ def find_rounds(sweep: Sweep, plan: Plan) -> tuple[Rounds | None, list[str]]:
 def describe_rounds(rounds: Rounds, sweep: Sweep) -> dict[str, Any]:
     """Return the interim analyses of a sweep's rounds with what each decided, and each variant's progress."""
     analyses = []
-    for seeds, level in zip(rounds.looks, rounds.levels, strict=True):
-        found = [finding for look in rounds.taken if look.seeds == seeds for finding in look.found]
+    for seeds, level in zip(rounds.schedule, rounds.levels, strict=True):
+        found = [finding for one in rounds.analyses if one.seeds == seeds for finding in one.findings]
         decided = sum(finding.verdict is not Verdict.INCONCLUSIVE for finding in found)
         analyses.append({"seeds": seeds, "level": level, "compared": len(found), "decided": decided})
-    variants = [asdict(variant) for variant in standings(rounds, sweep)]
-    return {"comparisons": len(rounds.family(sweep)), "analyses": analyses, "variants": variants}
+    variants = [asdict(variant) for variant in progress(rounds, sweep)]
+    return {"comparisons": len(rounds.comparisons(sweep)), "analyses": analyses, "variants": variants}
 
 
 def _cell_metric(sweep: Sweep) -> str:

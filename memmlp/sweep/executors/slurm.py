@@ -1,11 +1,12 @@
-"""Workers that are jobs of a Slurm cluster; all workers that start together are one job array."""
+"""Workers that are jobs of a Slurm cluster, submitted by submitit; an array of those that start together."""
 
 from __future__ import annotations
 
 import contextlib
+import logging
 import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,13 +15,13 @@ import submitit
 import submitit.helpers
 
 from memmlp.common.errors import InputError
-from memmlp.common.processes import children_import_the_same
-from memmlp.sweep.executors.executor import Work
-from memmlp.sweep.executors.submitit_jobs import UNLIMITED, Requeued, Submitted, explained
+from memmlp.common.processes import children_import_the_same, collect_garbage_rarely
+from memmlp.sweep.executors import Work
 
 TIME = re.compile(r"(?:(?P<days>\d+)-)?(?P<first>\d+)(?::(?P<second>\d+))?(?::(?P<third>\d+))?")
 OURS = ("array", "output", "error", "open_mode", "signal", "wrap", "wait", "parsable", "test_only")
 ONE = ("nodes", "ntasks", "ntasks_per_node", "ntasks_per_gpu")  # a worker is one task
+UNLIMITED = 365 * 24 * 60  # minutes, where submitit wants a limit and there is none
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class SlurmOptions:
 
     Attributes:
         parameters: sbatch's parameters by their long names, with _ for -; True for one without a value.
-        srun: words for srun, which starts the worker inside the job.
+        srun: arguments for srun, which starts the worker inside the job.
         setup: a shell command that each job runs first; None for none.
         python: the command that starts Python in the job; None for this process' own.
         minutes: the time limit, if `parameters` has one that is given in minutes.
@@ -49,16 +50,17 @@ class SlurmOptions:
         return counted or any("gpu" in str(value) for value in wanted)
 
 
-def slurm_options(words: Mapping[str, str]) -> SlurmOptions:
-    """Return the options in the words `slurm.KEY=VALUE` of a command line.
+def slurm_options(settings: Mapping[str, str]) -> SlurmOptions:
+    """Return the options that `slurm.KEY=VALUE` on a command line set.
 
     Raises:
         InputError: for a value of the wrong kind, and for options that memmlp sets itself.
     """
-    known = {key.replace("-", "_"): value for key, value in words.items()}
+    known = {key.replace("-", "_"): value for key, value in settings.items()}
     setup, python = known.pop("setup", None), known.pop("python", None)
     srun = shlex.split(known.pop("srun", ""))
-    srun += [f"--{_dashed(key)}={known.pop(key)}" for key in sorted(known) if key.startswith("container")]
+    containers = sorted(key for key in known if key.startswith("container"))
+    srun += [f"--{key.replace('_', '-')}={known.pop(key)}" for key in containers]
     parameters: dict[str, str | bool] = {}
     for key, value in known.items():
         parameters |= _parameter(key, value)
@@ -67,13 +69,12 @@ def slurm_options(words: Mapping[str, str]) -> SlurmOptions:
 
 
 def _parameter(key: str, value: str) -> dict[str, str | bool]:
-    """Return a word of the command line as a parameter of sbatch."""
     if key in OURS:
-        raise InputError(f"slurm.{key}: is set by memmlp; allowed are sbatch's other options")
+        raise InputError(f"slurm.{key}: is set by memmlp; expected another option of sbatch")
     if key in ONE:
-        raise InputError(f"slurm.{key}: allowed is none, since a worker is one task on one node (--workers)")
+        raise InputError(f"slurm.{key}: cannot be set, since a worker is one task on one node (--workers)")
     if not re.fullmatch(r"[a-z][a-z0-9_]*", key) or not value or not value.isprintable():
-        raise InputError(f"slurm.{key}={value}: allowed is the long name of an option of sbatch, and a value")
+        raise InputError(f"slurm.{key}={value}: expected the long name of an option of sbatch, and a value")
     if key == "mem_gb":
         return {"mem": f"{_number(key, value)}GB"}
     if key == "cpus":
@@ -85,7 +86,7 @@ def _parameter(key: str, value: str) -> dict[str, str | bool]:
 
 def _number(key: str, value: str) -> int:
     if not value.isdecimal() or int(value) == 0:
-        raise InputError(f"slurm.{key}={value}: allowed is a whole number above 0")
+        raise InputError(f"slurm.{key}={value}: must be a whole number above 0")
     return int(value)
 
 
@@ -93,7 +94,7 @@ def _minutes(text: str) -> int:
     """Return a time in minutes, rounded up, from Slurm's forms M, M:S, H:M:S, D-H, D-H:M or D-H:M:S."""
     found = TIME.fullmatch(text)
     if not found:
-        raise InputError(f"slurm.time={text}: allowed are MINUTES, H:MM:SS, D-HH and D-HH:MM")
+        raise InputError(f"slurm.time={text}: expected MINUTES, H:MM:SS, D-HH or D-HH:MM")
     days, *parts = (int(part) if part else 0 for part in found.group("days", "first", "second", "third"))
     if not found["days"] and not found["third"]:
         parts = [0, *parts[:2]]  # without hours
@@ -101,8 +102,20 @@ def _minutes(text: str) -> int:
     return (days * 24 + hours) * 60 + minutes + (seconds > 0)
 
 
-def _dashed(key: str) -> str:
-    return key.replace("_", "-")
+class Requeued:
+    """Work that a preempted job does again; its runs continue from their checkpoints."""
+
+    def __init__(self, work: Work):
+        self.work = work
+
+    def __call__(self) -> str | None:
+        """Do the work, in the process that submitit started for it."""
+        collect_garbage_rarely()
+        return self.work()
+
+    def checkpoint(self) -> Any:
+        """Return the submission that submitit queues when the job is preempted or its time is up."""
+        return submitit.helpers.DelayedSubmission(self)
 
 
 class DelayedSubmission(submitit.helpers.DelayedSubmission):  # submitit looks for this name
@@ -117,17 +130,16 @@ class SubmititSlurm(submitit.SlurmExecutor):
     """Submitit's executor, also for jobs without a time limit of their own, where the cluster's applies."""
 
     def _internal_process_submissions(self, delayed_submissions: list) -> list:
-        given: list = [
-            DelayedSubmission(one.function, *one.args, **one.kwargs) for one in delayed_submissions
-        ]
-        return super()._internal_process_submissions(given)
+        return super()._internal_process_submissions(
+            [DelayedSubmission(one.function, *one.args, **one.kwargs) for one in delayed_submissions]
+        )
 
     def set(self, options: SlurmOptions) -> None:
         """Set the options with which jobs are submitted."""
-        words = {"additional_parameters": dict(options.parameters), "srun_args": list(options.srun)}
+        given = {"additional_parameters": dict(options.parameters), "srun_args": list(options.srun)}
         setup = {"setup": [options.setup]} if options.setup else {}
         # Submitit would set a wckey of its own, which clusters without such keys refuse.
-        self.update_parameters(job_name="memmlp", time=options.minutes, wckey=None, **words, **setup)
+        self.update_parameters(job_name="memmlp", time=options.minutes, wckey=None, **given, **setup)
 
 
 class Unsent(SubmititSlurm):
@@ -137,6 +149,27 @@ class Unsent(SubmititSlurm):
     def affinity(cls) -> int:
         """Return 1, which tells submitit that Slurm is available."""
         return 1
+
+
+class Job:
+    """A worker that is a job of Slurm."""
+
+    def __init__(self, job: submitit.Job):
+        self.job = job
+
+    def alive(self) -> bool:
+        """Return whether the job is waiting or working."""
+        return not self.job.done()
+
+    def cancel(self) -> None:
+        """End the job."""
+        self.job.cancel(check=False)
+
+    def complaint(self) -> str | None:
+        """Return the worker's own line about why it could do no work; None after any other end."""
+        if not self.job.paths.result_pickle.exists() or self.job.exception() is not None:
+            return None
+        return self.job.result()
 
 
 class Slurm:
@@ -151,24 +184,33 @@ class Slurm:
     """
 
     def __init__(self, folder: Path, options: SlurmOptions):
-        with explained("slurm"):
+        with _one_line_errors():
             self.executor = SubmititSlurm(folder=folder, python=options.python)
             self.executor.set(options)
         self.imports = children_import_the_same if options.python is None else contextlib.nullcontext
         self.gpus = options.gpu
 
-    def submit(self, work: Work, count: int = 1) -> list[Submitted]:
+    def submit(self, work: Work, count: int = 1) -> list[Job]:
         """Start workers as one job array. Raises InputError if sbatch refuses an option."""
-        with explained("slurm"):
+        with _one_line_errors():
             with self.imports(), self.executor.batch():
                 jobs: list[Any] = [self.executor.submit(Requeued(work)) for _ in range(count)]
-            return [Submitted(job) for job in jobs]
+            return [Job(job) for job in jobs]
 
 
-def script(folder: Path, options: SlurmOptions, workers: int) -> str:
+def batch_script(folder: Path, options: SlurmOptions, workers: int) -> str:
     """Return the file that sbatch would get for the given number of workers; Slurm need not be installed."""
     executor = Unsent(folder=folder, python=options.python)
     executor.set(options)
     if workers > 1:
         executor.parameters["map_count"] = workers
     return executor._make_submission_file_text(executor._submitit_command_str, "worker")
+
+
+@contextlib.contextmanager
+def _one_line_errors() -> Iterator[None]:
+    logging.getLogger("submitit").setLevel(logging.ERROR)
+    try:
+        yield
+    except (RuntimeError, TypeError, ValueError, NameError) as error:
+        raise InputError(f"executor=slurm: {' '.join(str(error).split())}") from None

@@ -24,9 +24,9 @@ from memmlp.sweep.plan import Entry, Plan, RunTask, unique
 from memmlp.sweep.progress_table import total_steps
 from memmlp.sweep.search.progress_table import SearchBoard
 from memmlp.sweep.search.search_file import Objective, Value
-from memmlp.sweep.search.study import Study, values
+from memmlp.sweep.search.study import Study, trial_values
 
-HOPELESS = 5  # so many trials that all fail end the search
+MAX_FAILURES = 5  # so many trials that all fail end the search
 DROPPED = (TrialState.PRUNED, TrialState.FAIL)  # states of trials whose runs nobody wants any more
 
 Compose = Callable[[Mapping[str, Value]], Sequence[Sequence[RunTask]]]
@@ -37,7 +37,7 @@ Raises InputError if the config rejects the values.
 
 
 @dataclass
-class Going:
+class RunningTrial:
     """A running trial.
 
     Attributes:
@@ -79,81 +79,74 @@ class Director:
 
     def __init__(self, study: Study, compose: Compose, plan: Plan, check: Callable[[], None] = lambda: None):
         self.study, self.compose, self.plan, self.check = study, compose, plan, check
-        self.going: dict[int, Going] = {}
+        self.running: dict[int, RunningTrial] = {}
         for trial in study.running():
-            self._begin(trial)
+            self._start(trial)
 
-    def look(self, capacity: int) -> Plan:
+    def update(self, capacity: int) -> Plan:
         """Record ended trials, ask for new ones until `capacity` runs can run at once, and return the plan.
 
         Raises:
-            InputError: if all trials failed, and there are at least HOPELESS of them, or if `check` refuses
-                a new trial.
+            InputError: if all trials failed, and there are at least MAX_FAILURES of them, or if `check`
+                refuses a new trial.
         """
-        for number in list(self.going):
-            if self._ended(self.going[number]):
-                del self.going[number]
+        for number in list(self.running):
+            if self._end_if_over(self.running[number]):
+                del self.running[number]
         while self._busy() < capacity and not self.study.full:
             self.check()
             trial = self.study.ask()
-            self._check_hope()
-            self._begin(trial)
-        return self._planned()
+            ended = [one for one in self.study.trials if one.state.is_finished()]
+            if len(ended) >= MAX_FAILURES and all(one.state == TrialState.FAIL for one in ended):
+                reason = ended[-1].user_attrs.get("reason", "for an unknown reason")
+                raise InputError(f"all {len(ended)} trials failed, the last one: {reason}")
+            self._start(trial)
+        return self._make_plan()
 
-    def _begin(self, trial: Trial) -> None:
+    def _start(self, trial: Trial) -> None:
         """Add a trial's first run to the plan. A trial whose values the config rejects fails at once."""
         try:
-            going = Going(trial, self.compose(values(trial, self.study.search)))
+            started = RunningTrial(trial, self.compose(trial_values(trial, self.study.search)))
         except InputError as error:
             self.study.fail(trial, str(error))
             return
-        trial.set_user_attr("steps", total_steps(going.seeds[0][-1]))
-        going.want(1)
-        self.going[trial.number] = going
+        trial.set_user_attr("steps", total_steps(started.seeds[0][-1]))
+        started.want(1)
+        self.running[trial.number] = started
 
-    def _ended(self, going: Going) -> bool:
+    def _end_if_over(self, one: RunningTrial) -> bool:
         """Return whether the trial has ended, and record it with the study if so.
 
         Once its first run is done, the trial wants the runs of the other seeds.
         """
-        runs = [self.plan.run_of(tasks[-1]) for tasks in going.seeds]
-        done = [self.plan.complete(tasks[-1]) for tasks in going.seeds]
-        if other := next((reason for tasks in going.seeds if (reason := self._otherwise(tasks[-1]))), None):
-            self.study.fail(going.trial, other)
-            return True
-        news = self._report(going.trial, runs[0])
-        if done[0]:
-            going.want(len(runs))
-        if all(done):
-            self.study.complete(going.trial, [objectives(self.study.search.objectives, run) for run in runs])
-            return True
-        for task in going.tasks:
-            if failure := self.plan.run_of(task).failure:
-                self.study.fail(going.trial, failure)
+        last = [tasks[-1] for tasks in one.seeds]
+        runs = [self.plan.run_of(task) for task in last]
+        for task, run in zip(last, runs, strict=True):
+            used, wanted = inference(run.config) if run.done else None, inference(task.config)
+            if used is not None and used != wanted:
+                self.study.fail(one.trial, f"run {run.id} was validated with {used}, not {wanted}")
                 return True
-        total = total_steps(going.seeds[0][-1])
-        return going.wanted == 1 and 0 < news < total and self.study.prune(going.trial)
-
-    def _otherwise(self, task: RunTask) -> str | None:
-        """Say why a finished run's validations don't suit the task: they used its network in another way.
-
-        Return None if they suit it.
-        """
-        run, wanted = self.plan.run_of(task), inference(task.config)
-        if not run.done or inference(run.config) == wanted:
-            return None
-        return f"run {run.id} was validated with {inference(run.config)}, not {wanted}; it has no others"
+        step = self._report(one.trial, runs[0])
+        if self.plan.complete(last[0]):
+            one.want(len(runs))
+        if all(map(self.plan.complete, last)):
+            self.study.complete(one.trial, [objectives(self.study.search.objectives, run) for run in runs])
+            return True
+        for task in one.tasks:
+            if failure := self.plan.run_of(task).failure:
+                self.study.fail(one.trial, failure)
+                return True
+        return one.wanted == 1 and 0 < step < total_steps(last[0]) and self.study.prune(one.trial)
 
     def _busy(self) -> int:
         """Return how many workers the running trials can use: one for each wanted run that is not done.
 
         A trial whose runs are all done still counts as one until it is recorded as ended.
         """
-        return sum(max(1, sum(not run.done for run in self._runs(going))) for going in self.going.values())
-
-    def _runs(self, going: Going) -> list[Run]:
-        """Return a trial's runs that are wanted so far."""
-        return [Run.of(self.plan.outputs, run_id) for run_id in going.runs]
+        outputs = self.plan.outputs
+        return sum(
+            max(1, sum(not Run.of(outputs, name).done for name in one.runs)) for one in self.running.values()
+        )
 
     def _report(self, trial: Trial, run: Run) -> int:
         """Report the run's new validations to the study, if there is only one objective.
@@ -165,33 +158,25 @@ class Director:
         if others:
             return 0
         known = trial.study.get_trials(deepcopy=False)[trial.number].intermediate_values
-        news = {e.step: objective.value(e.values) for e in validations(run) if e.step not in known}
-        for step, value in news.items():
-            self.study.report(trial, step, value)
-        return max(news, default=0)
+        new = {e.step: objective.value(e.values) for e in validations(run) if e.step not in known}
+        for step, value in new.items():
+            trial.report(value, step)
+        return max(new, default=0)
 
-    def _planned(self) -> Plan:
-        """Return the plan of the running trials, with the runs of pruned and failed trials cancelled."""
+    def _make_plan(self) -> Plan:
         entries = tuple(
             Entry(f"trial {number}", seed, run_id)
-            for number, going in self.going.items()
-            for seed, run_id in enumerate(going.runs)
+            for number, one in self.running.items()
+            for seed, run_id in enumerate(one.runs)
         )
         dropped = [trial for trial in self.study.trials if trial.state in DROPPED]
         cancelled = {run_id for trial in dropped for run_id in trial.user_attrs.get("runs", ())}
         return replace(
             self.plan,
             entries=entries,
-            tasks=unique(task for going in self.going.values() for task in going.tasks),
+            tasks=unique(task for one in self.running.values() for task in one.tasks),
             cancelled=tuple(sorted(cancelled - {entry.id for entry in entries})),
         )
-
-    def _check_hope(self) -> None:
-        """Raise InputError if all trials so far failed, and there are at least HOPELESS of them."""
-        ended = [trial for trial in self.study.trials if trial.state.is_finished()]
-        if len(ended) >= HOPELESS and all(trial.state == TrialState.FAIL for trial in ended):
-            reason = ended[-1].user_attrs.get("reason", "no reason is known")
-            raise InputError(f"all {len(ended)} trials failed, the last one so: {reason}")
 
 
 def validations(run: Run) -> list[LogRecord]:
@@ -220,9 +205,9 @@ def direct(director: Director, fleet: Fleet, board: SearchBoard, path: Path) -> 
     plan = None
     try:
         with board:
-            while plan is None or director.going:
+            while plan is None or director.running:
                 check_owner(path)
-                before, plan = plan, director.look(fleet.size)
+                before, plan = plan, director.update(fleet.size)
                 if plan != before:
                     plan.save(path)
                 os.utime(path)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import math
 import warnings
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import optuna
 import yaml
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
@@ -18,13 +18,13 @@ from optuna.exceptions import ExperimentalWarning
 from optuna.importance import PedAnovaImportanceEvaluator
 from optuna.trial import FrozenTrial, TrialState
 
+from memmlp.common.errors import require
 from memmlp.common.files import atomic_write
 from memmlp.common.overrides import last_by_key
-from memmlp.sweep.search.search_file import Search
-from memmlp.sweep.search.study import Study, deviations, reason, values
+from memmlp.sweep.search.study import Study, deviations, reason, trial_values
 
 TABLE = 5  # the paper's table of manual weights against learned ones
-IMPORTANCE = "by which keys the best tenth of the trials is set apart"
+IMPORTANCE = "by which keys the best tenth of the trials differs"
 ENOUGH_TRIALS = 25
 """From so many complete trials on a tenth of them is more than two, and importance more than chance.
 
@@ -37,38 +37,27 @@ def write_trials(study: Study, path: Path) -> None:
     """Write all trials to a CSV file: number, state, objectives, values, runs, and the reason of a failure.
 
     With several seeds the objectives are means, followed by each objective's standard deviation and by the
-    values of the single seeds. A pruned trial has none, since that of an earlier step is no result; its
-    reason tells it.
+    values of the single seeds. A pruned trial has none, since the value of an earlier step is not a result;
+    its reason has it.
     """
-    names = [objective.text for objective in study.search.objectives]
-    keys = [one.key for one in study.search.space]
+    search = study.search
+    names, keys = [one.text for one in search.objectives], [one.key for one in search.space]
+    seeds = range(1, search.seeds + 1) if search.seeds > 1 else ()
+    seed_columns = [f"{name} sd" for name in names] if seeds else []
+    seed_columns += [f"{name}, run {number}" for number in seeds for name in names]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["trial", "state", *names, *_seed_columns(study.search), *keys, "run", "reason"])
+    writer.writerow(["trial", "state", *names, *seed_columns, *keys, "run", "reason"])
     for trial in study.trials:
         figures = trial.values if trial.state == TrialState.COMPLETE else [""] * len(names)
-        by_seed = _seed_values(study.search, trial)
+        by_seed: list[Any] = []
+        if seeds:
+            by_seed = [*deviations(trial), *itertools.chain(*trial.user_attrs.get("values", ()))]
+            by_seed = by_seed or [""] * len(seed_columns)
         params = [trial.params.get(key, "") for key in keys]
         extra = [" ".join(trial.user_attrs.get("runs", ())), reason(trial)]
         writer.writerow([trial.number, trial.state.name.lower(), *figures, *by_seed, *params, *extra])
     atomic_write(path, text.getvalue())
-
-
-def _seed_columns(search: Search) -> list[str]:
-    """Return the heads of the columns that `_seed_values` fills."""
-    if search.seeds == 1:
-        return []
-    names = [objective.text for objective in search.objectives]
-    counted = [f"{name}, run {number}" for number in range(1, search.seeds + 1) for name in names]
-    return [*(f"{name} sd" for name in names), *counted]
-
-
-def _seed_values(search: Search, trial: FrozenTrial) -> list[float | str]:
-    """Return each objective's standard deviation over seeds, then the objectives of each seed's run."""
-    if search.seeds == 1:
-        return []
-    found = [*deviations(trial), *(value for seed in trial.user_attrs.get("values", ()) for value in seed)]
-    return found or [""] * len(_seed_columns(search))
 
 
 def write_experiments(study: Study, folder: Path, groups: Collection[str]) -> list[Path]:
@@ -84,30 +73,38 @@ def write_experiments(study: Study, folder: Path, groups: Collection[str]) -> li
     Returns:
         The files, the best trial's first.
     """
-    (folder / "experiment").mkdir(parents=True, exist_ok=True)
+    folder = folder / "experiment"
+    folder.mkdir(parents=True, exist_ok=True)
     best = study.best()
-    files = [folder / "experiment" / f"trial-{trial.number}.yaml" for trial in best[1:]]
-    files = [folder / "experiment" / "best.yaml", *files] if best else []
+    files = [folder / ("best.yaml" if not n else f"trial-{one.number}.yaml") for n, one in enumerate(best)]
     for path, trial in zip(files, best, strict=True):
         atomic_write(path, experiment(study, trial, groups))
-    for left in {*(folder / "experiment").glob("trial-[0-9]*.yaml")} - {*files}:
-        left.unlink()
+    for stale in {*folder.glob("trial-[0-9]*.yaml")} - {*files}:
+        stale.unlink()
     return files
 
 
 def experiment(study: Study, trial: FrozenTrial, groups: Collection[str]) -> str:
     """Return a trial as the text of a file for the config group `experiment`.
 
-    It lacks an experiment of the search's base, and does not stand against one of a command line.
+    It lacks an experiment of the search's base, since an experiment cannot choose another one, and it does
+    not override an experiment of a command line.
     """
     search = study.search
     tree: dict[str, Any] = {}
     options: list[dict[str, str]] = []
-    for key, text in _words(search, trial):
+    texts = (*search.base, *search.overrides(trial_values(trial, search)))
+    for key, override in last_by_key(texts).items():
+        if key == "experiment":
+            continue
         if key in groups:
-            options.append({f"override /{key}": text})
-        else:
-            _put(tree, key.split("."), yaml.safe_load(text))
+            options.append({f"override /{key}": override.value or ""})
+            continue
+        *parents, leaf = key.split(".")
+        node = tree
+        for name in parents:
+            node = node.setdefault(name, {})
+        node[leaf] = yaml.safe_load(override.value or "")
     head = (
         f"# @package _global_\n# Trial {trial.number} of {len(study.trials)} of the search {search.name}: "
         f"{', '.join(o.text for o in search.objectives)} on validation "
@@ -116,30 +113,14 @@ def experiment(study: Study, trial: FrozenTrial, groups: Collection[str]) -> str
     return head + yaml.safe_dump({"defaults": [*options, "_self_"], **tree}, sort_keys=False)
 
 
-def _words(search: Search, trial: FrozenTrial) -> Iterator[tuple[str, str]]:
-    """Yield the keys of the search's base and of the trial, each once, with their values as they are typed.
-
-    The base's experiment is not among them, since none can choose another.
-    """
-    words = (*search.base, *search.overrides(values(trial, search)))
-    last = {key: override.value or "" for key, override in last_by_key(words).items()}
-    yield from ((key, value) for key, value in last.items() if key != "experiment")
-
-
-def _put(tree: dict[str, Any], keys: Sequence[str], value: Any) -> None:
-    for key in keys[:-1]:
-        tree = tree.setdefault(key, {})
-    tree[keys[-1]] = value
-
-
-def write_table(study: Study, shipped: Path, path: Path, words: Sequence[str]) -> bool:
+def write_table(study: Study, shipped: Path, path: Path, overrides: Sequence[str]) -> bool:
     """Write the paper's Table 5 with the best trial as one more variant, if only loss weights were searched.
 
     Args:
         study: the study.
         shipped: the file of Table 5.
         path: the file to write.
-        words: the overrides of the search's command line, which all variants get, since the weights were
+        overrides: the overrides of the search's command line, which all variants get, since the weights were
             searched with them. The table has its own seeds.
 
     Returns:
@@ -149,23 +130,18 @@ def write_table(study: Study, shipped: Path, path: Path, words: Sequence[str]) -
     if not best or not all(one.key.startswith("loss.") for one in study.search.space):
         return False
     content = yaml.safe_load(shipped.read_text(encoding="utf-8"))
-    overrides = [*study.search.base, *study.search.overrides(values(best[0], study.search))]
-    content["base"] = [*content.get("base", []), *(word for word in words if not word.startswith("seed="))]
-    content["variants"] = {"manual, searched": {"overrides": overrides}, **content["variants"]}
+    own = [*study.search.base, *study.search.overrides(trial_values(best[0], study.search))]
+    content["base"] = [*content.get("base", []), *(one for one in overrides if not one.startswith("seed="))]
+    content["variants"] = {"manual, searched": {"overrides": own}, **content["variants"]}
     atomic_write(path, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
     return True
 
 
-def importances(study: Study) -> list[tuple[str, float]]:
-    """Return each key's importance for the first objective; see `study_importances`."""
-    return study_importances(study.study)
-
-
-def study_importances(study: optuna.Study) -> list[tuple[str, float]]:
+def importances(study: optuna.Study) -> list[tuple[str, float]]:
     """Return each key's importance for the first objective of an Optuna study, largest first; their sum is 1.
 
-    It tells by which keys the best tenth of the trials is set apart from all of them (PED-ANOVA, Watanabe et
-    al. 2023); it is no share in the variation. The list is empty with fewer than ENOUGH_TRIALS complete
+    It shows by which keys the best tenth of the trials differs from all of them (PED-ANOVA, Watanabe et
+    al. 2023); it is not a share of the variation. The list is empty with fewer than ENOUGH_TRIALS complete
     trials or a single key.
     """
     complete = _complete(study)
@@ -183,7 +159,7 @@ def too_few_trials(study: optuna.Study) -> str | None:
     complete = _complete(study)
     if not 0 < len(complete) < ENOUGH_TRIALS or len(complete[0].params) < 2:
         return None
-    return f"told from {ENOUGH_TRIALS} complete trials on; of {len(complete)} it would be chance"
+    return f"needs {ENOUGH_TRIALS} complete trials; with {len(complete)} it would be chance"
 
 
 def _complete(study: optuna.Study) -> list[FrozenTrial]:
@@ -191,8 +167,7 @@ def _complete(study: optuna.Study) -> list[FrozenTrial]:
 
 
 def _evaluator() -> PedAnovaImportanceEvaluator:
-    """Return what measures importance, whatever an Optuna's own choice is; its others need scikit-learn."""
-    with warnings.catch_warnings():
+    with warnings.catch_warnings():  # Optuna's other evaluators need scikit-learn
         warnings.simplefilter("ignore", ExperimentalWarning)
         return PedAnovaImportanceEvaluator()
 
@@ -201,15 +176,14 @@ def _first(trial: FrozenTrial) -> float:
     return trial.values[0]
 
 
-def at_an_end(study: optuna.Study) -> list[str]:
+def boundary_warnings(study: optuna.Study) -> list[str]:
     """Return a warning for each key whose best value is at an end of its range: better ones may lie beyond.
 
     A value within a fiftieth of the range's width is at its end (of the logarithm's width, if that is
     searched). There are no warnings for several objectives, whose front reaches the ends, and none at zero,
     beyond which nothing lies.
     """
-    complete = _complete(study)
-    if len(complete) < 2 or len(study.directions) > 1:
+    if len(_complete(study)) < 2 or len(study.directions) > 1:
         return []
     best = study.best_trial
     ends = ((key, best.params[key], _end(best.params[key], one)) for key, one in best.distributions.items())
@@ -224,12 +198,13 @@ def _end(value: Any, tried: BaseDistribution) -> str | None:
     """Return the end at which a value is among those searched, "smallest" or "largest"; None for neither."""
     if isinstance(tried, CategoricalDistribution):
         numbers = [one for one in tried.choices if isinstance(one, int | float) and not isinstance(one, bool)]
-        low, high, margin = min(numbers, default=0), max(numbers, default=0), 0.0
-        known = len(numbers) == len(tried.choices)
+        if len(numbers) < len(tried.choices):
+            return None
+        low, high, margin = min(numbers), max(numbers), 0.0
     else:
         assert isinstance(tried, FloatDistribution | IntDistribution)
-        low, high, margin, known = tried.low, tried.high, 0.02, True
-    if not known or low == high:
+        low, high, margin = tried.low, tried.high, 0.02
+    if low == high:
         return None
     scale = math.log if getattr(tried, "log", False) else float
     share = (scale(value) - scale(low)) / (scale(high) - scale(low))
@@ -240,9 +215,8 @@ def _end(value: Any, tried: BaseDistribution) -> str | None:
 
 def plots(study: Study) -> dict[str, dict[str, Any]]:
     """Return the plots that are possible for a study, by name, with their further arguments."""
-    complete = [trial for trial in study.trials if trial.state == TrialState.COMPLETE]
     names = [objective.text for objective in study.search.objectives]
-    if len(complete) < 2:
+    if len(_complete(study.study)) < 2:
         return {}
     if len(names) == 2:
         first = {"target": _first, "target_name": names[0]}
@@ -251,48 +225,38 @@ def plots(study: Study) -> dict[str, dict[str, Any]]:
     found: dict[str, dict[str, Any]] = dict.fromkeys(
         ("optimization_history", "parallel_coordinate", "slice"), titled
     )
-    return found | (
-        {"param_importances": {**titled, "evaluator": _evaluator()}} if importances(study) else {}
-    )
+    if importances(study.study):
+        found["param_importances"] = {**titled, "evaluator": _evaluator()}
+    return found
 
 
 def write_plots(study: Study, folder: Path) -> list[Path]:
     """Write the plots as PNG files, and all of them into study.html, which works offline."""
     wanted = plots(study)
-    files = [_png(study, name, keywords, folder / f"{name}.png") for name, keywords in wanted.items()]
-    if wanted:
-        files.append(_page(study, wanted, folder / "study.html"))
-    return files
-
-
-def _png(study: Study, name: str, keywords: dict[str, Any], path: Path) -> Path:
-    """Draw a plot with matplotlib into a PNG file, and return the file."""
+    if not wanted:
+        return []
+    files: list[Path] = []
+    parts: list[str] = []
+    matplotlib = require("matplotlib", "plots", "the plots of a search")
+    require("plotly", "plots", "the page of a search")
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    draw = getattr(optuna.visualization.matplotlib, f"plot_{name}")
     with warnings.catch_warnings(), pyplot.rc_context():
         warnings.simplefilter("ignore")
-        axes = draw(study.study, **keywords)
-        figure = next(iter(axes.flat)).figure if hasattr(axes, "flat") else axes.figure
-        figure.set_size_inches(max(figure.get_size_inches()[0], 9), 5)
-        figure.savefig(path, dpi=110, bbox_inches="tight")
-        pyplot.close("all")
-    return path
-
-
-def _page(study: Study, wanted: dict[str, dict[str, Any]], path: Path) -> Path:
-    """Draw all plots with plotly into one HTML page, and return its file."""
-    parts: list[str] = []
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ExperimentalWarning)
         for name, keywords in wanted.items():
-            figure = getattr(optuna.visualization, f"plot_{name}")(study.study, **keywords)
-            parts.append(figure.to_html(full_html=False, include_plotlyjs=not parts))
+            axes = getattr(optuna.visualization.matplotlib, f"plot_{name}")(study.study, **keywords)
+            figure = next(iter(axes.flat)).figure if hasattr(axes, "flat") else axes.figure
+            figure.set_size_inches(max(figure.get_size_inches()[0], 9), 5)
+            figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
+            pyplot.close("all")
+            files.append(folder / f"{name}.png")
+            page = getattr(optuna.visualization, f"plot_{name}")(study.study, **keywords)
+            parts.append(page.to_html(full_html=False, include_plotlyjs=not parts))
     title = f"search {study.search.name}: {len(study.trials)} trials"
     atomic_write(
-        path,
+        folder / "study.html",
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title>'
         f"<body><h1>{title}</h1>{''.join(parts)}</body></html>\n",
     )
-    return path
+    return [*files, folder / "study.html"]

@@ -92,7 +92,7 @@ class Objective:
         for _, name in self.terms:
             if name not in metrics:
                 known = ", ".join(metrics)
-                raise InputError(f"search.objectives: '{name}' is not validated; allowed are {known}")
+                raise InputError(f"search.objectives: '{name}' is not validated; expected one of {known}")
         return sum(weight * metrics[name] for weight, name in self.terms)
 
 
@@ -127,10 +127,10 @@ class Search:
 
     def overrides(self, values: Mapping[str, Value]) -> tuple[str, ...]:
         """Return a trial's values as overrides of `memmlp train`."""
-        return tuple(f"{key}={word(value)}" for key, value in values.items())
+        return tuple(f"{key}={typed(value)}" for key, value in values.items())
 
 
-def word(value: Value) -> str:
+def typed(value: Value) -> str:
     """Return a value as the text that an override has for it."""
     return str(value).lower() if isinstance(value, bool) else str(value)
 
@@ -139,58 +139,50 @@ def parse_search(content: Mapping[str, Any]) -> Search:
     """Return the search that a config describes. Raises InputError, which names the key, if it is wrong."""
     for key in content:
         if key not in KEYS:
-            raise InputError(f"search.{key}: no such key; allowed are {', '.join(KEYS)}")
+            raise InputError(f"search.{key}: no such key; expected one of {', '.join(KEYS)}")
     for key in KEYS:
         if key not in content:
             raise InputError(f"search.{key}: has no value; give one with search.{key}=...")
+    name, storage = str(content["name"]), content["storage"]
+    if not re.fullmatch(r"[\w-]{1,64}", name):
+        raise InputError(f"search.name={name}: expected up to 64 letters, digits, - and _")
+    if storage is not None and not isinstance(storage, str):
+        raise InputError(f"search.storage={storage}: expected a URL, or null")
     space = tuple(_ranges(content["space"], ""))
     if not space:
-        raise InputError("search.space: empty; allowed are config keys with low and high, or with choices")
+        raise InputError("search.space: empty; expected config keys with low and high, or with choices")
     objectives = tuple(_objective(text) for text in _texts(content["objectives"], "search.objectives"))
-    if not 1 <= len(objectives) <= 2:
-        raise InputError(
-            f"search.objectives: {len(objectives)} of them; allowed is 1, or 2 for a Pareto front"
-        )
+    if len(objectives) not in (1, 2) or len({one.text for one in objectives}) < len(objectives):
+        raise InputError("search.objectives: expected one, or two different ones for a Pareto front")
     if len(objectives) > 1 and content["pruner"] != "none":
-        raise InputError(f"search.pruner={content['pruner']}: allowed with two objectives is none")
+        raise InputError(f"search.pruner={content['pruner']}: must be none with two objectives")
     if content["seeds"] != 1 and any(one.key == "seed" for one in space):
-        raise InputError(f"search.seeds={content['seeds']}: allowed is 1 where the space has the seed")
+        raise InputError(f"search.seeds={content['seeds']}: must be 1 if the space has the seed")
     if content["sampler"] == "grid":
         _check_grid(space, content["n_trials"])
-    name = str(content["name"])
-    if not re.fullmatch(r"[\w-]{1,64}", name):
-        raise InputError(f"search.name={name}: allowed are up to 64 letters, digits, - and _")
-    storage = content["storage"]
-    if storage is not None and not isinstance(storage, str):
-        raise InputError(f"search.storage={storage}: allowed is a URL, or null")
-    if len({objective.text for objective in objectives}) < len(objectives):
-        raise InputError("search.objectives: twice the same; allowed are two different ones")
     return Search(
         name=name,
         base=tuple(_texts(content["base"], "search.base")),
         space=space,
         objectives=objectives,
-        n_trials=_whole(content, "n_trials", 1),
-        seeds=_whole(content, "seeds", 1),
+        n_trials=_whole(content, "n_trials"),
+        seeds=_whole(content, "seeds"),
         sampler=_one_of(content, "sampler", SAMPLERS),
-        startup=_whole_or_null(content, "startup", needed=content["sampler"] == "tpe"),
-        seed=_whole(content, "seed", 0),
+        startup=_whole(content, "startup", needed=content["sampler"] == "tpe"),
+        seed=_whole(content, "seed", least=0),
         pruner=_one_of(content, "pruner", PRUNERS),
-        prune_after=_whole_or_null(content, "prune_after", needed=content["pruner"] != "none"),
+        prune_after=_whole(content, "prune_after", needed=content["pruner"] != "none"),
         storage=storage,
     )
 
 
 def _check_grid(space: Sequence[Range], n_trials: Any) -> None:
-    """Raise InputError unless every key has choices only, and there are as many trials as combinations."""
     for one in space:
         if not one.choices or one.first is not None:
-            raise InputError(f"search.space.{one.key}: with search.sampler=grid allowed are choices alone")
+            raise InputError(f"search.space.{one.key}: must have choices alone with search.sampler=grid")
     combinations = math.prod(len(one.choices) for one in space)
     if n_trials != combinations:
-        raise InputError(
-            f"search.n_trials={n_trials}: allowed with search.sampler=grid is {combinations}, all"
-        )
+        raise InputError(f"search.n_trials={n_trials}: must be {combinations}, all, with search.sampler=grid")
 
 
 def _ranges(node: Any, prefix: str) -> Iterator[Range]:
@@ -199,62 +191,51 @@ def _ranges(node: Any, prefix: str) -> Iterator[Range]:
         return
     where = f"search.space{'.' if prefix else ''}{prefix}"
     if not isinstance(node, Mapping):
-        raise InputError(f"{where}: {node!r}; allowed is a mapping with low and high, or with choices")
+        raise InputError(f"{where}: {node!r}; expected a mapping with low and high, or with choices")
     if not set(node) & set(RANGE_KEYS):
         for key, child in node.items():
             yield from _ranges(child, f"{prefix}.{key}" if prefix else str(key))
         return
     for key in node:
         if key not in RANGE_KEYS:
-            raise InputError(f"{where}.{key}: no such key; allowed are {', '.join(RANGE_KEYS)}")
-    yield _range(prefix, node, where)
-
-
-def _range(key: str, node: Mapping[str, Any], where: str) -> Range:
-    made = _choices(key, node, where) if "choices" in node else _interval(key, node, where)
-    if made.first is not None and not made.allows(made.first):
-        raise InputError(f"{where}.first={made.first}: allowed is a value of the range")
-    return made
+            raise InputError(f"{where}.{key}: no such key; expected one of {', '.join(RANGE_KEYS)}")
+    found = _choices(prefix, node, where) if "choices" in node else _interval(prefix, node, where)
+    if found.first is not None and not found.allows(found.first):
+        raise InputError(f"{where}.first={found.first}: must be a value of the range")
+    yield found
 
 
 def _choices(key: str, node: Mapping[str, Any], where: str) -> Range:
-    """Return the range of a node with `choices`. Raises InputError if the node is wrong."""
     choices = node["choices"]
     if isinstance(choices, list):
-        choices = [_listed(item) if isinstance(item, list) else item for item in choices]
-    plain = isinstance(choices, Sequence) and all(isinstance(item, int | float | str) for item in choices)
+        choices = [f"[{','.join(map(typed, one))}]" if isinstance(one, list) else one for one in choices]
+    plain = isinstance(choices, Sequence) and all(isinstance(one, int | float | str) for one in choices)
     if isinstance(choices, str) or not plain or len(set(choices)) < max(len(choices), 2):
-        raise InputError(f"{where}.choices: allowed is a list of at least two values, each once")
+        raise InputError(f"{where}.choices: expected a list of at least two values, each once")
     for other in set(node) - {"choices", "first"}:
         raise InputError(f"{where}.{other}: does not go with choices")
     return Range(key, choices=tuple(choices), first=node.get("first"))
 
 
-def _listed(items: list[Any]) -> str:
-    """Return a choice that is a list as the text that an override has for it."""
-    return f"[{','.join(word(item) for item in items)}]"
-
-
 def _interval(key: str, node: Mapping[str, Any], where: str) -> Range:
-    """Return the range of a node with `low` and `high`. Raises InputError if the node is wrong."""
     low, high = (_number(node.get(end), f"{where}.{end}") for end in ("low", "high"))
     log, step, first = node.get("log", False), node.get("step"), node.get("first")
     if not isinstance(log, bool):
-        raise InputError(f"{where}.log={log}: allowed is true or false")
+        raise InputError(f"{where}.log={log}: must be true or false")
     if low >= high:
-        raise InputError(f"{where}.high={high}: allowed is more than low={low}")
+        raise InputError(f"{where}.high={high}: must be more than low={low}")
     if log and low <= 0:
-        raise InputError(f"{where}.low={low}: allowed with log is above 0")
+        raise InputError(f"{where}.low={low}: must be above 0 with log")
     if step is not None and (log or _number(step, f"{where}.step") <= 0):
-        raise InputError(f"{where}.step={step}: allowed is a number above 0, without log")
+        raise InputError(f"{where}.step={step}: must be above 0, and does not go with log")
     if step is not None and isinstance(low, int) and isinstance(high, int) and not isinstance(step, int):
-        raise InputError(f"{where}.step={step}: allowed is a whole number, as low and high are")
+        raise InputError(f"{where}.step={step}: must be a whole number, as low and high are")
     if first is not None and isinstance(low, int) and isinstance(high, int) and not isinstance(first, int):
-        raise InputError(f"{where}.first={first}: allowed is a whole number, as low and high are")
+        raise InputError(f"{where}.first={first}: must be a whole number, as low and high are")
     if step is not None and step > high - low:
-        raise InputError(f"{where}.step={step}: allowed is at most high - low")
+        raise InputError(f"{where}.step={step}: must be at most high - low")
     if step is not None and first is not None and abs((first - low) / step % 1 - 0.5) < 0.5 - 1e-9:
-        raise InputError(f"{where}.first={first}: allowed is low or some steps above it")
+        raise InputError(f"{where}.first={first}: must be low or some steps above it")
     return Range(key, low, high, log, step, first=first)
 
 
@@ -271,43 +252,39 @@ def _term(part: str, text: str) -> tuple[float, str]:
     if match is None or metric not in UNITS or branch not in OBJECTIVE_BRANCHES:
         names, branches = ", ".join(UNITS), " or ".join(OBJECTIVE_BRANCHES)
         raise InputError(
-            f"search.objectives: '{text}'; allowed is a sum of [WEIGHT*][{branches}] METRIC "
+            f"search.objectives: '{text}'; expected a sum of [WEIGHT*][{branches}] METRIC "
             f"with a metric of {names}"
         )
     if metric in HIGHER:
-        raise InputError(
-            f"search.objectives: '{text}'; of {metric} more is better, and objectives are lowered"
-        )
+        raise InputError(f"search.objectives: '{text}'; {metric} is better if higher, so not minimised")
     weight = float(match[1] or 1)
     if not 0 < weight < math.inf:
-        raise InputError(f"search.objectives: '{text}'; allowed are weights above 0")
+        raise InputError(f"search.objectives: '{text}'; weights must be above 0")
     return weight, f"{branch} {metric}"
 
 
 def _number(value: Any, name: str) -> float | int:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{name}: {'nothing' if value is None else value}; allowed is a number")
+        raise InputError(f"{name}: {'nothing' if value is None else value}; expected a number")
     return value
 
 
-def _whole(content: Mapping[str, Any], name: str, least: int) -> int:
+def _whole(content: Mapping[str, Any], name: str, least: int = 1, needed: bool = True) -> Any:
     value = content[name]
+    if value is None and not needed:
+        return None
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise InputError(f"search.{name}={value}: allowed is a whole number of at least {least}")
+        raise InputError(f"search.{name}={value}: must be a whole number of at least {least}")
     return value
 
 
-def _whole_or_null(content: Mapping[str, Any], name: str, needed: bool) -> int | None:
-    return None if content[name] is None and not needed else _whole(content, name, 1)
-
-
-def _one_of(content: Mapping[str, Any], name: str, words: Sequence[str]) -> str:
-    if content[name] not in words:
-        raise InputError(f"search.{name}={content[name]}: allowed is {' or '.join(words)}")
+def _one_of(content: Mapping[str, Any], name: str, options: Sequence[str]) -> str:
+    if content[name] not in options:
+        raise InputError(f"search.{name}={content[name]}: expected {' or '.join(options)}")
     return content[name]
 
 
 def _texts(value: Any, name: str) -> list[str]:
     if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-        raise InputError(f"{name}={value}: allowed is a list of words")
+        raise InputError(f"{name}={value}: expected a list of texts")
     return value

@@ -40,7 +40,7 @@ class Study:
         self.search, self.study = search, study
 
     @classmethod
-    def opened(cls, search: Search, name: str, folder: Path) -> Study:
+    def open(cls, search: Search, name: str, folder: Path) -> Study:
         """Return the study with that name, new or as it was left, for its only owner.
 
         Args:
@@ -55,12 +55,14 @@ class Study:
             mend(journal(folder))
         after = search.prune_after
         pruner = optuna.pruners.NopPruner() if after is None else optuna.pruners.MedianPruner(after, 0)
-        kept: dict[str, Any] = {"storage": storage(search, folder), "study_name": name, "pruner": pruner}
+        settings: dict[str, Any] = {
+            "storage": open_storage(search.storage, folder), "study_name": name, "pruner": pruner
+        }  # fmt: skip
         try:
-            study = optuna.load_study(**kept)
+            study = optuna.load_study(**settings)
         except KeyError:
             minimize = [StudyDirection.MINIMIZE] * len(search.objectives)
-            study = optuna.create_study(**kept, directions=minimize)
+            study = optuna.create_study(**settings, directions=minimize)
         if study.metric_names is None:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", ExperimentalWarning)
@@ -75,7 +77,8 @@ class Study:
         if search.storage is None and not journal(folder).exists():
             return None
         try:
-            return cls(search, optuna.load_study(storage=storage(search, folder), study_name=name))
+            storage = open_storage(search.storage, folder)
+            return cls(search, optuna.load_study(storage=storage, study_name=name))
         except KeyError:
             return None
 
@@ -86,10 +89,14 @@ class Study:
         return [trial for trial in trials if trial.state != TrialState.WAITING]
 
     def running(self) -> Iterator[Trial]:
-        """Yield the trials that have not ended, each with all its values."""
+        """Yield the trials that have not ended, each with all its values.
+
+        Their last owner may have been killed before they had all of them.
+        """
         for trial in self.trials:
             if trial.state == TrialState.RUNNING:
-                yield self._taken_up(trial)
+                self.study.sampler = sampler(self.search, trial.number)
+                yield self._suggest(Trial(self.study, trial._trial_id))
 
     @property
     def full(self) -> bool:
@@ -99,22 +106,12 @@ class Study:
     def ask(self) -> Trial:
         """Return a new trial."""
         self.study.sampler = sampler(self.search, len(self.trials))
-        return self._suggested(self.study.ask())
+        return self._suggest(self.study.ask())
 
-    def _taken_up(self, trial: FrozenTrial) -> Trial:
-        """Return a running trial; its last owner may have been killed before it had all its values."""
-        self.study.sampler = sampler(self.search, trial.number)
-        return self._suggested(Trial(self.study, trial._trial_id))
-
-    def _suggested(self, trial: Trial) -> Trial:
-        """Return the trial with a value for every key; existing values stay."""
+    def _suggest(self, trial: Trial) -> Trial:
         for one in self.search.space:
             suggest(trial, one)
         return trial
-
-    def report(self, trial: Trial, step: int, value: float) -> None:
-        """Report the objective's value at one of a trial's validations; for searches with one objective."""
-        trial.report(value, step)
 
     def prune(self, trial: Trial) -> bool:
         """End the trial if other trials were better at its step, and return whether it was ended."""
@@ -130,9 +127,11 @@ class Study:
         """
         trial.set_user_attr("values", [list(seed) for seed in values])
         means = [fmean(of_seeds) for of_seeds in zip(*values, strict=True)]
-        names = [objective.text for objective in self.search.objectives]
-        if none := [name for name, mean in zip(names, means, strict=True) if math.isnan(mean)]:
-            trial.set_user_attr("reason", f"{' and '.join(none)} is no number")
+        names = [
+            one.text for one, mean in zip(self.search.objectives, means, strict=True) if math.isnan(mean)
+        ]
+        if names:
+            trial.set_user_attr("reason", f"{' and '.join(names)} is NaN")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             self.study.tell(trial.number, means, skip_if_finished=True)
@@ -144,8 +143,7 @@ class Study:
 
     def best(self) -> list[FrozenTrial]:
         """Return the best trial; with two objectives the Pareto front, sorted by the first objective."""
-        complete = [trial for trial in self.trials if trial.state == TrialState.COMPLETE]
-        if not complete:
+        if all(trial.state != TrialState.COMPLETE for trial in self.trials):
             return []
         if len(self.search.objectives) == 1:
             return [self.study.best_trial]
@@ -169,19 +167,11 @@ class FencedJournal(JournalFileBackend):
             os.fsync(file.fileno())
 
 
-def storage(search: Search, folder: Path) -> BaseStorage:
-    """Return the journal in a folder, or the storage of the search's URL.
-
-    Raises:
-        InputError: for a bad URL or a damaged journal.
-    """
-    return open_storage(search.storage, folder)
-
-
 def open_storage(url: str | None, folder: Path) -> BaseStorage:
     """Return the storage of a URL, or for None the journal in a folder.
 
-    Raises InputError as `storage` does.
+    Raises:
+        InputError: for a bad URL or a damaged journal.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     if url:
@@ -206,22 +196,20 @@ def journal(folder: Path) -> Path:
 
 
 def mend(path: Path) -> None:
-    """Replace a journal by a copy without an incomplete last line, and remove its locks; only for the owner.
+    """Replace a journal by a copy without an incomplete last line, which a killed process may leave.
 
-    A killed process may leave both behind (locks only in earlier versions). Optuna takes a line that is
-    appended to an incomplete one for damage. If an earlier owner was frozen and wakes up, it appends to the
-    file that it has open, which is no longer this one, so it changes nothing.
+    Only for the owner. Optuna takes a line that is appended to an incomplete one for damage. If an earlier
+    owner was frozen and wakes up, it appends to the file that it has open, which is no longer this one, so it
+    changes nothing.
     """
     check_journal(path)
-    for left in path.parent.glob(f"{path.name}.lock*"):
-        left.unlink(missing_ok=True)
     if path.exists():
         content = path.read_bytes()
         atomic_write(path, content[: content.rfind(b"\n") + 1])
 
 
 def check_journal(path: Path) -> None:
-    """Raise InputError for a file that is no journal, which Optuna would take for an empty one."""
+    """Raise InputError for a file that is not a journal, which Optuna would take for an empty one."""
     if path.exists():
         with open(path, "rb") as file:
             begins = file.read(len(BEGINNING))
@@ -230,7 +218,7 @@ def check_journal(path: Path) -> None:
 
 
 def _damaged(path: Path, reason: object) -> InputError:
-    return InputError(f"{path}: not a journal of Optuna's ({reason}); move it away to begin the search anew")
+    return InputError(f"{path}: not a journal of Optuna's ({reason}); move it away to restart the search")
 
 
 def sampler(search: Search, number: int) -> optuna.samplers.BaseSampler:
@@ -270,6 +258,6 @@ def deviations(trial: FrozenTrial) -> list[float]:
     return np.std(by_seed, axis=0, ddof=1).tolist() if len(by_seed) > 1 else []
 
 
-def values(trial: FrozenTrial | Trial, search: Search) -> Mapping[str, Value]:
+def trial_values(trial: FrozenTrial | Trial, search: Search) -> Mapping[str, Value]:
     """Return a trial's values by config key, in the order of the search's space."""
     return {one.key: trial.params[one.key] for one in search.space}

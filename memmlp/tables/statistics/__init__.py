@@ -2,10 +2,9 @@
 clips.
 
 `differences` are always (K, S, C): for each of K comparisons, one variant's error minus the other's, for seed
-s on clip c. `crossed` estimates the error of their mean, to which seeds and groups of clips contribute.
-`paired_differences` turns it into intervals and p-values. `power` says which effects could have been found,
-`verdicts` what may be claimed about many comparisons, in one look or in several, and `robust` describes
-errors without testing. docs/statistics.md explains the method and how well it keeps its promises.
+s on clip c. `paired_differences` has intervals and p-values, `power` the effects that could have been found,
+`verdicts` what may be claimed about many comparisons, at once or in interim analyses. docs/statistics.md
+explains the method and how well it keeps its promises.
 """
 
 from __future__ import annotations
@@ -17,24 +16,16 @@ from memmlp.tables.statistics.paired_differences import (
     seed_effects,
 )
 from memmlp.tables.statistics.power import detectable, seeds_needed
-from memmlp.tables.statistics.robust import (
-    interquartile_mean,
-    performance_profile,
-    probability_of_improvement,
-)
-from memmlp.tables.statistics.verdicts import Verdict, holm, looks, sequential, spending, verdict
+from memmlp.tables.statistics.verdicts import Verdict, analysis_schedule, holm, sequential, spending, verdict
 
 __all__ = [
     "EffectEstimates",
     "Verdict",
+    "analysis_schedule",
     "detectable",
     "equivalence_p",
     "holm",
-    "interquartile_mean",
-    "looks",
     "paired_effects",
-    "performance_profile",
-    "probability_of_improvement",
     "seed_effects",
     "seeds_needed",
     "sequential",

@@ -8,8 +8,7 @@ import functools
 import numpy as np
 from scipy.special import chdtri, ndtri
 
-from memmlp.tables.statistics.crossed_seeds_and_groups import Error, Groups, error
-from memmlp.tables.statistics.paired_differences import LEVEL
+from memmlp.tables.statistics.paired_differences import LEVEL, Error, Groups, error
 
 DRAWS = 4096  # simulated tables; a power of two, as Sobol's sequence wants
 

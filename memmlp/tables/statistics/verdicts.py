@@ -1,4 +1,4 @@
-"""What may be claimed about many comparisons, at once or in several looks at a growing number of seeds."""
+"""What may be claimed about many comparisons, at once or in interim analyses at a growing number of seeds."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def verdict(
         equivalence: the p-value of `equivalence_p`, corrected in the same way.
         mean: the measured mean difference.
         paper: the paper's difference; None or 0 if the paper claims no sign.
-        level: the level that either family may spend, less than 5 % with several looks.
+        level: the level that either family may spend, less than 5 % for an interim analysis.
     """
     if equivalence <= level:
         return Verdict.EQUIVALENT
@@ -63,10 +63,10 @@ def verdict(
     return Verdict.HIGHER if mean > 0 else Verdict.LOWER
 
 
-def looks(most: int) -> tuple[int, ...]:
-    """Return the numbers of seeds at which there are looks: 3, 5, 8, 13, ... up to `most`.
+def analysis_schedule(most: int) -> tuple[int, ...]:
+    """Return the numbers of seeds of the interim analyses: 3, 5, 8, 13, ... up to `most`.
 
-    Two seeds never decide anything at the levels of a table, so the first look is at three.
+    Two seeds never decide anything at the levels of a table, so the first one is at three.
     """
     counts = [3, 5]
     while counts[-1] < most:
@@ -75,9 +75,9 @@ def looks(most: int) -> tuple[int, ...]:
 
 
 def spending(number: int) -> tuple[float, ...]:
-    """Return the level that each of `number` looks may spend.
+    """Return the level that each of `number` interim analyses may spend.
 
-    Together they are 5 %, so that nothing need be assumed about how the looks depend on each other. Each
+    Together they are 5 %, so that nothing need be assumed about how the analyses depend on each other. Each
     level is twice the one before: among weights growing by a factor of 1, 2 or 3, these lose few decisions
     and cost few seeds.
     """
@@ -86,18 +86,17 @@ def spending(number: int) -> tuple[float, ...]:
 
 
 def sequential(p: np.ndarray, claimed: np.ndarray, closed: np.ndarray) -> np.ndarray:
-    """Correct p-values (K,) by Holm at a look after others; compare them with the look's share of the level.
+    """Correct p-values (K,) by Holm at an interim analysis; compare them with the analysis' level.
 
     What was decided stays decided. Comparisons that this family has claimed are removed from the correction
     of the others. Comparisons that are closed without such a claim, because the other family decided them or
     their variant has stopped, stay in the correction, but can no longer be claimed. So a first wrong claim
-    needs a true null whose p-value is below the look's level over the number of nulls, at a look that was
-    fixed
-    beforehand: the looks' levels add up.
+    needs a true null whose p-value is below the analysis' level over the number of nulls, at an analysis that
+    was fixed beforehand: the levels add up.
 
     Args:
-        p: p-values (K,) of this look; NaN if there is none, which never decides.
-        claimed: what this family claimed at earlier looks, (K,) bool.
+        p: p-values (K,) of this analysis; NaN if there is none, which never decides.
+        claimed: what this family claimed at earlier analyses, (K,) bool.
         closed: which comparisons are closed without such a claim, (K,) bool.
     """
     return holm(np.where(claimed, 0.0, np.where(closed, 1.0, p)))

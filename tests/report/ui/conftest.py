@@ -9,10 +9,9 @@ import pytest
 from fake_runs import fake_run
 
 from memmlp.runs.run import Run
-from memmlp.sweep.definition import Sweep
+from memmlp.sweep.definition import Sweep, keep_sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.sweep_file import parse_sweep
-from memmlp.sweep.sweep_json import keep_sweep
 
 VARIANTS = {"none": 1.0, "gru": 0.8}
 SEEDS = (0, 1, 2)

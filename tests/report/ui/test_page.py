@@ -14,16 +14,15 @@ from chromium import Browser
 from report.ui.conftest import SEEDS, make_outputs, run_of, started_run
 from report.ui.test_replay import motion
 
-from memmlp.cli.seed_rounds import look
+from memmlp.cli.sweep import analyse
 from memmlp.evaluation.metric_facts import UNITS
 from memmlp.report.ui.report_file import ReportedSweep, write_page
 from memmlp.report.ui.server import Answers, RunsServer
 from memmlp.runs.run import Run
+from memmlp.sweep.definition import kept_sweep
 from memmlp.sweep.plan import Plan
-from memmlp.sweep.sweep_json import kept_sweep
-from memmlp.tables.build_table import finished_runs, make_table
+from memmlp.tables.build_table import finished_runs, make_table, run_finder
 from memmlp.tables.measured_run import load
-from memmlp.tables.runs_of_plan import run_finder
 from memmlp.tables.seed_rounds import new_rounds
 
 EVIL = "<img src=x onerror=owned=1>"
@@ -209,7 +208,7 @@ def test_no_difference_is_shown_from_a_control_on_other_data(browser: Browser, t
 
 def test_rounds_of_a_sweep(browser: Browser, tmp_path: Path):
     sweep, folder = make_outputs(tmp_path), tmp_path / "sweeps" / "mine"
-    look(sweep, tmp_path, new_rounds(sweep), Plan.load(folder / "plan.json"))
+    analyse(sweep, tmp_path, new_rounds(sweep), Plan.load(folder / "plan.json"))
     with RunsServer(Answers(tmp_path), 0, every=0.05) as running:
         go(browser, running.url, "sweep/mine", "document.body.textContent.includes('Rounds')")
         words = browser.value("document.body.textContent")

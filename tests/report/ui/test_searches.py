@@ -35,11 +35,11 @@ def test_a_search_in_a_storage_of_ones_own_is_read_again(folder: Path, tmp_path:
     write_json(folder / "search.json", asdict(study.search))
     one, searches = director(study, folder), Searches(tmp_path / "outputs")
     plan = folder / "controllers/a.json"
-    one.look(1).save(plan)
+    one.update(1).save(plan)
     assert searches.describe("mine")["counts"] == {"running": 1}
     before = searches.stamp()
-    finish(one.look(1))
-    one.look(1).save(plan)
+    finish(one.update(1))
+    one.update(1).save(plan)
     assert searches.describe("mine")["counts"] == {"complete": 1, "running": 1}
     assert searches.stamp() != before
 
@@ -51,5 +51,5 @@ def test_of_few_trials_it_says_why_there_is_no_importance(folder: Path):
     page = Searches(folder.parents[1]).describe("mine")
     assert (page["importance"], page["too_few"]) == (
         [],
-        "told from 25 complete trials on; of 2 it would be chance",
+        "needs 25 complete trials; with 2 it would be chance",
     )

@@ -10,17 +10,16 @@ import pytest
 from fake_runs import fake_run
 from report.ui.conftest import run_of, started_run
 
-from memmlp.cli.seed_rounds import look
+from memmlp.cli.sweep import analyse
 from memmlp.report.ui.run_index import RunIndex
 from memmlp.report.ui.server import Answers
 from memmlp.report.ui.sweeps import DAMAGED_ROUNDS, OTHER_ROUNDS, Sweeps
 from memmlp.runs.run import Run
+from memmlp.sweep.definition import keep_sweep, kept_sweep
 from memmlp.sweep.plan import Plan, RunTask
-from memmlp.sweep.sweep_json import keep_sweep, kept_sweep
-from memmlp.tables.build_table import finished_runs, make_table
+from memmlp.tables.build_table import finished_runs, make_table, run_finder, state_finder
 from memmlp.tables.formats import as_json
 from memmlp.tables.measured_run import load
-from memmlp.tables.runs_of_plan import run_finder, state_finder
 from memmlp.tables.seed_rounds import Rounds, new_rounds
 
 
@@ -207,7 +206,7 @@ def looked(outputs: Path) -> Rounds:
     folder = outputs / "sweeps" / "mine"
     sweep = kept_sweep(folder)
     assert sweep is not None
-    return look(sweep, outputs, new_rounds(sweep), Plan.load(folder / "plan.json"))
+    return analyse(sweep, outputs, new_rounds(sweep), Plan.load(folder / "plan.json"))
 
 
 def test_verdicts_of_rounds_and_their_looks_are_shown(outputs: Path):
@@ -231,8 +230,11 @@ def test_verdicts_of_rounds_and_their_looks_are_shown(outputs: Path):
     ("change", "flag"),
     [
         ({"subject": {}}, OTHER_ROUNDS),
-        ({"taken": 3}, DAMAGED_ROUNDS),
-        ({"taken": [{"seeds": 3, "level": 0.01, "runs": {"gru": "0" * 16}, "found": []}]}, DAMAGED_ROUNDS),
+        ({"analyses": 3}, DAMAGED_ROUNDS),
+        (
+            {"analyses": [{"seeds": 3, "level": 0.1, "runs": {"gru": "0"}, "findings": []}]},
+            DAMAGED_ROUNDS,
+        ),
     ],
 )
 def test_rounds_of_something_else_are_flagged(outputs: Path, change: dict, flag: str):

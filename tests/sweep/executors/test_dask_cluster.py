@@ -26,8 +26,8 @@ def test_options():
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        ({"gpus": "1"}, "dask.gpus: no such key; allowed here: address, resources.NAME"),
-        ({"resources.GPU": "much"}, "dask.resources.GPU=much: allowed is a number"),
+        ({"gpus": "1"}, "dask.gpus: no such key; expected one of address, resources.NAME"),
+        ({"resources.GPU": "much"}, "dask.resources.GPU=much: must be a number"),
     ],
 )
 def test_bad_options_are_one_line(words: dict[str, str], line: str):

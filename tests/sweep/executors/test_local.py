@@ -12,12 +12,11 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+import torch
 from processes import ignoring_interrupts, until
 
-from memmlp.sweep.executors.local import Debug, Local
-from memmlp.sweep.executors.submitit_jobs import Requeued
-
-pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # logs stay open
+from memmlp.common.errors import InputError
+from memmlp.sweep.executors.local import Debug, Local, divide_gpus, visible_gpus, worker_count
 
 
 def touch(path: str) -> None:
@@ -25,8 +24,8 @@ def touch(path: str) -> None:
 
 
 def test_a_debug_worker_works_in_this_process(tmp_path: Path):
-    (handle,) = Debug(tmp_path / "%j").submit(partial(touch, str(tmp_path / "done")))
-    handle.job.results()  # debug jobs run when they are asked
+    (handle,) = Debug().submit(partial(touch, str(tmp_path / "done")))
+    assert not handle.alive()  # it works when it is asked
     assert (tmp_path / "done").exists()
     assert handle.complaint() is None
 
@@ -43,19 +42,13 @@ def test_a_worker_imports_the_package_that_starts_it(tmp_path: Path, monkeypatch
 
 @pytest.mark.parametrize("around", [contextlib.nullcontext, ignoring_interrupts])
 def test_a_cancelled_local_worker_ends(tmp_path: Path, around):
-    """Also where interrupts are ignored, by which submitit cancels."""
+    """Also where interrupts are ignored."""
     with around():
         (handle,) = Local(tmp_path / "%j").submit(partial(time.sleep, 6000))
     assert handle.alive()
     handle.cancel()
     until(lambda: not handle.alive(), "the worker ends")
     assert handle.complaint() is None
-
-
-def test_preempted_work_is_queued_again(tmp_path: Path):
-    work = Requeued(partial(touch, str(tmp_path / "again")))
-    work.checkpoint().function()
-    assert (tmp_path / "again").exists()
 
 
 @pytest.mark.slow
@@ -69,7 +62,7 @@ def test_each_worker_sees_its_own_gpus_and_a_new_one_those_of_the_dead(tmp_path:
     workers = executor.submit(work, 4)
     assert executor.gpus
     assert [variable(worker) for worker in workers] == ["0", "1", "0", "1"]
-    os.kill(workers[1].job._process.pid, signal.SIGKILL)
+    os.kill(workers[1].process.pid, signal.SIGKILL)
     until(lambda: not workers[1].alive(), "the worker is dead")
     workers += executor.submit(work)
     assert variable(workers[4]) == "1"
@@ -86,10 +79,58 @@ def test_each_worker_sees_its_own_gpus_and_a_new_one_those_of_the_dead(tmp_path:
 
 def variable(worker) -> str:
     """What the system has for a worker's process."""
-    environment = Path(f"/proc/{worker.job._process.pid}/environ")
+    environment = Path(f"/proc/{worker.process.pid}/environ")
     name = b"CUDA_VISIBLE_DEVICES="
 
     def entries() -> list[bytes]:  # the parent's, until the process is another program
         return [entry for entry in environment.read_bytes().split(b"\0") if entry.startswith(name)]
 
     return until(entries, "the process has its environment")[0].removeprefix(name).decode()
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("0,1", ("0", "1")), (" 3 , GPU-8f2a ", ("3", "GPU-8f2a")), ("", ()), ("-1", ()), ("2,-1,3", ("2",)),
+        ("MIG-a,MIG-b", ("MIG-a", "MIG-b")),
+    ],
+)  # fmt: skip
+def test_visible_are_those_of_the_variable(monkeypatch: pytest.MonkeyPatch, words: str, found: tuple):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", words)
+    assert visible_gpus() == found
+
+
+@pytest.mark.parametrize("count", [0, 2])
+def test_without_the_variable_all_are_visible(monkeypatch: pytest.MonkeyPatch, count: int):
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: count)
+    assert visible_gpus() == ("0", "1")[:count]
+
+
+def test_shares():
+    four = ("0", "1", "2", "3")
+    assert divide_gpus(four) == [("0",), ("1",), ("2",), ("3",)]
+    assert divide_gpus(four, 2) == [("0", "1"), ("2", "3")]
+    assert divide_gpus(four, 3) == [("0", "1", "2")]
+    assert divide_gpus(four, 0) == []
+    assert divide_gpus(()) == []
+    for gpus, size, line in (
+        (("0", "1"), 3, "at most 2; visible here: 0, 1"),
+        ((), 1, "visible here: no GPU"),
+    ):
+        with pytest.raises(InputError, match=f"--gpus-per-worker {size}: .*{line}"):
+            divide_gpus(gpus, size)
+
+
+def test_worker_counts():
+    two = [("0",), ("1",)]
+    assert worker_count(two, None, None) == 2
+    assert worker_count(two, 5, None) == 5  # shared as evenly as it goes
+    assert worker_count(two, None, 3) == 6
+    assert worker_count(two, 4, 3) == 4
+    assert worker_count([], 4, None) == 4
+    assert worker_count([], None, None) == os.cpu_count()
+    with pytest.raises(InputError, match="--workers 7: must be at most 6 with --workers-per-gpu 3"):
+        worker_count(two, 7, 3)
+    with pytest.raises(InputError, match="--workers-per-gpu 2"):
+        worker_count([], 4, 2)

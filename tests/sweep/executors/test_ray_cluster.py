@@ -33,9 +33,9 @@ def test_options(tmp_path: Path):
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        ({"gpus": "1"}, "ray.gpus: no such key; allowed here: address"),
-        ({"num_gpus": "-1"}, "ray.num_gpus=-1: allowed is a number"),
-        ({"resources.x": "much"}, "ray.resources.x=much: allowed is a number"),
+        ({"gpus": "1"}, "ray.gpus: no such key; expected one of address"),
+        ({"num_gpus": "-1"}, "ray.num_gpus=-1: must be a number"),
+        ({"resources.x": "much"}, "ray.resources.x=much: must be a number"),
         ({"runtime_env": "/none.yaml"}, "ray.runtime_env=/none.yaml: no such file"),
         ({"runtime_env": __file__}, "ray.runtime_env"),
     ],
@@ -48,7 +48,7 @@ def test_bad_options_are_one_line(words: dict[str, str], line: str):
 
 @pytest.mark.skipif(RAY, reason="Ray is installed")
 def test_ray_is_refused_where_it_is_not():
-    with pytest.raises(InputError, match="executor=ray: Ray is not installed"):
+    with pytest.raises(InputError, match="executor=ray"):
         Ray(RayOptions())
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.sweep.executors.slurm import Slurm, SlurmOptions, script, slurm_options
+from memmlp.sweep.executors.slurm import Requeued, Slurm, SlurmOptions, batch_script, slurm_options
 
 
 def lines(tmp_path: Path, workers: int = 1, **words: str) -> list[str]:
-    return script(tmp_path / "%j", slurm_options(words), workers).splitlines()
+    return batch_script(tmp_path / "%j", slurm_options(words), workers).splitlines()
 
 
 def test_options_reach_sbatch(tmp_path: Path):
@@ -77,13 +77,13 @@ def test_whether_a_job_is_to_have_a_gpu(words: dict[str, str], gpu: bool):
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        ({"time": "1h"}, "slurm.time=1h: allowed are MINUTES"),
-        ({"comment": "a\nb"}, "allowed is the long name"),
-        ({"cpus": "0"}, "slurm.cpus=0: allowed is a whole"), ({"array": "0-3"}, "set by memmlp"),
+        ({"time": "1h"}, "slurm.time=1h: expected MINUTES"),
+        ({"comment": "a\nb"}, "expected the long name"),
+        ({"cpus": "0"}, "slurm.cpus=0: must be a whole"), ({"array": "0-3"}, "set by memmlp"),
         ({"mem_gb": "x"}, "slurm.mem_gb=x"), ({"gpus": "-1"}, "slurm.gpus=-1"),
-        ({"nodes": "2"}, "slurm.nodes: allowed is none"), ({"ntasks-per-node": "2"}, "allowed is none"),
-        ({"Q": "x"}, "allowed is the long name"),
-        ({"comment": ""}, "allowed is the long name"),
+        ({"nodes": "2"}, "slurm.nodes: cannot be set"), ({"ntasks-per-node": "2"}, "cannot be set"),
+        ({"Q": "x"}, "expected the long name"),
+        ({"comment": ""}, "expected the long name"),
     ],
 )  # fmt: skip
 def test_bad_options_are_one_line(words: dict[str, str], line: str):
@@ -148,3 +148,9 @@ def test_what_sbatch_refuses_is_one_line(tmp_path: Path, cluster: Path):
     with pytest.raises(InputError, match=r"executor=slurm: .*unrecognized option '--patition=x'") as error:
         Slurm(tmp_path / "logs" / "%j", slurm_options({"patition": "x"})).submit(print)
     assert "\n" not in str(error.value)
+
+
+def test_preempted_work_is_queued_again(tmp_path: Path):
+    work = Requeued(partial((tmp_path / "again").write_text, "done"))
+    work.checkpoint().function()
+    assert (tmp_path / "again").exists()

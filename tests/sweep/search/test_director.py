@@ -45,7 +45,7 @@ def test_a_search_has_the_trials_it_wants_and_the_papers_first(tmp_path: Path):
 def test_the_number_of_trials_is_a_total(tmp_path: Path):
     to_the_end(open_study(tmp_path), tmp_path)
     again = open_study(tmp_path)
-    assert director(again, tmp_path).look(2).tasks == ()
+    assert director(again, tmp_path).update(2).tasks == ()
     more = open_study(tmp_path, n_trials=8)
     to_the_end(more, tmp_path)
     assert len(more.trials) == 8
@@ -53,10 +53,10 @@ def test_the_number_of_trials_is_a_total(tmp_path: Path):
 
 def test_capacity_is_kept_and_each_plan_holds_what_is_under_way(tmp_path: Path):
     one = director(open_study(tmp_path), tmp_path)
-    assert len(one.look(3).tasks) == 3
-    assert one.look(3) == one.look(3)
-    finish(one.look(3))
-    plan = one.look(3)
+    assert len(one.update(3).tasks) == 3
+    assert one.update(3) == one.update(3)
+    finish(one.update(3))
+    plan = one.update(3)
     assert [entry.label for entry in plan.entries] == ["trial 3", "trial 4", "trial 5"]
     assert plan.open
 
@@ -68,7 +68,7 @@ def test_a_director_killed_while_it_asks_loses_and_repeats_nothing(
     """It dies before a new trial's first value, between its values, after them, or once its run is known."""
     study = open_study(tmp_path)
     one = director(study, tmp_path)
-    finish(one.look(1))
+    finish(one.update(1))
     before = [trial.number for trial in study.trials]
 
     calls = 0
@@ -91,9 +91,9 @@ def test_a_director_killed_while_it_asks_loses_and_repeats_nothing(
         one.compose = composed
         if moment < 3:
             with pytest.raises(KeyboardInterrupt):
-                one.look(1)
+                one.update(1)
         else:
-            one.look(1)
+            one.update(1)
     study = open_study(tmp_path)
     assert [trial.number for trial in study.trials] == [*before, 1]
     to_the_end(study, tmp_path)
@@ -107,18 +107,18 @@ def test_a_trial_worse_than_the_median_is_pruned_and_its_run_cancelled(tmp_path:
     study = open_study(tmp_path, pruner="median", prune_after=2)
     one = director(study, tmp_path)
     for level in (5.0, 6.0):
-        run = begun(one.look(1))
+        run = begun(one.update(1))
         for step in (10, 20, 30):
             log(run, step, level)
         run.finish([])
-    run = begun(one.look(1))
+    run = begun(one.update(1))
     log(run, 10, 5.2)
-    assert run.id in {task.id for task in one.look(1).tasks}  # better than the median of 5 and 6
+    assert run.id in {task.id for task in one.update(1).tasks}  # better than the median of 5 and 6
     run.fail("not of interest here")
     failed = run.id
-    run = begun(one.look(1))
+    run = begun(one.update(1))
     log(run, 10, 7.0)
-    plan = one.look(1)
+    plan = one.update(1)
     assert set(plan.cancelled) == {run.id, failed}
     assert run.id not in {task.id for task in plan.tasks}
     assert [trial.state for trial in study.trials[:4]] == [
@@ -128,7 +128,7 @@ def test_a_trial_worse_than_the_median_is_pruned_and_its_run_cancelled(tmp_path:
     ]
     assert study.trials[0].intermediate_values == {10: 5.0, 20: 5.0, 30: 5.0}
     resumed = director(open_study(tmp_path, pruner="median", prune_after=2), tmp_path)
-    assert set(resumed.look(1).cancelled) == {run.id, failed}
+    assert set(resumed.update(1).cancelled) == {run.id, failed}
 
 
 def test_no_trial_is_pruned_at_its_last_step_or_without_a_pruner(tmp_path: Path):
@@ -137,19 +137,19 @@ def test_no_trial_is_pruned_at_its_last_step_or_without_a_pruner(tmp_path: Path)
         study = open_study(tmp_path / name, pruner=pruner, prune_after=1)
         one = director(study, tmp_path / name)
         for level in (5.0, 6.0):
-            run = begun(one.look(1))
+            run = begun(one.update(1))
             log(run, step, level)
             if step < STEPS:
                 log(run, STEPS, level)
             run.finish([])
-        log(begun(one.look(1)), step, 50.0)
-        assert one.look(1).cancelled == ()
+        log(begun(one.update(1)), step, 50.0)
+        assert one.update(1).cancelled == ()
 
 
 def test_a_failed_run_fails_its_trial_and_the_search_goes_on(tmp_path: Path):
     study = open_study(tmp_path)
     one = director(study, tmp_path)
-    begun(one.look(1)).fail("the loss is nan")
+    begun(one.update(1)).fail("the loss is nan")
     to_the_end(study, tmp_path)
     assert study.trials[0].state == TrialState.FAIL
     assert study.trials[0].user_attrs["reason"] == "the loss is nan"
@@ -162,19 +162,19 @@ def test_values_that_make_no_sense_fail_their_trial_and_hopeless_searches_end(tm
 
     study = open_study(tmp_path, n_trials=20)
     one = director(study, tmp_path, refused)
-    with pytest.raises(InputError, match="all 5 trials failed, the last one so: hand=position needs"):
-        one.look(2)
+    with pytest.raises(InputError, match="all 5 trials failed, the last one: hand=position needs"):
+        one.update(2)
 
 
 def test_a_value_that_is_no_number_is_a_failure(tmp_path: Path):
     study = open_study(tmp_path)
     one = director(study, tmp_path)
-    run = begun(one.look(1))
+    run = begun(one.update(1))
     log(run, STEPS, float("nan"))
     run.finish([])
-    one.look(1)
+    one.update(1)
     assert study.trials[0].state == TrialState.FAIL
-    assert reason(study.trials[0]) == "MPJPE is no number"
+    assert reason(study.trials[0]) == "MPJPE is NaN"
 
 
 def test_a_pruned_trials_run_is_wanted_again_by_one_with_its_values(tmp_path: Path):
@@ -183,7 +183,7 @@ def test_a_pruned_trials_run_is_wanted_again_by_one_with_its_values(tmp_path: Pa
     one = director(study, tmp_path)
     seen = set()
     for _ in range(12):
-        plan = one.look(1)
+        plan = one.update(1)
         if not plan.tasks:
             break
         assert not {task.id for task in plan.tasks} & set(plan.cancelled)
@@ -193,7 +193,7 @@ def test_a_pruned_trials_run_is_wanted_again_by_one_with_its_values(tmp_path: Pa
         if not run.done:
             run.begin("memmlp", task.config, data="d", upstream=None)
             log(run, 10, 5.0 if not seen - {task.id} else 9.0)
-            one.look(1)
+            one.update(1)
             if study.trials[-1].state != TrialState.PRUNED and not run.done:
                 log(run, STEPS, 5.0)
                 run.finish([])
@@ -203,7 +203,7 @@ def test_a_pruned_trials_run_is_wanted_again_by_one_with_its_values(tmp_path: Pa
 def test_a_trials_value_is_the_mean_of_its_seeds(tmp_path: Path):
     study = open_study(tmp_path, seeds=3, n_trials=2)
     one = seeded(study, tmp_path)
-    while (plan := one.look(1)).tasks:
+    while (plan := one.update(1)).tasks:
         finish(plan)
     for trial in study.trials:
         first = error({"values": trial.params, "seed": 0})
@@ -217,17 +217,17 @@ def test_a_trials_value_is_the_mean_of_its_seeds(tmp_path: Path):
 
 def test_the_other_seeds_wait_for_the_first_ones_end_and_count_for_capacity(tmp_path: Path):
     one = seeded(open_study(tmp_path, seeds=3), tmp_path)
-    plan = one.look(2)
+    plan = one.update(2)
     assert [(entry.label, entry.seed) for entry in plan.entries] == [("trial 0", 0), ("trial 1", 0)]
     run = begun(replace(plan, tasks=plan.tasks[:1]))
     log(run, STEPS, 5.0)
     run.finish([])
-    plan = one.look(2)
+    plan = one.update(2)
     assert [(entry.label, entry.seed) for entry in plan.entries] == [
         ("trial 0", 0), ("trial 0", 1), ("trial 0", 2), ("trial 1", 0),
     ]  # fmt: skip
     assert len(plan.left()) == 3
-    assert one.look(4).entries[-1].label == "trial 2"
+    assert one.update(4).entries[-1].label == "trial 2"
 
 
 def test_pruning_is_by_the_first_seed_alone(tmp_path: Path):
@@ -235,21 +235,21 @@ def test_pruning_is_by_the_first_seed_alone(tmp_path: Path):
     one = seeded(study, tmp_path)
     for level in (5.0, 6.0):
         for _ in range(2):
-            run = begun(replace(plan := one.look(1), tasks=tuple(plan.left())))
+            run = begun(replace(plan := one.update(1), tasks=tuple(plan.left())))
             for step in (10, 20, STEPS):
                 log(run, step, level)
             run.finish([])
-    run = begun(one.look(1))
+    run = begun(one.update(1))
     log(run, 10, 50.0)
     run.finish([])  # done before the director looks, so that it is not pruned
-    second = begun(replace(plan := one.look(1), tasks=tuple(plan.left())))
+    second = begun(replace(plan := one.update(1), tasks=tuple(plan.left())))
     log(second, 20, 50.0)  # a further bad seed enters the mean, but doesn't end the trial
-    assert second.id in {task.id for task in one.look(1).left()}
+    assert second.id in {task.id for task in one.update(1).left()}
     assert study.trials[2].intermediate_values == {10: 50.0}
     second.fail("not of interest here")
-    run = begun(one.look(1))
+    run = begun(one.update(1))
     log(run, 10, 50.0)
-    plan = one.look(1)
+    plan = one.update(1)
     assert run.id in plan.cancelled
     assert study.trials[-2].state == TrialState.PRUNED
     assert study.trials[-2].user_attrs["runs"] == [run.id]
@@ -258,11 +258,11 @@ def test_pruning_is_by_the_first_seed_alone(tmp_path: Path):
 def test_one_failed_seed_fails_the_trial_and_cancels_the_others(tmp_path: Path):
     study = open_study(tmp_path, seeds=3)
     one = seeded(study, tmp_path)
-    finish(one.look(1))
-    plan = one.look(1)
+    finish(one.update(1))
+    plan = one.update(1)
     bad, other = (begun(replace(plan, tasks=(task,))) for task in plan.left())
     bad.fail("the loss is nan")
-    plan = one.look(1)
+    plan = one.update(1)
     assert study.trials[0].state == TrialState.FAIL
     assert study.trials[0].user_attrs["reason"] == "the loss is nan"
     assert {bad.id, other.id} <= set(plan.cancelled)
@@ -273,11 +273,11 @@ def test_a_director_killed_between_seeds_repeats_and_loses_none(tmp_path: Path):
     (tmp_path / "calm").mkdir()
     calm = open_study(tmp_path / "calm", seeds=3, n_trials=3)
     one = seeded(calm, tmp_path / "calm")
-    while (plan := one.look(1)).tasks:
+    while (plan := one.update(1)).tasks:
         finish(plan)
     stopped = open_study(tmp_path, seeds=3, n_trials=3)
     made: list[str] = []
-    while tasks := (plan := seeded(stopped, tmp_path).look(1)).left():  # a director of its own for each run
+    while tasks := (plan := seeded(stopped, tmp_path).update(1)).left():  # a director of its own for each run
         made.append(tasks[0].id)
         finish(replace(plan, tasks=tasks[:1]))
         stopped = open_study(tmp_path, seeds=3, n_trials=3)
@@ -301,9 +301,9 @@ def test_validations_of_a_network_used_otherwise_are_no_trials(tmp_path: Path):
     for value, state in ((0.5, "COMPLETE"), (0.1, "FAIL")):
         folder = tmp_path / f"blend {value}"
         folder.mkdir()
-        study = Study.opened(search(n_trials=1), folder.name, folder)
+        study = Study.open(search(n_trials=1), folder.name, folder)
         one = director(study, tmp_path, blended(value))
-        while (plan := one.look(1)).tasks:
+        while (plan := one.update(1)).tasks:
             finish(plan)
         (trial,) = study.trials
         assert trial.state.name == state

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import pytest
 from fake_search import STEPS, begun, director, finish, log, open_study
 from rich.console import Console
 
-from memmlp.sweep.search.progress_table import line, progress, render
+from memmlp.sweep.search.progress_table import SearchBoard, describe_end, render
 
 CARD = {"device": "cuda", "gpu": "A card", "gpu_index": "1"}
 
@@ -20,9 +21,16 @@ def drawn(study, folder: Path) -> str:
     return said.get()
 
 
+def first_lines(study, folder: Path) -> list[str]:
+    board, said = SearchBoard(folder), io.StringIO()
+    board.console = Console(file=said, width=200)
+    board.update(study)
+    return said.getvalue().splitlines()
+
+
 def test_the_devices_of_runs_under_way_are_counted(tmp_path: Path):
     study = open_study(tmp_path)
-    plan = director(study, tmp_path).look(3)
+    plan = director(study, tmp_path).update(3)
     assert "running on" not in drawn(study, tmp_path)
     runs = [plan.run_of(task) for task in plan.tasks]
     for run, task, facts in zip(runs, plan.tasks, (CARD, {"device": "cpu"}, CARD), strict=True):
@@ -30,9 +38,9 @@ def test_the_devices_of_runs_under_way_are_counted(tmp_path: Path):
         run.write_manifest(facts)
     with runs[0].lock(), runs[1].lock(), runs[2].lock():
         assert "running on GPU 1 (A card): 2, cpu: 1" in drawn(study, tmp_path)
-        lines = progress(study, tmp_path)
+        lines = first_lines(study, tmp_path)
         assert [text.partition(";")[2][:9] for text in lines] == [" trial 0:", " trial 1:", " trial 2:"]
-    assert progress(study, tmp_path) == [f"0 of {study.search.n_trials}; workers are starting"]
+    assert first_lines(study, tmp_path) == [f"0 of {study.search.n_trials}; workers are starting"]
 
 
 @pytest.mark.parametrize(
@@ -41,11 +49,11 @@ def test_the_devices_of_runs_under_way_are_counted(tmp_path: Path):
 def test_a_trial_that_ended_says_on_which_device(tmp_path: Path, facts: dict, said: str):
     study = open_study(tmp_path)
     one = director(study, tmp_path)
-    plan = one.look(1)
+    plan = one.update(1)
     finish(plan)
     plan.run_of(plan.tasks[0]).write_manifest(facts)
-    one.look(1)
-    assert f"; trial 0 {said}" in line(study.search, study.trials[0], 1, tmp_path)
+    one.update(1)
+    assert f"trial 0 {said}" in describe_end(study.trials[0], tmp_path)
 
 
 def test_a_trial_that_ended_is_told_with_values_of_any_kind(tmp_path: Path):
@@ -54,16 +62,16 @@ def test_a_trial_that_ended_is_told_with_values_of_any_kind(tmp_path: Path):
     space = {**choices, "optim": {"lr": {"low": 1e-3, "high": 1e-2, "first": 0.00123456}}}
     study = open_study(tmp_path, space=space)
     one = director(study, tmp_path)
-    run = begun(one.look(1))
+    run = begun(one.update(1))
     log(run, STEPS, 1.0)
     run.finish([])
-    one.look(1)
-    said = line(study.search, study.trials[0], 1, tmp_path)
+    one.update(1)
+    said = describe_end(study.trials[0], tmp_path)
     assert said.endswith("1.000 (model.cell=gru, data.mirror=True, optim.lr=0.001235)")
 
 
 def test_brackets_of_a_value_are_shown(tmp_path: Path):
     choices = {"evaluation": {"modes": {"choices": ["[stream]", "[window]"], "first": "[stream]"}}}
     study = open_study(tmp_path, space=choices)
-    director(study, tmp_path).look(1)
+    director(study, tmp_path).update(1)
     assert "[stream]" in drawn(study, tmp_path)

@@ -33,10 +33,10 @@ from memmlp.sweep.search.study import Study, suggest
 def test_trials_of_several_seeds_as_csv(tmp_path: Path):
     study = open_study(tmp_path, seeds=2, n_trials=2, objectives=["MPJPE", "Jitter"])
     one = seeded(study, tmp_path)
-    finish(one.look(1))
-    finish(one.look(1))
-    begun(one.look(1)).fail("the loss is nan")
-    one.look(1)
+    finish(one.update(1))
+    finish(one.update(1))
+    begun(one.update(1)).fail("the loss is nan")
+    one.update(1)
     results.write_trials(study, tmp_path / "trials.csv")
     with open(tmp_path / "trials.csv", newline="") as file:
         row, failed = csv.DictReader(file)
@@ -65,10 +65,10 @@ def test_a_trial_that_is_no_longer_of_the_front_has_no_file(tmp_path: Path):
     study = open_study(tmp_path, objectives=["MPJPE", "Jitter"], n_trials=3)
     one = director(study, tmp_path)
     for errors in ((1.0, 3.0), (3.0, 1.0), (0.5, 0.5)):
-        run = begun(one.look(1))
+        run = begun(one.update(1))
         run.log(STEPS, dict(zip(("rotation MPJPE", "rotation Jitter"), errors, strict=True)), "val")
         run.finish([])
-        one.look(0)
+        one.update(0)
         results.write_experiments(study, tmp_path, ["loss"])
     assert [path.name for path in (tmp_path / "experiment").iterdir()] == ["best.yaml"]
 
@@ -122,10 +122,10 @@ def test_what_a_search_leaves(tmp_path: Path):
 def test_table_5_takes_only_loss_weights(tmp_path: Path):
     study = open_study(tmp_path, space={"optim": {"lr": {"low": 0.1, "high": 1.0}}}, n_trials=1)
     one = director(study, tmp_path)
-    run = begun(one.look(1))
+    run = begun(one.update(1))
     log(run, STEPS, 1.0)
     run.finish([])
-    one.look(1)
+    one.update(1)
     assert not results.write_table(study, tmp_path / "none", tmp_path / "table05.yaml", [])
 
 
@@ -133,10 +133,10 @@ def after_one_trial(folder: Path, space: dict, base: list[str]) -> Study:
     """A study whose one trial is complete."""
     study = open_study(folder, space=space, n_trials=1, base=base)
     one = director(study, folder)
-    run = begun(one.look(1))
+    run = begun(one.update(1))
     log(run, STEPS, 1.0)
     run.finish([])
-    one.look(1)
+    one.update(1)
     return study
 
 
@@ -175,7 +175,7 @@ def test_of_a_key_in_the_base_and_the_trial_the_trials_value_is_written(tmp_path
         ({"low": 2, "high": 6}, [4, 2, 6], "6, is the largest"),
     ],
 )  # fmt: skip
-def test_a_best_value_at_an_end_of_what_was_tried_is_told(tried, values, said):
+def test_a_best_value_boundary_warnings_of_what_was_tried_is_told(tried, values, said):
     """The last value is the best: so is a network tuned that is not, and looks it."""
     study = optuna.create_study()
     for number, value in enumerate(values):
@@ -183,7 +183,7 @@ def test_a_best_value_at_an_end_of_what_was_tried_is_told(tried, values, said):
         trial = study.ask()
         suggest(trial, Range("optim.lr", **{k: tuple(v) if k == "choices" else v for k, v in tried.items()}))
         study.tell(trial, -number)
-    found = results.at_an_end(study)
+    found = results.boundary_warnings(study)
     assert [line.startswith(f"optim.lr: the best value, {said}") for line in found] == [True] * bool(said)
 
 
@@ -197,20 +197,19 @@ def add_random_trials(
         study.add_trial(create_trial(params=params, distributions=between, value=(values[0] - 0.5) ** 2))
 
 
-@pytest.mark.parametrize("number", [6, 10, 24])
-def test_of_few_trials_no_importance_is_told(number: int):
+def test_few_trials_have_no_importance():
     """It would be chance: an inert key ranks first in most random searches of ten trials."""
     study = optuna.create_study()
     assert results.too_few_trials(study) is None
-    add_random_trials(study, number)
-    assert results.study_importances(study) == []
-    assert results.too_few_trials(study) == f"told from 25 complete trials on; of {number} it would be chance"
+    add_random_trials(study, 24)
+    assert results.importances(study) == []
+    assert results.too_few_trials(study) == "needs 25 complete trials; with 24 it would be chance"
 
 
 def test_of_enough_trials_the_key_that_acts_is_the_most_important():
     study = optuna.create_study()
     add_random_trials(study, results.ENOUGH_TRIALS)
-    (first, share), *rest = results.study_importances(study)
+    (first, share), *rest = results.importances(study)
     assert (first, len(rest), share > 0.5) == ("acts", 2, True)
     assert results.too_few_trials(study) is None
 
@@ -220,7 +219,7 @@ def test_a_single_key_has_no_importance():
     add_random_trials(study, 10, ["acts"])
     assert results.too_few_trials(study) is None
     add_random_trials(study, 20, ["acts"])
-    assert results.study_importances(study) == []
+    assert results.importances(study) == []
 
 
 @pytest.mark.slow
@@ -242,4 +241,4 @@ def test_a_front_reaches_to_the_ends():
         trial = study.ask()
         trial.suggest_float("lr", 0.1, 0.2)
         study.tell(trial, [value, -value])
-    assert results.at_an_end(study) == []
+    assert results.boundary_warnings(study) == []

@@ -65,86 +65,68 @@ def test_an_objective_is_a_weighted_sum(text: str, value: float):
 
 
 def test_an_objective_that_is_not_validated_is_named():
-    with pytest.raises(InputError, match="'position MPJRE' is not validated; allowed are rotation MPJPE"):
+    with pytest.raises(InputError, match="'position MPJRE' is not validated"):
         made(objectives=["position MPJRE"]).objectives[0].value({"rotation MPJPE": 1.0})
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"space": {}}, "search.space: empty"),
-        ({"space": {"loss": 3}}, "search.space.loss: 3; allowed is a mapping"),
-        ({"space": space(low=1.0)}, "search.space.optim.lr.high: nothing; allowed is a number"),
-        ({"space": space(low=2.0, high=1.0)}, "optim.lr.high=1.0: allowed is more than low=2.0"),
-        ({"space": space(low=0.0, high=1.0, log=True)}, "optim.lr.low=0.0: allowed with log is above 0"),
-        ({"space": space(low=1.0, high=2.0, log=True, step=0.1)}, "optim.lr.step=0.1: allowed"),
-        ({"space": space(low=1.0, high=2.0, step=0)}, "optim.lr.step=0: allowed is a number above 0"),
-        ({"space": space(low=True, high=2.0)}, "optim.lr.low: True; allowed is a number"),
-        (
-            {"space": space(low=1.0, high=2.0, first=3.0)},
-            "optim.lr.first=3.0: allowed is a value of the range",
-        ),
-        ({"space": space(low=1.0, high=2.0, hihg=3.0)}, "optim.lr.hihg: no such key; allowed are low"),
-        ({"space": space(choices="ab")}, "optim.lr.choices: allowed is a list of at least two"),
-        ({"space": space(choices=[1])}, "optim.lr.choices: allowed is a list of at least two"),
-        ({"space": space(choices=[1, 2], low=1)}, "optim.lr.low: does not go with choices"),
-        ({"objectives": []}, "search.objectives: 0 of them"),
-        ({"objectives": ["MPJPE"] * 3}, "search.objectives: 3 of them"),
-        ({"objectives": ["MPJPE", "Jitter"]}, "search.pruner=median: allowed with two objectives is none"),
-        ({"objectives": ["Jitters"]}, "'Jitters'; allowed is a sum of"),
-        ({"objectives": ["MPJPE - Jitter"]}, "'MPJPE - Jitter'; allowed is a sum of"),
-        ({"objectives": ["head MPJPE"]}, "'head MPJPE'; allowed is a sum of"),
-        ({"objectives": "MPJPE"}, "search.objectives=MPJPE: allowed is a list"),
-        ({"base": [1]}, "search.base="),
-        ({"n_trials": 0}, "search.n_trials=0: allowed is a whole number of at least 1"),
-        ({"n_trials": True}, "search.n_trials=True"),
-        ({"seeds": 0}, "search.seeds=0: allowed is a whole number of at least 1"),
-        (
-            {"seeds": 3, "space": {"seed": {"low": 0, "high": 9}}},
-            "search.seeds=3: allowed is 1 where the space has the seed",
-        ),
-        ({"startup": 1.5}, "search.startup=1.5"),
-        ({"startup": None}, "search.startup=None: allowed is a whole number of at least 1"),
-        ({"prune_after": None}, "search.prune_after=None: allowed is a whole number of at least 1"),
-        ({"seed": -1}, "search.seed=-1"),
-        ({"sampler": "gp"}, "search.sampler=gp: allowed is tpe or random or grid"),
-        (
-            {"sampler": "grid"},
-            "search.space.loss.rotation_all: with search.sampler=grid allowed are choices alone",
-        ),
-        (
-            {"sampler": "grid", "space": space(choices=[1, 2], first=1)},
-            "optim.lr: with search.sampler=grid allowed are choices alone",
-        ),
-        (
-            {"sampler": "grid", "space": space(choices=[1, 2, 3]), "n_trials": 2},
-            "search.n_trials=2: allowed with search.sampler=grid is 3, all",
-        ),
-        ({"pruner": "hyperband"}, "search.pruner=hyperband: allowed is median or none"),
-        ({"prune_after": 0}, "search.prune_after=0"),
-        ({"name": "a/b"}, "search.name=a/b"),
-        ({"name": "a" * 65}, "allowed are up to 64 letters"),
-        ({"storage": 5}, "search.storage=5: allowed is a URL"),
-        ({"nonsense": 3}, "search.nonsense: no such key; allowed are name, base"),
-        ({"objectives": ["1e*MPJPE"]}, "'1e*MPJPE'; allowed is a sum of"),
-        ({"objectives": ["0*MPJPE"]}, "allowed are weights above 0"),
-        ({"objectives": ["1e999*MPJPE"]}, "allowed are weights above 0"),
-        ({"objectives": ["MPJPE", "MPJPE"], "pruner": "none"}, "twice the same"),
-        ({"space": space(low=1.0, high=2.0, log="maybe")}, "optim.lr.log=maybe: allowed is true or false"),
-        ({"space": space(low=4, high=8, step=1.5)}, "optim.lr.step=1.5: allowed is a whole number"),
-        ({"space": space(low=4, high=8, step=100)}, "optim.lr.step=100: allowed is at most high - low"),
-        ({"space": space(low=1, high=10, first=1.5)}, "optim.lr.first=1.5: allowed is a whole number"),
-        ({"space": space(low=4, high=8, step=2, first=5)}, "optim.lr.first=5: allowed is low or some steps"),
-        (
-            {"space": space(choices=[1, 1])},
-            "optim.lr.choices: allowed is a list of at least two values, each once",
-        ),
-    ],
-)
-def test_what_is_wrong_is_named(changes: dict[str, Any], message: str):
-    with pytest.raises(InputError) as caught:
-        made(**changes)
-    assert message in str(caught.value)
+WRONG: list[tuple[dict[str, Any], str]] = [
+    ({"space": {}}, "search.space: empty"),
+    ({"space": {"loss": 3}}, "search.space.loss: 3"),
+    ({"space": space(low=1.0)}, "search.space.optim.lr.high: nothing"),
+    ({"space": space(low=2.0, high=1.0)}, "optim.lr.high=1.0"),
+    ({"space": space(low=0.0, high=1.0, log=True)}, "optim.lr.low=0.0"),
+    ({"space": space(low=1.0, high=2.0, log=True, step=0.1)}, "optim.lr.step=0.1"),
+    ({"space": space(low=1.0, high=2.0, step=0)}, "optim.lr.step=0"),
+    ({"space": space(low=True, high=2.0)}, "optim.lr.low: True"),
+    ({"space": space(low=1.0, high=2.0, first=3.0)}, "optim.lr.first=3.0"),
+    ({"space": space(low=1.0, high=2.0, hihg=3.0)}, "optim.lr.hihg: no such key"),
+    ({"space": space(choices="ab")}, "optim.lr.choices"),
+    ({"space": space(choices=[1])}, "optim.lr.choices"),
+    ({"space": space(choices=[1, 1])}, "optim.lr.choices"),
+    ({"space": space(choices=[1, 2], low=1)}, "optim.lr.low"),
+    ({"space": space(low=1.0, high=2.0, log="maybe")}, "optim.lr.log=maybe"),
+    ({"space": space(low=4, high=8, step=1.5)}, "optim.lr.step=1.5"),
+    ({"space": space(low=4, high=8, step=100)}, "optim.lr.step=100"),
+    ({"space": space(low=1, high=10, first=1.5)}, "optim.lr.first=1.5"),
+    ({"space": space(low=4, high=8, step=2, first=5)}, "optim.lr.first=5"),
+    ({"objectives": []}, "search.objectives"),
+    ({"objectives": ["MPJPE", "MPJRE", "MPJVE"], "pruner": "none"}, "search.objectives"),
+    ({"objectives": ["MPJPE", "MPJPE"], "pruner": "none"}, "search.objectives"),
+    ({"objectives": ["MPJPE", "Jitter"]}, "search.pruner=median"),
+    ({"objectives": ["Jitters"]}, "'Jitters'"),
+    ({"objectives": ["MPJPE - Jitter"]}, "'MPJPE - Jitter'"),
+    ({"objectives": ["head MPJPE"]}, "'head MPJPE'"),
+    ({"objectives": ["1e*MPJPE"]}, "'1e*MPJPE'"),
+    ({"objectives": ["0*MPJPE"]}, "above 0"),
+    ({"objectives": ["1e999*MPJPE"]}, "above 0"),
+    ({"objectives": "MPJPE"}, "search.objectives=MPJPE"),
+    ({"base": [1]}, "search.base="),
+    ({"n_trials": 0}, "search.n_trials=0"),
+    ({"n_trials": True}, "search.n_trials=True"),
+    ({"seeds": 0}, "search.seeds=0"),
+    ({"seeds": 3, "space": {"seed": {"low": 0, "high": 9}}}, "search.seeds=3"),
+    ({"startup": 1.5}, "search.startup=1.5"),
+    ({"startup": None}, "search.startup=None"),
+    ({"prune_after": None}, "search.prune_after=None"),
+    ({"prune_after": 0}, "search.prune_after=0"),
+    ({"seed": -1}, "search.seed=-1"),
+    ({"sampler": "gp"}, "search.sampler=gp"),
+    ({"sampler": "grid"}, "search.space.loss.rotation_all"),
+    ({"sampler": "grid", "space": space(choices=[1, 2], first=1)}, "optim.lr"),
+    ({"sampler": "grid", "space": space(choices=[1, 2, 3]), "n_trials": 2}, "search.n_trials=2: must be 3"),
+    ({"pruner": "hyperband"}, "search.pruner=hyperband"),
+    ({"name": "a/b"}, "search.name=a/b"),
+    ({"name": "a" * 65}, "search.name="),
+    ({"storage": 5}, "search.storage=5"),
+    ({"nonsense": 3}, "search.nonsense: no such key"),
+]
+
+
+def test_what_is_wrong_is_named():
+    for changes, words in WRONG:
+        with pytest.raises(InputError) as caught:
+            made(**changes)
+        assert words in str(caught.value), changes
 
 
 def test_a_key_that_was_taken_away_is_named():

@@ -25,7 +25,7 @@ def test_a_resumed_search_proposes_what_the_undisturbed_one_does(tmp_path: Path)
     (tmp_path / "stopped").mkdir()
     for _ in range(6):
         one = director(open_study(tmp_path / "stopped"), tmp_path / "stopped")
-        finish(one.look(1))
+        finish(one.update(1))
     last = open_study(tmp_path / "stopped")
     to_the_end(last, tmp_path / "stopped", capacity=1)
     assert [trial.params for trial in last.trials] == [trial.params for trial in calm.trials]
@@ -47,7 +47,7 @@ def test_a_grid_has_each_combination_once_in_order_however_often_it_is_stopped(t
     grid = {"sampler": "grid", "space": space, "n_trials": 6, "startup": None, "prune_after": None}
     for _ in range(3):
         one = director(open_study(tmp_path, **grid), tmp_path)
-        finish(one.look(1))
+        finish(one.update(1))
     study = open_study(tmp_path, **grid)
     to_the_end(study, tmp_path, capacity=1)
     every = [
@@ -64,8 +64,8 @@ def test_a_torn_line_and_a_dead_owners_lock_are_mended(tmp_path: Path, monkeypat
 
     study = open_study(tmp_path)
     one = director(study, tmp_path)
-    finish(one.look(2))
-    one.look(2)
+    finish(one.update(2))
+    one.update(2)
     with open(journal(tmp_path), "ab") as file:
         file.write(b'{"op_code":4,"worker_id":"x"')
     Path(f"{journal(tmp_path)}.lock").symlink_to(journal(tmp_path))
@@ -116,7 +116,7 @@ def test_mending_leaves_a_whole_journal_alone(tmp_path: Path):
 def test_a_study_is_looked_at_while_its_owner_works(tmp_path: Path):
     assert Study.view(search(), "mine", tmp_path) is None
     study = open_study(tmp_path)
-    director(study, tmp_path).look(2)
+    director(study, tmp_path).update(2)
     seen = Study.view(search(), "mine", tmp_path)
     assert seen is not None
     assert len(seen.trials) == 2

@@ -11,7 +11,7 @@ from memmlp.tables.statistics import (
     paired_effects,
     seeds_needed,
 )
-from memmlp.tables.statistics.crossed_seeds_and_groups import error
+from memmlp.tables.statistics.paired_differences import error
 
 
 @pytest.mark.parametrize("comparisons", [1, 24])

@@ -8,8 +8,8 @@ from drawn import SHARES, TABLE, differences
 
 from memmlp.tables.statistics import (
     Verdict,
+    analysis_schedule,
     holm,
-    looks,
     paired_effects,
     sequential,
     spending,
@@ -51,9 +51,9 @@ def test_a_look_has_its_own_level():
 
 
 def test_looks_and_what_they_spend():
-    assert looks(13) == (3, 5, 8, 13)
-    assert looks(10) == (3, 5, 8, 10)
-    assert looks(2) == (2,)
+    assert analysis_schedule(13) == (3, 5, 8, 13)
+    assert analysis_schedule(10) == (3, 5, 8, 10)
+    assert analysis_schedule(2) == (2,)
     assert spending(1) == (0.05,)
     assert spending(2) == pytest.approx((0.05 / 3, 0.1 / 3))
     assert sum(spending(5)) == pytest.approx(0.05)
@@ -69,7 +69,7 @@ def test_claims_leave_the_correction_and_other_decisions_stay_in_it():
 
 def test_looks_keep_the_error_where_one_level_for_all_would_not():
     d = differences(13, 8, 1, SHARES["seeds"], tables=600)
-    rounds = looks(13)
+    rounds = analysis_schedule(13)
     kept, wasted = np.zeros((2, 600), bool)
     for seeds, level in zip(rounds, spending(len(rounds)), strict=True):
         p = paired_effects(d[:, :seeds]).p.reshape(600, TABLE)

@@ -1,0 +1,457 @@
+"""Flags: what a reader has to know about the runs behind a table, one line each."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import itertools
+import math
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+import numpy as np
+
+from memmlp.common.processes import MIN_CORE_SHARE
+from memmlp.runs.environment import changed, code_digests
+from memmlp.runs.lookup import hardly_trained
+from memmlp.sweep.definition import COSTS, TIMES, Sweep, Variant
+from memmlp.tables.effects import RunsBySeed, compared, one_and_the_same
+from memmlp.tables.measured_run import SHARED, UNKNOWN, Measured, core_share, undisturbed
+from memmlp.tables.table import STEADY
+
+DescribeRun = Callable[[Variant, int], str | None]
+Labelled = Sequence[tuple[str, Measured]]
+"""The finished runs of a table, each with its variant's label."""
+
+BUILT_IN = "builtin"
+ALIKE = 1.1  # how many times the frames of its control a variant may see in training before a flag says so
+UNTIED = 0.75  # share of test clips that are groups of their own from which on a flag asks for groups
+SMPLH = (1, 2, 3)  # the paper's tables on AMASS, on the rest joints of SMPL-H bodies
+FILES = 5  # names of files that a flag has at most
+ORIGIN = {
+    "code": "code", "data": "data", "hardware": "hardware", "device": "device", "gpu": "GPU",
+    "threads": "threads", "processes": "processes", "torch": "torch", "precision": "precision",
+}  # fmt: skip
+
+
+def no_description(variant: Variant, seed: int) -> None:
+    """Return None, as there is nothing to say about a run: the default for a `DescribeRun`."""
+
+
+def find_flags(
+    sweep: Sweep,
+    asked: Sweep,
+    runs: Mapping[str, RunsBySeed],
+    command: str,
+    state: DescribeRun,
+    older: DescribeRun,
+) -> Iterator[str]:
+    """Yield the flags of a table.
+
+    Args:
+        sweep: the sweep as it is shown.
+        asked: the sweep before variants without the wanted branch fell back to another branch.
+        runs: the finished runs of every runnable variant, by seed.
+        command: the command that makes missing runs.
+        state: describes in a word the state of a variant's and seed's unfinished run.
+        older: names the run with an earlier recipe that exists in place of a missing one.
+    """
+    every = [(variant.label, run) for variant in sweep.runnable() for run in runs[variant.label].values()]
+    has_errors = bool(set(sweep.metrics) - set(COSTS))
+    yield from _other_data(sweep)
+    yield from _missing_runs(sweep, runs, command, state)
+    yield from _older_runs(sweep, runs, older)
+    if has_errors:
+        yield from _branches(sweep, asked, runs, command)
+    offline = [label for label, run in every if run.origin.offline]
+    if offline:
+        yield f"offline: uses future frames: {quoted(offline)}"
+    yield from _same_runs(sweep, runs)
+    yield from _unequal_clips(sweep, runs)
+    yield from _unequal_groups(every)
+    yield from _unmeasured_seeds(sweep, runs)
+    yield from _diverged_runs(sweep, runs)
+    if "Jitter" in sweep.metrics:
+        yield from _smoother_than_truth(sweep, runs)
+    if has_errors:
+        yield from _data_warnings(every, "resampled")
+        yield from _data_warnings(every, "unusual")
+    for attribute, what in ORIGIN.items():
+        unknown = "none" if attribute == "gpu" else UNKNOWN
+        values = [(getattr(run.origin, attribute).replace(UNKNOWN, unknown), label) for label, run in every]
+        yield from differences(what, values)
+    yield from _unequal_code(every)
+    yield from older_code((label, run.code, run.origin.plugins) for label, run in every)
+    if set(TIMES) & set(sweep.metrics):
+        timed = [(run.origin.timed_on, label) for label, run in every if run.latency or run.costs]
+        yield from differences(
+            "machine of the times", [(machine, label) for machine, label in timed if machine != UNKNOWN]
+        )
+        yield from _busy_machine(sweep, runs)
+    if has_errors:
+        yield from _hardly_trained(every)
+    yield from _unequal_training(sweep, runs)
+    yield from _data_warnings(every, "partial", ", and no more")
+    yield from _data_warnings(every, "divided")
+    yield from _unequal_recipes(every)
+    uncommitted = [label for label, run in every if run.origin.changed]
+    if uncommitted:
+        yield f"made by code with uncommitted changes: {quoted(uncommitted)}"
+    if has_errors:
+        yield from _replicates(sweep, runs)
+        bare = [label for label, run in every if run.origin.body == BUILT_IN]
+        if sweep.table in SMPLH and bare:
+            yield f"on the built-in skeleton; the paper uses SMPL-H bodies (data.body=FILE): {quoted(bare)}"
+        less_precise = [label for label, run in every if run.origin.deployed != "fp32"]
+        if less_precise:
+            yield f"size and times are of a file of less precision, errors of float32: {quoted(less_precise)}"
+
+
+def early_tables(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
+    """Flag variants whose planned seeds are only partly finished.
+
+    Testing them now and again later inflates the false-positive rate.
+    """
+    early = [
+        one.label for one in sweep.runnable() if len(runs[one.label]) > 1 and missing_seeds(sweep, one, runs)
+    ]
+    if early:
+        yield (
+            "seeds are missing: repeated tests as they come give false positives more often than 1 in 20 "
+            f"(--until-decided corrects for this): {quoted(early)}"
+        )
+
+
+def missing_seeds(sweep: Sweep, variant: Variant, runs: Mapping[str, RunsBySeed]) -> list[int]:
+    """Return the seeds of a variant for which there is no run."""
+    return [seed for seed in sweep.seeds_of(variant) if seed not in runs[variant.label]]
+
+
+def older_code(runs: Iterable[tuple[str, Mapping[str, str], Iterable[str]]]) -> Iterator[str]:
+    """Flag runs that were made before code changed, though no recipe version was raised.
+
+    Args:
+        runs: for each run its variant's label, the digests of its code (`code_digests`; empty where these are
+            not known), and the users' packages that it uses.
+    """
+    current = functools.cache(code_digests)
+    found = [(label, changed(code, current(tuple(packages)))) for label, code, packages in runs if code]
+    names = sorted({name for _, files in found for name in files})
+    if names:
+        labels = quoted(label for label, files in found if files)
+        since = "has changed since these runs, under the same recipes"
+        yield f"code of {listed(names, FILES)} {since}: {labels}"
+
+
+def differences(what: str, found: Iterable[tuple[str, str]]) -> Iterator[str]:
+    """Flag a property in which variants differ, and name the variants that have each value.
+
+    `found` has pairs of a value and a variant's label.
+    """
+    groups: dict[str, list[str]] = defaultdict(list)
+    for value, label in found:
+        groups[value].append(label)
+    if len(groups) > 1:
+        parts = [f"{value} of {quoted(labels)}" for value, labels in groups.items()]
+        yield f"{what} differs: {'; '.join(parts)}"
+
+
+def unique(texts: Iterable[str]) -> list[str]:
+    """Return texts without repetitions, in their order."""
+    return list(dict.fromkeys(texts))
+
+
+def quoted(labels: Iterable[str]) -> str:
+    """Return labels in quotes, each once, joined with commas (`listed`)."""
+    return listed([f"'{label}'" for label in unique(labels)])
+
+
+def listed(texts: Sequence[str], most: int = 12) -> str:
+    """Join texts with commas; of many texts, only the first ones and the number of the others."""
+    return ", ".join(texts[:most]) + (f", and {len(texts) - most} more" if len(texts) > most else "")
+
+
+def describe_core_share(label: str, share: float) -> str:
+    """Name a run that was timed while its thread had a core for only a share of the time."""
+    return f"'{label}' (had a core for {100 * share:.0f} % of the time)"
+
+
+def _other_data(sweep: Sweep) -> Iterator[str]:
+    """Flag a table of the paper that names its data (a protocol on AMASS) but is shown for other data."""
+    own, chosen = (
+        next((text for text in reversed(texts) if text.startswith("data=")), None)
+        for texts in (sweep.base, sweep.command_line)
+    )
+    if sweep.table and own and chosen and own != chosen:
+        yield f"a table of {own}, shown with {chosen}: its errors do not compare with the paper's"
+
+
+def _missing_runs(
+    sweep: Sweep, runs: Mapping[str, RunsBySeed], command: str, state: DescribeRun
+) -> Iterator[str]:
+    lacking: dict[str, str] = {}
+    for variant in sweep.runnable():
+        if seeds := missing_seeds(sweep, variant, runs):
+            states = unique(text for seed in seeds if (text := state(variant, seed)))
+            described = f" ({', '.join(states)})" if states else ""
+            lacking[variant.label] = f"seed {', '.join(map(str, seeds))}{described}"
+    alike = 1 < len(sweep.runnable()) == len(lacking) and len(set(lacking.values())) == 1
+    if lacking:
+        gaps = listed([f"'{label}' {gap}" for label, gap in lacking.items()])
+        gaps = f"every variant's {next(iter(lacking.values()))}" if alike else gaps
+        yield f"missing: {gaps}; fill with: {command}"
+
+
+def _older_runs(sweep: Sweep, runs: Mapping[str, RunsBySeed], older: DescribeRun) -> Iterator[str]:
+    found = [
+        f"'{variant.label}' seed {seed} ({run})"
+        for variant in sweep.runnable()
+        for seed in missing_seeds(sweep, variant, runs)
+        if (run := older(variant, seed))
+    ]
+    if found:
+        yield f"made by an earlier recipe, left out and made again by the sweep: {listed(found)}"
+
+
+def _branches(sweep: Sweep, asked: Sweep, runs: Mapping[str, RunsBySeed], command: str) -> Iterator[str]:
+    wanted = {variant.label: variant.branch for variant in asked.variants}
+    other = [one for one in sweep.runnable() if one.branch != wanted[one.label]]
+    if other:
+        labels, branches = quoted(one.label for one in other), listed(unique(one.branch for one in other))
+        yield f"the network has no other branch, so the row shows {branches}: {labels}"
+    lacking = [
+        one for one in sweep.runnable() if any(not run.has(one.branch) for run in runs[one.label].values())
+    ]
+    if lacking:
+        branches, labels = listed(unique(a.branch for a in lacking)), quoted(a.label for a in lacking)
+        yield f"not evaluated in the branch {branches}: {labels}; do so with: {command}"
+
+
+def _same_runs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
+    """Flag variants that are the same run, because nothing distinguishes them under these overrides."""
+    for variant, other in compared(sweep):
+        ours, theirs = runs[variant.label], runs[other.label]
+        if one_and_the_same(variant, other, ours, theirs):
+            reason = "the difference between them has no effect here"
+            if any(ours[seed].costs != theirs[seed].costs for seed in ours.keys() & theirs.keys()):
+                reason = "they differ in how it is deployed, and in nothing but costs"
+            yield f"'{variant.label}' and '{other.label}' are one run: {reason}"
+
+
+def _unequal_clips(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
+    for variant, other in compared(sweep):
+        sides = [run.clips.keys() for one in (variant, other) for run in runs[one.label].values()]
+        every: set[str] = set().union(*sides)
+        shared = every.intersection(*sides)
+        if len(shared) < len(every) and runs[variant.label] and runs[other.label]:
+            yield (
+                f"unequal test clips: '{variant.label}' and '{other.label}' share {len(shared)} of "
+                f"{len(every)}; only those are compared, the means are over all"
+            )
+
+
+def _unequal_groups(every: Labelled) -> Iterator[str]:
+    groups: dict[str, set[str]] = defaultdict(set)
+    for _, run in every:
+        for clip in run.clips:
+            groups[clip].add(run.group(clip))
+    several = [clip for clip, names in groups.items() if len(names) > 1]
+    if several:
+        yield f"runs differ in the groups of test clips (data.split.groups): {quoted(several)}"
+
+
+def _unmeasured_seeds(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
+    """Flag runs that were not measured by a metric in which other seeds of their variant were."""
+    lacking: dict[tuple[str, int], list[str]] = defaultdict(list)
+    for variant in sweep.runnable():
+        found = runs[variant.label]
+        modes = sorted({mode for run in found.values() for mode in run.means}) or [""]
+        for metric, mode in itertools.product(sweep.metrics, modes):
+            without = [s for s, run in found.items() if run.value(mode, variant.branch, metric) is None]
+            for seed in without if len(without) < len(found) else ():
+                lacking[variant.label, seed].append(metric)
+    if lacking:
+        texts = [f"'{label}' seed {seed} ({listed(unique(m))})" for (label, seed), m in lacking.items()]
+        yield f"not measured, so the mean is of the other seeds: {listed(texts)}"
+
+
+def _diverged_runs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
+    """Flag runs that have no number for clips for which others have one, because their network diverged.
+
+    A clip for which no run has a number is too short for the metric, unless it has no position error either.
+    """
+    lost: dict[tuple[str, int], set[str]] = defaultdict(set)
+    every = [
+        (variant, seed, run) for variant in sweep.runnable() for seed, run in runs[variant.label].items()
+    ]
+    modes = {mode for _, _, run in every for mode in run.means}
+
+    def without_numbers(mode: str, metric: str) -> dict[tuple[str, int], set[str]]:
+        """Return the clips for which a run has no finite number, of runs that have the metric."""
+        found = {}
+        for variant, seed, run in every:
+            if run.value(mode, variant.branch, metric) is not None:
+                known = np.isfinite(run.by_clip(list(run.clips), mode, variant.branch, metric))
+                found[variant.label, seed] = set(itertools.compress(run.clips, ~known))
+        return found
+
+    for mode, metric in itertools.product(modes, set(sweep.metrics) - set(COSTS)):
+        lacking = without_numbers(mode, metric)
+        if any(lacking.values()):
+            short = set.intersection(*lacking.values())
+            short = short.difference(*without_numbers(mode, SHARED).values())
+            for cell, clips in lacking.items():
+                lost[cell] |= clips - short
+    found = [f"'{label}' seed {seed} ({len(clips)} clips)" for (label, seed), clips in lost.items() if clips]
+    if found:
+        yield f"NaN errors on clips, left out of differences, so verdicts stay inconclusive: {listed(found)}"
+
+
+def _smoother_than_truth(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
+    """Flag variants whose motion has less jitter than the true one, as when a network hardly follows at all.
+
+    Variants that were tested on other clips have another truth, and a line of their own.
+    """
+    smoother: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for variant in sweep.runnable():
+        found = list(runs[variant.label].values())
+        for mode in sorted({mode for run in found for mode in run.means}):
+            made, true = (
+                [
+                    value
+                    for run in found
+                    if (value := run.value(mode, variant.branch, metric)) is not None and math.isfinite(value)
+                ]
+                for metric in ("Jitter", "GT Jitter")
+            )
+            if made and true and np.mean(made) < np.mean(true):
+                smoother[mode, f"{np.mean(true):.2f}"].append(f"'{variant.label}' {np.mean(made):.2f}")
+    for (mode, truth), texts in smoother.items():
+        less = f"Jitter below the truth's {truth} ({mode}): {listed(texts)}"
+        yield f"{less}; motion that is smoother than the truth is not better"
+
+
+def _hardly_trained(every: Labelled) -> Iterator[str]:
+    found = [(label, hardly_trained(run.training.get("frames", 0.0))) for label, run in every]
+    for warning in unique(warning for _, warning in found if warning):
+        labels = unique(label for label, one in found if one == warning)
+        every_variant = len(labels) == len({label for label, _ in every})
+        yield f"{warning}: {'every variant' if every_variant else quoted(labels)}"
+
+
+def _unequal_training(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
+    frames = {
+        label: sorted(number for run in found.values() if (number := run.training.get("frames")))
+        for label, found in runs.items()
+    }
+
+    def millions(label: str) -> str:
+        return "-".join(unique(f"{number / 1e6:.3g}" for number in (frames[label][0], frames[label][-1])))
+
+    unequal = []
+    for variant, other in compared(sweep):
+        both = frames[variant.label] + frames[other.label]
+        if frames[variant.label] and frames[other.label] and max(both) > ALIKE * min(both):
+            ours, theirs = millions(variant.label), millions(other.label)
+            unequal.append(f"'{variant.label}' {ours} M to '{other.label}' {theirs} M")
+    if unequal:
+        yield f"number of frames seen in training differs: {listed(unequal)}"
+
+
+def _busy_machine(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
+    found, fewer = [], []
+    for variant in sweep.runnable():
+        label, counted = variant.label, undisturbed(runs[variant.label])
+        shares = [share for run in counted.values() if (share := core_share(run)) is not None]
+        ratios = [run.costs["ratio"] for run in counted.values() if "ratio" in run.costs]
+        if shares and min(shares) < MIN_CORE_SHARE:
+            found.append(describe_core_share(label, min(shares)))
+        elif ratios and max(ratios) > STEADY * min(ratios):
+            found.append(f"'{label}' (ratio {min(ratios):.3g} to {max(ratios):.3g} over seeds)")
+        if len(counted) < len(runs[label]):
+            fewer.append(f"'{label}' ({len(counted)} of {len(runs[label])})")
+    if found:
+        yield f"timed on a busy machine, so that other work is in the times: {listed(found)}"
+    if fewer:
+        yield f"times are of the seeds that were timed with a core to themselves: {listed(fewer)}"
+
+
+def _data_warnings(every: Labelled, field: str, ending: str = "") -> Iterator[str]:
+    for warning in unique(text for _, run in every if (text := getattr(run.origin, field))):
+        labels = quoted(label for label, run in every if getattr(run.origin, field) == warning)
+        yield f"{warning}{ending}: {labels}"
+
+
+def _unequal_code(every: Labelled) -> Iterator[str]:
+    """Flag files of memmlp whose code differs between variants, be it of one commit.
+
+    Users' packages are left to `_unequal_recipes`. Kept results have no digests of files, and are left out.
+    """
+    having = [(run.code, label) for label, run in every if run.code]
+    digests: dict[str, set[str]] = defaultdict(set)
+    for code, _ in having:
+        for name in code:
+            digests[name].add(code[name])
+    names = sorted(name for name, found in digests.items() if len(found) > 1 and ":" not in name)
+    versions = [
+        (hashlib.sha256(repr([code.get(name) for name in names]).encode()).hexdigest()[:7], label)
+        for code, label in having
+    ]
+    yield from differences(f"code of {listed(names, FILES)}", versions)
+
+
+def _unequal_recipes(every: Labelled) -> Iterator[str]:
+    versions = [(run.origin.every_recipe, label) for label, run in every]
+    for name in sorted({name for known, _ in versions for name in known}):
+        having = [(str(known[name]), label) for known, label in versions if name in known]
+        yield from differences(f"recipe of {name}", having)
+    weights: dict[str, list[tuple[str, str]]] = defaultdict(list)
+    for label, run in every:
+        for upstream, digests in run.origin.upstream_weights.items():
+            weights[upstream] += [(digest, label) for digest in digests.split(", ")]
+    for upstream, having in weights.items():  # trained again, or on another machine
+        yield from differences(f"digest of the weights of upstream run {upstream}", having)
+    for name in sorted({name for _, run in every for name in run.origin.plugins}):
+        having = [(run.origin.plugins[name], label) for label, run in every if name in run.origin.plugins]
+        yield from differences(f"code of {name}", having)
+
+
+def _replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
+    """Flag that intervals don't cover seeds, groups of clips or VQ-VAEs, if there is only one of them."""
+    measured = {label: list(found.values()) for label, found in runs.items() if found}
+    if len(measured) < 2:
+        return
+    every = [run for found in measured.values() for run in found]
+    one_seed = max(map(len, measured.values())) == 1
+    one_group = max(len({run.group(clip) for clip in run.clips}) for run in every) == 1
+    if one_seed and one_group:
+        yield "one seed a variant and one group of test clips: no interval and no star"
+    elif one_seed:
+        yield "one seed a variant: the intervals are about other clips, not about other seeds; no star"
+    else:
+        shared = {
+            one.label: len(runs[one.label].keys() & runs[two.label].keys()) for one, two in compared(sweep)
+        }
+        few = [label for label, number in shared.items() if number == 1]
+        if few:
+            interval = "no interval" if one_group else "an interval about other clips alone"
+            yield f"one seed, so {interval} and no star: {quoted(few)}"
+
+    def ungrouped(run: Measured) -> int:
+        return list(Counter(map(run.group, run.clips)).values()).count(1)
+
+    if not one_group and all(ungrouped(run) >= UNTIED * len(run.clips) for run in every):
+        alone, clips = min((ungrouped(run), len(run.clips)) for run in every if run.clips)
+        each = f"{alone} of {clips} test clips are groups of their own"
+        each = "each test clip is a group of its own" if alone == clips else each
+        yield f"{each} (data.split.groups): right if no two share a person"
+    if one_group and not one_seed:
+        yield "one group of test clips: the intervals are about other seeds, not about other takes or people"
+    upstream = {label: {run.origin.upstream for run in found} for label, found in measured.items()}
+    one_vqvae = [
+        label
+        for label, found in measured.items()
+        if len(found) > 1 and len(upstream[label]) == 1 and None not in upstream[label]
+    ]
+    if one_vqvae:
+        yield f"all seeds share one VQ-VAE, so they do not replicate it: {quoted(one_vqvae)}"
