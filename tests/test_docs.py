@@ -19,6 +19,7 @@ from omegaconf import OmegaConf
 from own_package import PACKAGE, registers_kept
 
 from memmlp.cli.main import COMMANDS
+from memmlp.common.components import names as component_names
 from memmlp.config.build import untrained
 from memmlp.config.compose import composed
 from memmlp.config.plugins import activate
@@ -189,14 +190,14 @@ def reference(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 @pytest.mark.slow
 def test_the_reference_has_every_key(reference: ModuleType):
     page = reference.config_page()
-    memories = [f"memory={path.stem}" for path in sorted((ROOT / "conf/memory").glob("*.yaml"))]
+    memories = [f"memory={name}" for name in component_names("memory")]
     for word in (*memories, "model=agrol_diffusion", "model=avatar_poser", "loss=manual", "rollout=streams"):
         config = OmegaConf.to_container(composed([word]), resolve=False)
         values = flatten(config).items()
         keys = {key for key, value in values if f"## {key}\n" not in page or value not in (None, {})}
         for key in keys:
             last = key.rsplit(".", 1)[-1]
-            assert last in ("name", "_target_") or f"| `{key}` |" in page, f"{word}: {key}"
+            assert last == "name" or f"| `{key}` |" in page, f"{word}: {key}"
 
 
 def test_the_reference_has_every_option(reference: ModuleType):
@@ -262,11 +263,12 @@ def test_the_metrics_of_the_guide_are_the_field_s():
 def test_the_first_quickstart_names_every_option_and_no_other():
     text = (DOCS / "quickstart" / "train.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| `(\w+)` \| (.*) \|$", text, re.MULTILINE))
-    groups = {name for name in rows if (ROOT / "conf" / name).is_dir()}
+    groups = {name for name in rows if (ROOT / "conf" / name).is_dir() or component_names(name)}
     assert {"model", "memory", "loss", "rollout"} <= groups
     keys = {"null", "batch", "lr", "drops", "drop"}  # what is said of options beside their names
     for group in sorted(groups):
-        options = {path.stem for path in (ROOT / "conf" / group).glob("*.yaml")}
+        files = (path.stem for path in (ROOT / "conf" / group).glob("*.yaml"))
+        options = {*files, *component_names(group)}
         named = set(re.findall(r"`([a-z_0-9]+)`", rows[group]))
         assert options <= named, group
         assert named - options <= keys, group

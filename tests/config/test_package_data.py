@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from memmlp.config.clip_groupings import DEFAULT, grouping_to_choose
 from memmlp.config.compose import composed
+from memmlp.config.package_data import DEFAULT, grouping_to_choose
 
 
 def test_names_choose_a_grouping():

@@ -1,0 +1,132 @@
+"""Declarations are found by name and read without torch, from memmlp and from users' packages."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from own_package import registers_kept
+
+from memmlp.common.components import SLOTS, add_package, collected, declared, find, names
+from memmlp.common.errors import InputError
+from memmlp.networks.ego_poser import EgoPoser, EgoPoserSettings
+
+TORCH_FREE = """
+import sys
+from memmlp.common.components import declared
+settings = [one.settings for one in declared().values()]
+assert len(settings) >= 50
+print("torch" in sys.modules, "omegaconf" in sys.modules)
+"""
+BASE = """
+import torch
+from dataclasses import dataclass
+from typing import ClassVar
+from memmlp.common.components import component
+from memmlp.common.settings import Settings, setting
+
+NUMBER = 3
+COMPUTED = torch.zeros(3)
+
+@component("memory", "one", version=4, builds="One")
+@dataclass
+class OneSettings(Settings):
+    width: int = setting(default=NUMBER)
+    defaults: ClassVar = {"loss": "manual"}
+
+class One(torch.nn.Module):
+    def __init__(self, width, extra):
+        super().__init__()
+        self.width, self.extra = width, extra
+"""
+DERIVED = """
+from dataclasses import dataclass
+from typing import ClassVar
+from mine.base import One, OneSettings
+from memmlp.common.components import component
+
+@component("memory", "two", builds="Two")
+@dataclass
+class TwoSettings(OneSettings):
+    depth: int = 2
+    defaults: ClassVar = {"hand": "off"}
+
+class Two(One):
+    pass
+
+@component("hand", "keyless")
+class Keyless:
+    pass
+"""
+
+
+def test_all_settings_are_read_without_torch():
+    ran = subprocess.run([sys.executable, "-c", TORCH_FREE], capture_output=True, text=True, check=True)
+    assert ran.stdout == "False False\n"
+
+
+def test_every_shipped_component_can_be_imported():
+    for (slot, name), one in declared().items():
+        assert callable(one.kind), (slot, name)
+        assert one.settings.option == f"{slot}={name}"
+    assert set(SLOTS) - {"term"} <= {slot for slot, _ in declared()}
+
+
+def test_declared_settings_and_those_of_the_module_are_the_same():
+    found = find("model", "ego_poser")
+    assert found.kind is EgoPoser
+    assert found.settings is not EgoPoserSettings  # it was read without an import
+    assert [spec for spec in found.settings.__dataclass_fields__] == [*EgoPoserSettings.__dataclass_fields__]
+    assert (found.version, found.package, found.module) == (2, "memmlp", "memmlp.networks.ego_poser")
+    assert collected(found.settings, "defaults") == {
+        "memory": None, "predictor": None, "hand": None, "loss": "ego_poser",
+    }  # fmt: skip
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    for name, text in {"__init__": "", "base": BASE, "derived": DERIVED}.items():
+        (folder / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    return folder
+
+
+def test_a_package_adds_components_whose_settings_extend_each_other(package: Path):
+    with registers_kept():
+        add_package("mine", package)
+        one, two = find("memory", "one"), find("memory", "two")
+        assert (one.version, two.version, two.module, two.package) == (4, 1, "mine.derived", "mine")
+        assert collected(two.settings, "defaults") == {"loss": "manual", "hand": "off"}
+        assert "mine.base" not in sys.modules
+        made = two.build({"name": "two", "width": 5}, extra=7)
+        assert (type(made).__name__, made.width, made.extra) == ("Two", 5, 7)
+        assert two.make_settings({"name": "two", "depth": 9}).width == 3
+        assert find("hand", "keyless").kind.__name__ == "Keyless"
+        add_package("mine", None)
+        assert "one" not in names("memory")
+
+
+def test_an_option_is_declared_once(package: Path):
+    (package / "again.py").write_text('\n@component("memory", "gru")\nclass Mine: pass\n')
+    with registers_kept():
+        with pytest.raises(InputError, match=r"again\.py: memory=gru: "):
+            add_package("mine", package)
+        assert find("memory", "gru").package == "memmlp"
+
+
+def test_settings_that_need_the_module_are_an_error(package: Path):
+    text = BASE.replace("setting(default=NUMBER)", "setting(default=COMPUTED)")
+    (package / "base.py").write_text(text)
+    with registers_kept():
+        add_package("mine", package)
+        with pytest.raises(InputError, match=r"base\.py: .*COMPUTED"):
+            _ = find("memory", "one").settings
+
+
+def test_an_unknown_option_is_one_line_with_the_known_ones():
+    with pytest.raises(InputError, match=r"memory=mamba: must be gru or lstm"):
+        find("memory", "mamba")
