@@ -46,20 +46,6 @@ class Codebook(nn.Module):
         """Return the index (...) of the code-vector nearest to each latent (..., width), Euclidean."""
         return self._distances(latent).argmin(-1)
 
-    def measure_margins(self, latent: Tensor) -> Tensor:
-        """Return how far (...) each latent (..., width) is from having another code-vector as its nearest.
-
-        It is the distance to the plane halfway between the two nearest code-vectors, as a share of the
-        latent's length. An error larger than that, such as rounding, can make another code-vector the
-        nearest.
-        """
-        if len(self.vectors) < 2:
-            return torch.full_like(latent[..., 0], float("inf"))
-        distances, index = self._distances(latent).topk(2, -1, largest=False)
-        between = (self.vectors[index[..., 1]] - self.vectors[index[..., 0]]).norm(dim=-1)
-        tiny = torch.finfo(latent.dtype).tiny
-        return distances.diff(dim=-1)[..., 0] / (2 * between * latent.norm(dim=-1)).clamp_min(tiny)
-
     def _distances(self, latent: Tensor) -> Tensor:
         """Return the squared distances (..., K) of latents (..., width), less the latents' own squares."""
         with in_float32(latent.device):  # bfloat16 would make another code-vector the nearest

@@ -8,7 +8,7 @@ import torch
 from memmlp.common import processes
 from memmlp.deploy import latency
 from memmlp.deploy.export import export
-from memmlp.deploy.latency import NoConversion, macs, strip_conversions
+from memmlp.deploy.latency import macs, strip_conversions
 from memmlp.motion.body import POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading, World
 from memmlp.motion.normalizer import Normalizer
@@ -51,25 +51,6 @@ def test_rotations_of_the_world_stay_as_members_make_them():
     members = [one(x, one.initial_state(x, 1), 1)[0] for _, one in model.named_members()]
     torch.testing.assert_close(made[..., ROTATION], sum(members) / 2)
     assert (made[..., POSITION] == 0).all()
-
-
-@torch.no_grad()
-def test_a_refiner_alone_has_no_kinematics():
-    alone = strip_conversions(tiny.refined(tiny.baseline("avatar_poser")))
-    made, _ = alone.advance(torch.randn(1, 1, SPARSE_DIM), alone.initial_state(), 1)
-    assert (made[..., POSITION] == 0).all()
-
-
-@torch.no_grad()
-def test_neither_conversion_nor_kinematics_are_left():
-    model = tiny.baseline("avatar_poser")
-    alone = strip_conversions(model)
-    window = torch.randn(1, 7, SPARSE_DIM)
-    made, _ = alone.advance(window, alone.initial_state(), 1)
-    torch.testing.assert_close(made[0, :, ROTATION], model.rotations(window))
-    assert (made[..., POSITION] == 0).all()
-    assert isinstance(alone.normalizer, NoConversion)
-    assert not isinstance(model.normalizer, NoConversion)
 
 
 @pytest.fixture(scope="module")
@@ -125,13 +106,6 @@ def test_the_order_of_files_is_reversed_and_each_rounds_share_of_a_core_is_kept(
     assert found["a"].core_shares.tolist() == [1, 1, 1]
     assert found["b"].core_shares.tolist() == [1, 0.25, 1]
     assert found["b"].seconds.tolist() == [[2], [2], [2]]
-
-
-@pytest.mark.slow
-def test_files_are_timed_in_turn(exported):
-    found = latency.time_in_turn({"a": exported[1], "b": exported[1]}, 2, 3)
-    assert all(times.seconds.shape == (2, 3) and (times.seconds > 0).all() for times in found.values())
-    assert all(times.core_shares.shape == (2,) for times in found.values())
 
 
 def test_macs_are_counted_by_hand():

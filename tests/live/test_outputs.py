@@ -89,12 +89,6 @@ def test_a_busy_network_drops_a_datagram_and_no_way_is_an_error():
         receiver.send(b"")
 
 
-def test_nothing_is_waited_for():
-    receiver = Receiver("127.0.0.1", 39539, "--vmc")
-    assert receiver.socket.getblocking() is False
-    receiver.close()
-
-
 def test_an_unknown_host_is_one_line():
     with pytest.raises(InputError, match=r"--vmc nowhere\.invalid"):
         Receiver("nowhere.invalid", 39539, "--vmc")

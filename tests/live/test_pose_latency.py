@@ -2,7 +2,6 @@
 
 import pytest
 
-from memmlp.common import processes
 from memmlp.live.pose_latency import alternate, measure_pose, time_poses_in_turn
 from memmlp.live.stream import Stream
 
@@ -18,12 +17,6 @@ def test_a_whole_pose_is_timed(step_files):
     both = alternate(stream, stream.network, 5)
     assert both.shape == (5, 2)
     assert (both > 0).all()
-
-
-def test_a_pose_whose_thread_had_no_core_is_seen(step_files, monkeypatch):
-    clock = iter([5.0, 5.0 + 1e-9])
-    monkeypatch.setattr(processes.time, "thread_time", lambda: next(clock))
-    assert measure_pose(step_files("no_memory"), 1)["pose_core_share"] < 1e-6
 
 
 def test_poses_are_timed_in_turn(step_files):

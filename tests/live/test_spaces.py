@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from memmlp.common.errors import InputError
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix
 from memmlp.live.spaces import SPACES, space_of
-from memmlp.live.tracker_resampling import UPRIGHT
 
 numbers = st.floats(-10, 10)
 points = st.tuples(numbers, numbers, numbers).map(np.array)
@@ -54,12 +53,6 @@ def test_the_axes(name, forward, up, left):
     np.testing.assert_allclose(upright @ [0, 0, 1], FORWARD, atol=1e-12)
     np.testing.assert_allclose(upright @ [0, 1, 0], UP, atol=1e-12)
     np.testing.assert_allclose(upright @ [1, 0, 0], LEFT, atol=1e-12)
-
-
-def test_amass_is_amass():
-    turn = Rotation.from_rotvec([0.3, 2, -1]).as_matrix()
-    np.testing.assert_array_equal(SPACES["amass"].rotations_in(turn), turn)
-    np.testing.assert_array_equal(UPRIGHT @ [0, 1, 0], UP)
 
 
 def test_a_head_that_turns_left_turns_left_everywhere():

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny
-import torch
 import wearer
 from processes import finished
 from scipy.spatial.transform import Rotation
@@ -31,7 +30,6 @@ from memmlp.live.tracker_resampling import t_pose
 from memmlp.live.wearer import Offsets
 from memmlp.motion.body import HEAD, N_JOINTS, SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading
-from memmlp.motion.synthetic import synthesize_clip
 from memmlp.networks.streaming import streaming
 from memmlp.runs.run import Run
 
@@ -86,17 +84,6 @@ def test_it_is_evaluations_stream_of_a_naive_graph_without_a_position_branch(tmp
     network = wearer.at_ease(tiny.baseline("avatar_poser", depth=1), PERSON.frames)
     export(network, tmp_path / "step.onnx", "0123456789abcdef")
     assert largest_difference(network, tmp_path / "step.onnx", PERSON) < 1e-4
-
-
-def test_on_a_boxer_at_60_and_at_120_hz(network, file):
-    clip = synthesize_clip("punching", 0, seconds=10.0, fps=120.0)
-    poses, trans = torch.tensor(clip.poses).double(), torch.tensor(clip.trans).double()
-    every, second = wearer.of_poses(poses, trans), wearer.of_poses(poses[::2], trans[::2])
-    assert largest_difference(network, file, second) < 1e-4
-    times = np.arange(len(poses)) / 120
-    fast = [p for p in wearer.play(Stream(file), every.positions, every.rotations, times) if p.fresh]
-    slow = wearer.joints(wearer.play(Stream(file), second.positions, second.rotations))
-    assert wearer.apart(wearer.joints(fast), slow).max() < 1e-3
 
 
 def test_the_head_is_on_its_tracker(undisturbed):

@@ -17,24 +17,6 @@ def test_the_nearest_code_is_chosen():
     assert torch.equal(vectors, book.vectors[brute])
 
 
-def test_a_margin_is_how_far_a_latent_may_move_before_another_code_is_chosen():
-    book = tiny.vqvae().codebook
-    latent = torch.randn(5, 3, 12)
-    margins = book.measure_margins(latent)
-    two = ((latent[..., None, :] - book.vectors) ** 2).sum(-1).topk(2, largest=False).indices
-    towards = book.vectors[two[..., 1]] - book.vectors[two[..., 0]]
-    step = (margins * latent.norm(dim=-1))[..., None] * towards / towards.norm(dim=-1, keepdim=True)
-    assert torch.equal(book.find_indices(latent + 0.999 * step), two[..., 0])
-    assert torch.equal(book.find_indices(latent + 1.001 * step), two[..., 1])
-
-
-def test_the_margin_is_none_between_equal_codes_and_infinite_with_one():
-    book = EMACodebook(codes=2, width=3, commitment=0.25, decay=0.9)
-    assert torch.equal(book.measure_margins(torch.ones(4, 3)), torch.zeros(4))
-    one = EMACodebook(codes=1, width=3, commitment=0.25, decay=0.9)
-    assert torch.equal(one.measure_margins(torch.ones(4, 3)), torch.full((4,), torch.inf))
-
-
 @pytest.mark.parametrize("codebook", ["ema", "gradient"])
 @torch.no_grad()
 def test_a_mixed_precision_training_finds_the_code_vectors_that_evaluation_finds(codebook):

@@ -6,7 +6,6 @@ import http.client
 import json
 import threading
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from processes import PATIENCE
@@ -96,19 +95,11 @@ def test_the_page_needs_no_network(server: LiveServer):
             assert "//" not in get(server, f"/{name}").read().decode().replace("// ", ""), name
 
 
-def test_the_licence_of_three_is_there():
-    assert "MIT" in (Path(module.__file__).parent / "page/three/LICENSE").read_text()
-
-
 @pytest.mark.parametrize(
     "path", ["/../page_server.py", "/three/LICENSE/..", "/%2e%2e/page_server.py", "/main"]
 )
 def test_nothing_else_is_served(server: LiveServer, path: str):
     assert get(server, path).status == 404
-
-
-def test_only_this_machine_is_served(server: LiveServer):
-    assert server.socket.getsockname()[0] == "127.0.0.1"
 
 
 def test_a_page_of_another_site_gets_nothing(server: LiveServer):
@@ -170,10 +161,6 @@ def test_orders_of_another_site_s_page_do_not(
 ):
     assert post(fitted, b'{"action": "forget"}', **headers)[0] == 403
     assert asked == []
-
-
-def test_nobody_to_fit_takes_no_orders(server: LiveServer):
-    assert post(server, b"{}")[0] == 404
 
 
 def test_at_another_address_everything_needs_the_token(clip: TrackedClip):

@@ -5,14 +5,12 @@ from __future__ import annotations
 import socket
 import threading
 from ipaddress import IPv4Network
-from pathlib import Path
 
 import numpy as np
 import pytest
 from processes import PATIENCE
 
 from memmlp.common.errors import InputError
-from memmlp.common.progress import announce_to
 from memmlp.live.rotations import quaternion_to_matrix
 from memmlp.live.session.sources import (
     HOST,
@@ -22,15 +20,11 @@ from memmlp.live.session.sources import (
     TrackedClip,
     from_json,
     from_osc,
-    npz_frames,
     send,
     to_json,
     to_osc,
 )
 from memmlp.live.spaces import SPACES
-from memmlp.motion.body import builtin_rest_joints
-from memmlp.motion.clip import Clip
-from memmlp.motion.formats.npz import write_clip
 
 PACKETS = {"udp": (to_json, from_json), "osc": (to_osc, from_osc)}
 
@@ -113,11 +107,6 @@ def test_the_truth_of_each_round_is_that_of_the_first(clip: TrackedClip, hz: flo
             np.testing.assert_allclose(truth, clip.truth(step / hz), atol=1e-6)
 
 
-def test_beyond_a_clip_there_is_its_end(clip: TrackedClip):
-    np.testing.assert_array_equal(clip.truth(-1.0), clip.joints[0])
-    np.testing.assert_array_equal(clip.truth(clip.seconds + 1), clip.joints[-1])
-
-
 def test_who_is_late_at_the_end_gets_the_last_sample(clip: TrackedClip):
     clock = Clock()
     played = source(clip, 60, clock)
@@ -127,16 +116,6 @@ def test_who_is_late_at_the_end_gets_the_last_sample(clip: TrackedClip):
     sample = played.read()
     assert (sample.time, sample.dropped) == (pytest.approx(119 / 60), 4)
     assert played.over
-
-
-def test_a_file_that_is_unusual_is_said(tmp_path: Path):
-    """Somebody who lies throughout, or a file with another axis up."""
-    turns = 1e-3 * np.arange(5.0)[:, None, None] + np.zeros((5, 22, 3))
-    write_clip(tmp_path / "a.npz", Clip("a", turns, np.zeros((5, 3)), 60.0))
-    said: list[str] = []
-    with announce_to(said.append):
-        assert len(npz_frames(tmp_path / "a.npz", builtin_rest_joints())) == 4
-    assert said[0].startswith(f"{tmp_path / 'a.npz'}: unusual, the head is never above the pelvis")
 
 
 @pytest.mark.parametrize(("kind", "space"), [("udp", "amass"), ("osc", "unity")])

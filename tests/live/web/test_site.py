@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 import re
 import subprocess
@@ -63,14 +62,6 @@ def test_nothing_of_another_host_is_named(site: Made):
     own = [path for path in site.folder.glob("*") if path.suffix in (".js", ".html", ".css")]
     assert [path.name for path in own if re.search(r"https?://", path.read_text())] == []
     assert not re.search(r"""(?:src|href)=["']/""", page)
-
-
-@pytest.mark.slow
-def test_compressed_files_are_what_they_were(site: Made):
-    packed = list(site.folder.rglob("*.gz"))
-    assert len(packed) > 5
-    starts = {gzip.decompress(path.read_bytes())[:1] for path in packed if path.parent.name != "clips"}
-    assert starts == {b"\0", b"\x08"}  # of WebAssembly and of ONNX
 
 
 def test_files_of_other_pages_are_there():

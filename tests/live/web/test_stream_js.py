@@ -201,8 +201,3 @@ def test_what_is_no_t_pose_is_not_calibrated(name: str, words: str, site: Made, 
 def entry_is_of(site: Made) -> bool:
     """Whether the site's network is the one that Python has."""
     return json.loads((site.folder / "site.json").read_text())["networks"][0]["run"] == RUN
-
-
-def test_parts_differ_enough_to_tell_a_stream_from_a_copy():
-    """Rates are resampled, hands are lost, and clips restart: none of the parts is the first one again."""
-    assert len({json.dumps(part) for part in PARTS.values()}) == len(PARTS)

@@ -4,7 +4,7 @@ import { History } from './history.js';
 import { Stage } from './stage.js';
 import { Wearer } from './wearer.js';
 
-const QUIET = 1000; // milliseconds without a frame after which the page says so
+const QUIET = 1000; // milliseconds without a frame after which the status changes
 const $ = id => document.getElementById(id);
 const history = new History();
 const wearer = new Wearer();
@@ -47,7 +47,7 @@ function greet(words) {
   try {
     stage ??= new Stage(document.querySelector('canvas'), words);
   } catch (error) {
-    trouble(`This browser draws no WebGL (${error.message}); the numbers go on.`);
+    trouble(`This browser does not support WebGL (${error.message}); the numbers continue.`);
   }
   if (stage && words.avatar && !avatar) dress(words.avatar);
 }
@@ -129,7 +129,7 @@ function tell(frame) {
   $('share').classList.toggle('over', share > 1);
 }
 
-let told = 0;
+let reported = 0;
 function tick(now) {
   const frame = history.shown;
   if (stage && frame) {
@@ -139,9 +139,9 @@ function tick(now) {
     frame.drawn = performance.now() - began;
     document.documentElement.dataset.shown = frame.number;
   }
-  if (now - told > 100) {
+  if (now - reported > 100) {
     tell(frame);
-    told = now;
+    reported = now;
   }
   requestAnimationFrame(tick);
 }

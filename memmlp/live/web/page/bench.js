@@ -11,7 +11,7 @@ const YARDSTICK = 'yardstick';
 export function bench(page, site) {
   const view = new Bench(page, site);
   view.describe();
-  const hidden = () => { if (document.hidden && view.proxy) view.stop('Stopped: browsers slow down a page that is not in front.'); };
+  const hidden = () => { if (document.hidden && view.proxy) view.stop('Stopped: browsers slow down a page in the background.'); };
   document.addEventListener('visibilitychange', hidden);
   return () => {
     document.removeEventListener('visibilitychange', hidden);
@@ -37,7 +37,7 @@ class Bench {
     this.note = h('p', { class: 'faint', id: 'progress' }, 'Nothing is measured yet. Keep this page in front, and the device on its charger.');
     this.bar = h('progress', { max: 1, value: 0, hidden: true });
     this.body = h('tbody');
-    replace(page, h('h1', {}, 'How long a step takes here'), this.explained(), this.tools(), this.note, this.bar, this.table());
+    replace(page, h('h1', {}, 'The time of a step here'), this.explained(), this.tools(), this.note, this.bar, this.table());
     this.rows();
   }
 
@@ -63,7 +63,7 @@ class Bench {
     return h('div', { class: 'scroll' }, h('table', { class: 'times' }, h('thead', {}, h('tr', {}, side)), this.body));
   }
 
-  // Ask what device and browser this is, and whether WebGPU is there.
+  // Find the device, the browser, and whether WebGPU is available.
   async describe() {
     this.about = await machine();
     if (!this.device.value) this.device.value = this.about.device;
@@ -98,12 +98,12 @@ class Bench {
       say(this.note.textContent);
       document.documentElement.dataset.bench = 'done';
     } catch (error) {
-      if (error.message !== 'stopped') this.stop(`This did not work: ${error.message}`);
+      if (error.message !== 'stopped') this.stop(`Failed: ${error.message}`);
     }
     this.copy.disabled = this.save.disabled = this.results.size === 0;
   }
 
-  // Time everything on a backend. What does not run there has its reason in its row.
+  // Time everything on a backend. The row of a graph that does not run there shows the reason.
   async backend(backend, each) {
     const proxy = (this.proxy = new WorkerProxy());
     const plan = [];
@@ -189,7 +189,7 @@ class Bench {
       await navigator.clipboard.writeText(this.file());
       this.note.textContent = 'Copied. Paste it into a file, and show it with memmlp table 17 --add FILE.';
     } catch {
-      this.note.textContent = 'This browser gives no page its clipboard here; save it as a file instead.';
+      this.note.textContent = 'This browser does not allow the clipboard here; save it as a file instead.';
     }
     say(this.note.textContent);
   }
@@ -203,7 +203,7 @@ class Bench {
 
 const size = network => `${(network.parameters / 1e6).toFixed(2)} M`;
 
-// Device and browser as far as the browser tells them.
+// Device and browser, as far as the browser reports them.
 async function machine() {
   const agent = navigator.userAgent;
   const known = await navigator.userAgentData?.getHighEntropyValues?.(['model', 'platform', 'platformVersion', 'fullVersionList']).catch(() => null);
@@ -218,7 +218,7 @@ async function machine() {
   };
 }
 
-// Why there is no WebGPU; null where there is.
+// The reason why WebGPU is not available; null if it is.
 async function noWebGPU() {
   if (!navigator.gpu) return window.isSecureContext ? 'not in this browser' : 'only at https or localhost';
   const adapter = await navigator.gpu.requestAdapter().catch(() => null);

@@ -1,4 +1,4 @@
-// What a WebXR frame tells of head and hands, as a Stream takes them, and where joints are on devices as a rule.
+// Head and hands of a WebXR frame, as a Stream takes them, and the typical offsets of joints on devices.
 
 // Head and hands in a reference space: { position, rotation } each, or null where the device does not see it.
 // Hands are controllers' grips, or wrists where the device tracks hands.
@@ -12,8 +12,8 @@ export function trackersOf(frame, space, sources) {
   return [tracker(frame.getViewerPose(space)), hand('left'), hand('right')];
 }
 
-// "hands" or "controllers" for left and right, each of which sits differently on a wrist; null where there is neither.
-// A headset may track one hand beside the other's controller.
+// "hands" or "controllers" for left and right, whose offsets differ; null for neither. A headset may track one hand beside
+// the other's controller.
 export const kindsOf = sources => ['left', 'right'].map(side => {
   const source = sourceOf(side, sources);
   return source && (source.hand ? 'hands' : 'controllers');
@@ -22,7 +22,7 @@ export const kindsOf = sources => ['left', 'right'].map(side => {
 const sourceOf = (side, sources) =>
   [...sources].find(({ handedness, gripSpace, hand }) => handedness === side && (gripSpace || hand)) ?? null;
 
-// A device that sees a hand no longer guesses for a while where it is, which is taken; then it gives no pose.
+// A device that loses a hand guesses its pose for a while, which is used; then it gives no pose.
 function tracker(pose) {
   if (!pose) return null;
   const { position: p, orientation: q } = pose.transform;
@@ -44,7 +44,7 @@ const SITS = {
   ],
 };
 
-// About where head and wrists are on the devices of these kinds, left and right, until a calibration finds out.
+// The typical offsets of head and wrists on devices of these kinds, left and right, until a calibration.
 export function usualOffsets(kinds) {
   const parts = [HEAD, ...kinds.map((kind, side) => SITS[kind ?? 'controllers'][side])];
   return { positions: parts.map(({ position }) => position), rotations: parts.map(({ rotation }) => rotation) };

@@ -1,4 +1,4 @@
-// The pages by their addresses, what the site has, and whether it works offline.
+// The pages by their addresses, the site's contents, and whether it works offline.
 
 import { bench } from './bench.js';
 import { h, replace } from './dom.js';
@@ -13,7 +13,7 @@ let home = 'wear';
 async function begin() {
   try {
     const answer = await fetch('site.json');
-    if (!answer.ok) throw new Error(`site.json: the server says ${answer.status}`);
+    if (!answer.ok) throw new Error(`site.json: the server answers ${answer.status}`);
     const site = await answer.json();
     about(site);
     if (!site.base) document.querySelector('nav a[href="#/bench"]').remove();
@@ -26,7 +26,7 @@ async function begin() {
   offline();
 }
 
-// Whether this browser can enter VR or AR; one that cannot has nothing to wear, but clips to play.
+// Whether this browser can enter VR or AR; if not, the site opens on the clips.
 async function wearable() {
   const asked = ['immersive-vr', 'immersive-ar'].map(mode => navigator.xr?.isSessionSupported(mode).catch(() => false) ?? false);
   return (await Promise.all(asked)).some(Boolean);

@@ -82,7 +82,7 @@ class Play {
     this.history.resume();
     this.dropped = 0;
     if (!this.clips().includes(this.clip)) this.clip = this.clips()[0];
-    if (!this.clip) return this.tell('This network has no test clip on this site.');
+    if (!this.clip) return this.tell('This site has no test clip of this network.');
     this.tell('Loading the network.');
     try {
       const [content] = await Promise.all([fetched(this.clip.file), this.proxy.open('play', this.network.play)]);
@@ -100,7 +100,7 @@ class Play {
     try {
       return new Stage(this.canvas, this.site);
     } catch (error) {
-      this.tell(`This browser draws no WebGL (${error.message}); the numbers go on.`);
+      this.tell(`This browser does not support WebGL (${error.message}); the numbers continue.`);
       return null;
     }
   }
@@ -110,7 +110,7 @@ class Play {
     this.trouble.hidden = !words;
   }
 
-  // Feed the clip to the stream at 60 Hz, over and over. What is due while a step is worked on is dropped.
+  // Feed the clip to the stream at 60 Hz, repeatedly. Frames that are due during a step are dropped.
   async rounds(clip, round) {
     const { body, fps } = this.network;
     const stream = new Stream({ fps, body, run: frame => this.proxy.call('pose', ['play', frame]) });

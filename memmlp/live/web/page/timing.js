@@ -1,12 +1,12 @@
-// How long steps take: all of them in turn, round by round, so that a machine that grows warm slows all alike.
+// Times of steps, in turn, round by round, so that a machine that grows warm slows all equally.
 
 export const ROUNDS = 5;
 export const WARM_UP = 30; // untimed steps of each at the start
 const SETTLING = 3; // untimed steps of each at the start of a round, in which caches fill
 
 // steps: { key: async () => anything }, each timed `rounds` times `each` times from its call until its outputs were read.
-// Resolves to { key: [[milliseconds of a round's steps]] }; told(share) hears how much is done.
-export async function interleaved(steps, { rounds = ROUNDS, each, told = () => {} }) {
+// Resolves to { key: [[milliseconds of a round's steps]] }; progress(share) reports the share that is done.
+export async function interleaved(steps, { rounds = ROUNDS, each, progress = () => {} }) {
   const keys = Object.keys(steps);
   const times = Object.fromEntries(keys.map(key => [key, []]));
   for (const key of keys) await repeated(steps[key], WARM_UP);
@@ -14,7 +14,7 @@ export async function interleaved(steps, { rounds = ROUNDS, each, told = () => {
     for (const [index, key] of keys.entries()) {
       await repeated(steps[key], SETTLING);
       times[key].push(await repeated(steps[key], each));
-      told((round + (index + 1) / keys.length) / rounds);
+      progress((round + (index + 1) / keys.length) / rounds);
     }
   }
   return times;

@@ -1,4 +1,4 @@
-// Enter VR or AR: the wearer's head and hands become a body, computed here, in front of a mirror.
+// Enter VR or AR: a body follows the wearer's head and hands, computed here, in front of a mirror.
 
 import { h, replace, select } from './dom.js';
 import { kindsOf, trackersOf, usualOffsets } from './headset.js';
@@ -10,9 +10,9 @@ import { median, percentile } from './timing.js';
 
 const MODES = { 'immersive-vr': 'Enter VR', 'immersive-ar': 'Enter AR' };
 const COUNTDOWN = 3; // seconds from the trigger to the calibration
-const AWAITED = 2; // samples that may wait for the network; what comes then is skipped
-const TIMED = 600; // the newest poses whose times are told
-const USUAL = 91; // the newest frames of the display, whose median tells its rate
+const AWAITED = 2; // samples that may wait for the network; later ones are skipped
+const TIMED = 600; // the newest poses whose times are shown
+const USUAL = 91; // the newest frames of the display, whose median gives its rate
 const SURE = 10; // so many of them at least
 const [SHORTEST, TALLEST] = [0.9, 2.4]; // metres; outside of them a floor or a height is wrong
 const INVITE = ['Pull a trigger or pinch, then stand upright in T-pose:', 'arms to the sides, palms down, eyes forward'];
@@ -25,7 +25,7 @@ export function wear(page, site) {
 class Wear {
   constructor(page, site) {
     Object.assign(this, { page, site, network: site.networks[0], worn: null });
-    this.canvas = h('canvas', { 'aria-label': 'What is seen in the mirror' });
+    this.canvas = h('canvas', { 'aria-label': 'The view in the mirror' });
     this.trouble = h('p', { class: 'trouble' }, 'Loading the network.');
     this.height = h('input', { type: 'number', id: 'height', min: 100, max: 230, step: 'any', placeholder: 'by headset' });
     this.record = h('input', { type: 'checkbox', id: 'record' });
@@ -36,7 +36,7 @@ class Wear {
     try {
       this.mirror = new WornScene(this.canvas, site);
     } catch (error) {
-      this.trouble.textContent = `This browser draws no WebGL: ${error.message}`;
+      this.trouble.textContent = `This browser does not support WebGL: ${error.message}`;
       return;
     }
     this.ready();
@@ -51,7 +51,7 @@ class Wear {
         this.site.networks.length > 1 && select('Network', this.site.networks.map(({ key, name }) => [key, name]), this.network.key, key => {
           this.worn?.session.end();
           this.network = this.site.networks.find(network => network.key === key);
-          this.remarked();
+          this.showRemark();
           this.ready();
         }),
         h('label', { class: 'field' }, h('span', {}, 'Your height [cm]'), this.height),
@@ -63,12 +63,11 @@ class Wear {
       h('ol', { class: 'steps' },
         h('li', {}, 'Put on the headset, open this page in its browser, and choose Enter VR (or AR, to see your room).'),
         h('li', {}, 'Pull a trigger, or pinch, and stand in T-pose within three seconds: upright, arms to the sides, palms down, eyes forward.'),
-        h('li', {}, 'Look into the mirror. Pull again to calibrate anew, as after changing between controllers and hands.')));
-    this.remarked();
+        h('li', {}, 'Look into the mirror. Pull again to repeat the calibration, such as after changing between controllers and hands.')));
+    this.showRemark();
   }
 
-  // Say what who sees this network move should know, if there is anything.
-  remarked() {
+  showRemark() {
     const { remark } = this.network;
     this.remark.hidden = !remark;
     this.remark.textContent = remark ? `This network is ${remark}.` : '';
@@ -86,9 +85,9 @@ class Wear {
     const can = await Promise.all(Object.keys(MODES).map(mode => navigator.xr?.isSessionSupported(mode).catch(() => false) ?? false));
     if (proxy !== this.proxy) return;
     this.buttons.forEach((button, i) => { button.disabled = !can[i]; });
-    const why = !window.isSecureContext ? 'This address is not secure: a headset may be entered at https or localhost alone.'
+    const why = !window.isSecureContext ? 'This address is not secure: VR needs https or localhost.'
       : !navigator.xr ? 'This browser has no WebXR. Open this page in a headset’s browser.'
-      : can.some(Boolean) ? '' : 'No headset is found. Open this page in a headset’s browser.';
+      : can.some(Boolean) ? '' : 'There is no headset. Open this page in a headset’s browser.';
     document.getElementById('support').textContent = why;
     this.trouble.hidden = true;
     this.seen.hidden = this.worn === null;
@@ -103,7 +102,7 @@ class Wear {
       this.mirror.renderer.xr.setReferenceSpaceType('local-floor');
       await this.mirror.renderer.xr.setSession(session);
     } catch (error) {
-      document.getElementById('support').textContent = `The headset was not entered: ${error.message}`;
+      document.getElementById('support').textContent = `VR was not entered: ${error.message}`;
     }
   }
 
@@ -151,8 +150,8 @@ class Wear {
     if (worn.frames % 20 === 0) this.tell();
   }
 
-  // Controllers and hands sit differently on the wrists: what was calibrated with one does not hold for the other.
-  // A side where there is neither keeps what was there.
+  // Controllers and hands have other offsets, so a calibration with one does not hold for the other. A side without
+  // either keeps its kind.
   change(seen) {
     const { worn } = this;
     const kinds = seen.map((kind, side) => kind ?? worn.kinds[side]);
@@ -169,7 +168,7 @@ class Wear {
     this.worn.placed = true;
   }
 
-  // When the countdown is over, take over how the devices sit on the body.
+  // When the countdown is over, calibrate the devices.
   calibrate(trackers) {
     const { worn, mirror } = this;
     if (worn.due === null) return;
@@ -189,7 +188,7 @@ class Wear {
     }
   }
 
-  // How tall the wearer is, metres: as typed in, else by the headset's height over the floor, else as the network's body.
+  // The wearer's height, metres: as typed in, else by the headset's height over the floor, else the network's body's.
   tall(head) {
     const { body } = this.worn?.network ?? this.network;
     const typed = this.height.valueAsNumber / 100;
@@ -242,8 +241,8 @@ class Wear {
     this.seen.hidden = true;
   }
 
-  // The recording: samples as the headset gave them, in OpenXR's axes, and the poses that were made of them; without
-  // the last ones, which still waited for the network.
+  // The recording: the headset's samples, in OpenXR's axes, and their poses, without the last ones, which still waited
+  // for the network.
   saved() {
     const samples = this.tape.filter(({ held, calibrated }) => held || calibrated);
     const content = JSON.stringify({ format: 'memmlp web recording 1', run: this.recorded, joints: this.site.joints, samples });
@@ -259,7 +258,7 @@ class Wear {
   }
 }
 
-// The display's rate as it is, and as it should be where the browser tells it.
+// The display's measured rate, and the expected one where the browser reports it.
 function rateOf({ passed, session }) {
   if (!passed.length) return '–';
   const usual = (1000 / median(passed)).toFixed(0);

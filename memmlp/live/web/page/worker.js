@@ -31,7 +31,7 @@ const calls = {
   // plan: [{ key, kind, body, fps }] of open graphs; kind: step, whole (from trackers to joints) or plain (no state).
   async time(plan, each, id) {
     const steps = Object.fromEntries(plan.map(part => [part.key, stepper[part.kind](onnxStreams.get(part.key), part)]));
-    const times = await interleaved(steps, { each, told: share => postMessage({ id, share }) });
+    const times = await interleaved(steps, { each, progress: share => postMessage({ id, share }) });
     for (const part of plan) await check(steps[part.key], part.key);
     return { times, clock: clockStep() };
   },
@@ -60,11 +60,11 @@ const stepper = {
   },
 };
 
-// A step whose numbers are none could be quicker or slower than the network's.
+// NaN or infinity could make a step quicker or slower than the network's.
 async function check(step, key) {
   const outputs = await step();
   const arrays = Object.values(outputs).filter(value => value instanceof Float32Array);
-  if (!arrays.length || !arrays.every(array => array.every(Number.isFinite))) throw new Error(`${key}: its outputs are no numbers`);
+  if (!arrays.length || !arrays.every(array => array.every(Number.isFinite))) throw new Error(`${key}: its outputs are not finite`);
 }
 
 onmessage = async ({ data: { id, call, args } }) => {

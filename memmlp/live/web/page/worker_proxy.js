@@ -1,4 +1,4 @@
-// The worker as an object: its calls by name, each of which resolves to the worker's answer.
+// The worker as an object: a call by name resolves to the worker's answer.
 
 export class WorkerProxy {
   constructor() {
@@ -9,10 +9,10 @@ export class WorkerProxy {
     this.worker.addEventListener('error', event => this.failed(event.message || 'the worker could not be loaded'));
   }
 
-  // told(share) hears how far a long call is.
-  call(name, args, told = () => {}) {
+  // progress(share) reports a long call's progress.
+  call(name, args, progress = () => {}) {
     return new Promise((resolve, reject) => {
-      this.waiting.set(++this.count, { resolve, reject, told });
+      this.waiting.set(++this.count, { resolve, reject, progress });
       this.worker.postMessage({ id: this.count, call: name, args });
     });
   }
@@ -22,7 +22,7 @@ export class WorkerProxy {
   answered({ id, value, error, share }) {
     const waits = this.waiting.get(id);
     if (!waits) return;
-    if (share !== undefined) return waits.told(share);
+    if (share !== undefined) return waits.progress(share);
     this.waiting.delete(id);
     if (error === undefined) waits.resolve(value);
     else waits.reject(new Error(error));

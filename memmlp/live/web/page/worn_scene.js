@@ -1,4 +1,4 @@
-// The scene that is worn: the wearer's body, without its head, a mirror that shows all of it, and words above it.
+// The scene in VR: the wearer's body, without its head, a mirror that shows all of it, and a board above it.
 
 import * as THREE from 'three';
 import { Limb } from './stage.js';
@@ -49,7 +49,7 @@ export class WornScene {
     this.through(false);
   }
 
-  // Show the room around (AR), or one of our own.
+  // Show the real room (AR), or a virtual one.
   through(real) {
     this.scene.background = real ? null : this.sky;
     this.floor.visible = this.ground.visible = !real;
@@ -65,10 +65,10 @@ export class WornScene {
     return mesh;
   }
 
-  // Put words above the mirror, line by line.
+  // Write lines on the board above the mirror.
   tell(...lines) {
-    if (this.told === lines.join('\n')) return;
-    this.told = lines.join('\n');
+    if (this.board === lines.join('\n')) return;
+    this.board = lines.join('\n');
     const pen = this.words.getContext('2d');
     [pen.fillStyle, pen.font, pen.textAlign, pen.textBaseline] = [FACE[0], '52px system-ui, sans-serif', 'center', 'middle'];
     pen.fillRect(0, 0, ...PANEL);
@@ -109,7 +109,7 @@ export class WornScene {
   }
 }
 
-// The mirror's frame, and a film that makes what lies behind it look a little paler.
+// The mirror's frame, and a film that makes the image behind it a little paler.
 function frame() {
   const group = new THREE.Group();
   const wood = new THREE.MeshStandardMaterial({ color: 0x3a4550, roughness: 0.6 });
