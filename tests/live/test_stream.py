@@ -11,6 +11,7 @@ import tracemalloc
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 import tiny
 import wearer
@@ -397,3 +398,61 @@ def test_a_run_or_its_folder_is_a_source(file, tmp_path):
         assert memmlp.Stream(source).network.frames == 7
     with pytest.raises(AttributeError, match="Streams"):
         _ = memmlp.Streams
+
+
+# Bad input
+
+
+def test_bad_arguments_are_rejected(file, step_files):
+    one = ([0, 0, 1.6], np.eye(3))
+    for space in ("up", ["amass"]):
+        with pytest.raises(InputError, match="space="):
+            Stream(file, space=space)
+    for source in (None, 5, ""):
+        with pytest.raises(InputError, match="source="):
+            Stream(source)
+    with pytest.raises(InputError, match="rotations=euler"):
+        Stream(file, rotations="euler")
+    with pytest.raises(InputError, match="offsets: shapes"):
+        Stream(file, offsets=Offsets(np.zeros(3), np.eye(3)))
+    with pytest.raises(InputError, match="calibrate: the hands are not apart"):
+        Stream(file).calibrate(one, one, one)
+    with pytest.raises(InputError, match=r"calibrate: .*left"):
+        Stream(file).calibrate(one, None, one)
+    with pytest.raises(InputError, match="left: a quaternion of norm 2"):
+        Stream(file).step(one, ([0, 0, 0], [0, 0, 0, 2]), one)
+    with pytest.raises(InputError, match="time="):
+        Stream(file).step(one, one, one, "1.0")
+    with pytest.raises(InputError, match="position branch"):
+        Stream(step_files("rotation_only"), ik=LBFGS())
+
+
+def test_bad_files_are_refused(file, tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        Stream(tmp_path)
+    (tmp_path / "text.onnx").write_text("no network")
+    with pytest.raises(InputError, match=r"text\.onnx"):
+        Stream(tmp_path / "text.onnx")
+    graph = onnx.load(file)
+    old = [prop for prop in graph.metadata_props if prop.key != "rest"]
+    del graph.metadata_props[:]
+    graph.metadata_props.extend(old)
+    onnx.save(graph, tmp_path / "old.onnx")
+    with pytest.raises(InputError, match="rest; export it again"):
+        Stream(tmp_path / "old.onnx")
+    del graph.metadata_props[:]
+    onnx.save(graph, tmp_path / "foreign.onnx")
+    with pytest.raises(InputError, match=r"foreign\.onnx"):
+        Stream(tmp_path / "foreign.onnx")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("rest", "[1]"), ("rest", "{"), ("joints", "3"), ("fps", "0"), ("fps", "x"), ("T", "1.5")],
+)
+def test_damaged_metadata_are_refused(key, value, file, tmp_path):
+    graph = onnx.load(file)
+    onnx.helper.set_model_props(graph, {p.key: p.value for p in graph.metadata_props} | {key: value})
+    onnx.save(graph, tmp_path / "damaged.onnx")
+    with pytest.raises(InputError, match="damaged"):
+        Stream(tmp_path / "damaged.onnx")

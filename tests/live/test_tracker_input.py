@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,10 +11,12 @@ import numpy as np
 import pytest
 
 import memmlp
+from memmlp.common.errors import InputError
 from memmlp.live.rotations import matrix_to_quaternion
-from memmlp.live.tracker_input import JUMPS, STILL, OddSamples
+from memmlp.live.tracker_input import JUMPS, STILL, OddSamples, check_time, read_trackers
 from memmlp.live.tracker_resampling import UPRIGHT
 
+ONE = ([0, 0, 1.6], np.eye(3))
 STANDING = np.array([[0, 0, 1.57], [0.7, 0, 1.4], [-0.7, 0, 1.4]])
 ALL, NO_HANDS = (False, False, False), (False, True, True)
 
@@ -108,3 +111,30 @@ def test_a_stream_warns_who_feeds_it(unit: float, second: float, kinds: list[str
     for warning, words in zip(caught, kinds, strict=True):
         assert words in str(warning.message)
         assert warning.filename == __file__
+
+
+# Malformed samples
+
+
+@pytest.mark.parametrize(
+    ("tracker", "words"),
+    [
+        (([0, 0], np.eye(3)), "left: a position of shape .2,."),
+        (([0, 0, 0], np.eye(4)), "left: a rotation of shape .4, 4."),
+        (([0, 0, 0], [0, 0, 0, 2]), "left: a quaternion of norm 2;"),
+        (([0, 0, 0], 2 * np.eye(3)), "left: the matrix is not orthonormal"),
+        (([0, 0, 0], np.diag([1, 1, -1])), "left: the matrix is a mirror image"),
+        ("no", "left: expected .position, rotation."),
+        (([0, 0, 0],), "left: expected .position, rotation."),
+    ],
+)
+def test_bad_trackers_are_rejected(tracker, words):
+    with pytest.raises(InputError, match=words):
+        read_trackers((ONE, tracker, ONE))
+
+
+@pytest.mark.parametrize("time", [float("nan"), 1e20, -math.inf, "1.0", [1]])
+def test_bad_times_are_rejected(time):
+    check_time(None), check_time(5), check_time(np.float32(1.5))
+    with pytest.raises(InputError, match="time="):
+        check_time(time)

@@ -19,6 +19,7 @@ from memmlp.live.tracker_resampling import t_pose
 from memmlp.live.wearer import (
     Calibration,
     Offsets,
+    check_offsets,
     make_wearer,
     read_calibration,
     save_calibration,
@@ -204,3 +205,13 @@ def test_what_is_no_calibration_is_refused(content: str, tmp_path: Path):
 def test_a_folder_that_does_not_exist_is_one_line(tmp_path: Path):
     with pytest.raises(InputError, match="cannot be written"):
         save_calibration(tmp_path / "none" / "me.json", WORN, BODY)
+
+
+@pytest.mark.parametrize(
+    "offsets",
+    [5, (1, 2, 3), Offsets(np.zeros(3), np.eye(3)), Offsets(np.full((3, 3), np.nan), TURNS),
+     Offsets(np.zeros((3, 3)), 2 * TURNS), Offsets(np.zeros((3, 3)), -TURNS)],
+)  # fmt: skip
+def test_bad_offsets_are_rejected(offsets):
+    with pytest.raises(InputError, match="offsets"):
+        check_offsets(offsets)

@@ -51,7 +51,7 @@ def read_motion(path: Path) -> Motion:
             )
         if saved["rotations"].ndim != 4:
             sys.exit(
-                f"{path}: rotations as quaternions; allowed are matrices (memmlp export without --rotations)"
+                f"{path}: rotations are quaternions; expected matrices (memmlp export without --rotations)"
             )
         local = UPRIGHT @ saved["rotations"].astype(float) @ UPRIGHT.T
         local[:, 0] = saved["rotations"][:, 0] @ UPRIGHT.T
@@ -151,7 +151,7 @@ def main() -> None:
     words = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
     asked = parser().parse_args(words)
     if asked.out.suffix not in SUFFIXES:
-        sys.exit(f"--out {asked.out}: allowed are {', '.join(SUFFIXES)}")
+        sys.exit(f"--out {asked.out}: must end in {', '.join(SUFFIXES)}")
     motion = read_motion(asked.motion)
     import bpy
 

@@ -1,11 +1,11 @@
-"""A whole body from head and hands, with NumPy and ONNX Runtime alone.
+"""A whole body from head and hands, with only NumPy and ONNX Runtime.
 
     python full_body.py body.onnx trackers.csv > joints.csv
     python full_body.py body.onnx trackers.csv --save motion.npz
 
-`body.onnx` is what `memmlp export RUN --scope full --space SPACE --out body.onnx` writes. `trackers.csv` has
-a header and one row for each frame at 60 Hz: x, y, z in metres and a quaternion qx, qy, qz, qw of head, left
-and right wrist, in SPACE. What comes out are the 22 joints of each frame, metres, in SPACE.
+`memmlp export RUN --scope full --space SPACE --out body.onnx` writes `body.onnx`. `trackers.csv` has a header
+and one row for each frame at 60 Hz: x, y, z in metres and a quaternion qx, qy, qz, qw of head, left and right
+wrist, in SPACE. The output is the 22 joints of each frame, metres, in SPACE.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ class FullBody:
     Attributes:
         joints, parents: names of the joints and indices of their parents, -1 for the root.
         rest: the T-pose (22, 3), metres, in SMPL's axes (Y up, facing +Z, left is +X), whatever the space.
-        space, fps: the frame of reference of what goes in and comes out; frames per second.
+        space, fps: the frame of reference of inputs and outputs; frames per second.
     """
 
     def __init__(self, path: Path):
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = 1  # quicker than more for so small a network
+        options.intra_op_num_threads = 1  # faster than more threads for a small network
         self.session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
         about = self.session.get_modelmeta().custom_metadata_map
         if about.get("scope") != "full":
@@ -49,10 +49,10 @@ class FullBody:
         self.state = {i.name: np.zeros(i.shape, np.float32) for i in inputs if i.name.startswith(STATE)}
 
     def step(self, positions: np.ndarray, rotations: np.ndarray) -> dict[str, np.ndarray]:
-        """Take in one frame of head, left and right: positions (3, 3), metres, and matrices (3, 3, 3).
+        """Take one frame of head, left and right: positions (3, 3), metres, and matrices (3, 3, 3).
 
         Returns rotations (22, 3, 3), each relative to its parent's and the root's global, or quaternions
-        (22, 4) of a file that was exported so; positions (22, 3), metres, by forward kinematics; joints
+        (22, 4) if the file was exported with them; positions (22, 3), metres, by forward kinematics; joints
         (22, 3), metres, the network's own guess of the positions.
         """
         trackers = {"tracker_positions": positions[None], "tracker_rotations": rotations[None]}
@@ -76,11 +76,11 @@ def matrices(quaternions: np.ndarray) -> np.ndarray:
 def read_trackers(path: Path) -> np.ndarray:
     """Read trackers (N, 3, 7): head, left, right; x y z, qx qy qz qw.
 
-    A frame with a lost tracker is refused: NaN would stay in the network's memory for ever.
+    A frame with a lost tracker is rejected: NaN would stay in the network's memory forever.
     """
     rows = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
     if rows.shape[1] != 21:
-        sys.exit(f"{path}: rows of {rows.shape[1]} numbers; allowed are 21")
+        sys.exit(f"{path}: rows of {rows.shape[1]} numbers; expected 21")
     trackers = rows.reshape(-1, 3, 7)
     wrong = ~(np.abs(np.linalg.norm(trackers[..., 3:], axis=-1) - 1) < 1e-2) | ~np.isfinite(trackers).all(-1)
     if wrong.any():

@@ -13,8 +13,8 @@ namespace Memmlp
     {
         const double FrameTime = 1.0 / 60; // seconds; the network was trained at this rate
         const double Early = 5e-4; // seconds that a frame may be ahead of its sample
-        const double Gap = 0.5; // seconds without a sample after which everything begins anew
-        const float Far = 0.25f; // metres from a T-pose's joint, beyond which a device is not worn there
+        const double Gap = 0.5; // seconds without a sample after which everything restarts
+        const float Far = 0.25f; // metres; a device farther from a T-pose's joint is not attached there
         const float Recovery = 0.2f; // seconds over which a lost tracker comes back, as a jump looks like a blow
 
         static readonly XRNode[] Nodes = { XRNode.Head, XRNode.LeftHand, XRNode.RightHand };

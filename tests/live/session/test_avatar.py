@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from wearer import body_frame
 from memmlp.common.errors import InputError
 from memmlp.live.rotations import BodyTree
 from memmlp.live.session.loop import UNIT, avatar_message, make_greeting, to_millimetres
-from memmlp.live.session.page_server import FILES, Hub, LiveServer, avatar_files, mannequin_vrm, read_vrm
+from memmlp.live.session.page_server import FILES, Hub, LiveServer, avatar_files, mannequin_vrm
 from memmlp.live.session.sources import ClipSource, TrackedClip
 from memmlp.live.stream import BodyFrame
 from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
@@ -166,22 +165,6 @@ def test_the_rotations_of_a_message_are_those_of_vrm_s_t_pose():
     found = np.array(avatar_message(person)["turns"]).reshape(22, 4)
     np.testing.assert_array_equal(np.abs(found), np.tile([0, 0, 0, UNIT], (22, 1)))
     assert to_millimetres(np.array([[1.0, 2, 3]])) == [1000, 3000, -2000]
-
-
-def test_files_that_are_no_avatar_are_refused(own: bytes, tmp_path: Path):
-    (tmp_path / "own.vrm").write_bytes(own)
-    assert read_vrm(tmp_path / "own.vrm") == own
-    plain = edited(own, lambda content: content.pop("extensions"))
-    for name, content, told in (
-        ("text", b"nothing", "text"),
-        ("short", b"glTF", "short"),
-        ("cut", own[:100], "cut"),
-        ("plain", plain, "plain"),
-        ("list", struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"[]", "list"),
-    ):
-        (tmp_path / name).write_bytes(content)
-        with pytest.raises(InputError, match=told):
-            read_vrm(tmp_path / name)
 
 
 def test_without_an_avatar_the_page_has_nothing_of_npm():

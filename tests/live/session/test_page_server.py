@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import http.client
 import json
+import struct
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from processes import PATIENCE
@@ -13,8 +15,9 @@ from processes import PATIENCE
 from memmlp.common.errors import InputError
 from memmlp.live.session import page_server as module
 from memmlp.live.session.loop import make_greeting
-from memmlp.live.session.page_server import FILES, Hub, LiveServer
+from memmlp.live.session.page_server import FILES, Hub, LiveServer, mannequin_vrm, read_vrm
 from memmlp.live.session.sources import ClipSource, TrackedClip
+from memmlp.motion.body import builtin_rest_joints
 
 
 @pytest.fixture
@@ -198,3 +201,23 @@ def test_the_end_leaves_the_port_and_no_thread(clip: TrackedClip):
     with LiveServer(Hub({}), port):
         pass
     assert threading.active_count() <= before + 1  # the watcher's own thread may still be ending
+
+
+def vrm(content: object) -> bytes:
+    """A binary glTF file with this JSON."""
+    text = json.dumps(content).encode()
+    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON") + text
+
+
+def test_files_without_an_avatar_are_rejected(tmp_path: Path):
+    mannequin = mannequin_vrm(builtin_rest_joints())
+    for name, content in (("own", mannequin), ("old", vrm({"extensions": {"VRM": {}}}))):
+        (tmp_path / name).write_bytes(content)
+        assert read_vrm(tmp_path / name) == content
+    others = {"text": b"nothing", "short": b"glTF", "cut": mannequin[:100], "plain": vrm({}), "list": vrm([])}
+    for name, content in others.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=name):
+            read_vrm(tmp_path / name)
+    with pytest.raises(InputError, match="missing"):
+        read_vrm(tmp_path / "missing")

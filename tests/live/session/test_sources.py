@@ -1,30 +1,145 @@
-"""Clips in real time, by a clock of the tests' own, and packets from a port."""
+"""Packets, whatever else arrives at the port, and clips in real time, by a clock of the tests' own."""
 
 from __future__ import annotations
 
+import contextlib
+import json
+import math
 import socket
+import sys
 import threading
 from ipaddress import IPv4Network
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 from processes import PATIENCE
 
 from memmlp.common.errors import InputError
+from memmlp.common.progress import announce_to
 from memmlp.live.rotations import quaternion_to_matrix
 from memmlp.live.session.sources import (
     HOST,
     PAUSE,
     ClipSource,
+    Packet,
     PacketSource,
     TrackedClip,
     from_json,
     from_osc,
+    npz_frames,
+    require_osc,
     send,
     to_json,
     to_osc,
 )
 from memmlp.live.spaces import SPACES
+from memmlp.motion.body import builtin_rest_joints
+from memmlp.motion.clip import Clip
+from memmlp.motion.formats.npz import write_clip
+
+KINDS = {"json": (to_json, from_json), "osc": (to_osc, from_osc)}
+POSE = (np.array([0.5, -1.25, 1.75]), np.array([0.5, 0.5, -0.5, 0.5]))
+WHOLE = Packet((POSE, None, POSE), 12.25, 735)
+
+kinds = pytest.mark.parametrize("kind", KINDS)
+
+
+@kinds
+@pytest.mark.parametrize("packet", [WHOLE, Packet((POSE, POSE, POSE)), Packet((None, POSE, None), 3.0)])
+def test_there_and_back(kind: str, packet: Packet):
+    there, back = KINDS[kind]
+    again = back(there(packet))
+    assert (again.time, again.seq) == (packet.time, packet.seq)
+    for a, b in zip(again.trackers, packet.trackers, strict=True):
+        assert (a is None) == (b is None)
+        if a is not None and b is not None:
+            assert np.allclose(np.concatenate(a), np.concatenate(b), atol=1e-6)
+
+
+def test_the_documented_json():
+    text = b'{"time": 12.25, "head": [0, 1.6, 0, 0, 0, 0, 1], "left": null}'
+    packet = from_json(text)
+    assert packet.time == 12.25
+    assert packet.trackers[0][0].tolist() == [0, 1.6, 0]
+    assert packet.trackers[0][1].tolist() == [0, 0, 0, 1]
+    assert packet.trackers[1:] == (None, None)
+
+
+def test_the_documented_osc():
+    data = to_osc(Packet((POSE, None, None), 2.5, 7))
+    assert data.startswith(b"#bundle\0")
+    for part in (b"/memmlp/head\0", b",fffffff\0", b"/memmlp/time\0", b",d\0", b"/memmlp/seq\0", b",i\0"):
+        assert part in data
+    assert b"left" not in data
+
+
+HEAD = [0, 0, 0, 0, 0, 0, 1]
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {},
+        {"time": 1.0},
+        {"head": 5},
+        {"head": "0000001"},
+        {"head": HEAD[:6]},
+        {"head": [*HEAD[:6], "1"]},
+        {"head": [*HEAD[:6], True]},
+        {"head": [math.nan, *HEAD[1:]]},
+        {"head": [math.inf, *HEAD[1:]]},
+        {"head": [1e7, *HEAD[1:]]},
+        {"head": [10**400, *HEAD[1:]]},
+        {"head": [0] * 7},
+        {"head": [0, 0, 0, 0, 0, 0, 2]},
+        {"head": HEAD, "time": "now"},
+        {"head": HEAD, "time": math.inf},
+        {"head": HEAD, "time": True},
+        {"head": HEAD, "seq": 1.5},
+        [HEAD],
+        None,
+    ],
+)
+def test_what_is_no_packet(fields):
+    with pytest.raises(ValueError, match=r"."):
+        from_json(json.dumps(fields).encode())
+
+
+@given(st.binary(max_size=200))
+@example(b"[" * 60_000)
+@example(b"\xff")
+@example(b"#bundle\0" + b"\0" * 8 + b"\xff\xff\xff\xff")
+def test_any_bytes_are_a_packet_or_refused(data: bytes):
+    for _, back in KINDS.values():
+        with contextlib.suppress(ValueError):
+            assert isinstance(back(data), Packet)
+
+
+@kinds
+@given(place=st.integers(0, 10**6), byte=st.integers(0, 255), cut=st.booleans())
+def test_damaged_packets_are_a_packet_or_refused(kind: str, place: int, byte: int, cut: bool):
+    there, back = KINDS[kind]
+    data = bytearray(there(WHOLE))
+    place %= len(data)
+    data[place] = byte
+    try:
+        packet = back(bytes(data[:place] if cut else data))
+    except ValueError:
+        return
+    for tracker in packet.trackers:
+        assert tracker is None or np.isfinite(np.concatenate(tracker)).all()
+
+
+def test_without_python_osc_a_line_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pythonosc", None)
+    with pytest.raises(InputError, match=r"pip install 'memmlp\[osc\]'"):
+        require_osc()
+
+
+# Sources
 
 PACKETS = {"udp": (to_json, from_json), "osc": (to_osc, from_osc)}
 
@@ -234,3 +349,16 @@ def test_a_sender_knows_whether_anybody_listens(clip: TrackedClip, heard: bool):
             listener.close()
         sent, refused = send(played, port, lambda packet: b"{}", SPACES["amass"])
     assert (sent, refused) == (played.count, not heard)
+
+
+def test_an_unusual_file_is_reported_and_a_short_one_rejected(tmp_path: Path):
+    """Somebody who lies throughout, or a file with another axis up."""
+    turns = 1e-3 * np.arange(5.0)[:, None, None] + np.zeros((5, 22, 3))
+    write_clip(tmp_path / "a.npz", Clip("a", turns, np.zeros((5, 3)), 60.0))
+    write_clip(tmp_path / "b.npz", Clip("b", turns[:2], np.zeros((2, 3)), 60.0))
+    said: list[str] = []
+    with announce_to(said.append):
+        assert len(npz_frames(tmp_path / "a.npz", builtin_rest_joints())) == 4
+        with pytest.raises(InputError, match=r"b\.npz: 2 frames"):
+            npz_frames(tmp_path / "b.npz", builtin_rest_joints())
+    assert said[0].startswith(f"{tmp_path / 'a.npz'}: unusual")

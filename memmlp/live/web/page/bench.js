@@ -7,6 +7,8 @@ import { median, percentile, ratio, ROUNDS } from './timing.js';
 const STEPS = [500, 1000, 2500];
 const GRAPHS = { naive: 'as published', streaming: 'stream' };
 const YARDSTICK = 'yardstick';
+const COLUMNS = [['network'], ['graph'], ['step', 'median, ms', 'n'], ['', 'p95, ms', 'n wide'], ['ratio', 'to AvatarPoser', 'n'],
+  ['whole pose', 'median, ms', 'n'], ['', 'p95, ms', 'n wide']];
 
 export function bench(page, site) {
   const view = new Bench(page, site);
@@ -19,62 +21,47 @@ export function bench(page, site) {
   };
 }
 
-// What is timed: { key, network, graph, precision, step, whole }, the graphs of the base first.
-function items(site) {
-  return [site.base, ...site.networks].flatMap(network =>
-    network.graphs.map(part => ({ key: `${network.key} ${part.graph} ${part.precision}`, network, ...part })));
-}
-
 class Bench {
   constructor(page, site) {
-    Object.assign(this, { page, site, items: items(site), results: new Map(), failures: new Map(), proxy: null, clock: 0 });
+    Object.assign(this, { page, site, results: new Map(), failures: new Map(), proxy: null, clock: 0 });
+    // What is timed: { key, network, graph, precision, step, whole }, the graphs of the base first.
+    this.items = [site.base, ...site.networks].flatMap(network =>
+      network.graphs.map(part => ({ key: `${network.key} ${part.graph} ${part.precision}`, network, ...part })));
     this.device = h('input', { type: 'text', id: 'device', maxLength: 60, placeholder: 'such as Quest 3', autocomplete: 'off' });
     this.steps = h('select', { id: 'steps' }, STEPS.map(count => h('option', { value: count }, `${count} steps`)));
     this.gpu = h('input', { type: 'checkbox', id: 'webgpu', disabled: true });
-    this.start = h('button', { type: 'button', class: 'primary', id: 'start', onclick: () => this.toggle() }, 'Start');
+    this.start = h('button', { type: 'button', class: 'primary', id: 'start', onclick: () => (this.proxy ? this.stop('Stopped.') : this.measure()) }, 'Start');
     this.copy = h('button', { type: 'button', id: 'copy', disabled: true, onclick: () => this.copied() }, 'Copy as Table 17 row');
     this.save = h('button', { type: 'button', id: 'save', disabled: true, onclick: () => this.saved() }, 'Save as file');
     this.note = h('p', { class: 'faint', id: 'progress' }, 'Nothing is measured yet. Keep this page in front, and the device on its charger.');
     this.bar = h('progress', { max: 1, value: 0, hidden: true });
     this.body = h('tbody');
-    replace(page, h('h1', {}, 'The time of a step here'), this.explained(), this.tools(), this.note, this.bar, this.table());
+    const head = COLUMNS.map(([name, unit, kind]) => h('th', { class: kind }, name, unit && h('small', {}, unit)));
+    replace(page,
+      h('h1', {}, 'The time of a step here'),
+      h('p', { class: 'faint' }, `One step of each network at 60 Hz on one thread, the networks in turn over ${ROUNDS} rounds. Each step is `
+        + 'awaited and its outputs are read. The ratio is to AvatarPoser as published, in this browser on the same backend. The whole pose '
+        + 'goes from trackers to joints: resampling, features, network, forward kinematics. Weights are random, which does not matter.'),
+      h('div', { class: 'tools' },
+        h('label', { class: 'field' }, h('span', {}, 'Device'), this.device),
+        h('label', { class: 'field' }, h('span', {}, 'Each network'), this.steps),
+        h('label', { class: 'tick' }, this.gpu, h('span', { id: 'gpu' }, 'WebGPU')),
+        this.start, this.copy, this.save),
+      this.note, this.bar,
+      h('div', { class: 'scroll' }, h('table', { class: 'times' }, h('thead', {}, h('tr', {}, head)), this.body)));
     this.rows();
-  }
-
-  explained() {
-    return h('p', { class: 'faint' }, `One step of each network at 60 Hz on one thread, the networks in turn over ${ROUNDS} rounds, each step `
-      + 'awaited and its outputs read. The ratio is to AvatarPoser as published, in this browser on the same backend. The whole '
-      + 'pose is the way from trackers to joints: resampling, features, network, forward kinematics. Weights are random, which does not '
-      + 'matter for the time.');
-  }
-
-  tools() {
-    return h('div', { class: 'tools' },
-      h('label', { class: 'field' }, h('span', {}, 'Device'), this.device),
-      h('label', { class: 'field' }, h('span', {}, 'Each network'), this.steps),
-      h('label', { class: 'tick' }, this.gpu, h('span', { id: 'gpu' }, 'WebGPU')),
-      this.start, this.copy, this.save);
-  }
-
-  table() {
-    const head = [['network'], ['graph'], ['step', 'median, ms', 'n'], ['', 'p95, ms', 'n wide'], ['ratio', 'to AvatarPoser', 'n'],
-      ['whole pose', 'median, ms', 'n'], ['', 'p95, ms', 'n wide']];
-    const side = head.map(([name, unit, kind]) => h('th', { class: kind }, name, unit && h('small', {}, unit)));
-    return h('div', { class: 'scroll' }, h('table', { class: 'times' }, h('thead', {}, h('tr', {}, side)), this.body));
   }
 
   // Find the device, the browser, and whether WebGPU is available.
   async describe() {
     this.about = await machine();
     if (!this.device.value) this.device.value = this.about.device;
-    const lacks = !this.site.backends.includes('webgpu') ? 'not on this site' : await noWebGPU();
-    this.gpu.disabled = lacks !== null;
-    this.gpu.checked = lacks === null;
-    document.getElementById('gpu').textContent = lacks === null ? 'WebGPU' : `WebGPU: ${lacks}`;
+    const problem = !this.site.backends.includes('webgpu') ? 'not on this site' : await noWebGPU();
+    this.gpu.disabled = problem !== null;
+    this.gpu.checked = problem === null;
+    document.getElementById('gpu').textContent = problem === null ? 'WebGPU' : `WebGPU: ${problem}`;
     document.documentElement.dataset.bench = 'ready';
   }
-
-  toggle() { return this.proxy ? this.stop('Stopped.') : this.measure(); }
 
   stop(words) {
     this.proxy?.close();
@@ -114,7 +101,7 @@ class Bench {
         plan.push({ key, ...part });
       } catch (error) {
         if (error.message === 'stopped') throw error;
-        this.failed(key, backend, error.message);
+        this.failures.set(`${key} ${backend}`, error.message);
       }
     };
     await open(YARDSTICK, this.site.yardstick, { kind: 'plain' });
@@ -126,55 +113,45 @@ class Bench {
     this.note.textContent = `${backend}: ${each * ROUNDS} steps of ${this.items.length} graphs, alone and as a whole pose`;
     const { times, clock } = await proxy.call('time', [plan, each], share => { this.bar.value = share; });
     this.clock = Math.max(clock, this.clock);
-    this.tell(times, backend, each);
+    const [base, yardstick] = [times[this.items[0].key], times[YARDSTICK]];
+    for (const { key, network, graph, precision } of this.items) {
+      const [alone, whole] = [times[key], times[`${key} whole`]];
+      if (!alone) continue;
+      this.results.set(`${key} ${backend}`, {
+        network: network.name, run: network.run, frames: network.frames, parameters: network.parameters,
+        graph, precision, backend, threads: 1, steps: each * ROUNDS,
+        median_ms: median(alone.flat()), p95_ms: percentile(alone.flat(), 95),
+        ratio_to_avatar_poser: base ? ratio(alone, base) : null,
+        ratio_to_yardstick: yardstick ? ratio(alone, yardstick) : null,
+        whole_median_ms: whole ? median(whole.flat()) : null, whole_p95_ms: whole ? percentile(whole.flat(), 95) : null,
+      });
+    }
     proxy.close();
     this.rows();
   }
 
-  tell(times, backend, each) {
-    const base = times[this.items[0].key];
-    for (const item of this.items) {
-      const alone = times[item.key];
-      if (!alone) continue;
-      const whole = times[`${item.key} whole`];
-      this.results.set(`${item.key} ${backend}`, {
-        network: item.network.name, run: item.network.run, frames: item.network.frames, parameters: item.network.parameters,
-        graph: item.graph, precision: item.precision, backend, threads: 1, steps: each * ROUNDS,
-        median_ms: median(alone.flat()), p95_ms: percentile(alone.flat(), 95),
-        ratio_to_avatar_poser: base ? ratio(alone, base) : null,
-        ratio_to_yardstick: times[YARDSTICK] ? ratio(alone, times[YARDSTICK]) : null,
-        whole_median_ms: whole ? median(whole.flat()) : null, whole_p95_ms: whole ? percentile(whole.flat(), 95) : null,
-      });
-    }
-  }
-
-  failed(key, backend, reason) {
-    this.results.delete(`${key} ${backend}`);
-    this.failures.set(`${key} ${backend}`, reason);
-  }
-
   rows() {
-    const backends = ['wasm', ...(this.failures.size || [...this.results.keys()].some(key => key.endsWith('webgpu')) ? ['webgpu'] : [])];
+    const gpu = this.failures.size || [...this.results.keys()].some(key => key.endsWith('webgpu'));
     const most = Math.max(...[...this.results.values()].map(row => row.ratio_to_avatar_poser ?? 0), 1);
-    const lines = [this.site.base, ...this.site.networks].flatMap(network =>
-      this.items.filter(item => item.network === network).flatMap(item => backends.map(backend => this.row(item, backend, most))));
-    replace(this.body, lines);
+    replace(this.body, this.items.flatMap(item => (gpu ? ['wasm', 'webgpu'] : ['wasm']).map(backend => this.row(item, backend, most))));
   }
 
-  row(item, backend, most) {
-    const found = this.results.get(`${item.key} ${backend}`);
-    const reason = this.failures.get(`${item.key} ${backend}`);
-    const number = (value, kind = 'n') => h('td', { class: kind }, value === null || value === undefined ? '–' : value.toFixed(2));
-    const graph = h('td', {}, `${GRAPHS[item.graph]}, ${item.precision}, ${backend}`);
-    const name = h('th', { scope: 'row' }, item.network.name, h('small', {}, size(item.network)));
-    if (reason) return h('tr', {}, name, graph, h('td', { colSpan: 5, class: 'faint' }, reason));
-    const share = `${(100 * (found?.ratio_to_avatar_poser ?? 0)) / most}%`;
-    return h('tr', {}, name, graph, number(found?.median_ms), number(found?.p95_ms, 'n wide'),
-      h('td', { class: 'n' }, found?.ratio_to_avatar_poser?.toFixed(2) ?? '–', h('span', { class: 'share' }, h('i', { style: `width: ${found ? share : 0}` }))),
+  row({ key, network, graph, precision }, backend, most) {
+    const found = this.results.get(`${key} ${backend}`);
+    const reason = this.failures.get(`${key} ${backend}`);
+    const number = (value, kind = 'n') => h('td', { class: kind }, value?.toFixed(2) ?? '–');
+    const start = [
+      h('th', { scope: 'row' }, network.name, h('small', {}, `${(network.parameters / 1e6).toFixed(2)} M`)),
+      h('td', {}, `${GRAPHS[graph]}, ${precision}, ${backend}`),
+    ];
+    if (reason) return h('tr', {}, start, h('td', { colSpan: 5, class: 'faint' }, reason));
+    const share = h('i', { style: `width: ${(100 * (found?.ratio_to_avatar_poser ?? 0)) / most}%` });
+    return h('tr', {}, start, number(found?.median_ms), number(found?.p95_ms, 'n wide'),
+      h('td', { class: 'n' }, found?.ratio_to_avatar_poser?.toFixed(2) ?? '–', h('span', { class: 'share' }, share)),
       number(found?.whole_median_ms), number(found?.whole_p95_ms, 'n wide'));
   }
 
-  // The measurement as `memmlp table 17 --add` takes it.
+  // The measurement as a file for `memmlp table 17 --add`.
   file() {
     const { browser, agent } = this.about;
     return JSON.stringify({
@@ -195,26 +172,23 @@ class Bench {
   }
 
   saved() {
-    const link = h('a', { href: `data:application/json,${encodeURIComponent(this.file())}`, download: 'table17.json' });
-    link.click();
+    h('a', { href: `data:application/json,${encodeURIComponent(this.file())}`, download: 'table17.json' }).click();
     this.note.textContent = 'Show it with memmlp table 17 --add table17.json.';
   }
 }
 
-const size = network => `${(network.parameters / 1e6).toFixed(2)} M`;
-
 // Device and browser, as far as the browser reports them.
 async function machine() {
   const agent = navigator.userAgent;
-  const known = await navigator.userAgentData?.getHighEntropyValues?.(['model', 'platform', 'platformVersion', 'fullVersionList']).catch(() => null);
+  const known = await navigator.userAgentData?.getHighEntropyValues?.(['model', 'platform', 'fullVersionList']).catch(() => null);
   const quest = /Quest ?(\d\w*|Pro)/.exec(agent)?.[0];
   const brands = known?.fullVersionList?.filter(({ brand }) => !/not.?a.?brand/i.test(brand)) ?? [];
   const brand = brands.find(({ brand }) => brand !== 'Chromium') ?? brands[0];
-  const named = /(OculusBrowser|Firefox|Edg|Chrome|Version)\/([\d.]+)/.exec(agent);
+  const [, name, version] = /(OculusBrowser|Firefox|Edg|Chrome|Version)\/([\d.]+)/.exec(agent) ?? [];
   return {
     agent,
     device: quest || known?.model || known?.platform || navigator.platform || '',
-    browser: brand ? `${brand.brand} ${brand.version}` : named ? `${named[1] === 'Version' ? 'Safari' : named[1]} ${named[2]}` : 'unknown browser',
+    browser: brand ? `${brand.brand} ${brand.version}` : name ? `${name === 'Version' ? 'Safari' : name} ${version}` : 'unknown browser',
   };
 }
 
