@@ -10,14 +10,13 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import onnx
-import onnxruntime
 import torch
 import torch.nn.functional as F
 from onnx import TensorProto, helper
 from torch import Tensor
 
 from memmlp.common.processes import CoreClock
-from memmlp.deploy.onnx_stream import OnnxStream
+from memmlp.deploy.onnx_stream import OnnxStream, start_session
 from memmlp.motion.body import MOTION_DIM, N_JOINTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Change, Normalizer
 from memmlp.networks.flop_counter import counting_flops
@@ -50,7 +49,7 @@ def measure_step(path: Path, steps: int = 200) -> dict[str, Any]:
     machines. At least 200 steps are timed, however few are asked for. `core_share` is the share of that time
     in which the thread had a core: if it is far less than 1, these times include waiting for other processes.
     """
-    stream, yardstick = OnnxStream(path), yardstick_session()
+    stream, reference = OnnxStream(path), start_session(yardstick().SerializeToString())
     sparse = np.zeros((1, SPARSE_DIM), np.float32)
     rows = {"input": np.ones(YARDSTICK_SHAPE[:2], np.float32)}
     ours, theirs = [], []
@@ -60,7 +59,7 @@ def measure_step(path: Path, steps: int = 200) -> dict[str, Any]:
         start = time.perf_counter()
         stream.step(sparse)
         middle = time.perf_counter()
-        yardstick.run(None, rows)
+        reference.run(None, rows)
         if step >= WARM_UP:
             ours.append(middle - start)
             theirs.append(time.perf_counter() - middle)
@@ -149,15 +148,6 @@ def macs(model: MotionModel | StreamingGraph) -> int:
     with counting_flops() as counter:
         model.advance(torch.zeros(1, 1, SPARSE_DIM), model.initial_state(1), 1)
     return counter.get_total_flops() // 2
-
-
-def yardstick_session() -> onnxruntime.InferenceSession:
-    """Open the yardstick, a fixed computation that compares machines, on one thread."""
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    return onnxruntime.InferenceSession(
-        yardstick().SerializeToString(), options, providers=["CPUExecutionProvider"]
-    )
 
 
 def yardstick() -> onnx.ModelProto:

@@ -99,6 +99,19 @@ def check_file(path: Path) -> None:
         )
 
 
+def start_session(model: str | bytes, severity: int = 2) -> onnxruntime.InferenceSession:
+    """Start a session of ONNX Runtime on one thread.
+
+    Args:
+        model: an ONNX file's path or content.
+        severity: the least severity of messages that it prints: 2 for warnings, 4 for fatal errors.
+    """
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = severity
+    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+
+
 def open_session(path: Path) -> onnxruntime.InferenceSession:
     """Open an ONNX file in ONNX Runtime on one thread.
 
@@ -106,10 +119,8 @@ def open_session(path: Path) -> onnxruntime.InferenceSession:
         InputError: if there is no such file, or ONNX Runtime cannot run it.
     """
     check_file(path)
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
     try:
-        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        return start_session(str(path))
     except Exception as error:  # ONNX Runtime's own exceptions have no common base class
         reason = " ".join(str(error).split())[:120]
         raise InputError(f"{path}: is not an ONNX file that runs here ({reason})") from error

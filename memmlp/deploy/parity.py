@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from memmlp.common.progress import progress_bar
-from memmlp.deploy.onnx_stream import NEXT, Arrays, OnnxStream
+from memmlp.deploy.onnx_stream import NEXT, Arrays, OnnxStream, start_session
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.geometry import one_thread
 from memmlp.networks.motion_model import MotionModel
@@ -148,7 +148,6 @@ def in_float64(path: Path, inputs: Mapping[str, np.ndarray]) -> Arrays:
         The outputs by name, each (N, ...), without states.
     """
     import onnx
-    import onnxruntime
     from onnx import TensorProto, helper, numpy_helper
     from onnx.reference import ReferenceEvaluator
 
@@ -172,15 +171,9 @@ def in_float64(path: Path, inputs: Mapping[str, np.ndarray]) -> Arrays:
     shapes = {i.name: [d.dim_value for d in i.type.tensor_type.shape.dim] for i in graph.input}
     names = [output.name for output in graph.output]
     given = {name: np.zeros(shape) for name, shape in shapes.items()}
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = FATAL
     run: Callable[[Arrays], Any]
     try:
-        session = onnxruntime.InferenceSession(
-            model.SerializeToString(), options, providers=["CPUExecutionProvider"]
-        )
-        run = partial(session.run, None)
+        run = partial(start_session(model.SerializeToString(), FATAL).run, None)
         run(given)
     except Exception:  # it lacks an operator in float64; its exceptions have no common base class
         run = partial(ReferenceEvaluator(model).run, None)  # slower by an order of magnitude
