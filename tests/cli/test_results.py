@@ -145,14 +145,6 @@ def test_results_of_a_file_elsewhere_keep_its_path(memmlp: Memmlp, planned: None
     assert memmlp("results", "docs").code == 0
 
 
-def test_a_file_of_ones_own_is_not_the_shipped_one(memmlp: Memmlp, planned: None):
-    """Though it has its name."""
-    Path("table14.yaml").write_text("variants: {a: [b=1], c: [b=2]}\nseeds: [0, 1]\ntitle: mine\n")
-    memmlp("results", "save", "table14.yaml")
-    assert memmlp("results", "docs").code == 0
-    assert "mine" in Path("docs/results/table14.md").read_text()
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

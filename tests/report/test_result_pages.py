@@ -16,13 +16,12 @@ from report.conftest import GROUPS
 
 from memmlp.cli.results import make_tables
 from memmlp.common.errors import InputError
-from memmlp.report.kept_results import Kept, dumps, overrides_of
-from memmlp.report.result_pages import KeptTable, Placeholders, _reverse, describe_origin, make_pages
+from memmlp.report.kept_results import Kept, overrides_of
+from memmlp.report.result_pages import KeptTable, Placeholders, describe_origin, make_pages
 from memmlp.sweep.definition import Sweep
 from memmlp.tables.build_table import make_table, together
-from memmlp.tables.statistics import Verdict, holm
+from memmlp.tables.statistics import Verdict
 from memmlp.tables.statistics.paired_differences import error
-from memmlp.tables.table import Cell, Effect
 from memmlp.tables.table_text import MINUS
 
 ROOT = Path(__file__).parent.parent.parent
@@ -183,7 +182,7 @@ def by_hand(
     return float(differences.mean() - half), float(differences.mean() + half)
 
 
-def test_the_way_from_the_first_arm_to_the_last_is_the_sum_of_its_steps(sweep: Sweep, tmp_path: Path):
+def test_the_way_from_the_first_variant_to_the_last_is_the_sum_of_its_steps(sweep: Sweep, tmp_path: Path):
     """Errors grow from arm to arm of a chain; a share is shown where the interval leaves 0 out."""
     labels = [arm.label for arm in sweep.variants]
     against = {labels[0]: labels[1], labels[1]: labels[2], labels[2]: labels[0]}  # the control, two before it
@@ -204,19 +203,3 @@ def test_the_way_from_the_first_arm_to_the_last_is_the_sum_of_its_steps(sweep: S
     assert parts[2][1].split("; paper ")[0] == str(words.verdict("t", labels[2], "stream", "MPJPE"))
     plain = Placeholders({"t": source(sweep, Kept("table14", (), runs_of(sweep, find), overrides_of(sweep)))})
     assert plain.steps("t") == ""
-
-
-def test_a_way_below_a_tenth_has_two_digits():
-    cell = Cell({0: 0.0034, 1: 0.0036}, effect=Effect(0.0012, verdict=Verdict.HIGHER))
-    assert _reverse(cell) == f"{MINUS}0.0012, lower"
-
-
-def test_by_hand_is_what_a_page_has(sweep: Sweep, kept: Kept):
-    """What the test of the committed pages computes is checked on results made here, too."""
-    content, table = json.loads(dumps(kept)), source(sweep, kept).table
-    row = table.rows[0]
-    effect = row.cells["stream"]["MPJPE"].effect
-    assert by_hand(content, row, table, "stream", "MPJPE") == pytest.approx(
-        (effect.low, effect.high), abs=1e-4
-    )
-    assert holm(np.array([effect.p]))[0] <= effect.holm

@@ -8,9 +8,8 @@ import tiny
 
 from memmlp.evaluation.modes import joint_positions
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.motion.limb_shapes import HEAT, LIMBS, ends
 from memmlp.report.pictures.clip_piece import ClipPiece
-from memmlp.report.pictures.raster import Camera, draw, heat, scale
+from memmlp.report.pictures.raster import Camera, draw, scale
 
 TRUTH = joint_positions(tiny.clip(31)[:, SPARSE_DIM:]).numpy().astype(np.float64)
 
@@ -69,24 +68,9 @@ def test_the_nearer_body_part_is_seen(camera: Camera):
     assert seen[1].argmax() == 2
 
 
-def test_heat_goes_through_its_colours():
-    shown = (255 * heat(np.linspace(0, 1, len(HEAT)))).round().astype(int)
-    assert ["#" + "".join(f"{value:02x}" for value in row) for row in shown] == list(HEAT)
-    assert np.array_equal(heat(np.array([7.0])), heat(np.array([1.0])))
-
-
 def test_the_scale_is_round_and_leaves_few_above():
     errors = np.random.default_rng(0).gamma(2, 4, 5000)
     assert scale(errors) == 25 or scale(errors) == 30
     assert (errors > scale(errors)).mean() <= 0.02
     assert scale(np.zeros(3)) == 10
     assert scale(np.full(3, 1e6)) == 100
-
-
-def test_tips_go_on_from_their_joint():
-    tips = [limb for limb in LIMBS if limb.tip]
-    assert len(tips) == 3
-    for limb in tips:
-        start, end = ends(limb, TRUTH[0])
-        assert np.array_equal(start, TRUTH[0, limb.end])
-        assert np.linalg.norm(end - start) == pytest.approx(limb.tip)

@@ -25,7 +25,7 @@ def js(code: str) -> Any:
     return json.loads(ran.stdout)
 
 
-def test_errors_that_are_no_numbers_come_first_and_are_shown():
+def test_nan_errors_come_first_and_are_shown():
     order = "[3, 'nan', undefined, 9, null, 1].sort((a, b) => f.largestFirst(a, b))"
     assert js(f"{order}.map(String)") == ["nan", "null", "9", "3", "1", "undefined"]
     assert js("[f.metricNumber('MPJPE', 'nan'), f.metricNumber('MPJPE', 3)]") == ["nan", "3.00"]

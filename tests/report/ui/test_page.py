@@ -154,7 +154,7 @@ def scored(run: Run, **values: float) -> None:
         path.write_text(json.dumps(report))
 
 
-def test_units_and_directions_of_metrics_of_ones_own(
+def test_units_and_directions_of_custom_metrics(
     browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Those of a package in use; of another metric nobody knows what is better."""
@@ -229,7 +229,7 @@ def test_news_are_shown_without_a_touch(browser: Browser, server: RunsServer, ho
     browser.wait(f"{data}?.includes('ends at 2.5')")
 
 
-def test_data_is_never_markup_and_damage_is_told(browser: Browser, server: RunsServer):
+def test_data_is_never_markup_and_damage_is_shown(browser: Browser, server: RunsServer):
     for route in ("runs?kind=all", f"run/{'e' * 16}", f"compare?runs={'e' * 16},abcdef0123456789"):
         go(browser, server.url, route, "document.body.textContent.includes('<img src=x')")
         assert browser.value("document.querySelectorAll('main img').length") == 0

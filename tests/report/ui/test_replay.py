@@ -52,7 +52,7 @@ def test_a_piece_is_around_the_worst_second_in_the_page_s_axes():
     assert cut_piece(made["true_positions"], made["predicted_positions"], 12.0)["from"] == 300
 
 
-def test_motion_that_is_no_number_is_said():
+def test_a_prediction_with_nan_fails():
     made = motion()
     made["predicted_positions"][120:] = np.nan
     found = cut_piece(made["true_positions"], made["predicted_positions"])
@@ -97,7 +97,7 @@ def test_a_prediction_is_computed_once_and_kept_for_these_weights(outputs: Path)
     assert len(asked) == 3
 
 
-def test_a_prediction_of_an_older_recipe_is_computed_anew(outputs: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_prediction_of_an_older_recipe_is_computed_again(outputs: Path, monkeypatch: pytest.MonkeyPatch):
     run, found = run_of(outputs), []
     for at in (300, 100):
         found.append(ready(Replays(outputs, lambda *_, at=at: motion(at)), run.id, "a clip", "stream"))
@@ -105,7 +105,7 @@ def test_a_prediction_of_an_older_recipe_is_computed_anew(outputs: Path, monkeyp
     assert [one["worst"][0]["first"] for one in found] == [300, 100]
 
 
-def test_a_damaged_file_is_computed_anew(outputs: Path):
+def test_a_damaged_file_is_computed_again(outputs: Path):
     run = run_of(outputs)
     replays = Replays(outputs, lambda *_: motion())
     ready(replays, run.id, "a clip", "stream")

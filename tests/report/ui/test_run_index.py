@@ -52,7 +52,7 @@ def test_times_of_a_run_are_those_of_the_file_that_was_asked_for(outputs: Path):
         (".holder", b'{"pid": "no number", "host": 3}', None),
     ],
 )
-def test_damage_is_told_and_raises_nothing(outputs: Path, name: str, content: bytes, damaged: str | None):
+def test_damage_is_listed_and_raises_nothing(outputs: Path, name: str, content: bytes, damaged: str | None):
     run = run_of(outputs)
     (run.folder / name).write_bytes(content)
     index = RunIndex(outputs)
@@ -113,16 +113,7 @@ def test_a_trained_run_whose_deployment_failed_is_not_done(outputs: Path):
     assert index.runs[run.id]["status"] == "done"
 
 
-def test_a_trained_run_without_its_evaluation_is_not_done(outputs: Path):
-    run, index = run_of(outputs), RunIndex(outputs)
-    run.want([path.stem for path in run.evaluations.iterdir()])
-    for path in run.evaluations.iterdir():
-        path.unlink()
-    index.refresh()
-    assert (run.status, index.runs[run.id]["status"]) == ("trained", "trained")
-
-
-def test_a_run_that_is_gone_is_told(outputs: Path):
+def test_a_deleted_run_is_listed(outputs: Path):
     index = RunIndex(outputs)
     index.refresh()
     run = started_run(outputs)

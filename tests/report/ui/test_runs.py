@@ -28,7 +28,7 @@ def test_one_folder_of_data_has_many_spellings():
     assert differing_keys([of("d", **here), of("d", seed=0)]) == []
 
 
-def test_units_and_what_is_better_where_somebody_knows():
+def test_units_and_what_is_better_of_known_metrics():
     names = ["MPJPE", "Jitter", "GT Jitter", "Score", "Odd"]
     metrics = [*(f"stream.rotation.{name}" for name in names), "window.rotation.MPJPE", "latency.median_ms"]
     with registers_kept():
@@ -44,7 +44,7 @@ def test_units_and_what_is_better_where_somebody_knows():
     assert "Score" not in describe_units(metrics)
 
 
-def test_what_an_earlier_recipe_measured_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_modes_of_an_earlier_component_version_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     run, settings = Run(tmp_path / ("a" * 16)), evaluation_settings({}, "window")
     report = {"mode": "window", "settings": settings, "recipes": evaluation_recipes(settings)}
     write_report(run.evaluation(evaluation_id_of(settings)), {**report, "mean": {}, "clips": []})
@@ -67,7 +67,7 @@ def test_what_was_appended_is_added(tmp_path: Path):
     assert position < curves.logs[run.id].position < run.metrics_path.stat().st_size
 
 
-def test_a_log_that_was_made_anew_is_read_anew(tmp_path: Path):
+def test_a_log_that_was_replaced_is_read_again(tmp_path: Path):
     run = started_run(tmp_path, step=200)
     curves = Curves(tmp_path)
     curves.read(run.id)

@@ -29,7 +29,7 @@ def test_a_pruned_trial_has_no_value(folder: Path):
     assert (second["state"], second["values"], second["reason"]) == ("pruned", [], "9 at step 10")
 
 
-def test_a_search_in_a_storage_of_ones_own_is_read_again(folder: Path, tmp_path: Path):
+def test_a_search_in_a_custom_storage_is_read_again(folder: Path, tmp_path: Path):
     """It has no journal that grows; its director touches the plan."""
     study = open_study(folder, storage=f"sqlite:///{tmp_path / 'trials.db'}", n_trials=2)
     write_json(folder / "search.json", asdict(study.search))

@@ -96,15 +96,6 @@ def test_nothing_else_is_sent(server: RunsServer, outputs: Path, path: str):
     assert answer.json.keys() == {"error"}
 
 
-def test_the_page_says_what_it_reads_before_it_has_read_it(server: RunsServer):
-    assert b"Reading the run folders" in get(server, "/").body
-
-
-def test_what_is_missing_is_named(server: RunsServer, outputs: Path):
-    assert f"nope: not found in {outputs / 'runs'};" in get(server, "/api/run/nope").json["error"]
-    assert f"none: not found in {outputs / 'sweeps'};" in get(server, "/api/sweeps/none").json["error"]
-
-
 @pytest.mark.parametrize(
     "path", ["/api/runs?since=x", "/api/replay/{id}?mode=other&clip=c", "/api/replay/{id}"]
 )
@@ -144,12 +135,6 @@ def test_a_run_s_file_is_text_without_any_right(server: RunsServer, outputs: Pat
 )
 def test_other_hosts_and_other_pages_get_nothing(server: RunsServer, headers: dict[str, str], code: int):
     assert get(server, "/api/runs", **headers).code == code
-
-
-def test_a_link_on_another_page_may_open_the_page_alone(server: RunsServer):
-    elsewhere = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate"}
-    assert get(server, "/", **elsewhere).code == 200
-    assert get(server, "/api/runs", **elsewhere).code == 403
 
 
 def test_it_starts_again_where_a_page_was_left_open(outputs: Path):

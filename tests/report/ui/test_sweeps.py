@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from fake_runs import fake_run
-from report.ui.conftest import run_of, started_run
+from report.ui.conftest import run_of
 
 from memmlp.cli.sweep import analyse
 from memmlp.report.ui.run_index import RunIndex
@@ -71,7 +71,7 @@ def test_progress_and_time_left(outputs: Path, monkeypatch: pytest.MonkeyPatch):
     assert (cell["variant"], cell["seed"], cell["step"], cell["steps"]) == ("gru", 2, 1000, 2000)
 
 
-def test_a_run_that_lacks_an_evaluation_is_trained_and_a_vqvae_is_no_arm(outputs: Path):
+def test_a_run_that_lacks_an_evaluation_is_trained_and_a_vqvae_is_a_prerequisite(outputs: Path):
     path = outputs / "sweeps" / "mine" / "plan.json"
     plan = Plan.load(path)
     upstream = fake_run(outputs, "vqvae")
@@ -92,13 +92,6 @@ def test_a_run_that_lacks_an_evaluation_is_trained_and_a_vqvae_is_no_arm(outputs
     say = state_finder(Plan.load(path))
     arm = next(arm for arm in kept_sweep(path.parent).runnable() if arm.label == first.label)
     assert say(arm, first.seed) == "trained, an evaluation or export is missing"
-
-
-def test_a_run_that_lacks_only_what_the_sweep_does_not_want_is_done(outputs: Path):
-    run_of(outputs, "gru", 2).want(["stream-0", "stream-absent"])
-    sweeps = sweeps_of(outputs)
-    assert describe(sweeps)["counts"] == {"done": 6}
-    assert sweeps.index.runs[run_of(outputs, "gru", 2).id]["status"] == "trained"
 
 
 def test_no_time_is_left_where_only_the_evaluation_is(outputs: Path):
@@ -122,7 +115,7 @@ def test_the_board_shows_the_sweep_s_first_metric_and_its_branch(outputs: Path):
     assert cell["value"] == pytest.approx(run.results["stream"]["combined"]["MPJRE"])
 
 
-def test_arms_of_one_training_have_each_the_value_of_their_own_evaluation(outputs: Path):
+def test_variants_of_one_training_have_each_the_value_of_their_own_evaluation(outputs: Path):
     """A network may be used in another way, such as with another estimate of its past."""
     run = run_of(outputs, "gru", 0)
     report = json.loads(run.evaluation("stream-0").read_text())
@@ -139,15 +132,6 @@ def test_arms_of_one_training_have_each_the_value_of_their_own_evaluation(output
     page = describe(sweeps_of(outputs))
     (cell,) = [cell for cell in page["cells"] if cell["id"] == run.id]
     assert cell["value"] == pytest.approx(own + 7.0)
-
-
-def test_a_failed_run_and_its_reason(outputs: Path):
-    run = run_of(outputs, "none", 1)
-    run.marker.unlink()
-    run.fail("the loss was no number")
-    page = describe(sweeps_of(outputs))
-    (cell,) = [cell for cell in page["cells"] if cell["state"] == "failed"]
-    assert (cell["variant"], cell["seed"], cell["failure"]) == ("none", 1, "the loss was no number")
 
 
 def test_a_sweep_without_its_file_or_plan_is_named(outputs: Path):
@@ -170,7 +154,7 @@ def test_a_sweep_with_another_control_has_another_table(outputs: Path):
     assert sweeps.refresh() != before
 
 
-def test_a_run_s_control_is_that_of_its_arm_and_not_the_first_arm(outputs: Path):
+def test_a_run_s_control_is_that_of_its_variant(outputs: Path):
     """Most of the paper's tables have a control that does not stand first."""
     folder, answers = outputs / "sweeps" / "mine", Answers(outputs)
     sweep = kept_sweep(folder)
@@ -187,7 +171,7 @@ def test_a_run_s_control_is_that_of_its_arm_and_not_the_first_arm(outputs: Path)
     assert control("none")["id"] == run_of(outputs, "gru", 1).id
 
 
-def test_a_sweep_that_is_planned_anew_has_another_table(outputs: Path):
+def test_a_sweep_that_is_planned_again_has_another_table(outputs: Path):
     """The same runs under each other's labels, as after a slip in the sweep's file was mended."""
     sweeps, path = sweeps_of(outputs), outputs / "sweeps" / "mine" / "plan.json"
     plan, other = Plan.load(path), {"none": "gru", "gru": "none"}
@@ -209,7 +193,7 @@ def looked(outputs: Path) -> Rounds:
     return analyse(sweep, outputs, new_rounds(sweep), Plan.load(folder / "plan.json"))
 
 
-def test_verdicts_of_rounds_and_their_looks_are_shown(outputs: Path):
+def test_verdicts_of_rounds_and_their_analyses_are_shown(outputs: Path):
     sweeps = sweeps_of(outputs)
     assert describe(sweeps)["rounds"] is None
     before = sweeps.refresh()
@@ -247,12 +231,7 @@ def test_rounds_of_something_else_are_flagged(outputs: Path, change: dict, flag:
     assert page["table"]["rows"][1]["cells"]["stream"]["MPJPE"]["effect"]["decided"] is None
 
 
-def test_damaged_rounds_are_flagged(outputs: Path):
-    (outputs / "sweeps" / "mine" / "rounds.json").write_text("{}")
-    assert DAMAGED_ROUNDS in describe(sweeps_of(outputs))["table"]["flags"]
-
-
-def test_damage_is_told(outputs: Path):
+def test_damage_is_named(outputs: Path):
     bad = outputs / "sweeps" / "bad"
     bad.mkdir()
     (bad / "plan.json").write_text("{")
@@ -262,13 +241,3 @@ def test_damage_is_told(outputs: Path):
     assert any("cannot be read" in flag for flag in describe(sweeps)["table"]["flags"])
     with pytest.raises(KeyError):
         sweeps.describe("bad")
-
-
-def test_a_table_is_made_again_when_a_run_changed(outputs: Path):
-    started_run(outputs)
-    sweeps = sweeps_of(outputs)
-    first = describe(sweeps)["table"]
-    assert describe(sweeps)["table"] is first
-    run_of(outputs, "gru", 0).marker.unlink()
-    sweeps.index.refresh()
-    assert [row["found"] for row in describe(sweeps)["table"]["rows"]] == [[0, 1, 2], [1, 2]]
