@@ -38,7 +38,8 @@ def make_outputs(outputs: Path) -> Sweep:
         for seed in SEEDS:
             optim = {"steps": 2000, "batch": 1, "lr": 1e-3}  # which is little motion
             config = {"memory": {"name": variant}, "seed": seed, "optim": optim, "model": {"frames": 11}}
-            run = fake_run(outputs, variant, seed, factor, config=config, log=True)
+            name = {"name": f"memory={variant} · seed {seed}"}
+            run = fake_run(outputs, variant, seed, factor, config=config, origin=name, log=True)
             entries.append(Entry(variant, seed, run.id))
             tasks.append(RunTask(run.id, "memmlp", config))
     folder = outputs / "sweeps" / "mine"
