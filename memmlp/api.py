@@ -20,10 +20,10 @@ from memmlp.common.errors import InputError
 from memmlp.evaluation.metric_facts import UNITS
 from memmlp.live.stream import Stream
 from memmlp.live.wearer import Offsets
+from memmlp.report.tables.measured_run import load
 from memmlp.runs.evaluation_file import COMBINED
 from memmlp.runs.lookup import check_trained, find_run, is_trained, list_runs
 from memmlp.runs.run import Run
-from memmlp.tables.measured_run import load
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -107,7 +107,7 @@ LONGEST = (
     "training/test_baselines", "networks/test_streaming", "training/test_loop", "config/test_baselines",
     "live/web/test_page", "test_example_package",
     "kills/test_rounds", "config/test_compose", "cli/test_main", "live/test_stream",
-    "kills/test_sweep", "tables/test_seed_rounds", "networks/test_baselines", "deploy/test_export",
+    "kills/test_sweep", "report/tables/test_seed_rounds", "networks/test_baselines", "deploy/test_export",
     "cli/test_tune", "report/ui/test_page", "kills/test_command", "kills/test_training",
     "cli/test_train_distributed", "runs/loggers/test_mlflow_server",
     "runs/loggers/test_mlflow", "live/session/test_live_page", "common/test_distributed",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from memmlp.tables.statistics import (
+from memmlp.report.tables.statistics import (
     holm,
 )
 

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from memmlp.report.tables.build_table import finished_runs, make_table
+from memmlp.report.tables.effects import RunsBySeed
+from memmlp.report.tables.measured_run import Measured, load
+from memmlp.report.tables.table import Table
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import MODES, Sweep, Variant
-from memmlp.tables.build_table import finished_runs, make_table
-from memmlp.tables.effects import RunsBySeed
-from memmlp.tables.measured_run import Measured, load
-from memmlp.tables.table import Table
 
 Find = Callable[[Variant, int], Run | None]
 BASE = {

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from memmlp.tables.formats import show
-from memmlp.tables.table import Table
+from memmlp.report.tables.formats import show
+from memmlp.report.tables.table import Table
 
 SHIPPED = Path(__file__).parent.parent / "sweeps"
 FILE = {

@@ -100,7 +100,7 @@ PRELOADED = [
     "memmlp.config.build", "memmlp.training.run_stages", "memmlp.deploy.export", "memmlp.motion.synthetic",
     "memmlp.report.pictures.clip_pictures", "torch.onnx", "torch._dynamo",
     "memmlp.cli.sweep", "memmlp.config.worker_process", "memmlp.sweep.controller",
-    "memmlp.sweep.executors.local", "memmlp.tables.build_table",
+    "memmlp.sweep.executors.local", "memmlp.report.tables.build_table",
     "memmlp.cli.tune", "memmlp.sweep.search.director", "memmlp.sweep.search.results", "optuna.importance",
     "optuna.visualization",
     "warm_server",

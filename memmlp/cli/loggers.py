@@ -15,9 +15,9 @@ from memmlp.cli.options import outputs_option
 from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
+    from memmlp.report.tables.table import Table
     from memmlp.runs.loggers.logger import RunLogger
     from memmlp.sweep.plan import Plan
-    from memmlp.tables.table import Table
 
 LOGGERS = ("mlflow", "tensorboard", "wandb")
 
@@ -87,7 +87,7 @@ def show_in_loggers(plan: Plan, folder: Path, table: Table) -> None:
     from omegaconf import OmegaConf
 
     from memmlp.config.build import build_loggers
-    from memmlp.tables.build_table import write_summary
+    from memmlp.report.tables.build_table import write_summary
 
     write_summary(plan, table, folder)
     if plan.tasks:

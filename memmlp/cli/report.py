@@ -33,10 +33,10 @@ def report(words: tuple[str, ...], out: Path | None, no_replays: bool, outputs: 
     from memmlp.cli.table import SHOWN_MODES, gathered, write
     from memmlp.cli.ui import predict
     from memmlp.config.compose_plan import sweep_folder
+    from memmlp.report.tables.measured_run import load
     from memmlp.report.ui.report_file import ReportedSweep, write_page
     from memmlp.report.ui.server import Answers
     from memmlp.runs.environment import environment
-    from memmlp.tables.measured_run import load
 
     names = [word for word in words if "=" not in word and not word.startswith("~")]
     overrides = [word for word in words if word not in names]

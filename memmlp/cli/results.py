@@ -23,8 +23,8 @@ from memmlp.common.errors import InputError
 if TYPE_CHECKING:
     from memmlp.report.kept_results import Kept
     from memmlp.report.result_pages import KeptTable
+    from memmlp.report.tables.table import Table
     from memmlp.sweep.definition import Sweep
-    from memmlp.tables.table import Table
 
 FOLDER = Path("docs/results")
 
@@ -64,9 +64,9 @@ def save_command(
     from memmlp.common.files import plain
     from memmlp.config.compose_plan import find_sweep, is_path
     from memmlp.report.kept_results import Kept, load_kept, overrides_of, save, shorten_paths
-    from memmlp.tables.build_table import finished_runs, run_finder
-    from memmlp.tables.flags import listed, missing_seeds
-    from memmlp.tables.measured_run import load
+    from memmlp.report.tables.build_table import finished_runs, run_finder
+    from memmlp.report.tables.flags import listed, missing_seeds
+    from memmlp.report.tables.measured_run import load
 
     sweep = find_sweep(name, overrides)
     shown = shown_sweep(sweep, overrides, outputs.absolute())
@@ -124,7 +124,7 @@ def show(name: str, source: str | None, together: tuple[str, ...], folder: Path)
     """Print the table of kept results, without any run; NAME is that of their page."""
     from memmlp.cli.table import print_tables
     from memmlp.report.kept_results import load_kept
-    from memmlp.tables.build_table import titled
+    from memmlp.report.tables.build_table import titled
 
     path = folder / "data" / f"{name}.json"
     if not path.is_file():
@@ -169,7 +169,7 @@ def make_tables(folder: Path) -> dict[str, KeptTable]:
     """Return the tables of all results kept below a folder, by the stems of their files."""
     from memmlp.report.kept_results import load_kept
     from memmlp.report.result_pages import KeptTable
-    from memmlp.tables.build_table import titled
+    from memmlp.report.tables.build_table import titled
 
     if not (folder / "data").is_dir():
         raise InputError(f"{folder}/data: no such folder; memmlp results save --out {folder}/data makes it")
@@ -192,9 +192,9 @@ def _make_table(kept: Kept, source: str | None = None, patterns: Sequence[str] =
     """
     from memmlp.cli.table import flag_of_other_rounds
     from memmlp.config.compose_plan import find_sweep
+    from memmlp.report.tables.build_table import make_table, on_source, together
+    from memmlp.report.tables.seed_rounds import Rounds
     from memmlp.runs.recipe_versions import outdated
-    from memmlp.tables.build_table import make_table, on_source, together
-    from memmlp.tables.seed_rounds import Rounds
 
     # With the command line's overrides, the table warns of other data than its own.
     sweep = replace(find_sweep(kept.sweep), command_line=kept.overrides)

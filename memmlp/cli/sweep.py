@@ -18,10 +18,10 @@ from memmlp.runs.identity import NETWORK
 
 if TYPE_CHECKING:
     from memmlp.cli.table import ShownSweep
+    from memmlp.report.tables.effects import RunsBySeed
+    from memmlp.report.tables.seed_rounds import Analysis, Rounds
     from memmlp.sweep.definition import Sweep
     from memmlp.sweep.plan import Plan
-    from memmlp.tables.effects import RunsBySeed
-    from memmlp.tables.seed_rounds import Analysis, Rounds
 
 
 @click.command("sweep")
@@ -145,8 +145,8 @@ def show(chosen: Sweep, plan: Plan, labels: Collection[str]) -> None:
     """
     from rich.console import Console
 
+    from memmlp.report.tables.flags import older_code
     from memmlp.sweep.progress_table import render
-    from memmlp.tables.flags import older_code
 
     shown = plan.of_variants(labels)
     click.echo(f"overrides: {' '.join(chosen.command_line) or 'none'}")  # others are another sweep
@@ -207,7 +207,7 @@ def show_outcome(shown: ShownSweep, given: Sequence[str], chosen: Sweep, labels:
     from memmlp.cli.table import SHOWN_MODES, print_tables, table_of_plan
     from memmlp.config import plugins
     from memmlp.config.compose_plan import sweep_folder
-    from memmlp.tables.measured_run import load
+    from memmlp.report.tables.measured_run import load
 
     plan, rounds, command = shown.plan, shown.rounds, " ".join([*given, *plugins.config_dir_words()])
     states = plan.states()
@@ -232,8 +232,8 @@ def check_rounds_options(overrides: Sequence[str], wanted: bool, most: int | Non
     """Raise InputError for options of --until-decided that don't go together."""
     if most is None and not wanted:
         return  # SciPy takes long to import
-    from memmlp.tables.seed_rounds import MOST
-    from memmlp.tables.statistics import analysis_schedule
+    from memmlp.report.tables.seed_rounds import MOST
+    from memmlp.report.tables.statistics import analysis_schedule
 
     if most is not None and not wanted:
         raise InputError("--max-seeds: needs --until-decided")
@@ -257,7 +257,7 @@ def current_rounds(sweep: Sweep, outputs: Path, most: int | None) -> Rounds:
         InputError: if the analyses were of a sweep that has changed since, or with another maximum.
     """
     from memmlp.cli.table import rounds_path
-    from memmlp.tables.seed_rounds import MOST, Rounds, new_rounds
+    from memmlp.report.tables.seed_rounds import MOST, Rounds, new_rounds
 
     path = rounds_path(sweep, outputs)
     kept = Rounds.read(path)
@@ -285,7 +285,7 @@ def run_until_decided(
     """
     from memmlp.cli.table import rounds_path
     from memmlp.config.compose_plan import kept_or_new_plan
-    from memmlp.tables.seed_rounds import check_same_runs
+    from memmlp.report.tables.seed_rounds import check_same_runs
 
     while True:
         spent = rounds.spent(sweep)
@@ -312,9 +312,9 @@ def analyse(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
     from memmlp.cli.table import rounds_path
     from memmlp.common.files import write_json
     from memmlp.common.lease import Lock
-    from memmlp.tables.build_table import finished_runs, run_finder
-    from memmlp.tables.measured_run import load
-    from memmlp.tables.seed_rounds import Rounds, advance, digest_of_runs
+    from memmlp.report.tables.build_table import finished_runs, run_finder
+    from memmlp.report.tables.measured_run import load
+    from memmlp.report.tables.seed_rounds import Rounds, advance, digest_of_runs
 
     path = rounds_path(sweep, outputs)
     with Lock(path.parent).hold():
@@ -341,7 +341,7 @@ def describe_schedule(rounds: Rounds) -> str:
 
 def describe_progress(rounds: Rounds, sweep: Sweep, last: Analysis | None = None) -> list[str]:
     """Describe each variant's progress: its verdicts, its seeds so far, and its next interim analysis."""
-    from memmlp.tables.seed_rounds import progress
+    from memmlp.report.tables.seed_rounds import progress
 
     variants = progress(rounds, sweep)
     decided = sum(variant.decided for variant in variants)
@@ -358,7 +358,7 @@ def describe_progress(rounds: Rounds, sweep: Sweep, last: Analysis | None = None
 
 def describe_end(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> list[str]:
     """Say why the rounds ended, what more seeds could do, and how many runs were spent."""
-    from memmlp.tables.seed_rounds import forecast_seeds
+    from memmlp.report.tables.seed_rounds import forecast_seeds
 
     latest = [finding for finding, _ in rounds.latest().values()]
     still = [finding for finding in latest if finding.verdict == "inconclusive"]

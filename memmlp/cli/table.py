@@ -22,12 +22,12 @@ from memmlp.common.errors import InputError
 from memmlp.sweep.definition import BRANCHES
 
 if TYPE_CHECKING:
+    from memmlp.report.tables.build_table import Read
+    from memmlp.report.tables.effects import Need, RunsBySeed
+    from memmlp.report.tables.seed_rounds import Rounds
+    from memmlp.report.tables.table import Table
     from memmlp.sweep.definition import Sweep
     from memmlp.sweep.plan import Plan
-    from memmlp.tables.build_table import Read
-    from memmlp.tables.effects import Need, RunsBySeed
-    from memmlp.tables.seed_rounds import Rounds
-    from memmlp.tables.table import Table
 
 SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", "window")}
 
@@ -98,8 +98,8 @@ def table(
 
     OVERRIDES are those that the sweep was run with; they find its runs again.
     """
-    from memmlp.tables import rows_measured_in_browsers
-    from memmlp.tables.measured_run import load
+    from memmlp.report.tables import rows_measured_in_browsers
+    from memmlp.report.tables.measured_run import load
 
     if seeds_needed and (form or out or add):
         raise InputError("--seeds-needed: does not go with --format, --out and --add")
@@ -169,14 +169,14 @@ def gathered(
         overrides: the command line's overrides.
         outputs: the folder of runs and caches.
         modes: modes of evaluation to show.
-        read: reads a run (`memmlp.tables.measured_run.load`).
+        read: reads a run (`memmlp.report.tables.measured_run.load`).
         selection: what of the results is shown.
 
     Raises:
         InputError: if none of them can be composed with the command line's overrides, or has that selection.
     """
     from memmlp.common.progress import progress_bar
-    from memmlp.tables.build_table import without_runs
+    from memmlp.report.tables.build_table import without_runs
 
     found, failures = [], []
     sweeps = find_sweeps(names, overrides)
@@ -207,7 +207,7 @@ def table_of_plan(
     selection: TableSelection = WHOLE,
 ) -> SweepTable:
     """Return a planned sweep's finished runs, and the table of a part of their results."""
-    from memmlp.tables.build_table import (
+    from memmlp.report.tables.build_table import (
         finished_runs,
         make_table,
         older_run_finder,
@@ -257,7 +257,7 @@ def print_tables(tables: Sequence[Table]) -> None:
     """Print tables in the width of the screen."""
     from rich.console import Console
 
-    from memmlp.tables.formats import show
+    from memmlp.report.tables.formats import show
 
     console = Console(highlight=False, markup=False)
     for one in tables:
@@ -266,8 +266,8 @@ def print_tables(tables: Sequence[Table]) -> None:
 
 def print_needs(found: Sequence[SweepTable], modes: Sequence[str]) -> None:
     """Print, sweep by sweep, how many seeds the paper's effects would need."""
-    from memmlp.tables.effects import needs
-    from memmlp.tables.table_text import caption
+    from memmlp.report.tables.effects import needs
+    from memmlp.report.tables.table_text import caption
 
     for one in found:
         wanted = needs(one.sweep, one.runs, modes)
@@ -303,7 +303,7 @@ def _describe_needs(wanted: Sequence[Need]) -> str:
 
 def _formatted(tables: Sequence[Table], form: str, alone: bool) -> str:
     """Return the tables as one text; in JSON, it is a single object if `alone`, else a list."""
-    from memmlp.tables.formats import FORMATS
+    from memmlp.report.tables.formats import FORMATS
 
     texts = [FORMATS[form](one) for one in tables]
     if form == "json" and not alone:
@@ -312,7 +312,7 @@ def _formatted(tables: Sequence[Table], form: str, alone: bool) -> str:
 
 
 def _form_of(out: Path | None) -> str:
-    from memmlp.tables.formats import FORMATS
+    from memmlp.report.tables.formats import FORMATS
 
     ending = out.suffix.removeprefix(".") if out else ""
     if ending not in FORMATS:
@@ -352,7 +352,7 @@ def shown_sweep(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> ShownS
     Otherwise the sweep is shown with its own seeds; if analyses were done, a flag says so.
     """
     from memmlp.config.compose_plan import kept_or_new_plan
-    from memmlp.tables.seed_rounds import Rounds, check_same_runs
+    from memmlp.report.tables.seed_rounds import Rounds, check_same_runs
 
     path = rounds_path(sweep, outputs)
     kept = Rounds.read(path)
@@ -375,7 +375,7 @@ def flag_of_other_rounds(kept: Rounds, sweep: Sweep, seeds_given: bool = False) 
 
     `seeds_given` says that the sweep's seeds were given on the command line.
     """
-    from memmlp.tables.seed_rounds import new_rounds
+    from memmlp.report.tables.seed_rounds import new_rounds
 
     other = "seeds" if seeds_given else kept.difference(new_rounds(sweep, len(kept.seeds)))
     if other is None:
@@ -385,7 +385,7 @@ def flag_of_other_rounds(kept: Rounds, sweep: Sweep, seeds_given: bool = False) 
 
 def flag_of_earlier_rounds(sweep: Sweep, outputs: Path) -> tuple[str, ...]:
     """Return a flag for a table with a fixed number of seeds if interim analyses were done before."""
-    from memmlp.tables.seed_rounds import Rounds
+    from memmlp.report.tables.seed_rounds import Rounds
 
     kept = Rounds.read(rounds_path(sweep, outputs))
     if kept is None or not kept.analyses:
@@ -396,6 +396,6 @@ def flag_of_earlier_rounds(sweep: Sweep, outputs: Path) -> tuple[str, ...]:
 def rounds_path(sweep: Sweep, outputs: Path) -> Path:
     """Return the file in which a sweep's rounds are kept."""
     from memmlp.config.compose_plan import sweep_folder
-    from memmlp.tables.seed_rounds import ROUNDS_FILE
+    from memmlp.report.tables.seed_rounds import ROUNDS_FILE
 
     return sweep_folder(sweep, outputs) / ROUNDS_FILE

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from memmlp.common.processes import MIN_CORE_SHARE
 from memmlp.evaluation.metric_facts import UNITS
+from memmlp.report.tables.measured_run import CORE_SHARES, SAME, SHARED, Errors, load
 from memmlp.runs.deployment_folder import (
     INT8_PRECISIONS,
     MAX_GROWTH,
@@ -23,7 +24,6 @@ from memmlp.runs.deployment_folder import (
 from memmlp.runs.lookup import frames_seen, hardly_trained
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import BRANCHES
-from memmlp.tables.measured_run import CORE_SHARES, SAME, SHARED, Errors, load
 from memmlp.training.request import Outcome
 
 STAGES = ("training", "evaluation", "deployment")

@@ -1,9 +1,9 @@
-"""Makes the plan of a sweep file: every arm is composed and checked, and gets its run's identity.
+"""Makes the plan of a sweep file: every variant is composed and checked, and gets its run's identity.
 
 This is in config because only config composes.
 
-Composing takes a moment for each arm. So the plan of a sweep that was started is kept, and used again for as
-long as the sweep, the configs, the code and the data are unchanged.
+Composing takes a moment for each variant. So the plan of a sweep that was started is kept, and used again for
+as long as the sweep, the configs, the code and the data are unchanged.
 """
 
 from __future__ import annotations
@@ -43,35 +43,35 @@ def find_sweep(name: str, overrides: Sequence[str] = ()) -> Sweep:
     """
     activate(named(overrides))
     sweep = load_sweep(_path(name), lambda base: activate(named(base))).with_overrides(overrides)
-    for arm in sweep.runnable():
-        check_preset(sweep, arm)
+    for variant in sweep.runnable():
+        check_preset(sweep, variant)
     return sweep
 
 
-def check_preset(sweep: Sweep, arm: Variant) -> None:
-    """Check that an arm's `experiment=NAME` sets all that it should, and replaces no other experiment.
+def check_preset(sweep: Sweep, variant: Variant) -> None:
+    """Check that a variant's `experiment=NAME` sets all that it should, and replaces no other experiment.
 
     Hydra lets a group or key on the command line win over an experiment's, wherever it stands, and the last
-    experiment replaces those before. So an override of the base could undo a part of what the arm is for.
+    experiment replaces those before. So an override of the base could undo a part of what the variant is for.
 
     Raises:
-        InputError: for such an arm; the message names the sweep, the arm and both overrides.
+        InputError: for such a variant; the message names the sweep, the variant and both overrides.
     """
     from memmlp.config.compose import EXPERIMENT, set_by_experiments
 
-    own = {key_of(word): word for word in arm.overrides or ()}
+    own = {key_of(word): word for word in variant.overrides or ()}
     chosen = own.get(EXPERIMENT)
     if chosen is None:
         return
-    others = arm.own_overrides if chosen in arm.cell else ()
+    others = variant.own_overrides if chosen in variant.cell else ()
     around = {key_of(word): word for word in (*sweep.base, *sweep.command_line)}
     around = {key: word for key, word in around.items() if key not in own or key == EXPERIMENT}
     before, options = Override.parse(around.pop(EXPERIMENT, "")).options, Override.parse(chosen).options
-    where = f"sweep {sweep.name}, variant '{arm.label}': {chosen}"
+    where = f"sweep {sweep.name}, variant '{variant.label}': {chosen}"
     if options and (lost := [option for option in before if option not in options]):
         both = ",".join(dict.fromkeys([*before, *options]))
         raise InputError(f"{where} would replace {EXPERIMENT}={lost[0]}; use {EXPERIMENT}=[{both}]")
-    known = set_by_experiments(options, sweep.all_overrides(arm))
+    known = set_by_experiments(options, sweep.all_overrides(variant))
     for key, word in (around | {key_of(word): word for word in others}).items():
         if key in known:
             raise InputError(f"{where} sets {key}, and {word} would override it; remove it or the experiment")
@@ -122,7 +122,7 @@ def kept_or_new_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan
             identity and are left out.
 
     Raises:
-        InputError: if a config is wrong; the message names arm and key.
+        InputError: if a config is wrong; the message names variant and key.
     """
     path = sweep_folder(sweep, outputs) / "plan_stamp.json"
     if not prepare and not path.parent.is_dir():
@@ -142,8 +142,8 @@ def kept_or_new_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan
 
 
 def _has_all(sweep: Sweep, plan: Plan, path: Path) -> bool:
-    """Return whether a plan has all entries of the kept plan, except those of arms that are gone."""
-    labels = {arm.label for arm in sweep.variants}
+    """Return whether a plan has all entries of the kept plan, except those of variants that are gone."""
+    labels = {variant.label for variant in sweep.variants}
     cells = {(one.get("label"), one.get("seed")) for one in read_json(path).get("entries", ())}
     return {cell for cell in cells if cell[0] in labels} <= {(one.label, one.seed) for one in plan.entries}
 
@@ -160,10 +160,10 @@ def plan_anew(sweep: Sweep, outputs: Path) -> Plan:
 def orphans(sweep: Sweep, plan: Plan) -> list[Entry]:
     """Return the begun runs of earlier versions of the sweep that the sweep no longer has.
 
-    Their arm's label is gone, or the arm has another config now.
+    Their variant's label is gone, or the variant has another config now.
     """
     recorded = read_json(sweep_folder(sweep, plan.outputs) / "entries.json").get("entries", [])
-    labels = {arm.label for arm in sweep.variants}
+    labels = {variant.label for variant in sweep.variants}
     now = {(entry.label, entry.seed): entry.id for entry in plan.entries}
     used = set(now.values())
     entries = [Entry(entry["label"], entry["seed"], entry["id"]) for entry in recorded]
@@ -181,33 +181,33 @@ def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[s
     planned: list[tuple[Entry, list[RunTask]]] = []
     data: dict[str, dict[str, Any]] = {}
     complete = True
-    for arm in sweep.runnable():
-        for seed, request in _requests(sweep, arm, outputs):
+    for variant in sweep.runnable():
+        for seed, request in _requests(sweep, variant, outputs):
             known = _data_digest(request, prepare, data)
             complete &= known is not None
             if known is not None:
                 found = tasks_of(request, known)
-                planned.append((Entry(arm.label, seed, found[-1].id, found[-1].stages), found))
-    planned.sort(key=lambda one: sweep.seeds.index(one[0].seed))  # a half-done sweep then has every arm
+                planned.append((Entry(variant.label, seed, found[-1].id, found[-1].stages), found))
+    planned.sort(key=lambda one: sweep.seeds.index(one[0].seed))  # a half-done sweep then has every variant
     tasks = unique(task for _, found in planned for task in found)
     plan = Plan(sweep.name, outputs, tuple(entry for entry, _ in planned), tasks)
     return plan, list(data.values()) if complete else None
 
 
-def _requests(sweep: Sweep, arm: Variant, outputs: Path) -> Iterable[tuple[int, RunRequest]]:
-    """Yield the checked requests of an arm, with their seeds."""
+def _requests(sweep: Sweep, variant: Variant, outputs: Path) -> Iterable[tuple[int, RunRequest]]:
+    """Yield the checked requests of a variant, with their seeds."""
     from memmlp.config.build_request import build_request
     from memmlp.config.compose import composed
 
     try:
-        cfg = composed(list(sweep.all_overrides(arm)))
-        if cfg.force:  # arms that share a run would make it again and again
+        cfg = composed(list(sweep.all_overrides(variant)))
+        if cfg.force:  # variants that share a run would make it again and again
             raise InputError("force=true: use --again, which makes a sweep's finished runs again")
-        for seed in sweep.seeds_of(arm):
+        for seed in sweep.seeds_of(variant):
             cfg.seed, cfg.paths.outputs = seed, str(outputs)
             yield seed, build_request(cfg)
     except InputError as error:
-        raise InputError(f"sweep {sweep.name}, variant '{arm.label}': {error}") from None
+        raise InputError(f"sweep {sweep.name}, variant '{variant.label}': {error}") from None
 
 
 def tasks_of(request: RunRequest, data: str) -> list[RunTask]:

@@ -11,31 +11,33 @@ from memmlp.common.progress import show_progress
 from memmlp.config.build import build_deployment, untrained
 from memmlp.config.compose import composed
 from memmlp.deploy.deployment import GRAPHS, Deployment
+from memmlp.report.tables.effects import RunsBySeed
+from memmlp.report.tables.measured_run import Measured, of_untrained
 from memmlp.runs.environment import environment
 from memmlp.sweep.definition import COSTS, SIZES, Sweep
-from memmlp.tables.effects import RunsBySeed
-from memmlp.tables.measured_run import Measured, of_untrained
 
 
 def with_costs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> tuple[dict[str, RunsBySeed], tuple[str, ...]]:
-    """Measure untrained networks for a sweep's arms that have no finished run.
+    """Measure untrained networks for a sweep's variants that have no finished run.
 
     Times are measured only if the sweep's table shows any.
 
     Returns:
-        The runs by arm and seed, including those networks, and flags that say so.
+        The runs by variant and seed, including those networks, and flags that say so.
 
     Raises:
         InputError: as `check_costs` does.
     """
     check_costs(sweep)
     timed = not set(sweep.metrics) <= set(SIZES)
-    without = [arm for arm in sweep.runnable() if not runs[arm.label]]
+    without = [variant for variant in sweep.runnable() if not runs[variant.label]]
     costs: dict[str, RunsBySeed] = {}
     with show_progress("networks", len(without)) as count:
-        for arm in without:
-            count.note(arm.label)  # a large one takes minutes
-            costs[arm.label] = {sweep.seeds_of(arm)[0]: measure_costs(sweep.all_overrides(arm), timed)}
+        for variant in without:
+            count.note(variant.label)  # a large one takes minutes
+            costs[variant.label] = {
+                sweep.seeds_of(variant)[0]: measure_costs(sweep.all_overrides(variant), timed)
+            }
             count.advance()
     names = ", ".join(f"'{label}'" for label in costs)
     flags = (f"networks that were not trained, with random weights: {names}",) if costs else ()

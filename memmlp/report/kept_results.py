@@ -19,9 +19,9 @@ from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, plain
+from memmlp.report.tables.effects import RunsBySeed
+from memmlp.report.tables.measured_run import Errors, Measured, Origin
 from memmlp.sweep.definition import Sweep
-from memmlp.tables.effects import RunsBySeed
-from memmlp.tables.measured_run import Errors, Measured, Origin
 
 DIGITS = 6
 FLAT_LIST = re.compile(r"\[\n([^\[\]{}]*?)\n *\]")  # of plain values; no string contains a line break

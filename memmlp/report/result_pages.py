@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 from memmlp.common.errors import InputError, require
 from memmlp.report.kept_results import Kept
-from memmlp.tables.formats import escaped, markdown
-from memmlp.tables.measured_run import UNKNOWN
-from memmlp.tables.statistics import Verdict
-from memmlp.tables.table import Cell, Row, Table
-from memmlp.tables.table_text import (
+from memmlp.report.tables.formats import escaped, markdown
+from memmlp.report.tables.measured_run import UNKNOWN
+from memmlp.report.tables.statistics import Verdict
+from memmlp.report.tables.table import Cell, Row, Table
+from memmlp.report.tables.table_text import (
     MINUS,
     MISSING,
     caption,

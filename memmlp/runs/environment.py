@@ -28,7 +28,6 @@ NOT_NUMBERS = (
     "report",
     "runs/loggers",
     "sweep",
-    "tables",
 )
 """Folders of the package whose code does not affect results; only `live` measures one, the time of a pose."""
 WIRING = ("config/build.py", "config/build_motion.py")

@@ -104,14 +104,14 @@ def _plans(outputs: Path) -> Iterator[Path]:
 
 
 def _left(folder: Path) -> Iterator[str]:
-    """Yield the ids of runs that a sweep no longer has: their arm is gone, or has another run now.
+    """Yield the ids of runs that a sweep no longer has: their variant is gone, or has another run now.
 
     A missing entry in a plan proves nothing about its run: the plan may have fewer seeds, or its data may be
     absent.
     """
     now = {(one.get("label"), one.get("seed")): one["id"] for one in _listed(folder / "plan.json", "entries")}
-    arms = read_json(folder / "sweep.json").get("variants")
-    labels = {arm.get("label") for arm in arms} if arms else None
+    variants = read_json(folder / "sweep.json").get("variants")
+    labels = {variant.get("label") for variant in variants} if variants else None
     for one in _listed(folder / "entries.json", "entries"):
         gone = labels is not None and one.get("label") not in labels
         if gone or now.get((one.get("label"), one.get("seed")), one["id"]) != one["id"]:

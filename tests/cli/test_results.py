@@ -11,10 +11,10 @@ from conftest import Memmlp, one_line
 from fake_runs import CLIPS, fake_sweep
 
 from memmlp.report.kept_results import _digest
+from memmlp.report.tables.build_table import Find, finished_runs
+from memmlp.report.tables.effects import RunsBySeed
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.plan import Entry, Plan
-from memmlp.tables.build_table import Find, finished_runs
-from memmlp.tables.effects import RunsBySeed
 
 
 @pytest.fixture
@@ -23,8 +23,8 @@ def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 
     def plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
         find = fake_sweep(tmp_path / sweep.name, sweep, clips=CLIPS[-4:])
-        entries = [(arm, seed) for arm in sweep.runnable() for seed in sweep.seeds]
-        found = [Entry(arm.label, seed, find(arm, seed).id) for arm, seed in entries]  # type: ignore[union-attr]
+        entries = [(variant, seed) for variant in sweep.runnable() for seed in sweep.seeds]
+        found = [Entry(variant.label, seed, find(variant, seed).id) for variant, seed in entries]  # type: ignore[union-attr]
         return Plan(sweep.name, tmp_path / sweep.name, () if sweep.name == "table10" else tuple(found), ())
 
     monkeypatch.setattr("memmlp.config.compose_plan.kept_or_new_plan", plan)
@@ -83,7 +83,7 @@ def test_results_of_an_earlier_default_do_not_stand_beside_todays(
         return {**found, "2": {seed: run for seed, run in found["2"].items() if seed != 1}}
 
     with monkeypatch.context() as patched:
-        patched.setattr("memmlp.tables.build_table.finished_runs", but_one)
+        patched.setattr("memmlp.report.tables.build_table.finished_runs", but_one)
         assert one_line(memmlp("results", "save", "14"), "variant '2'", "(seed 1)", "--name")
     assert path.read_text() == json.dumps(content)
     memmlp("results", "save", "14")
@@ -116,7 +116,7 @@ def test_pages_without_data_go(memmlp: Memmlp, planned: None):
 
 def test_what_a_sweep_lacks_is_told(memmlp: Memmlp, planned: None, monkeypatch: pytest.MonkeyPatch):
     assert "missing" not in memmlp("results", "save", "14").out
-    monkeypatch.setattr("memmlp.tables.build_table.finished_runs", without_the_last_seed)
+    monkeypatch.setattr("memmlp.report.tables.build_table.finished_runs", without_the_last_seed)
     said = memmlp("results", "save", "14", "--name", "fewer").out.splitlines()[-1]
     assert re.fullmatch(
         r"missing of the sweep: ('[^']+' seed 2(, )?){4}; make them with: memmlp sweep .*", said

@@ -24,12 +24,12 @@ from memmlp.config.build_motion import build_motion
 from memmlp.config.compose import composed
 from memmlp.config.compose_plan import find_sweep
 from memmlp.config.schema import restored
+from memmlp.report.tables.table_text import heading
 from memmlp.runs import environment
 from memmlp.runs.environment import code_digest, user_packages
 from memmlp.runs.identity import evaluation_id, evaluation_settings
 from memmlp.runs.run import Run
 from memmlp.sweep.search.search_file import parse_search
-from memmlp.tables.table_text import heading
 
 OWN = [f"plugins=[{PACKAGE}]", "experiment=feet", "profile=tiny"]
 

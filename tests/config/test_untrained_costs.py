@@ -13,9 +13,9 @@ from memmlp.config.build import untrained
 from memmlp.config.untrained_costs import with_costs
 from memmlp.report.kept_results import Kept
 from memmlp.report.result_pages import describe_origin
+from memmlp.report.tables.build_table import make_table
+from memmlp.report.tables.measured_run import load
 from memmlp.sweep.sweep_file import parse_sweep
-from memmlp.tables.build_table import make_table
-from memmlp.tables.measured_run import load
 
 ARMS = {"Mem-MLP": [], "AvatarPoser": ["model=avatar_poser"], "printed alone": {"overrides": None}}
 METRICS = ["FLOPs", "MACs", "size", "parameters"]

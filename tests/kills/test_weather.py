@@ -19,13 +19,13 @@ from processes import until
 from memmlp.common import lease
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
+from memmlp.report.tables.measured_run import load
 from memmlp.runs.evaluation_file import intact, write_report
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.search.director import objectives
 from memmlp.sweep.search.search_file import Objective
 from memmlp.sweep.worker import attempt
-from memmlp.tables.measured_run import load
 
 TASK = RunTask("a" * 16, "memmlp", {}, None, ("stream-0", "fp32-0"))
 STEPS = 2

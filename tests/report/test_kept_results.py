@@ -13,8 +13,8 @@ from fake_runs import fake_run, runs_of
 
 from memmlp.common.errors import InputError
 from memmlp.report.kept_results import Kept, dumps, load_kept, overrides_of, save, shorten_paths
+from memmlp.report.tables.build_table import make_table
 from memmlp.sweep.definition import Sweep
-from memmlp.tables.build_table import make_table
 
 
 def test_kept_results_make_the_runs_table(sweep: Sweep, kept: Kept, tmp_path: Path):

@@ -18,11 +18,11 @@ from memmlp.cli.results import make_tables
 from memmlp.common.errors import InputError
 from memmlp.report.kept_results import Kept, overrides_of
 from memmlp.report.result_pages import KeptTable, Placeholders, describe_origin, make_pages
+from memmlp.report.tables.build_table import make_table, together
+from memmlp.report.tables.statistics import Verdict
+from memmlp.report.tables.statistics.paired_differences import error
+from memmlp.report.tables.table_text import MINUS
 from memmlp.sweep.definition import Sweep
-from memmlp.tables.build_table import make_table, together
-from memmlp.tables.statistics import Verdict
-from memmlp.tables.statistics.paired_differences import error
-from memmlp.tables.table_text import MINUS
 
 ROOT = Path(__file__).parent.parent.parent
 DOCS = ROOT / "docs" / "results"
@@ -186,8 +186,8 @@ def test_the_way_from_the_first_variant_to_the_last_is_the_sum_of_its_steps(swee
     """Errors grow from arm to arm of a chain; a share is shown where the interval leaves 0 out."""
     labels = [arm.label for arm in sweep.variants]
     against = {labels[0]: labels[1], labels[1]: labels[2], labels[2]: labels[0]}  # the control, two before it
-    arms = tuple(replace(arm, against=against.get(arm.label)) for arm in sweep.variants)
-    chained = replace(sweep, variants=arms, control=labels[0])
+    variants = tuple(replace(variant, against=against.get(variant.label)) for variant in sweep.variants)
+    chained = replace(sweep, variants=variants, control=labels[0])
     find = fake_sweep(tmp_path, chained, {labels[1]: 1.1, labels[2]: 1.3}, groups=GROUPS)
     words = Placeholders(
         {"t": source(chained, Kept("table14", (), runs_of(chained, find), overrides_of(chained)))}

@@ -10,13 +10,13 @@ from begun_runs import begun
 import memmlp.runs.recipe_versions
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
+from memmlp.report.tables.measured_run import load
 from memmlp.report.ui.run_index import read_facts
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.evaluations_as_configured import EvaluationsAsConfigured
 from memmlp.runs.identity import evaluation_id_of
 from memmlp.runs.query import record
 from memmlp.runs.run import Run
-from memmlp.tables.measured_run import load
 
 
 def solved(run: Run, ik: str, value: float, iterations: int | None = None, made: str = "1") -> None:

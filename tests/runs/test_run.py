@@ -16,6 +16,7 @@ from memmlp.cli.runs.listing import shown_number
 from memmlp.cli.runs.show import measured_numbers
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
+from memmlp.report.tables.measured_run import load
 from memmlp.report.ui.run_index import read_facts
 from memmlp.runs.deployment_folder import ONNX_FILES
 from memmlp.runs.evaluation_file import intact, write_report
@@ -29,7 +30,6 @@ from memmlp.runs.identity import (
 from memmlp.runs.loggers.facts import read_run
 from memmlp.runs.query import record
 from memmlp.runs.run import Run
-from memmlp.tables.measured_run import load
 
 
 def test_a_run_is_done_when_its_marker_is_whole(tmp_path: Path):

@@ -26,6 +26,7 @@ from memmlp.config.compose import composed
 from memmlp.config.package_data import packaged
 from memmlp.live.stream import Stream
 from memmlp.motion.dataset import MotionDataset
+from memmlp.report.tables.measured_run import load
 from memmlp.runs import environment
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.loggers.logger import Loggers
@@ -33,7 +34,6 @@ from memmlp.runs.lookup import list_runs
 from memmlp.runs.recipe_versions import RECIPES
 from memmlp.runs.run import Run
 from memmlp.sweep.worker import Cancelled, deaths
-from memmlp.tables.measured_run import load
 from memmlp.training import run_stages
 from memmlp.training.run_stages import make_prerequisites, recording_outcome
 

@@ -178,7 +178,7 @@ def summarize(rows: Sequence[dict[str, Any]], times: float) -> dict[str, Any]:
     """
     import numpy as np
 
-    from memmlp.tables.statistics import seed_effects, verdict
+    from memmlp.report.tables.statistics import seed_effects, verdict
 
     ratios = [
         row["current"]["seconds"] / row["recipe"]["seconds"] if row["recipe"] else np.nan for row in rows

@@ -42,10 +42,10 @@ def show(run: str, config: bool, outputs: Path) -> None:
 
     RUN is its id, the beginning of it, or its folder.
     """
+    from memmlp.report.tables.measured_run import load
     from memmlp.runs.evaluation_file import with_solvers
     from memmlp.runs.identity import flatten
     from memmlp.runs.lookup import find_run, is_trained
-    from memmlp.tables.measured_run import load
 
     found = find_run(outputs, run)
     console().print(_pairs(_summary(found)))

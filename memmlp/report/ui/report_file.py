@@ -7,13 +7,13 @@ import urllib.parse
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
+from memmlp.report.tables.effects import RunsBySeed
+from memmlp.report.tables.table import Table
 from memmlp.report.ui.page_files import one_file
 from memmlp.report.ui.runs import thin_out
 from memmlp.report.ui.server import Answers
 from memmlp.report.ui.sweeps import describe_results, name_sweep
 from memmlp.sweep.definition import MODES, Sweep
-from memmlp.tables.effects import RunsBySeed
-from memmlp.tables.table import Table
 
 MAX_POINTS = 120  # of a curve, about
 MAX_CLIPS = 60  # of a run, its worst

@@ -11,14 +11,14 @@ from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import plain, read_json
+from memmlp.report.tables.measured_run import load
+from memmlp.report.tables.table_text import better, unit
 from memmlp.report.ui.run_index import COSTS, RunIndex, parse_line, read_config
 from memmlp.runs.deployment_folder import as_deployed
 from memmlp.runs.evaluation_file import with_solvers
 from memmlp.runs.identity import NETWORK, NEUTRAL, flatten, is_data_path
 from memmlp.runs.lookup import frames_seen, hardly_trained, is_trained
 from memmlp.runs.run import Run
-from memmlp.tables.measured_run import load
-from memmlp.tables.table_text import better, unit
 
 VIEWABLE = (
     "config.yaml", "manifest.json", "metrics.jsonl", "code.patch", "FAILED", "notes.json", "poses.png",

@@ -18,21 +18,21 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.common.files import plain
 from memmlp.evaluation.metric_facts import UNITS
+from memmlp.report.tables.build_table import finished_runs, make_table
+from memmlp.report.tables.effects import RunsBySeed
+from memmlp.report.tables.error_distributions import distributions, performance_profile
+from memmlp.report.tables.formats import as_json
+from memmlp.report.tables.measured_run import Measured, load
+from memmlp.report.tables.seed_rounds import ROUNDS_FILE, Rounds, check_same_runs, progress, subject
+from memmlp.report.tables.statistics import Verdict
+from memmlp.report.tables.table import Table
+from memmlp.report.tables.table_text import better, caption, heading, legend
 from memmlp.report.ui.run_index import RunIndex
 from memmlp.runs.identity import NETWORK, training_settings
 from memmlp.runs.run import STAGE_WORDS
 from memmlp.sweep.definition import SWEEP_FILE, Sweep, Variant, kept_sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.progress_table import task_name
-from memmlp.tables.build_table import finished_runs, make_table
-from memmlp.tables.effects import RunsBySeed
-from memmlp.tables.error_distributions import distributions, performance_profile
-from memmlp.tables.formats import as_json
-from memmlp.tables.measured_run import Measured, load
-from memmlp.tables.seed_rounds import ROUNDS_FILE, Rounds, check_same_runs, progress, subject
-from memmlp.tables.statistics import Verdict
-from memmlp.tables.table import Table
-from memmlp.tables.table_text import better, caption, heading, legend
 
 DAMAGED_ROUNDS = "seeds were spent in rounds that cannot be shown here: these verdicts do not keep the 5 %"
 OTHER_ROUNDS = "seeds were spent in rounds, but not of these runs: these verdicts do not keep the 5 %"

@@ -17,7 +17,7 @@ from live.web.conftest import PERSON, REMARK, RUN, Made, package_files
 from memmlp.common.npm import IWER
 from memmlp.live.stream import Stream
 from memmlp.live.wearer import Offsets
-from memmlp.tables.rows_measured_in_browsers import read
+from memmlp.report.tables.rows_measured_in_browsers import read
 
 pytestmark = pytest.mark.slow
 

@@ -16,14 +16,14 @@ from report.ui.test_replay import motion
 
 from memmlp.cli.sweep import analyse
 from memmlp.evaluation.metric_facts import UNITS
+from memmlp.report.tables.build_table import finished_runs, make_table, run_finder
+from memmlp.report.tables.measured_run import load
+from memmlp.report.tables.seed_rounds import new_rounds
 from memmlp.report.ui.report_file import ReportedSweep, write_page
 from memmlp.report.ui.server import Answers, RunsServer
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import kept_sweep
 from memmlp.sweep.plan import Plan
-from memmlp.tables.build_table import finished_runs, make_table, run_finder
-from memmlp.tables.measured_run import load
-from memmlp.tables.seed_rounds import new_rounds
 
 EVIL = "<img src=x onerror=owned=1>"
 READY = "document.documentElement.dataset.ready !== undefined"
@@ -159,9 +159,9 @@ def test_units_and_directions_of_custom_metrics(
 ):
     """Those of a package in use; of another metric nobody knows what is better."""
     monkeypatch.setitem(UNITS, "Score", "points")
-    monkeypatch.setattr("memmlp.tables.table_text.HIGHER", {"Score"})
+    monkeypatch.setattr("memmlp.report.tables.table_text.HIGHER", {"Score"})
     make_outputs(tmp_path)
-    none, gru = (run_of(tmp_path, arm, 0) for arm in ("none", "gru"))
+    none, gru = (run_of(tmp_path, variant, 0) for variant in ("none", "gru"))
     scored(none, Score=5.0, Odd=1.0)
     scored(gru, Score=7.0, Odd=2.0)
     with RunsServer(Answers(tmp_path), 0, every=0.05) as running:
@@ -189,7 +189,7 @@ def test_units_and_directions_of_custom_metrics(
 def test_no_difference_is_shown_from_a_control_on_other_data(browser: Browser, tmp_path: Path):
     """Its means are over other test clips."""
     make_outputs(tmp_path)
-    gru, none = (run_of(tmp_path, arm, 0) for arm in ("gru", "none"))
+    gru, none = (run_of(tmp_path, variant, 0) for variant in ("gru", "none"))
     small = "[...document.querySelectorAll('.grid td.n > small')].length"
     told = "document.body.textContent.includes('The control has other data')"
     with RunsServer(Answers(tmp_path), 0, every=0.05) as running:

@@ -11,16 +11,16 @@ from fake_runs import fake_run
 from report.ui.conftest import run_of
 
 from memmlp.cli.sweep import analyse
+from memmlp.report.tables.build_table import finished_runs, make_table, run_finder, state_finder
+from memmlp.report.tables.formats import as_json
+from memmlp.report.tables.measured_run import load
+from memmlp.report.tables.seed_rounds import Rounds, new_rounds
 from memmlp.report.ui.run_index import RunIndex
 from memmlp.report.ui.server import Answers
 from memmlp.report.ui.sweeps import DAMAGED_ROUNDS, OTHER_ROUNDS, Sweeps
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import keep_sweep, kept_sweep
 from memmlp.sweep.plan import Plan, RunTask
-from memmlp.tables.build_table import finished_runs, make_table, run_finder, state_finder
-from memmlp.tables.formats import as_json
-from memmlp.tables.measured_run import load
-from memmlp.tables.seed_rounds import Rounds, new_rounds
 
 
 def sweeps_of(outputs: Path) -> Sweeps:
@@ -90,8 +90,8 @@ def test_a_run_that_lacks_an_evaluation_is_trained_and_a_vqvae_is_a_prerequisite
         6,
     )
     say = state_finder(Plan.load(path))
-    arm = next(arm for arm in kept_sweep(path.parent).runnable() if arm.label == first.label)
-    assert say(arm, first.seed) == "trained, an evaluation or export is missing"
+    variant = next(variant for variant in kept_sweep(path.parent).runnable() if variant.label == first.label)
+    assert say(variant, first.seed) == "trained, an evaluation or export is missing"
 
 
 def test_no_time_is_left_where_only_the_evaluation_is(outputs: Path):
@@ -142,7 +142,7 @@ def test_a_sweep_without_its_file_or_plan_is_named(outputs: Path):
 
 
 def test_a_sweep_with_another_control_has_another_table(outputs: Path):
-    """The runs stay as they are: an arm's control, metrics and margins are the sweep's own."""
+    """The runs stay as they are: a variant's control, metrics and margins are the sweep's own."""
     folder = outputs / "sweeps" / "mine"
     sweeps, sweep = sweeps_of(outputs), kept_sweep(folder)
     assert sweep is not None
@@ -160,9 +160,9 @@ def test_a_run_s_control_is_that_of_its_variant(outputs: Path):
     sweep = kept_sweep(folder)
     assert sweep is not None
 
-    def control(arm: str) -> dict | None:
+    def control(variant: str) -> dict | None:
         answers.refresh()
-        return answers.answer(f"run/{run_of(outputs, arm, 1).id}", {})["control"]
+        return answers.answer(f"run/{run_of(outputs, variant, 1).id}", {})["control"]
 
     assert control("none") is None
     assert control("gru")["id"] == run_of(outputs, "none", 1).id

@@ -23,9 +23,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import digest
-from memmlp.sweep.definition import COSTS, MODES, Sweep, Variant
-from memmlp.sweep.plan import Plan
-from memmlp.tables.effects import (
+from memmlp.report.tables.effects import (
     RunsBySeed,
     compared,
     or_nan,
@@ -35,7 +33,7 @@ from memmlp.tables.effects import (
     tested,
     with_existing_branches,
 )
-from memmlp.tables.statistics import (
+from memmlp.report.tables.statistics import (
     Verdict,
     analysis_schedule,
     seeds_needed,
@@ -43,7 +41,9 @@ from memmlp.tables.statistics import (
     spending,
     verdict,
 )
-from memmlp.tables.table import Effect, Key
+from memmlp.report.tables.table import Effect, Key
+from memmlp.sweep.definition import COSTS, MODES, Sweep, Variant
+from memmlp.sweep.plan import Plan
 
 MOST = 13  # the largest number of seeds of a variant by default
 ROUNDS_FILE = "rounds.json"

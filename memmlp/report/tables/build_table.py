@@ -14,25 +14,25 @@ from typing import TYPE_CHECKING, Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, write_json
-from memmlp.runs.lookup import list_runs
-from memmlp.runs.recipe_versions import outdated
-from memmlp.runs.run import Run
-from memmlp.sweep.definition import COSTS, MODES, Sweep, Variant
-from memmlp.sweep.plan import Plan, count_states
-from memmlp.tables.effects import (
+from memmlp.report.tables.effects import (
     RunsBySeed,
     control_variant,
     effects,
     paper_effect,
     with_existing_branches,
 )
-from memmlp.tables.flags import DescribeRun, early_tables, find_flags, no_description
-from memmlp.tables.formats import FORMATS
-from memmlp.tables.measured_run import Measured, measured_for
-from memmlp.tables.table import Cell, Effect, Key, Row, Table
+from memmlp.report.tables.flags import DescribeRun, early_tables, find_flags, no_description
+from memmlp.report.tables.formats import FORMATS
+from memmlp.report.tables.measured_run import Measured, measured_for
+from memmlp.report.tables.table import Cell, Effect, Key, Row, Table
+from memmlp.runs.lookup import list_runs
+from memmlp.runs.recipe_versions import outdated
+from memmlp.runs.run import Run
+from memmlp.sweep.definition import COSTS, MODES, Sweep, Variant
+from memmlp.sweep.plan import Plan, count_states
 
 if TYPE_CHECKING:
-    from memmlp.tables.seed_rounds import Rounds
+    from memmlp.report.tables.seed_rounds import Rounds
 
 Find = Callable[[Variant, int], Measured | None]
 Read = Callable[[Path, tuple[str, ...]], Measured]

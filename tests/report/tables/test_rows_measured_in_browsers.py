@@ -10,9 +10,9 @@ import pytest
 
 from memmlp.common.errors import InputError
 from memmlp.config.compose_plan import find_sweep
-from memmlp.tables.build_table import without_runs
-from memmlp.tables.formats import FORMATS
-from memmlp.tables.rows_measured_in_browsers import read, with_rows
+from memmlp.report.tables.build_table import without_runs
+from memmlp.report.tables.formats import FORMATS
+from memmlp.report.tables.rows_measured_in_browsers import read, with_rows
 
 ROW = {
     "network": "AvatarPoser", "run": "random", "parameters": 4_120_000, "graph": "naive",

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from memmlp.report.tables.statistics import Verdict
 from memmlp.sweep.definition import COSTS
-from memmlp.tables.statistics import Verdict
 
 LEVEL = 0.05
 STEADY = 1.25  # how many times a measured time may be another of the same work
@@ -34,7 +34,7 @@ class Effect:
         low, high: its 95 % interval.
         p: its p-value, not corrected.
         holm: its p-value, corrected over the table's comparisons.
-        equal: the corrected p-value of equivalence (see `memmlp.tables.statistics`).
+        equal: the corrected p-value of equivalence (see `memmlp.report.tables.statistics`).
         verdict: the verdict that follows from these.
         detectable: the smallest difference that this comparison would have found with 80 % power.
         seeds, clips, groups: how many of each were paired.

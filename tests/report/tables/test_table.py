@@ -10,11 +10,11 @@ import pytest
 from fake_runs import fake_sweep, table_of
 from fake_table import cell, printed
 
+from memmlp.report.tables.statistics import Verdict
+from memmlp.report.tables.table import Cell, Effect, Table
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import parse_sweep
-from memmlp.tables.statistics import Verdict
-from memmlp.tables.table import Cell, Effect, Table
 
 
 def test_mean_and_sd_over_seeds(sweep: Sweep, table: Table, tmp_path: Path):

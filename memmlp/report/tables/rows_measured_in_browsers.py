@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError, one_line, why_unreadable
-from memmlp.tables.table import Cell, Effect, Row, Table
+from memmlp.report.tables.table import Cell, Effect, Row, Table
 
 FORMAT = "memmlp web bench 1"
 NUMBER = 17  # the table's, in the paper

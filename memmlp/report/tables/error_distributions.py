@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from memmlp.evaluation.metric_facts import HIGHER
+from memmlp.report.tables.effects import RunsBySeed, control_variant, with_existing_branches
 from memmlp.sweep.definition import COSTS, Sweep, Variant
-from memmlp.tables.effects import RunsBySeed, control_variant, with_existing_branches
 
 
 class Distribution(NamedTuple):

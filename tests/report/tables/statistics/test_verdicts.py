@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from drawn import SHARES, TABLE, differences
 
-from memmlp.tables.statistics import (
+from memmlp.report.tables.statistics import (
     Verdict,
     analysis_schedule,
     holm,

@@ -16,14 +16,14 @@ from fake_table import cell, printed
 
 from memmlp.report.kept_results import Kept, dumps, load_kept
 from memmlp.report.result_pages import describe_origin
+from memmlp.report.tables.build_table import make_table
+from memmlp.report.tables.formats import FORMATS
+from memmlp.report.tables.measured_run import Measured, load
+from memmlp.report.tables.statistics import Verdict
+from memmlp.report.tables.table import Table
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import Sweep, Variant
-from memmlp.tables.build_table import make_table
-from memmlp.tables.formats import FORMATS
-from memmlp.tables.measured_run import Measured, load
-from memmlp.tables.statistics import Verdict
-from memmlp.tables.table import Table
 
 
 def test_a_protocol_on_amass_with_other_data_is_flagged(sweep: Sweep):
@@ -295,7 +295,7 @@ def test_runs_upon_upstream_runs_of_different_origin_are_flagged(
     sweep: Sweep, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """A VQ-VAE by other code, on another machine, or trained again under its id, is in every error."""
-    monkeypatch.setattr("memmlp.tables.flags.code_digests", lambda packages: {"ik.py": "1"})
+    monkeypatch.setattr("memmlp.report.tables.flags.code_digests", lambda packages: {"ik.py": "1"})
     usual = UPSTREAM | {"recipes": {"vqvae": 1}, "sources": {"ik.py": "1"}}
 
     def flags(change: dict) -> set[str]:
@@ -371,7 +371,7 @@ def test_runs_from_before_code_changed_are_said(
         asked.append(packages)
         return {"training/loop.py": "1", "ik.py": "1", "new.py": "1", "mine:mine.py": "2"}
 
-    monkeypatch.setattr("memmlp.tables.flags.code_digests", today)
+    monkeypatch.setattr("memmlp.report.tables.flags.code_digests", today)
     code = {"training/loop.py": "1", "ik.py": "1", "gone.py": "0"}
     old = {"full_model": code | {"ik.py": "0"}, "by position": code | {"mine:mine.py": "1"}}
     own = {"by position": {"mine": {"version": None, "digest": "d"}}}

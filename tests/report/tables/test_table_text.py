@@ -10,10 +10,10 @@ import pytest
 from fake_runs import fake_sweep, table_of
 from fake_table import SHIPPED, cell, printed
 
+from memmlp.report.tables.table import Cell, Effect, Table
+from memmlp.report.tables.table_text import MINUS, effect_words, heading, legend, number_words, value_words
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import load_sweep
-from memmlp.tables.table import Cell, Effect, Table
-from memmlp.tables.table_text import MINUS, effect_words, heading, legend, number_words, value_words
 
 
 def test_costs_show_how_many_times_the_controls_they_are(tmp_path: Path):

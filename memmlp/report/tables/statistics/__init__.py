@@ -9,14 +9,21 @@ explains the method and how well it keeps its promises.
 
 from __future__ import annotations
 
-from memmlp.tables.statistics.paired_differences import (
+from memmlp.report.tables.statistics.paired_differences import (
     EffectEstimates,
     equivalence_p,
     paired_effects,
     seed_effects,
 )
-from memmlp.tables.statistics.power import detectable, seeds_needed
-from memmlp.tables.statistics.verdicts import Verdict, analysis_schedule, holm, sequential, spending, verdict
+from memmlp.report.tables.statistics.power import detectable, seeds_needed
+from memmlp.report.tables.statistics.verdicts import (
+    Verdict,
+    analysis_schedule,
+    holm,
+    sequential,
+    spending,
+    verdict,
+)
 
 __all__ = [
     "EffectEstimates",

@@ -15,12 +15,12 @@ from processes import finished
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
+from memmlp.report.tables.build_table import make_table, on_source, together, without_runs, write_summary
+from memmlp.report.tables.measured_run import load
 from memmlp.runs.loggers.facts import SweepFacts
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.sweep_file import load_sweep, parse_sweep
-from memmlp.tables.build_table import make_table, on_source, together, without_runs, write_summary
-from memmlp.tables.measured_run import load
 
 
 def test_collect_reads_each_run_once(sweep: Sweep, tmp_path: Path):
@@ -38,7 +38,7 @@ def test_collect_reads_each_run_once(sweep: Sweep, tmp_path: Path):
 
 def test_tables_need_no_torch():
     """Tables need no scipy.stats, matplotlib or Hydra either, for these take seconds to import."""
-    code = "import sys, memmlp.cli.table, memmlp.tables.formats as r; print(*sys.modules)"
+    code = "import sys, memmlp.cli.table, memmlp.report.tables.formats as r; print(*sys.modules)"
     ran = finished([sys.executable, "-c", code])
     assert ran.returncode == 0, ran.stderr
     assert not {"torch", "scipy.stats", "matplotlib", "hydra"} & set(ran.stdout.split())

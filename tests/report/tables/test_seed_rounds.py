@@ -10,14 +10,14 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
+from memmlp.report.tables.build_table import make_table
+from memmlp.report.tables.effects import RunsBySeed
+from memmlp.report.tables.formats import markdown
+from memmlp.report.tables.measured_run import Measured, Origin
+from memmlp.report.tables.seed_rounds import Rounds, advance, forecast_seeds, new_rounds
+from memmlp.report.tables.statistics import Verdict
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import parse_sweep
-from memmlp.tables.build_table import make_table
-from memmlp.tables.effects import RunsBySeed
-from memmlp.tables.formats import markdown
-from memmlp.tables.measured_run import Measured, Origin
-from memmlp.tables.seed_rounds import Rounds, advance, forecast_seeds, new_rounds
-from memmlp.tables.statistics import Verdict
 
 ORIGIN = Origin("c", False, "d", "cpu")
 CLIPS = [f"clip {number}" for number in range(10)]

@@ -12,10 +12,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from memmlp.report.tables.measured_run import SHARED, Measured, measured_for
+from memmlp.report.tables.statistics import (
+    detectable,
+    equivalence_p,
+    holm,
+    paired_effects,
+    seeds_needed,
+    verdict,
+)
+from memmlp.report.tables.table import STEADY, Effect, Key
 from memmlp.sweep.definition import COSTS, MODES, TIMES, Sweep, Variant
-from memmlp.tables.measured_run import SHARED, Measured, measured_for
-from memmlp.tables.statistics import detectable, equivalence_p, holm, paired_effects, seeds_needed, verdict
-from memmlp.tables.table import STEADY, Effect, Key
 
 RunsBySeed = Mapping[int, Measured]  # a variant's finished runs by seed
 

@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.special import stdtrit
 
-from memmlp.tables.statistics import (
+from memmlp.report.tables.statistics import (
     EffectEstimates,
     detectable,
     equivalence_p,
     paired_effects,
     seeds_needed,
 )
-from memmlp.tables.statistics.paired_differences import error, skewed
+from memmlp.report.tables.statistics.paired_differences import error, skewed
 
 
 def satterthwaite(d: np.ndarray) -> np.ndarray:
@@ -242,7 +242,7 @@ def test_means_of_few_skewed_values_have_the_tails_they_are_given(count: int):
 
 def test_the_example_of_the_documentation():
     """Each of its numbers follows from its table."""
-    page = (Path(__file__).parents[3] / "docs/statistics.md").read_text()
+    page = (Path(__file__).parents[4] / "docs/statistics.md").read_text()
     example = page[page.index("**An example**") : page.index("## The error of a mean")]
     rows = [[float(cell) for cell in row.split("|")[2:8]] for row in re.findall(r"\| seed .*", example)]
     table = np.array(rows)

@@ -12,12 +12,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from memmlp.common.processes import MIN_CORE_SHARE
+from memmlp.report.tables.effects import RunsBySeed, compared, one_and_the_same
+from memmlp.report.tables.measured_run import SHARED, UNKNOWN, Measured, core_share, undisturbed
+from memmlp.report.tables.table import STEADY
 from memmlp.runs.environment import changed, code_digests
 from memmlp.runs.lookup import hardly_trained
 from memmlp.sweep.definition import COSTS, TIMES, Sweep, Variant
-from memmlp.tables.effects import RunsBySeed, compared, one_and_the_same
-from memmlp.tables.measured_run import SHARED, UNKNOWN, Measured, core_share, undisturbed
-from memmlp.tables.table import STEADY
 
 DescribeRun = Callable[[Variant, int], str | None]
 Labelled = Sequence[tuple[str, Measured]]

@@ -8,7 +8,7 @@ import functools
 import numpy as np
 from scipy.special import chdtri, ndtri
 
-from memmlp.tables.statistics.paired_differences import LEVEL, Error, Groups, error
+from memmlp.report.tables.statistics.paired_differences import LEVEL, Error, Groups, error
 
 DRAWS = 4096  # simulated tables; a power of two, as Sobol's sequence wants
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from memmlp.tables.error_distributions import (
+from memmlp.report.tables.error_distributions import (
     interquartile_mean,
     performance_profile,
     probability_of_improvement,

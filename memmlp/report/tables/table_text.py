@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from memmlp.evaluation.metric_facts import HIGHER, UNITS
+from memmlp.report.tables.statistics import Verdict
+from memmlp.report.tables.table import STEADY, Cell, Row, Table
 from memmlp.sweep.definition import COSTS
-from memmlp.tables.statistics import Verdict
-from memmlp.tables.table import STEADY, Cell, Row, Table
 
 COST_UNITS = {
     "FLOPs": "G",

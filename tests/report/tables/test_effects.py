@@ -12,13 +12,13 @@ import pytest
 from fake_runs import CLIPS, fake_run, fake_sweep, runs_of, table_of
 from fake_table import EFFECTS, cell, printed
 
+from memmlp.report.tables.build_table import make_table
+from memmlp.report.tables.effects import mean_cost, needs
+from memmlp.report.tables.measured_run import load
+from memmlp.report.tables.statistics import Verdict, holm, paired_effects
+from memmlp.report.tables.table import Table
 from memmlp.runs.evaluation_file import write_report
 from memmlp.sweep.definition import MODES, Sweep
-from memmlp.tables.build_table import make_table
-from memmlp.tables.effects import mean_cost, needs
-from memmlp.tables.measured_run import load
-from memmlp.tables.statistics import Verdict, holm, paired_effects
-from memmlp.tables.table import Table
 
 
 def test_difference_is_paired_by_seed_and_clip(sweep: Sweep, tmp_path: Path):

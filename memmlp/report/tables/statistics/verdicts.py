@@ -7,7 +7,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from memmlp.tables.statistics.paired_differences import LEVEL
+from memmlp.report.tables.statistics.paired_differences import LEVEL
 
 
 class Verdict(StrEnum):

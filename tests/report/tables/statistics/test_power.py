@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from drawn import SHARES, TABLE, differences
 
-from memmlp.tables.statistics import (
+from memmlp.report.tables.statistics import (
     detectable,
     paired_effects,
     seeds_needed,
 )
-from memmlp.tables.statistics.paired_differences import error
+from memmlp.report.tables.statistics.paired_differences import error
 
 
 @pytest.mark.parametrize("comparisons", [1, 24])

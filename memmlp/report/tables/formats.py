@@ -14,9 +14,9 @@ from typing import Any
 from rich.console import Console
 
 from memmlp.common.files import plain
-from memmlp.tables.statistics import Verdict
-from memmlp.tables.table import Table
-from memmlp.tables.table_text import MINUS, Grid, VariantLine, caption, grids, legend
+from memmlp.report.tables.statistics import Verdict
+from memmlp.report.tables.table import Table
+from memmlp.report.tables.table_text import MINUS, Grid, VariantLine, caption, grids, legend
 
 GAP = "  "  # stands between columns on a terminal
 LABEL = 18  # the largest width of the variants' column on a terminal, characters

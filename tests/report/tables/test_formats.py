@@ -10,10 +10,10 @@ import pytest
 from fake_runs import CLIPS, fake_sweep, table_of
 from fake_table import SHIPPED, cell, printed
 
+from memmlp.report.tables.formats import FORMATS
+from memmlp.report.tables.table import Table
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import load_sweep
-from memmlp.tables.formats import FORMATS
-from memmlp.tables.table import Table
 
 
 def test_only_costs_need_one_block(tmp_path: Path):

@@ -8,9 +8,9 @@ import pytest
 from fake_runs import fake_sweep, table_of
 from fake_table import EFFECTS, FILE
 
+from memmlp.report.tables.table import Table
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import parse_sweep
-from memmlp.tables.table import Table
 
 
 @pytest.fixture

@@ -14,11 +14,11 @@ from fake_runs import CLIPS, ORIGIN, fake_run, fake_sweep, table_of
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
 from memmlp.report.kept_results import Kept, dumps, load_kept
+from memmlp.report.tables.measured_run import Measured, load
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.identity import deployment_id_of
 from memmlp.runs.recipe_versions import RECIPES, outdated
 from memmlp.sweep.definition import Sweep
-from memmlp.tables.measured_run import Measured, load
 
 
 def test_costs_have_the_tables_units(tmp_path: Path):
