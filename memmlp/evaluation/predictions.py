@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -19,7 +19,7 @@ from memmlp.evaluation.ik import IK, NoIK
 from memmlp.motion.body import FPS, SPARSE_DIM
 from memmlp.motion.clip import SPLINES, Clip, resample
 from memmlp.motion.dataset import MotionDataset
-from memmlp.motion.exporting import ExportPlan, ExportReport, Target, read_motion, read_targets, write_motion
+from memmlp.motion.exporting import ExportPlan, ExportReport, Target, read_motion, read_targets, write_clips
 from memmlp.motion.normalizer import Normalizer
 from memmlp.motion.preparing.cache import frame_blocks
 from memmlp.networks.motion_model import MotionModel
@@ -147,7 +147,6 @@ class ClipPredictor:
         ]
 
     def _clip(self, name: str, arrays: Mapping[str, np.ndarray]) -> Clip:
-        """Return this predictor's branch of `prediction_arrays` as a clip."""
         kind = KINDS_OF_POSES[self.branch]
         return motion_clip(name, arrays[f"{kind}_rotations"], arrays[f"{kind}_positions"], self.rest)
 
@@ -162,18 +161,15 @@ class ClipPredictor:
         Raises:
             InputError: if no clip could be read, or a file cannot be written.
         """
-        written: list[Path] = []
         skipped, odd = list(plan.skipped), dict[str, str]()
-        seconds = 0.0
-        clips = read_targets(plan, lambda target: self._frames(target, odd), skipped, strict)
-        while batch := list(islice(clips, self.evaluation.batch)):
-            targets, frames = zip(*batch, strict=True)
-            made = self.predict([target.name for target in targets], frames)
-            for target, clip in zip(targets, made, strict=True):
-                write_motion(target.path, clip, self.rest, plan.format)
-                written.append(target.path)
-                seconds += len(clip) / FPS
-        return ExportReport(tuple(written), seconds, tuple(skipped), odd)
+        frames = read_targets(plan, lambda target: self._frames(target, odd), skipped, strict)
+
+        def predicted() -> Iterator[tuple[Target, Clip]]:
+            while batch := list(islice(frames, self.evaluation.batch)):
+                targets, clips = zip(*batch, strict=True)
+                yield from zip(targets, self.predict([target.name for target in targets], clips), strict=True)
+
+        return write_clips(plan, predicted(), self.rest, skipped, odd)
 
     def _frames(self, target: Target, odd: dict[str, str]) -> Tensor:
         """Read a clip's frames (N, 252), computed on the network's body as in a cache.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -187,15 +187,36 @@ def export(
     rest = load_rest_joints(body)
     if plan.format.has_bones:
         check_imported_body([target.source for target in plan.targets], rest, f"--body {body}")
-    written: list[Path] = []
     skipped, odd = list(plan.skipped), dict[str, str]()
-    seconds = 0.0
 
     def read(target: Target) -> Clip:
         clip = read_motion(target, odd)
         return clip if fps is None else resample(clip, fps)[0]
 
-    for target, clip in read_targets(plan, read, skipped, strict):
+    return write_clips(plan, read_targets(plan, read, skipped, strict), rest, skipped, odd)
+
+
+def write_clips(
+    plan: ExportPlan,
+    clips: Iterable[tuple[Target, Clip]],
+    rest: np.ndarray,
+    skipped: Sequence[Skipped],
+    odd: Mapping[str, str],
+) -> ExportReport:
+    """Write clips on a body with rest joints (22, 3), metres, to the targets of a plan.
+
+    Args:
+        plan: the targets and the format.
+        clips: some of the plan's targets, each with its clip.
+        rest: the body's rest joints.
+        skipped: the skipped clips, for the report; complete once all clips are read.
+        odd: remarks on unusual clips, for the report; complete once all clips are read.
+
+    Raises:
+        InputError: if a file cannot be written.
+    """
+    written, seconds = [], 0.0
+    for target, clip in clips:
         write_motion(target.path, clip, rest, plan.format)
         written.append(target.path)
         seconds += len(clip) / clip.fps

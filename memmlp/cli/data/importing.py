@@ -81,7 +81,6 @@ def import_(
 
 
 def _rates(texts: Sequence[str]) -> dict[str, float]:
-    """Parse FOLDER=HZ or HZ into rates by folder ("" for all)."""
     rates: dict[str, float] = {}
     for text in texts:
         folder, _, rate = text.rpartition("=")
@@ -95,7 +94,6 @@ def _rates(texts: Sequence[str]) -> dict[str, float]:
 
 
 def _floor(text: str) -> str | float:
-    """Parse auto, none or metres."""
     if text in ("auto", "none"):
         return text
     try:

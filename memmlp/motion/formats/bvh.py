@@ -212,7 +212,6 @@ class _Words:
 
 
 def _hierarchy(words: _Words) -> tuple[list[str], list[int], list[list[float]], list[tuple[str, ...]]]:
-    """Read names, parents and offsets of joints and end sites, and the joints' channels."""
     names: list[str] = []
     parents: list[int] = []
     offsets: list[list[float]] = []
@@ -304,7 +303,6 @@ def _header(path: Path, number: int, line: bytes, key: str) -> str:
 
 
 def _frame(path: Path, number: int, line: bytes, width: int) -> np.ndarray:
-    """Parse the numbers (width,) of a frame's line."""
     words = line.split()
     if len(words) != width:
         _fail(path, number, f"{len(words)} values", f"{width}, one for each channel")

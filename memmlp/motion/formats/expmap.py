@@ -123,8 +123,6 @@ def read_expmap(path: Path) -> Expmap:
 
 
 def _row(path: Path, number: int, line: str) -> np.ndarray:
-    """Parse the numbers (117,) of a line."""
-
     def fail(wrong: str) -> NoReturn:
         raise InputError(f"{path}: line {number}: {wrong}; expected {WIDTH} numbers with commas between them")
 

@@ -133,7 +133,6 @@ def _primitive(buffer: Buffer, mesh: Mesh, material: int) -> dict[str, Any]:
 
 
 def _animation(buffer: Buffer, clip: Clip, rest: np.ndarray) -> dict[str, Any]:
-    """Return the animation: each joint's rotation and the root's translation, at the clip's frames."""
     quaternions = np.empty((len(clip), N_JOINTS, 4), "<f4")
     root = np.empty((len(clip), 3), "<f4")
     end = 0

@@ -118,7 +118,6 @@ def write_clip(path: Path, clip: Clip) -> None:
 
 
 def _keys(file: _Npz) -> tuple[dict[str, tuple[int, ...]], str, str]:
-    """Return the layout of a file, and its keys of translation and frame rate."""
     if not any(key in file.names for layout in LAYOUTS for key in layout):
         raise NoMotion(f"{file.path}: no poses in it, so it is not motion")
     layout = next((layout for layout in LAYOUTS if set(layout) <= file.names), None)
@@ -189,8 +188,6 @@ class _Header:
 
 
 class _Npz:
-    """An npz that is open for reading."""
-
     def __init__(self, path: Path, archive: zipfile.ZipFile) -> None:
         self.path = path
         self._zip = archive

@@ -146,7 +146,6 @@ def _worst(errors: np.ndarray, names: list[str] | tuple[str, ...]) -> Worst:
 def _file_faults(
     found: Fidelity, positions: np.ndarray, expected: np.ndarray, mapped: np.ndarray
 ) -> Iterator[str]:
-    """Yield the differences from the file."""
     if found.mm.value > MOST_MM:
         where, frame = found.mm.where, found.mm.frame
         yield f"{where} is {found.mm.value:.1f} mm off on the file's own bones in frame {frame}"
@@ -165,7 +164,6 @@ def _file_faults(
 
 
 def _posture_faults(rotations: np.ndarray, positions: np.ndarray, mapped: np.ndarray) -> Iterator[str]:
-    """Yield impossible postures of head, knees and feet."""
     upright = (positions[:, HEAD, 2] > positions[:, 0, 2]).mean()
     if upright < UPRIGHT_SHARE:
         yield f"the head is below the pelvis in {1 - upright:.0%} of the frames"
@@ -215,8 +213,6 @@ def _turn_faults(rotations: np.ndarray, positions: np.ndarray) -> Iterator[str]:
 
 
 def _length_faults(expected: np.ndarray, rest: np.ndarray) -> Iterator[str]:
-    """Yield the limbs whose lengths in the file are impossible for a person."""
-
     def length(at: np.ndarray, start: int, end: int) -> float:
         return float(np.median(np.linalg.norm(at[..., end, :] - at[..., start, :], axis=-1)))
 

@@ -230,7 +230,6 @@ def _check_import(files: Mapping[Path, Path], out: Path, how: ImportSettings) ->
 
 
 def _make_staging(out: Path) -> tempfile.TemporaryDirectory:
-    """Make a folder beside `out`, in which an import grows until it is complete."""
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         return tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-")
@@ -247,7 +246,6 @@ def _import_file(
     rest: np.ndarray,
     source: Path,
 ) -> Imported:
-    """Write one clip below the staging folder."""
     content = recording.path.read_bytes()
     top = source if source.is_dir() else source.parent
     rate = true_rate(recording.fps, relative, content, top, how.fps)
@@ -344,7 +342,6 @@ def _take_notes(names: Mapping[str, str], takes: Sequence[str]) -> Iterator[str]
 
 
 def _notes(clips: Sequence[Imported], maps: Mapping[str, SkeletonMap], how: ImportSettings) -> Iterator[str]:
-    """Yield remarks on rates, skeletons, first frames and floors, one line for all clips of a kind."""
     corrected: dict[str, list[str]] = {}
     odd: dict[float, list[str]] = {}
     for clip in clips:
@@ -373,7 +370,6 @@ def _notes(clips: Sequence[Imported], maps: Mapping[str, SkeletonMap], how: Impo
 
 
 def _skeleton_notes(name: str, clips: Sequence[Imported]) -> Iterator[str]:
-    """Yield differences between the clips of one skeleton."""
     for key in ("up", "unit"):
         found = Counter(getattr(clip, key) for clip in clips)
         if len(found) > 1:

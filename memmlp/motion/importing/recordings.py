@@ -113,7 +113,6 @@ def folder_key(folder: Path) -> str:
 
 @cache
 def _known_rates() -> dict[str, float]:
-    """Return the true rates of files with wrong headers, by the first digits of their digests."""
     path = Path(__file__).with_name("known_rates.yaml")
     return {digest: float(fps) for digest, fps in yaml.safe_load(path.read_text("utf-8")).items()}
 

@@ -83,7 +83,6 @@ def _divided_folders_remark(manifest: Manifest) -> str:
 
 
 def _is_untied(split: Mapping[str, Any], name: str) -> bool:
-    """Return whether no pattern of a split's groups matches a clip."""
     for source, own in split.get("sources", {}).items():
         if name.startswith(f"{source}/"):
             return _is_untied(own, name.removeprefix(f"{source}/"))

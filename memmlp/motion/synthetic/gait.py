@@ -281,7 +281,6 @@ def running(rng: np.random.Generator, t: Array) -> Puppet:
 
 
 def _locomotion(rng: np.random.Generator, t: Array, gait: Gait) -> Puppet:
-    """Move with a gait, in one person's style."""
     style = Style.draw(rng)
     course = _course(rng, t, gait, style)
     puppet = stand(rng, t, style)

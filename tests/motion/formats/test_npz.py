@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.motion.clip import Clip
 from memmlp.motion.formats import npz as bounded_npz
-from memmlp.motion.formats.npz import NoMotion, read_clip, write_clip
+from memmlp.motion.formats.npz import NoMotion, read_clip
 
 
 def arrays(frames: int = 20, width: int = 156) -> dict[str, np.ndarray]:
@@ -82,14 +81,6 @@ def test_parts_of_another_size_are_refused(tmp_path):
         path.write_bytes(npz(**(good | change)))
         with pytest.raises(InputError, match=r"a\.npz: .*(root_orient|pose_body)"):
             read_clip(path, "a")
-
-
-def test_written_clips_are_read_back(tmp_path):
-    clip = Clip("x", arrays()["poses"][:, :66].reshape(-1, 22, 3), arrays()["trans"], 59.94)
-    write_clip(tmp_path / "sub" / "x.npz", clip)
-    back = read_clip(tmp_path / "sub" / "x.npz", "x")
-    np.testing.assert_allclose(back.poses, clip.poses, atol=1e-6)
-    assert back.fps == pytest.approx(59.94)
 
 
 class Payload:

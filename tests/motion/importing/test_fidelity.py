@@ -36,12 +36,6 @@ def test_imports_keep_joints_and_limbs(tmp_path: Path, skeleton: str) -> None:
     assert fidelity.degrees.value < 3
 
 
-def test_a_turning_joint_without_counterpart_shows(tmp_path: Path) -> None:
-    """A buttock that turns moves the thigh on a bone that the import lacks."""
-    path = write(tmp_path, person("cmu_daz", 10, 5, folded=True).text())
-    assert converted(path, load_skeleton("cmu_daz")).fidelity.mm.value > 1
-
-
 @pytest.fixture
 def walk(tmp_path: Path) -> Converted:
     chosen = load_skeleton("cmu_daz")
@@ -106,13 +100,6 @@ def test_a_head_that_flips_for_a_while_is_said(walk: Converted) -> None:
     flipped = bent(walk.clip, "head", slice(40, 46), [0.0, 0.0, np.pi])
     said = compare(flipped, walk.motion, REST, "cmu_daz").faults
     assert any(f"{6 / len(flipped):.0%} of the frames, first in frame 40" in fault for fault in said)
-
-
-def test_segments_that_stretch_are_said(walk: Converted) -> None:
-    positions = walk.motion.positions.copy()
-    positions[10:, JOINT["left_wrist"]] += 0.1
-    faults = compare(walk.clip, replace(walk.motion, positions=positions), REST, "cmu_daz").faults
-    assert any("left_elbow to left_wrist changes its length by" in fault for fault in faults)
 
 
 # Wrong maps, units and rest poses

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from bvh_samples import (
-    POSITIONS,
     TREES,
     Sample,
     own_tree,
@@ -123,22 +122,6 @@ def test_a_standing_person_stands(tmp_path: Path, skeleton: str) -> None:
     np.testing.assert_allclose(rotations[wrists], 0, atol=1e-9)
 
 
-def test_left_is_left_of_facing(tmp_path: Path) -> None:
-    """A person who has turned by 90 degrees about the file's up axis faces +x, with the left on +y."""
-    sample = person("cmu_daz", 2, 0)
-    sample.values[:] = 0
-    turn = 3 + [name[0] for name in sample.channels[0][3:]].index("Y")
-    sample.values[1, turn] = 90
-    rotations, positions = on_body(
-        imported(read_bvh(write(tmp_path, sample.text())), load_skeleton("cmu_daz"))
-    )
-    facing = rotations[0, 0] @ [0, 0, 1]
-    left = unit(positions[0, JOINT["left_wrist"]] - positions[0, JOINT["right_wrist"]])
-    np.testing.assert_allclose(facing[1], 0, atol=1e-9)
-    assert facing[0] > 0.95
-    assert np.cross([0, 0, 1], facing) @ left > 0.99
-
-
 def test_up_axis(tmp_path: Path) -> None:
     """The same motion in a Z-up file gives the same clip."""
     sample, chosen = person("cmu_daz", 6, 2), load_skeleton("cmu_daz")
@@ -173,23 +156,6 @@ def test_translation_is_scaled_by_the_legs(tmp_path: Path) -> None:
     source = np.linalg.norm([0, -36.8, 0.7]) + np.linalg.norm([-0.7, -45.1, -5.1])
     moved = np.diff(imported(bvh, load_skeleton("cmu_daz")).trans, axis=0)[0]
     np.testing.assert_allclose(moved, np.array([10, 5, 2]) * sum(legs) / source, atol=1e-9)
-
-
-def test_lengths_are_those_of_the_motion(tmp_path: Path) -> None:
-    """Where every joint has position channels, they count, and no OFFSET does."""
-    chosen = replace(load_skeleton("cmu_daz"), calibration_frame=False)
-    sample = performed(chosen, synthesize_clip("walking", 1, seconds=0.5))
-    expected = imported(read_bvh(write(tmp_path, sample.text())), chosen)
-    frames, column = len(sample.values), sum(map(len, sample.channels))
-    wide = replace(sample, channels=list(sample.channels), values=sample.values.copy())
-    for joint in range(len(sample.names) - 1, 0, -1):
-        column -= len(sample.channels[joint])
-        places = np.tile(sample.offsets[joint], (frames, 1))
-        wide.values = np.insert(wide.values, [column] * 3, places, axis=1)
-        wide.channels[joint] = (*POSITIONS, *sample.channels[joint])
-    wide.offsets = (10 * np.array(sample.offsets)).tolist()
-    found = imported(read_bvh(write(tmp_path, wide.text())), chosen)
-    np.testing.assert_allclose(found.trans, expected.trans, atol=1e-3)
 
 
 def test_calibration_frame_is_dropped(tmp_path: Path) -> None:
@@ -228,18 +194,6 @@ def test_a_performance_comes_back_from_its_file(tmp_path: Path, skeleton: str) -
 
 def zero_pose(sample: Sample) -> Bvh:
     return replace(sample, values=np.zeros((2, sample.values.shape[1]))).hierarchy()
-
-
-@pytest.mark.parametrize("skeleton", TREES)
-def test_people_are_upright_on_the_floor(tmp_path: Path, skeleton: str) -> None:
-    chosen = load_skeleton(skeleton)
-    file = performed(chosen, synthesize_clip("walking", 1, seconds=4.0), sample=tree(skeleton))
-    clip = convert(read_bvh(write(tmp_path, file.text())), chosen, REST, name="clip").clip
-    height = np.median(on_body(clip)[1][..., 2], axis=0)
-    assert 1.4 < height[JOINT["head"]] < 1.65
-    assert 0.8 < height[JOINT["pelvis"]] < 1.0
-    toes = on_body(clip)[1][:, [JOINT["left_foot"], JOINT["right_foot"]], 2].min(1)
-    assert abs(np.percentile(toes, 5) - 0.02) < 0.03
 
 
 # The stance from which a skeleton is read, and what is refused by name
@@ -330,19 +284,6 @@ def test_a_wrong_up_axis_is_refused(tmp_path: Path, walk: Clip) -> None:
         found(tmp_path, walk, DAZ, written=replace(DAZ, up="z"))
 
 
-def test_hips_at_one_place_are_refused(tmp_path: Path) -> None:
-    bvh = read(tmp_path, "cmu_daz")
-    offsets = bvh.offsets.copy()
-    offsets[[bvh.nodes.index(name) for name in ("lButtock", "rButtock")]] = 0
-    chosen = load_skeleton("cmu_daz")
-    flat = replace(bvh, offsets=offsets)
-    with refuse(bvh.path, "the hips are at the same place"):
-        find_stance(flat, chosen, pick_joints(flat, chosen))
-    nothing = replace(bvh, offsets=bvh.offsets * 0, values=bvh.values * 0)
-    with refuse(bvh.path, "pelvis and head are at the same place"):
-        find_stance(nothing, chosen, pick_joints(nothing, chosen))
-
-
 # Left and right
 
 
@@ -384,12 +325,6 @@ def test_joints_of_a_leg_that_stand_for_others_are_refused(tmp_path: Path, walk:
 
 
 # A map's rest
-
-
-def test_the_pose_of_a_map(tmp_path: Path, walk: Clip) -> None:
-    turns = rest_turns(BANDAI, own_tree(BANDAI))
-    stance = found(tmp_path, walk, BANDAI, BANDAI, turns)
-    assert (stance.source, stance.straight) == ("the map's rest pose", False)
 
 
 def leaning(degrees: float) -> list[float]:

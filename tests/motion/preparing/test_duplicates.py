@@ -66,8 +66,7 @@ def test_a_published_list_is_kept_although_copies_join_its_groups():
     assert split.assign.call_count == 1
 
 
-@pytest.mark.parametrize("source", ["", "cmu/"])
-@pytest.mark.parametrize("copy", [False, True])
+@pytest.mark.parametrize(("source", "copy"), [("", False), ("", True), ("cmu/", True)])
 def test_a_copy_leaves_the_limit_of_clips_of_a_group(source: str, copy: bool):
     """Twelve takes of ten clips each; one clip of the first take is there again in the second."""
     names = [f"{source}take{take:02}/{clip}" for take in range(12) for clip in range(10)]
