@@ -194,14 +194,14 @@ def as_yaml(proposed: Guess, recording: Recording) -> str:
         "# Check it with `memmlp data skeleton show` before you use it.",
         f"name: {_scalar(skeleton.name)}",
     ]
+    unit = up = ""
     try:
         settled = find_unit_and_up(recording, skeleton)
-        lines += [
-            f"unit: auto  # in this file {settled.unit or 0:.4g} m",
-            f"up: auto  # in this file {settled.up}",
-        ]
+        if settled.unit is not None:
+            unit, up = f"  # in this file {settled.unit:.4g} m", f"  # in this file {settled.up}"
     except InputError as error:
-        lines += [f"# In doubt: {str(error).removeprefix(f'{recording.path}: ')}.", "unit: auto", "up: auto"]
+        lines.append(f"# In doubt: {str(error).removeprefix(f'{recording.path}: ')}.")
+    lines += [f"unit: auto{unit}", f"up: auto{up}"]
     if skeleton.calibration_frame:
         lines.append("calibration_frame: true  # guessed: frame 0 is far from frame 1")
     lines.append("joints:")
