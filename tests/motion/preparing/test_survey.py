@@ -40,7 +40,7 @@ def test_one_bad_file_never_stops_a_folder(root):
     (root / "directory.npz").mkdir()
     found = survey(root)
     assert {file.file: file.reason.split(";")[0] for file in found.skipped} == {
-        "text.npz": "no zip, so no npz (memmlp data import makes one of BVH)",
+        "text.npz": "not a zip, so not an npz (memmlp data import makes one of BVH)",
         "dangling.npz": "cannot be read (No such file or directory)",
         "pipe.npz": "not a regular file",
         r"line\nfeed.npz": "line feeds or other control characters in its name",
