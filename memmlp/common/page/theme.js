@@ -1,35 +1,28 @@
-// Light or dark: as the system has it, unless the switch says otherwise. The choice is remembered in this browser.
+// Light or dark: the system's setting, unless the switch at the top chooses; the choice is remembered in this browser.
 
 (() => {
   const NEXT = { system: 'light', light: 'dark', dark: 'system' };
+  const KEY = 'memmlp theme';
   const root = document.documentElement;
+  const attempt = work => { try { return work(); } catch { return null; } }; // some browsers do not store anything
 
-  function kept() {
-    try {
-      return localStorage.getItem('memmlp theme');
-    } catch { // a browser that keeps nothing, or a file
-      return null;
-    }
+  function name() {
+    const button = document.getElementById('theme');
+    button.title = `Colours: ${root.dataset.theme}`;
+    button.setAttribute('aria-label', `${button.title}; change to ${NEXT[root.dataset.theme]}`);
   }
 
-  function choose(theme) {
-    root.dataset.theme = theme;
-    try {
-      localStorage.setItem('memmlp theme', theme);
-    } catch { /* it holds until the page is closed */ }
+  function choose() {
+    root.dataset.theme = NEXT[root.dataset.theme];
+    attempt(() => localStorage.setItem(KEY, root.dataset.theme));
     name();
     dispatchEvent(new Event('theme'));
   }
 
-  function name() {
-    const button = document.getElementById('theme');
-    button.title = `Colours: ${{ system: 'as the system has them', light: 'light', dark: 'dark' }[root.dataset.theme]}`;
-    button.setAttribute('aria-label', `${button.title}; change to ${NEXT[root.dataset.theme]}`);
-  }
-
-  root.dataset.theme = kept() in NEXT ? kept() : 'system';
+  const stored = attempt(() => localStorage.getItem(KEY));
+  root.dataset.theme = stored in NEXT ? stored : 'system';
   addEventListener('DOMContentLoaded', () => {
     name();
-    document.getElementById('theme').addEventListener('click', () => choose(NEXT[root.dataset.theme]));
+    document.getElementById('theme').addEventListener('click', choose);
   });
 })();
