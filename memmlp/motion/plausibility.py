@@ -34,12 +34,12 @@ SAMPLES = 50  # frames that are tested for posture
 
 def check_plausible(path: Path, clip: Clip) -> None:
     """Raise InputError, which names the file, for a clip that cannot be a person's motion."""
-    reason = implausible(clip)
+    reason = why_implausible(clip)
     if reason is not None:
         raise InputError(f"{path}: {reason}")
 
 
-def implausible(clip: Clip) -> str | None:
+def why_implausible(clip: Clip) -> str | None:
     """Return why a clip cannot be a person's motion in radians, metres and with Z up, or None."""
     share = (np.linalg.norm(clip.poses, axis=-1).max(1) > MOST_TURN).mean()
     if share > 0.5:
@@ -55,8 +55,8 @@ def implausible(clip: Clip) -> str | None:
     return "the person stands along Y and never along Z, so Y is up, not Z" if _is_y_up(clip) else None
 
 
-def unusual(clip: Clip) -> str | None:
-    """Return a warning about a clip that is odd but may be sound, or None."""
+def why_unusual(clip: Clip) -> str | None:
+    """Return what is odd about a clip that may be sound, or None."""
     joints = _joints(clip, _spread(clip))
     if (joints[:, HEAD, 2] - joints[:, 0, 2] > 0.2).mean() < 0.02:
         return "the head is never above the pelvis, so the person lies throughout, or Z is not up"

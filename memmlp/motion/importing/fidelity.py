@@ -29,7 +29,7 @@ from memmlp.motion.importing.anatomy import (
     unit,
 )
 from memmlp.motion.importing.skeleton_map import Z_UP, MappedMotion
-from memmlp.motion.plausibility import implausible
+from memmlp.motion.plausibility import why_implausible
 
 MOST_MM, MOST_DEGREES = 1.0, 3.0  # the largest errors that an import may have
 SHORTEST = 1e-2  # metres: the direction of a shorter segment does not count
@@ -97,7 +97,7 @@ def compare(clip: Clip, motion: MappedMotion, rest: np.ndarray, skeleton: str) -
         *floor_faults(positions),
         *_turn_faults(rotations, positions),
         *_length_faults(expected, rest),
-        *filter(None, [implausible(clip)]),
+        *filter(None, [why_implausible(clip)]),
     ]
     return replace(result, faults=tuple(faults))
 

@@ -67,25 +67,25 @@ same number for a person.
 """
 
 
-def unpacked(name: str) -> str:
+def strip_archives(name: str) -> str:
     """Return a clip's name without the folders of archives above the subset's own folder."""
     archive, _, rest = name.partition("/")
     if "/" not in rest:
         return name
     twice = subset(archive) == subset(rest)
     within = archive not in FOLDERS and rest.split("/")[0] in FOLDERS and rest.count("/") > 1
-    return unpacked(rest) if twice or within else name
+    return strip_archives(rest) if twice or within else name
 
 
 def clip_key(name: str) -> str:
     """Return a key that is the same for all names of a clip in all releases, except for letter case."""
-    _, _, rest = unpacked(name).partition("/")
-    return f"{subset(unpacked(name))}/{SUFFIX.sub('', rest.replace(' ', '_'))}"
+    _, _, rest = strip_archives(name).partition("/")
+    return f"{subset(strip_archives(name))}/{SUFFIX.sub('', rest.replace(' ', '_'))}"
 
 
 def present_subsets(names: Iterable[str]) -> set[str]:
     """Return the subsets of clips, or of folders of subsets, by their names."""
-    return {subset(one) for name in names for one in (name, unpacked(name))}
+    return {subset(one) for name in names for one in (name, strip_archives(name))}
 
 
 def absent_subsets(data: str, names: Iterable[str]) -> str:
@@ -116,7 +116,7 @@ def divided_subjects(parts: Iterable[tuple[str, str]]) -> list[str]:
     names: dict[tuple[str, str], str] = {}
     found: dict[str, set[str]] = defaultdict(set)
     for name, part in parts:
-        folders = unpacked(name).split("/")[:-1]
+        folders = strip_archives(name).split("/")[:-1]
         if len(folders) >= 2 and subset(folders[0]) in SUBSETS:
             found[names.setdefault(_subject_key(folders), "/".join(folders[:2]))].add(part)
     return sorted(subject for subject, of in found.items() if {"train", "test"} <= of)

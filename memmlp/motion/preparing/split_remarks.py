@@ -7,7 +7,7 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from memmlp.motion.preparing.amass_names import divided_subjects, unpacked
+from memmlp.motion.preparing.amass_names import divided_subjects, strip_archives
 from memmlp.motion.preparing.manifest import Manifest
 
 
@@ -86,7 +86,7 @@ def _is_untied(split: Mapping[str, Any], name: str) -> bool:
     for source, own in split.get("sources", {}).items():
         if name.startswith(f"{source}/"):
             return _is_untied(own, name.removeprefix(f"{source}/"))
-    return not any(re.search(pattern, unpacked(name)) for pattern in split.get("groups", ()))
+    return not any(re.search(pattern, strip_archives(name)) for pattern in split.get("groups", ()))
 
 
 def _folders(name: str) -> list[str]:

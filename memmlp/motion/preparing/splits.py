@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.motion.preparing.amass_names import clip_key, present_subsets, subset, unpacked
+from memmlp.motion.preparing.amass_names import clip_key, present_subsets, strip_archives, subset
 from memmlp.motion.preparing.groups import Grouping
 
 PARTS = ("train", "val", "test")
@@ -186,7 +186,7 @@ class SeededSplit(GroupedSplit):
         self._check_fractions(test=self.test, val=self.val)
 
     def assign(self, names: Sequence[str]) -> Assignment:
-        seen = {name: unpacked(name) for name in names}
+        seen = {name: strip_archives(name) for name in names}
         parts, groups = self._divide(seen, {"test": self.test, "val": self.val}), self.grouping.names(seen)
         return Assignment(self.limit(parts, groups), groups)
 
@@ -347,7 +347,7 @@ class SubsetSplit(PublishedSplit):
 
     def assign(self, names: Sequence[str]) -> Assignment:
         part_of = {subset(name): part for part in LISTED for name in getattr(self, part)}
-        seen = {name: unpacked(name) for name in names}
+        seen = {name: strip_archives(name) for name in names}
         parts = {name: part_of.get(subset(name), part_of.get(subset(own))) for name, own in seen.items()}
         clips = defaultdict(list)
         for name in sorted(name for name, part in parts.items() if part):

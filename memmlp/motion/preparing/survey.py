@@ -14,7 +14,7 @@ from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS
 from memmlp.motion.clip import LINES, Clip, Skipped, resample
 from memmlp.motion.formats.npz import NoMotion, read_clip
-from memmlp.motion.plausibility import check_plausible, unusual
+from memmlp.motion.plausibility import check_plausible, why_unusual
 from memmlp.motion.preparing.duplicates import (
     Marks,
     find_resampled_copies,
@@ -98,7 +98,7 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
             digests = file_digest(path), _content_digest(clip)
             clips[name] = ClipRecord(name, file, "", "", 0, len(resampled) - 1, *digests, clip.fps, how)
             firsts[name], marks[name] = first_frames(clip), mark_frames(resampled)
-            odd |= {name: reason} if (reason := unusual(clip)) else {}
+            odd |= {name: reason} if (reason := why_unusual(clip)) else {}
     records = list(clips.values())
     records = merge_contents(records, find_resampled_copies(root, records, firsts))
     records = merge_contents(records, find_shared_stretches(root, records, marks))
