@@ -71,7 +71,7 @@ def bin_folder(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     probe = [*pip, "download", "--no-deps", "--dest", folder / "probe", "click"]
     if subprocess.run([*map(str, probe)], capture_output=True, check=False, timeout=300).returncode:
         pytest.skip("pip can download nothing here")
-    run(*pip, "install", "-c", ROOT / "constraints.txt", wheel, folder=folder)
+    run(*pip, "install", "-c", ROOT / "constraints.txt", f"{wheel}[plots]", folder=folder)
     return folder / "bin"
 
 

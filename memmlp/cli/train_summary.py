@@ -47,7 +47,8 @@ def show(outcome: Outcome) -> None:
     if "latency" in results:
         show_latency(console, results["latency"])
     console.print(f"run      {run.folder}", soft_wrap=True)
-    console.print(f"picture  {run.picture}", soft_wrap=True)
+    if run.picture.exists():  # without matplotlib there is none
+        console.print(f"picture  {run.picture}", soft_wrap=True)
 
 
 def show_side_by_side(outcomes: Mapping[str, Outcome]) -> None:

@@ -69,7 +69,7 @@ def delete(one: Garbage) -> bool:
 def _reason(run: Run, orphans: Mapping[str, str]) -> tuple[str, str]:
     if run.failure and not run.done:  # a trained run may have failed in an export alone
         return "failed", run.failure
-    if changed := outdated({**upstream_recipes(run), **(run.manifest.get("recipes") or {})}):
+    if changed := outdated({**upstream_recipes(run.manifest), **(run.manifest.get("recipes") or {})}):
         return "old", f"older version: {', '.join(changed)}"
     return ("orphaned", orphans[run.id]) if run.id in orphans else ("", "")
 

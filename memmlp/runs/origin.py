@@ -7,12 +7,9 @@ another machine, it has others. So a run's manifest has the origins of both, as 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from memmlp.runs.environment import changed
-
-if TYPE_CHECKING:
-    from memmlp.runs.run import Run
 
 MACHINE = ("device", "gpu", "gpu_index", "threads", "processes", "precision", "cpu")
 """What can change a result's last digits, and which of a machine's GPUs it was."""
@@ -24,18 +21,16 @@ FACTS = ("recipes", "git", "version", "sources", "plugins", "packages", *MACHINE
 """What the manifest of a prerequisite run has on its code and its machine."""
 
 
-def upstream_origins(upstream: Run | None) -> list[dict[str, Any]]:
+def upstream_origins(manifest: Mapping[str, Any], weights: str | None) -> list[dict[str, Any]]:
     """Return the origins of the prerequisite runs of a run that begins, the nearest first.
 
     Each has the run's `id` and `kind`, the SHA-256 of its `weights`, and FACTS as far as known.
 
     Args:
-        upstream: the finished run whose weights the run uses; None without one.
+        manifest: the manifest of the finished run whose weights the run uses.
+        weights: the SHA-256 of these weights.
     """
-    if upstream is None:
-        return []
-    manifest = upstream.manifest
-    own = {"id": upstream.id, "kind": manifest.get("kind"), "weights": upstream.weights_digest}
+    own = {"id": manifest.get("id"), "kind": manifest.get("kind"), "weights": weights}
     facts = {name: manifest[name] for name in FACTS if name in manifest}
     return [own | facts, *recorded_upstream(manifest)]
 
@@ -45,9 +40,9 @@ def recorded_upstream(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
     return manifest.get(UPSTREAM) or []
 
 
-def upstream_recipes(run: Run) -> dict[str, int]:
-    """Return the component versions with which a run's prerequisite runs were trained."""
-    every = [one.get("recipes") or {} for one in recorded_upstream(run.manifest)]
+def upstream_recipes(manifest: Mapping[str, Any]) -> dict[str, int]:
+    """Return the component versions with which a run's prerequisite runs were trained, from its manifest."""
+    every = [one.get("recipes") or {} for one in recorded_upstream(manifest)]
     return {name: number for recipes in every for name, number in recipes.items()}
 
 

@@ -300,7 +300,7 @@ def begin(
     above = identity.upstream
     counting: Mapping[str, Any] = {**(above.config if above else {}), **identity.config}
     facts = {
-        **({UPSTREAM: upstream_origins(before)} if before else {}),
+        **({UPSTREAM: upstream_origins(before.manifest, before.weights_digest)} if before else {}),
         "recipes": identity.recipes,
         "what": identity.what,
         **machine(experiment),

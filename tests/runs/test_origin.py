@@ -15,7 +15,9 @@ CODES, PART, NETWORK = (letter * 16 for letter in "abc")
 
 def trained(outputs: Path, name: str, upstream: Run | None = None, weights: str = "w", **facts) -> Run:
     run = Run.of(outputs, name)
-    above = {"upstream_runs": upstream_origins(upstream)} if upstream else {}
+    above = (
+        {"upstream_runs": upstream_origins(upstream.manifest, upstream.weights_digest)} if upstream else {}
+    )
     run.begin("vqvae", {}, data="d", upstream=upstream.id if upstream else None, **facts, **above)
     run.model.write_text(weights)
     run.finish([run.model.name])
@@ -28,7 +30,8 @@ def test_what_a_run_builds_upon_stays_known_when_that_is_trained_again(tmp_path:
     network = trained(tmp_path, NETWORK, codes)
     digest, before = file_digest(codes.model), network.manifest["upstream_runs"]
     codes.reset()
-    assert upstream_origins(trained(tmp_path, CODES, weights="others"))[0]["weights"] != digest
+    others = trained(tmp_path, CODES, weights="others")
+    assert upstream_origins(others.manifest, others.weights_digest)[0]["weights"] != digest
     (found,) = network.manifest["upstream_runs"]
     assert [found] == before
     assert (found["id"], found["kind"], found["weights"]) == (CODES, "vqvae", digest)
@@ -41,15 +44,14 @@ def test_what_lies_further_upstream_is_known_too(tmp_path: Path):
     part = trained(tmp_path, PART, codes, recipes={"model.mem_mlp": 2})
     network = trained(tmp_path, NETWORK, part)
     assert [one["id"] for one in network.manifest["upstream_runs"]] == [PART, CODES]
-    assert upstream_recipes(network) == {"vqvae": 1, "model.mem_mlp": 2}
-    assert upstream_origins(None) == []
+    assert upstream_recipes(network.manifest) == {"vqvae": 1, "model.mem_mlp": 2}
 
 
 def test_a_training_that_is_resumed_upon_other_weights_has_both(tmp_path: Path):
     network = Run.of(tmp_path, NETWORK)
     for weights in ("first", "first", "others"):
         codes = trained(tmp_path, CODES, weights=weights)
-        above = upstream_origins(codes)
+        above = upstream_origins(codes.manifest, codes.weights_digest)
         network.begin("memmlp", {}, data="d", upstream=CODES, upstream_runs=above)
         network.checkpoint.touch()
     found = [one["weights"] for one in network.manifest["upstream_runs"]]

@@ -371,7 +371,7 @@ def _with_upstream(origin: Origin, run: Run) -> Origin:
         digests[one["id"]] += [one["weights"][:8]] if one.get("weights") else []
     weights = {name: _words(found) for name, found in digests.items() if found}
     joined = _joined(origin, list(map(_origin, upstream)))
-    return replace(joined, upstream_recipes=upstream_recipes(run), upstream_weights=weights)
+    return replace(joined, upstream_recipes=upstream_recipes(run.manifest), upstream_weights=weights)
 
 
 def _evaluated(origin: Origin, reports: Sequence[Mapping[str, Any]]) -> Origin:
