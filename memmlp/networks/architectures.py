@@ -62,9 +62,14 @@ class Architecture:
         Raises:
             InputError: if the file of weights is damaged.
         """
-        if self.trained_parts is None or upstream is None:
-            return self.network(normalizer, self.load_vqvae(upstream) if upstream else None)
-        model, (tensors, _) = self.network(normalizer, None), checkpoint.read(upstream)
+        tensors = checkpoint.read(upstream)[0] if upstream else {}
+        if self.trained_parts is None:
+            if upstream is None:
+                return self.network(normalizer, None)
+            codes = self.vqvae()
+            checkpoint.load_module("model", codes, tensors)
+            return self.network(normalizer, codes.eval())
+        model = self.network(normalizer, None)
         for name in self.trained_parts:
             checkpoint.load_module(f"model.{name}", model.get_submodule(name).requires_grad_(False), tensors)
         if not self.trained_parts:
@@ -77,16 +82,6 @@ class Architecture:
         if self.normalize:
             return Normalizer.fit(self.coordinates, rest, frames)
         return Normalizer.raw(self.coordinates, rest)
-
-    def load_vqvae(self, weights: Path) -> VQVAE:
-        """Load a trained VQ-VAE from a file of weights.
-
-        Raises:
-            InputError: if the file is damaged.
-        """
-        model = self.vqvae()
-        checkpoint.load_module("model", model, checkpoint.read(weights)[0])
-        return model.eval()
 
     def load(self, weights: Path) -> MotionModel:
         """Load a trained network from a file of weights.

@@ -73,20 +73,16 @@ class BoDiffusionGraph(StemGraph):
 
         def step(noisy: Tensor, index: int) -> tuple[Tensor, Tensor]:
             count = 1 if index == last else self.frames
-            made = self._made(noisy, window, index, count)
+            h = window + self.motion(noisy) + self.model.places
+            *earlier, (block, modulation) = zip(self.blocks, self.modulations[index], strict=True)
+            for one, its in earlier:
+                h = one.newest(h, its.chunk(6), self.frames)
+            made = self.made(block.newest(h, modulation.chunk(6), count))
+            made = Denoised(*made.split(ROTATION.stop, -1))
             mean, variance = diffusion.step(noisy[-count:], made, index, limits)
             return mean, variance.sqrt()
 
         return diffusion.sample(step, self.model.noises)
-
-    def _made(self, noisy: Tensor, window: Tensor, index: int, count: int) -> Denoised:
-        """Predict noise and variance of the newest `count` frames of (T, 132) at sampling step `index`."""
-        h = window + self.motion(noisy) + self.model.places
-        *earlier, last = zip(self.blocks, self.modulations[index], strict=True)
-        for block, modulation in earlier:
-            h = block.newest(h, modulation.chunk(6), self.frames)
-        block, modulation = last
-        return Denoised(*self.made(block.newest(h, modulation.chunk(6), count)).split(ROTATION.stop, -1))
 
 
 @component("model", "bodiffusion", version=2, builds="BoDiffusion")

@@ -95,12 +95,6 @@ class TokenEmbedding(nn.Module):
         return F.leaky_relu(torch.cat(made, -1))
 
 
-def split_width(width: int) -> list[int]:
-    """Divide a width into four parts that are as equal as possible."""
-    bounds = [width * part // 4 for part in range(5)]
-    return [stop - start for start, stop in pairwise(bounds)]
-
-
 class NormedLSTM(nn.Module):
     """An LSTM whose weights are directions times a learned gain for each row (Salimans & Kingma 2016).
 
@@ -213,7 +207,9 @@ class HMDPoser(WindowlessModel):
     def __init__(self, normalizer: Normalizer, settings: HMDPoserSettings):
         super().__init__(normalizer, settings.frames)
         self.width, self.depth, self.shape_weight = settings.width, settings.depth, settings.shape_weight
-        tracked, turns = ((6, 6, 3, 3), split_width(settings.width)), 15 * settings.width // 32
+        bounds = [settings.width * part // 4 for part in range(5)]  # four parts, as equal as possible
+        tracked = (6, 6, 3, 3), [stop - start for start, stop in pairwise(bounds)]
+        turns = 15 * settings.width // 32
         self.trackers = nn.ModuleList(TokenEmbedding(*tracked) for _ in TRACKED)
         self.hands = nn.ModuleList(TokenEmbedding(*tracked) for _ in range(HANDS))
         unseen = (6, 6, 3), (turns, turns, settings.width - 2 * turns)
@@ -279,13 +275,9 @@ class HMDPoser(WindowlessModel):
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call, which adds the loss of the predicted shape; see MotionModel."""
         features, kept = self.compute_features(sparse, state)
-        return TrainingOutputs(
-            self.normalizer.posed(self.pose(features), sparse), kept, self._shape_loss(features)
-        )
-
-    def _shape_loss(self, features: Tensor) -> dict[str, Tensor]:
-        """Return the weighted loss of how much the shapes of features (B, T, d) vary within a window."""
-        if self.shape is None:
-            return {}
-        shapes = self.shape(features).to(self.normalizer.mean)  # their differences are small
-        return {"shape": self.shape_weight * (shapes - shapes.mean(1, keepdim=True)).abs().mean()}
+        losses = {}
+        if self.shape is not None:  # how much the predicted shapes vary within a window
+            shapes = self.shape(features).to(self.normalizer.mean)  # their differences are small
+            variation = (shapes - shapes.mean(1, keepdim=True)).abs().mean()
+            losses["shape"] = self.shape_weight * variation
+        return TrainingOutputs(self.normalizer.posed(self.pose(features), sparse), kept, losses)

@@ -193,7 +193,9 @@ class Manikin(MotionModel):
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call in which each window is turned by its own random heading; see MotionModel."""
         inputs, kept = self.append_inputs(sparse, state)
-        heading, space = self.draw_headings(true_frames), Heading()
+        angle = self.turned * 2 * math.pi * distributed.draw_rows(torch.rand_like, true_frames[:, :1, :1])
+        heading = torch.cat([torch.zeros_like(true_frames[:, :1, :3]), angle.cos(), angle.sin()], -1)
+        space = Heading()
         window = space.sparse_in(inputs[:, -self.frames :], heading)
         encoded = self.normalizer.encode_sparse(window, self.normalizer.origin(window))
         made = self.predict_parts(encoded)
@@ -202,11 +204,6 @@ class Manikin(MotionModel):
         motion = space.motion_out(self.normalizer.posed(rotation, window[:, -count:]), heading)
         true = torch.cat([window, space.motion_in(true_frames[..., SPARSE_DIM:], heading)], -1)
         return TrainingOutputs(motion, kept, self.compute_losses(made, true))
-
-    def draw_headings(self, true_frames: Tensor) -> Tensor:
-        """Draw a turn about the world's vertical axis for each window, as an origin (B, 1, 5) of Heading."""
-        angle = self.turned * 2 * math.pi * distributed.draw_rows(torch.rand_like, true_frames[:, :1, :1])
-        return torch.cat([torch.zeros_like(true_frames[:, :1, :3]), angle.cos(), angle.sin()], -1)
 
     def compute_losses(self, made: Tensor, true: Tensor) -> dict[str, Tensor]:
         """Return the weighted losses of outputs (B, n, 86 or more), given true world frames (B, T, 252)."""

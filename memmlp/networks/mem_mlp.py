@@ -165,12 +165,9 @@ class Converter:
 
     def convert(self, source: nn.Module) -> StreamingBlock:
         """Make the streaming block of an MLPBlock or a MemoryBlock."""
-        if isinstance(source, MemoryBlock):
-            return self._convert_memory_block(source)
-        assert isinstance(source, MLPBlock)
-        return StreamingBlock(source)
-
-    def _convert_memory_block(self, source: MemoryBlock) -> StreamingBlock:
+        if not isinstance(source, MemoryBlock):
+            assert isinstance(source, MLPBlock)
+            return StreamingBlock(source)
         kinds: dict[type[MLPBlock], type[SharedBlock]] = {
             ResidualFusion: ResidualBlock,
             PlainFusion: PlainBlock,
@@ -179,10 +176,6 @@ class Converter:
         block = kinds[type(source.fusion)](source.fusion, len(self.shared))
         self.shared.append(block)
         return block
-
-    def convert_branch(self, source: Branch) -> StreamedBranch:
-        """Make the streaming form of a predictor's branch."""
-        return StreamedBranch([self.convert(block) for block in source.blocks], source.linear)
 
 
 class MemMLPGraph(StreamingGraph):
@@ -209,7 +202,8 @@ class MemMLPGraph(StreamingGraph):
         self.predictor = model.predictor
         for name, branch in list(model.predictor.named_children()):
             assert isinstance(branch, Branch)
-            setattr(self.predictor, name, converter.convert_branch(branch))
+            blocks = [converter.convert(block) for block in branch.blocks]
+            setattr(self.predictor, name, StreamedBranch(blocks, branch.linear))
         parts = [block.feature_part for block in converter.shared]
         self.recall = model.memory.streaming_recall(model.memory, converter.features, parts)
         self.contributions = [f"memory.{index}" for index in range(len(converter.shared))]

@@ -26,19 +26,6 @@ from memmlp.networks.transformer import Attention, EncoderLayer
 FRESH = 0.25  # of the training windows begin as a live stream does, without a past
 
 
-def make_sines(length: int, width: int) -> Tensor:
-    """Return the position embeddings (length, d), sines and cosines (Vaswani et al. 2017, Sec. 3.5)."""
-    rates = torch.exp(-math.log(10_000) * torch.arange(0, width, 2) / width)
-    angles = torch.arange(length)[:, None] * rates
-    return torch.stack([angles.sin(), angles.cos()], -1).flatten(-2)[:, :width]
-
-
-def compute_freedom(horizon: int) -> Tensor:
-    """Return how far each of the W predicted frames (W, 1) may change at a step, from almost 0 to 1."""
-    distance = torch.arange(1, horizon + 1) / horizon
-    return (1 - (distance * math.pi / 2).cos())[:, None]
-
-
 class RPMGraph(FrameGraph):
     """RPM's streaming graph."""
 
@@ -112,10 +99,15 @@ class RPM(WindowlessModel):
             for _ in range(settings.depth)
         )
         self.head = nn.Linear(settings.width, ROTATION.stop)
-        self.register_buffer(
-            "places", make_sines(settings.context + settings.horizon, settings.width), persistent=False
-        )
-        self.register_buffer("freedom", compute_freedom(settings.horizon), persistent=False)
+        # Sines and cosines as position embeddings (context + W, d) (Vaswani et al. 2017, Sec. 3.5).
+        rates = torch.exp(-math.log(10_000) * torch.arange(0, settings.width, 2) / settings.width)
+        angles = torch.arange(settings.context + settings.horizon)[:, None] * rates
+        places = torch.stack([angles.sin(), angles.cos()], -1).flatten(-2)[:, : settings.width]
+        self.register_buffer("places", places, persistent=False)
+        # How far each of the predicted frames (W, 1) may change at a step, from almost 0 to 1.
+        distance = torch.arange(1, settings.horizon + 1) / settings.horizon
+        freedom = (1 - (distance * math.pi / 2).cos())[:, None]
+        self.register_buffer("freedom", freedom, persistent=False)
 
     def initial_state(self, batch: int = 1) -> State:
         """Return the state of a fresh start, zeros.
@@ -198,7 +190,14 @@ class RPM(WindowlessModel):
         begin = now - int(torch.randint(now - self.context + 1, ()))
         encoded = self.encode(sparse)
         past = slice(begin - self.context, begin)
-        state = self.start_windows(state, encoded[:, past], true_frames[:, past])
+        motion = self.normalizer.encode(true_frames[:, past])[..., SPARSE_DIM:][..., ROTATION]
+        drawn = distributed.draw_rows(torch.rand_like, true_frames[:, past][:, :1, 0])
+        known = (drawn >= FRESH).to(true_frames.dtype)  # the other windows start without a past
+        state = state | {
+            "sparse": known[..., None] * encoded[:, past],
+            "motion": known[..., None] * motion,
+            "started": known,
+        }
         training = self.training
         self.train(training and self.own_dropout)
         with torch.no_grad():
@@ -208,19 +207,3 @@ class RPM(WindowlessModel):
         torch.clear_autocast_cache()  # weights that were cast without a gradient would have none below
         made, state = self.roll(encoded[:, now : now + 1], state)
         return TrainingOutputs(self.normalizer.posed(made, sparse[:, now:]), state, {})
-
-    def start_windows(self, fresh: State, encoded: Tensor, true_frames: Tensor) -> State:
-        """Return the state after true frames, or a fresh start for a randomly drawn share of the windows.
-
-        Args:
-            fresh: a fresh start.
-            encoded: inputs (B, context, 54) in network space.
-            true_frames: the same frames (B, context, 252) in the world.
-        """
-        motion = self.normalizer.encode(true_frames)[..., SPARSE_DIM:][..., ROTATION]
-        known = (distributed.draw_rows(torch.rand_like, true_frames[:, :1, 0]) >= FRESH).to(true_frames.dtype)
-        return fresh | {
-            "sparse": known[..., None] * encoded,
-            "motion": known[..., None] * motion,
-            "started": known,
-        }

@@ -173,20 +173,17 @@ class ProductQuantiser(nn.Module):
         Distances to the code-vectors are in float32, also in mixed-precision training.
         """
         with in_float32(z.device):
-            return self.quantise(z.to(self.vectors.dtype))
-
-    def quantise(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what `forward` does, in the precision of the latents (..., 384)."""
-        parts = z.flatten(0, -2).unflatten(-1, (BOOKS, -1)).transpose(0, 1)
-        distance = torch.cdist(parts, self.vectors).square()
-        index = distance.argmin(-1)
-        found = torch.stack([book[chosen] for book, chosen in zip(self.vectors, index, strict=True)], 1)
-        found = found.flatten(-2).view_as(z)
-        loss = (found.detach() - z).square().mean() + (found - z.detach()).square().mean()
-        if self.training:
-            self.revive(parts.detach(), distance.detach(), index)
-            loss = loss + sum(compute_contrast(one) for one in distance[:CONTRASTED])
-        return z + (found - z).detach(), loss
+            z = z.to(self.vectors.dtype)
+            parts = z.flatten(0, -2).unflatten(-1, (BOOKS, -1)).transpose(0, 1)
+            distance = torch.cdist(parts, self.vectors).square()
+            index = distance.argmin(-1)
+            codes = torch.stack([book[chosen] for book, chosen in zip(self.vectors, index, strict=True)], 1)
+            codes = codes.flatten(-2).view_as(z)
+            loss = (codes.detach() - z).square().mean() + (codes - z.detach()).square().mean()
+            if self.training:
+                self.revive(parts.detach(), distance.detach(), index)
+                loss = loss + sum(compute_contrast(one) for one in distance[:CONTRASTED])
+            return z + (codes - z).detach(), loss
 
     @torch.no_grad()
     def revive(self, parts: Tensor, distance: Tensor, index: Tensor) -> None:

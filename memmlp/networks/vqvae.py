@@ -44,12 +44,9 @@ class Codebook(nn.Module):
 
     def find_indices(self, latent: Tensor) -> Tensor:
         """Return the index (...) of the code-vector nearest to each latent (..., width), Euclidean."""
-        return self._distances(latent).argmin(-1)
-
-    def _distances(self, latent: Tensor) -> Tensor:
-        """Return the squared distances (..., K) of latents (..., width), less the latents' own squares."""
         with in_float32(latent.device):  # bfloat16 would make another code-vector the nearest
-            return self.vectors.square().sum(-1) - 2 * latent.to(self.vectors.dtype) @ self.vectors.T
+            products = latent.to(self.vectors.dtype) @ self.vectors.T
+            return (self.vectors.square().sum(-1) - 2 * products).argmin(-1)
 
     def forward(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         """Return the code-vectors (..., width) and indices (...) of latents (..., width)."""

@@ -6,7 +6,6 @@ import tiny
 import torch
 
 from memmlp.motion.body import ROTATION, SPARSE_DIM
-from memmlp.networks import rpm
 
 TRUTH = torch.stack([tiny.clip(9, seed) for seed in (1, 2)])
 SPARSE = TRUTH[..., :SPARSE_DIM]
@@ -76,7 +75,7 @@ def test_training_predicts_the_last_frames_after_free_running(monkeypatch, own_d
 
 
 def test_places_are_of_sines_and_cosines():
-    places = rpm.make_sines(5, 8).numpy()
-    for place, index in np.ndindex(5, 8):
-        angle = place / 10_000 ** (2 * (index // 2) / 8)
+    places = tiny.baseline("rpm").places.numpy()
+    for place, index in np.ndindex(places.shape):
+        angle = place / 10_000 ** (2 * (index // 2) / places.shape[1])
         np.testing.assert_allclose(places[place, index], (np.sin, np.cos)[index % 2](angle), atol=1e-6)

@@ -15,18 +15,17 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.training.losses.loss import CompleteLossSettings, Fixed, Loss, Terms, joints
 from memmlp.training.losses.terms import Comparison
 
+ERRORS: dict[str, Callable[[Tensor], Tensor]] = {
+    "norm": lambda error: error.unflatten(-1, (N_JOINTS, 6)).norm(dim=-1).mean(),
+    "square": lambda error: error.square().mean(),
+}
+"""How AGRoL's 6D errors (..., 132) become a number."""
 
-def joint_norms(error: Tensor) -> Tensor:
-    """Return the L2 norm of each joint's 6D error (..., 132), averaged over frames and joints."""
-    return error.unflatten(-1, (N_JOINTS, 6)).norm(dim=-1).mean()
-
-
-def mean_square(error: Tensor) -> Tensor:
-    """Return the mean of the squared components of errors (..., 132)."""
-    return error.square().mean()
-
-
-ERRORS: dict[str, Callable[[Tensor], Tensor]] = {"norm": joint_norms, "square": mean_square}
+ANCHORS: dict[str, Callable[[Tensor], Tensor]] = {
+    "pelvis": lambda positions: positions - positions[..., ROOT : ROOT + 1, :],
+    "head": lambda positions: positions,
+}
+"""How joint positions (..., 22, 3), whose head is on its tracker, are anchored before they are compared."""
 
 
 @component("loss", "agrol", builds="AGRoLLoss")
@@ -45,7 +44,7 @@ class AGRoLLoss(Loss):
     """AGRoL's error of the 6D rotations, in network space, as is the diffusion model's noise.
 
     Args:
-        error: "norm" for the error with which its released code trains both networks (`joint_norms`), or
+        error: "norm" for the error with which its released code trains both networks, or
             "square" for the mean squared error, a possible reading of its paper (Du et al. 2023, L2).
     """
 
@@ -59,19 +58,6 @@ class AGRoLLoss(Loss):
         origin = normalizer.origin(sparse)
         error = normalizer.encode_motion(motion, origin) - normalizer.encode_motion(truth, origin)
         return {"rotation_all": self.error(error[..., ROTATION])}
-
-
-def from_pelvis(positions: Tensor) -> Tensor:
-    """Return joint positions (..., 22, 3) relative to the pelvis."""
-    return positions - positions[..., ROOT : ROOT + 1, :]
-
-
-def from_origin(positions: Tensor) -> Tensor:
-    """Return joint positions (..., 22, 3) unchanged, in the world."""
-    return positions
-
-
-ANCHORS: dict[str, Callable[[Tensor], Tensor]] = {"pelvis": from_pelvis, "head": from_origin}
 
 
 @component("loss", "avatar_poser", builds="AvatarPoserLoss")

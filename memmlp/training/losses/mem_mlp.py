@@ -100,19 +100,6 @@ class Term:
         return {}
 
 
-def rotation_terms(motion: Tensor, truth: Tensor) -> Terms:
-    """Return Eqs. 1 and 2, from motion and truth (B, T, 198)."""
-    error = (motion - truth)[..., ROTATION]
-    return {"rotation_all": l1(error), "rotation_velocity": l1(error.diff(dim=1))}
-
-
-def position_terms(motion: Tensor, truth: Tensor) -> Terms:
-    """Return Eqs. 3 and 4 (Eq. 4 on the lower body alone), from motion and truth (B, T, 198)."""
-    error = joints(motion) - joints(truth)
-    steps = error[:, :, list(LOWER)].diff(dim=1)
-    return {"position_branch": l1(error), "velocity_lower_body": l1(steps)}
-
-
 class MotionLoss(Loss):
     """Mem-MLP's loss (Eq. 5), with the terms of those branches that the predictor has.
 
@@ -153,9 +140,12 @@ class MotionLoss(Loss):
         """Return the paper's terms and the hand term."""
         terms: Terms = {}
         if "rotation" in self.branches:
-            terms |= rotation_terms(motion, truth)
+            error = (motion - truth)[..., ROTATION]
+            terms |= {"rotation_all": l1(error), "rotation_velocity": l1(error.diff(dim=1))}  # Eqs. 1 and 2
         if "position" in self.branches:
-            terms |= position_terms(motion, truth)
+            error = joints(motion) - joints(truth)
+            steps = error[:, :, list(LOWER)].diff(dim=1)  # of the lower body only
+            terms |= {"position_branch": l1(error), "velocity_lower_body": l1(steps)}  # Eqs. 3 and 4
         if self.hand.branch in self.branches:
             terms |= self.hand(motion, truth, sparse, normalizer)
         return terms
