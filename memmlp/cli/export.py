@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -159,7 +158,7 @@ def copy_deployed(run: Run, out: Path, form: Form, max_growth: float) -> str | N
     Returns:
         A line about its recorded check; None if no deployment has such a file.
     """
-    from memmlp.common.files import file_digest
+    from memmlp.common.files import atomic_write, file_digest
 
     if form.full:
         return None
@@ -180,7 +179,7 @@ def copy_deployed(run: Run, out: Path, form: Form, max_growth: float) -> str | N
             if not cost["growth"] <= max_growth:
                 continue
             said = f"copied from the run; on test clips {describe_cost(cost, form.precision)}"
-        shutil.copyfile(path, out)
+        atomic_write(out, path.read_bytes())
         return said
     return None
 

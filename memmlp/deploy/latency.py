@@ -179,34 +179,30 @@ def _milliseconds(prefix: str, seconds: list[float]) -> dict[str, float]:
 
 
 class NoConversion(Normalizer):
-    """A normalizer that changes nothing: inputs are features already, outputs stay in network space."""
+    """A normalizer that changes nothing: inputs are features already, outputs stay in network space.
+
+    Joint positions are zeros.
+    """
 
     def encode_sparse(self, sparse: Tensor, origin: Tensor) -> Tensor:
-        """Return the inputs (..., 54) unchanged."""
         return sparse
 
     def encode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
-        """Return the motion (..., 198) unchanged."""
         return motion
 
     def decode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
-        """Return the motion (..., 198) unchanged."""
         return motion
 
     def rotations_out(self, rotations: Tensor, origin: Tensor) -> Tensor:
-        """Return the rotations (..., 6 n) unchanged."""
         return rotations
 
     def posed(self, rotation: Tensor, sparse: Tensor) -> Tensor:
-        """Return the rotations (..., 132) as motion (..., 198) whose positions are zeros."""
         return F.pad(rotation, (0, MOTION_DIM - ROTATION.stop))
 
     def posed_in_world(self, rotations: Tensor, sparse: Tensor, change: Change | None = None) -> Tensor:
-        """Return the rotations (..., 132) as motion (..., 198) whose positions are zeros."""
         return self.posed(rotations, sparse)
 
     def pose(self, motion: Tensor, sparse: Tensor) -> Tensor:
-        """Return zeros (..., 22, 3) in place of joint positions."""
         return torch.zeros_like(motion[..., POSITION]).unflatten(-1, (N_JOINTS, 3))
 
 

@@ -179,11 +179,6 @@ def test_interface_and_metadata(folder: Path):
         Stream(folder / "unity.onnx")
 
 
-def test_an_unknown_space_is_refused(tmp_path: Path):
-    with pytest.raises(InputError, match="space=maya"):
-        export_full(tiny.model(), tmp_path / "full.onnx", RUN, "maya")
-
-
 def test_trackers_of_frames_have_their_features():
     positions, rotations = trackers_of(PERSON.frames.double())
     again = sparse_features(rotations, positions)
