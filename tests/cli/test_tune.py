@@ -49,7 +49,7 @@ def folder_of(home: Path) -> Path:
 def test_a_search_ends_with_its_best_trial_and_the_command_for_it(home: Path):
     said = (home / "said.txt").read_text()
     assert "3 of 3 trials: 3 complete" in said
-    assert "importance: told from 25 complete trials on; of 3 it would be chance" in said
+    assert "importance: needs 25 complete trials; with 3 it would be chance" in said
     rows = list(csv.DictReader((folder_of(home) / "trials.csv").read_text().splitlines()))
     assert rows[0]["loss.rotation_velocity"] == "30.0"
     assert examine(home / "outputs", 3) == []
@@ -65,7 +65,7 @@ def test_the_same_command_does_nothing_and_status_shows_the_same(home: Path):
     again = command(home, "tune", *TINY, "search.n_trials=3")
     assert "3 of 3 trials: 3 complete" in again
     assert "3 of 3 trials: 3 complete" in command(home, "tune", *TINY, "search.n_trials=3", "--status")
-    assert "not begun" in command(home, "tune", *TINY, "search.seed=5", "--status")
+    assert "not started" in command(home, "tune", *TINY, "search.seed=5", "--status")
     assert (folder_of(home) / "study.journal").read_bytes() == before
 
 

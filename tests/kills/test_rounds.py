@@ -26,7 +26,6 @@ WORDS = ["sweep", "trial.yaml", *(word for word in TINY if "synth" not in word),
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:unclosed file .*DEBUG:ResourceWarning")  # submitit leaves its logs open
 def test_rounds_go_on_after_a_kill(tmp_path: Path):
     """Of two variants that hardly differ, which three seeds show."""
     hardly = ["memory=none", "optim.weight_decay=1.001e-4"]
@@ -45,8 +44,8 @@ def test_rounds_go_on_after_a_kill(tmp_path: Path):
     assert len(runs) == 6
     assert all(one.done for one in runs)
     path = next(tmp_path.glob("outputs/sweeps/*/rounds.json"))
-    (look,) = json.loads(path.read_text())["taken"]
-    assert {finding["verdict"] for finding in look["found"]} == {"equivalent"}
+    (analysis,) = json.loads(path.read_text())["analyses"]
+    assert {finding["verdict"] for finding in analysis["findings"]} == {"equivalent"}
     before = [one.marker.stat().st_mtime_ns for one in runs]
     assert "6 of 6 runs done" in run(tmp_path, *WORDS, "--until-decided")
     assert [one.marker.stat().st_mtime_ns for one in runs] == before
