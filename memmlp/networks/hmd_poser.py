@@ -264,10 +264,6 @@ class HMDPoser(WindowlessModel):
         return tokens.flatten(-2), {"hidden": hidden, "cell": cell}
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """Take in the newest frames; see MotionModel.
-
-        By default the n new frames are returned, which are the most that this network can make.
-        """
         features, kept = self.compute_features(sparse, state)
         wanted = sparse.shape[1] if newest is None else newest
         return self.normalizer.posed(self.pose(features[:, -wanted:]), sparse[:, -wanted:]), kept

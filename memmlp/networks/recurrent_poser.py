@@ -459,7 +459,6 @@ class RecurrentPoser(WindowlessModel):
         return torch.stack(made), _join(kept)
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """Take in the newest frames; see MotionModel."""
         wanted = sparse.shape[1] if newest is None else newest
         made, kept = self.predict_members(sparse, state, wanted)
         return self.pose(made.mean(0), sparse[:, sparse.shape[1] - wanted :]), kept

@@ -164,10 +164,6 @@ class RPM(WindowlessModel):
         return self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """Take in the newest frames, one after the other; see MotionModel.
-
-        `newest`: how many of the last frames to return, at most n (the default).
-        """
         shown = []
         for frame in self.encode(sparse).split(1, 1):
             made, state = self.roll(frame, state)

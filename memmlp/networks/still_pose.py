@@ -59,9 +59,5 @@ class StillPose(WindowlessModel):
             self.pose.data.copy_(matrix_to_sixd(torch.eye(3)).repeat(N_JOINTS))
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """Take in the newest frames, each on its own; see MotionModel.
-
-        By default the n new frames are returned, which are the most that this network can make.
-        """
         seen = sparse if newest is None else sparse[:, -newest:]
         return self.normalizer.posed(self.pose.expand(*seen.shape[:-1], -1), seen), state

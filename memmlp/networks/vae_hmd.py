@@ -156,10 +156,6 @@ class VAEHMD(WindowlessModel):
         return self.encoder(torch.cat([encoded[..., part] for part in POSES], -1))
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """Take in the newest frames, each on its own; see MotionModel.
-
-        `newest`: how many of the last frames to return, at most n (the default).
-        """
         seen = sparse if newest is None else sparse[:, -newest:]
         return self.normalizer.posed(self.decoder(self.encode(seen).chunk(2, -1)[0]), seen), state
 

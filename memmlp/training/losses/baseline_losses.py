@@ -78,14 +78,7 @@ class AvatarPoserLoss(Loss):
     """Mean absolute errors of root orientation, local rotations and joint positions (Jiang et al. 2022).
 
     The positions follow by forward kinematics. The mean is over the 22 joints; the authors' mean includes the
-    fingers, which move with the wrists.
-
-    Args:
-        orientation: weight of the root orientation's error; 0.02 in the released code, 0.05 in the paper.
-        rotation: weight of the local rotations' error.
-        position: weight of the positions' error.
-        anchor: the point at which predicted and true body are brought together: "pelvis" as in the released
-            code, which has no translation, or "head", which puts the predicted head on its tracker.
+    fingers, which move with the wrists. For the arguments see AvatarPoserLossSettings.
     """
 
     def __init__(
@@ -135,12 +128,7 @@ class RPMLoss(Loss):
 
     Rotations are compared in network space, so as z-scores where the network has them; positions by forward
     kinematics with the head on its tracker, metres in the world.
-
-    Args:
-        rotation_all: weight of the 6D rotations' error.
-        rotation_velocity: weight of their differences between frames.
-        world_position: weight of the positions' error.
-        velocity: weight of their differences between frames.
+    For the arguments see RPMLossSettings.
     """
 
     def __init__(
