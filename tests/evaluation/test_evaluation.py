@@ -38,8 +38,8 @@ class Displaced(nn.Module):
         super().__init__()
         self.output = output
 
-    def posed(self, made, sparse, normalizer):
-        motion = self.output.posed(made, sparse, normalizer).clone()
+    def pose(self, made, sparse, normalizer):
+        motion = self.output.pose(made, sparse, normalizer).clone()
         motion[..., -66:] = sparse[..., 36:39].repeat_interleave(22, -1)
         return motion
 
