@@ -326,13 +326,13 @@ class Prediction:
                 without frames, a number of poses out of range, or an MP4 without PyAV installed.
         """
         from memmlp.report.pictures.clip_pictures import check_picture, write_picture
-        from memmlp.report.pictures.clip_piece import span
+        from memmlp.report.pictures.clip_piece import frame_range
 
         file = Path(path)
         check_picture(file)
         if poses not in range(1, 21):
             raise InputError(f"poses {poses}: allowed are 1 to 20")
-        first, last = span(len(self), self.clip, begin, end)
+        first, last = frame_range(len(self), self.clip, begin, end)
         write_picture(file, self._piece(branch, first, last), poses)
         return file
 

@@ -108,11 +108,11 @@ def _predict_piece(
     from memmlp.common.progress import announce
     from memmlp.config.open_run import clip_of
     from memmlp.evaluation.predictions import predict_clip
-    from memmlp.report.pictures.clip_piece import ClipPiece, span
+    from memmlp.report.pictures.clip_piece import ClipPiece, frame_range
 
     first_run = next(iter(runs.values()))
     title = clip or first_run.test.names[0]
-    first, last = span(len(clip_of(first_run.test, title)), title, begin, end, ("--from", "--to"))
+    first, last = frame_range(len(clip_of(first_run.test, title)), title, begin, end, ("--from", "--to"))
     truths, predictions = [], {}
     for label, run in runs.items():
         announce(f"render: {label} on {title}")

@@ -63,7 +63,7 @@ def save_command(
     from memmlp.cli.table import shown_sweep
     from memmlp.common.files import plain
     from memmlp.config.compose_plan import find_sweep, is_path
-    from memmlp.report.kept_results import Kept, load_kept, overrides_of, save, shorten_paths
+    from memmlp.report.kept_results import Kept, list_overrides, load_kept, save, shorten_paths
     from memmlp.report.tables.build_table import finished_runs, run_finder
     from memmlp.report.tables.flags import listed, missing_seeds
     from memmlp.report.tables.measured_run import load
@@ -80,7 +80,7 @@ def save_command(
         name if is_path(name) else sweep.name,
         shorten_paths(word for word in overrides if not word.startswith("seed=")),
         runs,
-        overrides_of(sweep),
+        list_overrides(sweep),
         plain(asdict(shown.rounds)) if shown.rounds else None,
         flags,
     )
@@ -205,10 +205,12 @@ def _make_table(kept: Kept, source: str | None = None, patterns: Sequence[str] =
         if source or patterns:
             raise InputError("--source, --together: need a fixed number of seeds, not rounds")
         spent = rounds.spent(sweep)
-        table = make_table(spent, kept.of(spent), command=f"{kept.command} --until-decided", rounds=rounds)
+        table = make_table(
+            spent, kept.runs_of(spent), command=f"{kept.command} --until-decided", rounds=rounds
+        )
     else:
         sweep = _with_kept_seeds(sweep, kept)
-        runs = kept.of(sweep)
+        runs = kept.runs_of(sweep)
         if source is not None:
             sweep, runs, left_out = on_source(sweep, runs, source)
             flags += left_out

@@ -151,13 +151,13 @@ class Kept:
         """The names of the sources of the test clips; empty if there is only one source."""
         return tuple(sorted({source for run in self.every for source in run.clip_sources.values()}))
 
-    def of(self, sweep: Sweep) -> dict[str, RunsBySeed]:
+    def runs_of(self, sweep: Sweep) -> dict[str, RunsBySeed]:
         """Return the runs of the variants and seeds that the sweep has now.
 
         Raises:
             InputError: as `check` does.
         """
-        self.check(overrides_of(sweep))
+        self.check(list_overrides(sweep))
         return {
             variant.label: {
                 seed: run
@@ -168,7 +168,7 @@ class Kept:
         }
 
 
-def overrides_of(sweep: Sweep) -> dict[str, tuple[str, ...]]:
+def list_overrides(sweep: Sweep) -> dict[str, tuple[str, ...]]:
     """Return the overrides that a sweep's file gives each variant, including those of the base."""
     bare = replace(sweep, command_line=())
     return {variant.label: shorten_paths(bare.all_overrides(variant)) for variant in sweep.runnable()}

@@ -12,7 +12,7 @@ import pytest
 from fake_runs import fake_run, runs_of
 
 from memmlp.common.errors import InputError
-from memmlp.report.kept_results import Kept, dumps, load_kept, overrides_of, save, shorten_paths
+from memmlp.report.kept_results import Kept, dumps, list_overrides, load_kept, save, shorten_paths
 from memmlp.report.tables.build_table import make_table
 from memmlp.sweep.definition import Sweep
 
@@ -24,7 +24,7 @@ def test_kept_results_make_the_runs_table(sweep: Sweep, kept: Kept, tmp_path: Pa
     assert (read.sweep, read.overrides, read.command) == (
         "table14", ("data=mocap",), "memmlp sweep table14 data=mocap",
     )  # fmt: skip
-    tables = [make_table(sweep, one.of(sweep)) for one in (kept, read)]
+    tables = [make_table(sweep, one.runs_of(sweep)) for one in (kept, read)]
     assert tables[0].flags == tables[1].flags
     for before, after in zip(tables[0].rows, tables[1].rows, strict=True):
         for mode in tables[0].modes:
@@ -46,7 +46,7 @@ def test_a_run_that_diverged_is_kept(sweep: Sweep, kept: Kept, tmp_path: Path, n
     run.means["stream"]["combined"]["MPJPE"] = number
     save(tmp_path / "kept.json", kept)
     cells = [
-        next(row for row in make_table(sweep, one.of(sweep)).rows if row.label == "2").cells["stream"][
+        next(row for row in make_table(sweep, one.runs_of(sweep)).rows if row.label == "2").cells["stream"][
             "MPJPE"
         ]
         for one in (kept, load_kept(tmp_path / "kept.json"))
@@ -107,7 +107,7 @@ def test_two_deployments_of_one_run_are_kept_apart(sweep: Sweep, kept: Kept, tmp
         assert (run.id, read.runs[two][seed].costs["ms"]) == (read.runs[two][seed].id, 5.0)
         assert read.runs[three][seed].means != run.means
     assert dumps(read) == (tmp_path / "kept.json").read_text()
-    flags = make_table(replace(sweep, control=one), read.of(sweep)).flags
+    flags = make_table(replace(sweep, control=one), read.runs_of(sweep)).flags
     (said,) = (flag for flag in flags if "are one run" in flag)
     assert (
         said
@@ -157,9 +157,9 @@ def test_results_of_a_variant_with_other_overrides_are_rejected(sweep: Sweep, ke
     variants = [replace(one, overrides=other_two.get(one.label, one.overrides)) for one in sweep.variants]
     other = replace(sweep, variants=tuple(variants))
     with pytest.raises(InputError, match="variant '2' was made with the overrides"):
-        kept.of(other)
+        kept.runs_of(other)
     with pytest.raises(InputError, match="variant '2' was made with the overrides"):
-        kept.merge(replace(kept, variants=overrides_of(other)))
+        kept.merge(replace(kept, variants=list_overrides(other)))
 
 
 def test_runs_that_a_variant_would_not_have_now_are_rejected(kept: Kept):

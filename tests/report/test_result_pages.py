@@ -16,7 +16,7 @@ from report.conftest import GROUPS
 
 from memmlp.cli.results import make_tables
 from memmlp.common.errors import InputError
-from memmlp.report.kept_results import Kept, overrides_of
+from memmlp.report.kept_results import Kept, list_overrides
 from memmlp.report.result_pages import KeptTable, Placeholders, describe_origin, make_pages
 from memmlp.report.tables.build_table import make_table, together
 from memmlp.report.tables.statistics import Verdict
@@ -29,7 +29,7 @@ DOCS = ROOT / "docs" / "results"
 
 
 def source(sweep: Sweep, kept: Kept) -> KeptTable:
-    return KeptTable(kept, make_table(sweep, kept.of(sweep), command=kept.command))
+    return KeptTable(kept, make_table(sweep, kept.runs_of(sweep), command=kept.command))
 
 
 def test_a_template_takes_numbers_and_verdicts_from_the_table(sweep: Sweep, kept: Kept):
@@ -73,7 +73,7 @@ def test_significant_differences_are_counted_with_coarser_groups_too(sweep: Swee
 
     def coarser(patterns: Sequence[str]):
         assert patterns == ("a", "b")
-        return make_table(sweep, together(kept.of(sweep), ["."])[0])
+        return make_table(sweep, together(kept.runs_of(sweep), ["."])[0])
 
     made = made._replace(regroup=coarser)
     words = '{{ decided("t") }}, {{ decided("t", "a", "b") }}'
@@ -190,7 +190,7 @@ def test_the_way_from_the_first_variant_to_the_last_is_the_sum_of_its_steps(swee
     chained = replace(sweep, variants=variants, control=labels[0])
     find = fake_sweep(tmp_path, chained, {labels[1]: 1.1, labels[2]: 1.3}, groups=GROUPS)
     words = Placeholders(
-        {"t": source(chained, Kept("table14", (), runs_of(chained, find), overrides_of(chained)))}
+        {"t": source(chained, Kept("table14", (), runs_of(chained, find), list_overrides(chained)))}
     )
     rows = [line.split(" | ") for line in words.steps("t").splitlines()[2:]]
     assert [row[0].strip("| ") for row in rows] == [
@@ -201,5 +201,7 @@ def test_the_way_from_the_first_variant_to_the_last_is_the_sum_of_its_steps(swee
     assert float(parts[0][0]) + float(parts[1][0]) == pytest.approx(float(parts[2][0]), abs=0.011)
     assert [part[1] for part in parts[:2]] == ["67 %", "33 %"]  # 1.3 to 1.1 to 1
     assert parts[2][1].split("; paper ")[0] == str(words.verdict("t", labels[2], "stream", "MPJPE"))
-    plain = Placeholders({"t": source(sweep, Kept("table14", (), runs_of(sweep, find), overrides_of(sweep)))})
+    plain = Placeholders(
+        {"t": source(sweep, Kept("table14", (), runs_of(sweep, find), list_overrides(sweep)))}
+    )
     assert plain.steps("t") == ""

@@ -60,12 +60,12 @@ def show(source: Path, out: Path, clips: int, body: str) -> None:
     from memmlp.common.files import atomic_write
     from memmlp.report.pictures.canvas import png
     from memmlp.report.pictures.clip_pictures import check_picture
-    from memmlp.report.pictures.clip_sheet import clip_sheet, some_clips
+    from memmlp.report.pictures.clip_sheet import draw_sheet, read_sample
 
     check_picture(out, "--out", (".png",))
-    shown, skipped, total = some_clips(source, clips, body)
+    shown, skipped, total = read_sample(source, clips, body)
     show_skipped(skipped)
-    atomic_write(out, png(clip_sheet(shown)))
+    atomic_write(out, png(draw_sheet(shown)))
     click.echo(f"{len(shown)} of {total} clips: {out}")
 
 

@@ -201,11 +201,11 @@ def show(file: Path, which: str | None, out: Path) -> None:
     from memmlp.motion.importing.recordings import read_recording
     from memmlp.motion.importing.skeleton_map import find_skeleton, load_skeleton
     from memmlp.report.pictures.clip_pictures import check_picture
-    from memmlp.report.pictures.skeleton_picture import skeleton_png
+    from memmlp.report.pictures.skeleton_picture import write_skeleton_picture
 
     check_picture(out, "--out", (".png",))
     recording = read_recording(file)
     chosen = find_skeleton(recording, None if which is None else load_skeleton(which))
     stance = view_stance(recording, chosen, load_rest_joints("builtin"))
-    skeleton_png(out, stance, f"{file.name}: {chosen.name}")
+    write_skeleton_picture(out, stance, f"{file.name}: {chosen.name}")
     click.echo(f"{chosen.name}, read from {stance.source}: {out}")

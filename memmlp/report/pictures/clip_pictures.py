@@ -15,7 +15,7 @@ from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS
 from memmlp.report.pictures.canvas import FAINT, Sheet, png
 from memmlp.report.pictures.clip_piece import ClipPiece
-from memmlp.report.pictures.raster import NEUTRAL, draw, heat
+from memmlp.report.pictures.raster import NEUTRAL, draw, heat_colours
 
 SUFFIXES = (".png", ".gif", ".mp4")
 POSES = 6
@@ -128,7 +128,7 @@ def encode_gif(pictures: Iterable[np.ndarray]) -> bytes:
     """
     from PIL import Image
 
-    hues = ((heat(np.linspace(0, 1, 28)), 7), (np.array([NEUTRAL]), 36), (np.ones((1, 3)), 24))
+    hues = ((heat_colours(np.linspace(0, 1, 28)), 7), (np.array([NEUTRAL]), 36), (np.ones((1, 3)), 24))
     shades = [(np.linspace(0.3, 1, count)[:, None, None] * colours).reshape(-1, 3) for colours, count in hues]
     palette = Image.new("P", (1, 1))
     palette.putpalette((255 * np.clip(np.concatenate(shades), 0, 1) + 0.5).astype(np.uint8).tobytes())

@@ -11,7 +11,7 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.motion.body import FPS, ROOT
 from memmlp.motion.limb_shapes import LIMBS, RADII
-from memmlp.report.pictures.raster import ELEVATION, Camera, scale
+from memmlp.report.pictures.raster import ELEVATION, Camera, colour_scale_top
 
 BOTTOM = -0.195  # height of a picture's lower edge above the floor, metres
 SIDE = np.deg2rad(25)  # the camera's angle from the person's front, radians
@@ -20,7 +20,7 @@ TIP = max(limb.tip + max(limb.radii) for limb in LIMBS)  # largest reach of a li
 SMOOTHING = 0.4  # seconds over which the camera's path is smoothed
 
 
-def span(
+def frame_range(
     length: int, title: str, begin: float, end: float | None, keys: tuple[str, str] = ("begin", "end")
 ) -> tuple[int, int]:
     """Return the first frame of a piece of a clip, and the frame after its last.
@@ -65,7 +65,7 @@ class ClipPiece:
     @cached_property
     def top(self) -> float:
         """The top of the colour scale, cm, shared by all predictions."""
-        return scale(np.stack(list(self.errors.values())))
+        return colour_scale_top(np.stack(list(self.errors.values())))
 
     @cached_property
     def floor(self) -> float:

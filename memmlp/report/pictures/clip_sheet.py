@@ -22,7 +22,7 @@ LENS = 1.0  # height that the camera looks at, metres
 SIDE = np.deg2rad(35)  # the camera's angle from the person's front, radians
 
 
-def some_clips(
+def read_sample(
     source: Path, count: int, body: str = "builtin"
 ) -> tuple[list[tuple[str, np.ndarray]], list[Skipped], int]:
     """Read a clip, or `count` of a folder's npz files, evenly spread in the order of their names.
@@ -52,7 +52,7 @@ def some_clips(
     return clips, skipped, len(files)
 
 
-def clip_sheet(clips: Sequence[tuple[str, np.ndarray]], moments: int = 3) -> np.ndarray:
+def draw_sheet(clips: Sequence[tuple[str, np.ndarray]], moments: int = 3) -> np.ndarray:
     """Draw clips side by side, each at evenly spread moments.
 
     Args:

@@ -23,14 +23,14 @@ FLOOR = 0.56  # radius of the visible floor as a fraction of the picture's width
 SHADOW = 0.13  # metres over which a shadow is blurred
 
 
-def heat(fractions: np.ndarray) -> np.ndarray:
+def heat_colours(fractions: np.ndarray) -> np.ndarray:
     """Return colours (..., 3), 0 to 1, of errors (...) as fractions of the scale's top."""
     anchors = np.array([[int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)] for colour in HEAT])
     place = np.clip(fractions, 0, 1) * (len(anchors) - 1)
     return np.stack([np.interp(place, range(len(anchors)), channel) for channel in anchors.T], -1)
 
 
-def scale(errors: np.ndarray) -> float:
+def colour_scale_top(errors: np.ndarray) -> float:
     """Return the top of a scale for errors in cm: the least of `SCALES` below which 98 % of them are."""
     high = float(np.percentile(errors, 98))
     return float(next((top for top in SCALES if high <= top), SCALES[-1]))
@@ -169,6 +169,6 @@ def _draw_limb(
     light = AMBIENT + (1 - AMBIENT) * np.clip(normal @ LIGHT, 0, 1) + 0.12 * normal[..., 2] - 0.06
     colour = np.array(NEUTRAL)
     if errors is not None:
-        colour = heat(np.interp(t, (0, 1), errors[[limb.first, limb.end]]))
+        colour = heat_colours(np.interp(t, (0, 1), errors[[limb.first, limb.end]]))
     picture[rows, columns][visible] = np.clip(colour * light[..., None], 0, 1)[visible]
     depth[rows, columns][visible] = near[visible]

@@ -23,7 +23,7 @@ SPACING = 21  # pixels from a name to the next
 LEFT, RIGHT, MIDDLE, BARE = "#1f6fd0", "#d0561f", "#2a8c4a", "#b4bac1"
 
 
-def skeleton_png(path: Path, stance: StanceView, title: str) -> None:
+def write_skeleton_picture(path: Path, stance: StanceView, title: str) -> None:
     """Write a PNG of a stance from the front and from the right: the file's nodes, and the body.
 
     All nodes are grey; those mapped to a body joint are coloured, and named `body joint = node`.

@@ -16,7 +16,7 @@ from memmlp.common.files import read_json
 from memmlp.live.spaces import SPACES
 from memmlp.motion.body import FPS, JOINTS
 from memmlp.motion.limb_shapes import HEAT, LIMBS
-from memmlp.report.pictures.raster import scale
+from memmlp.report.pictures.raster import colour_scale_top
 from memmlp.runs.identity import evaluation_id
 from memmlp.runs.run import Run
 
@@ -159,7 +159,7 @@ def cut_piece(
     piece = slice(first, first + length)
     return {
         "state": "ready", "fps": FPS, "frames": len(truth), "from": first, "worst": worst,
-        "top": scale(distances), "mean": round(float(errors.mean()), 3),
+        "top": colour_scale_top(distances), "mean": round(float(errors.mean()), 3),
         "errors": np.round(errors, 2).tolist(),
         "truth": _millimetres(truth[piece]), "joints": _millimetres(prediction[piece]),
     }  # fmt: skip

@@ -91,7 +91,7 @@ class Answers:
             case (("run" | "replay"), True) if ID.fullmatch(name) and name in self.index.runs:
                 if kind == "replay":
                     return self._replay(name, query)
-                return runs.describe_run(self.index, name, self.sweeps.control_of(name), self.places())
+                return runs.describe_run(self.index, name, self.sweeps.find_control(name), self.places())
         raise KeyError(path)
 
     def missing(self, path: str) -> str:

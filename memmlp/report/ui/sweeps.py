@@ -89,13 +89,13 @@ class Sweeps:
 
     def list_rows(self) -> dict[str, Any]:
         """Return a row for each sweep, the most recently changed first."""
-        rows = [self.describe_progress(one, self.states(one.plan)) for one in self.known.values()]
+        rows = [self.describe_progress(one, self.find_states(one.plan)) for one in self.known.values()]
         return {"sweeps": rows, "damaged": self.damaged}
 
     def describe(self, name: str) -> dict[str, Any]:
         """Return everything that a sweep's page shows. Raises KeyError for an unknown sweep."""
         known = self.known[name]
-        plan, states = known.plan, self.states(known.plan)
+        plan, states = known.plan, self.find_states(known.plan)
         results = self._results(known)
         values = results["values"]
         return {
@@ -128,7 +128,7 @@ class Sweeps:
             "remaining": self._remaining_seconds(plan, states),
         }
 
-    def control_of(self, run_id: str) -> str | None:
+    def find_control(self, run_id: str) -> str | None:
         """Return the run of the same seed with which a run's variant is compared; None for none.
 
         If several sweeps use the run, the first one in which its variant has a control decides.
@@ -142,7 +142,7 @@ class Sweeps:
                     return control
         return None
 
-    def states(self, plan: Plan) -> dict[str, str]:
+    def find_states(self, plan: Plan) -> dict[str, str]:
         """Return every task's state by its key, as `Plan.states` does, from the facts in the index."""
         return plan.with_blocked({task.key: self._state(plan, task) for task in plan.tasks})
 

@@ -9,18 +9,18 @@ import tiny
 from memmlp.common.errors import InputError
 from memmlp.evaluation.modes import joint_positions
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.report.pictures.clip_piece import ClipPiece, span
+from memmlp.report.pictures.clip_piece import ClipPiece, frame_range
 from memmlp.report.pictures.raster import draw
 
 TRUTH = joint_positions(tiny.clip(31)[:, SPARSE_DIM:]).numpy().astype(np.float64)
 
 
 def test_a_piece_without_frames_is_rejected():
-    assert span(120, "walk", 0.5, None) == (30, 120)
-    assert span(120, "walk", 0.0, 9.0) == (0, 120)
+    assert frame_range(120, "walk", 0.5, None) == (30, 120)
+    assert frame_range(120, "walk", 0.0, 9.0) == (0, 120)
     for begin, end in ((2.0, None), (1.0, 1.0), (float("nan"), None)):
         with pytest.raises(InputError, match="begin"):
-            span(120, "walk", begin, end)
+            frame_range(120, "walk", begin, end)
 
 
 def test_the_camera_goes_along():

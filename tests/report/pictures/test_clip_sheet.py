@@ -9,7 +9,7 @@ import pytest
 from memmlp.common.errors import InputError
 from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.synthetic import synthesize_clip
-from memmlp.report.pictures.clip_sheet import COLUMNS, HEIGHT, LABEL, WIDTH, clip_sheet, some_clips
+from memmlp.report.pictures.clip_sheet import COLUMNS, HEIGHT, LABEL, WIDTH, draw_sheet, read_sample
 
 
 @pytest.fixture
@@ -23,16 +23,16 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize(("count", "numbers"), [(1, [0]), (3, [0, 3, 6]), (99, range(7))])
 def test_clips_are_evenly_spread(folder: Path, count: int, numbers: list[int]):
-    clips, skipped, total = some_clips(folder, count)
+    clips, skipped, total = read_sample(folder, count)
     assert [name for name, _ in clips] == [f"{number}/walk" for number in numbers]
     assert (skipped, total) == ([], 7)
     assert clips[0][1].shape[1:] == (22, 3)
-    assert some_clips(folder / "2" / "walk.npz", count)[0][0][0] == "walk"
+    assert read_sample(folder / "2" / "walk.npz", count)[0][0][0] == "walk"
 
 
 def test_bad_files_are_named(folder: Path):
     (folder / "0" / "walk.npz").write_bytes(b"no")
-    clips, skipped, _ = some_clips(folder, 7)
+    clips, skipped, _ = read_sample(folder, 7)
     assert len(clips) == 6
     assert [file.file for file in skipped] == ["0/walk.npz"]
     assert str(folder) not in skipped[0].reason
@@ -41,15 +41,15 @@ def test_bad_files_are_named(folder: Path):
 def test_nothing_to_show_is_rejected(folder: Path, tmp_path: Path):
     (folder / "0" / "walk.npz").write_bytes(b"no")
     with pytest.raises(InputError, match=r"no clip in 1 files.*0/walk\.npz"):
-        some_clips(folder, 1)
+        read_sample(folder, 1)
     with pytest.raises(InputError, match="No such file"):
-        some_clips(tmp_path / "none.npz", 1)
+        read_sample(tmp_path / "none.npz", 1)
 
 
 @pytest.mark.slow
 def test_a_sheet_has_a_row_for_every_few_clips(folder: Path):
-    clips = some_clips(folder, 5)[0]
-    sheet = clip_sheet(clips)
+    clips = read_sample(folder, 5)[0]
+    sheet = draw_sheet(clips)
     assert sheet.shape == (2 * (HEIGHT + LABEL), COLUMNS * WIDTH, 3)
     blank = [
         (sheet[HEIGHT + 2 * LABEL :, left : left + WIDTH] == 255).all()

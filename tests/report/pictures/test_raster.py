@@ -9,7 +9,7 @@ import tiny
 from memmlp.evaluation.modes import joint_positions
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.report.pictures.clip_piece import ClipPiece
-from memmlp.report.pictures.raster import Camera, draw, scale
+from memmlp.report.pictures.raster import Camera, colour_scale_top, draw
 
 TRUTH = joint_positions(tiny.clip(31)[:, SPARSE_DIM:]).numpy().astype(np.float64)
 
@@ -70,7 +70,7 @@ def test_the_nearer_body_part_is_seen(camera: Camera):
 
 def test_the_scale_is_round_and_leaves_few_above():
     errors = np.random.default_rng(0).gamma(2, 4, 5000)
-    assert scale(errors) == 25 or scale(errors) == 30
-    assert (errors > scale(errors)).mean() <= 0.02
-    assert scale(np.zeros(3)) == 10
-    assert scale(np.full(3, 1e6)) == 100
+    assert colour_scale_top(errors) == 25 or colour_scale_top(errors) == 30
+    assert (errors > colour_scale_top(errors)).mean() <= 0.02
+    assert colour_scale_top(np.zeros(3)) == 10
+    assert colour_scale_top(np.full(3, 1e6)) == 100

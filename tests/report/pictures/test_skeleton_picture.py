@@ -14,7 +14,15 @@ from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.importing.convert import view_stance
 from memmlp.motion.importing.skeleton_map import find_skeleton
-from memmlp.report.pictures.skeleton_picture import HEIGHT, LEFT, MIDDLE, RIGHT, WIDTH, skeleton_png, spread
+from memmlp.report.pictures.skeleton_picture import (
+    HEIGHT,
+    LEFT,
+    MIDDLE,
+    RIGHT,
+    WIDTH,
+    spread,
+    write_skeleton_picture,
+)
 
 
 @pytest.mark.parametrize(
@@ -41,7 +49,7 @@ def draw(folder: Path, name: str, far: bool = False) -> np.ndarray:
     stance = view_stance(bvh, find_skeleton(bvh), builtin_rest_joints())
     if far:
         stance.positions[stance.nodes.index("HeadTop_End")] += [5.0, 0.0, 5.0]
-    skeleton_png(folder / "out.png", stance, "a file")
+    write_skeleton_picture(folder / "out.png", stance, "a file")
     return np.asarray(Image.open(folder / "out.png"))
 
 
