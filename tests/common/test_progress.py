@@ -8,7 +8,6 @@ import pytest
 
 from memmlp.common import progress
 from memmlp.common.progress import (
-    announce,
     announce_to,
     label_progress,
     notify,
@@ -38,15 +37,6 @@ def test_a_remark_is_shown_on_a_terminal_too(capsys, monkeypatch: pytest.MonkeyP
     assert told == ["data: 1 file was skipped"]
 
 
-def test_lines_are_told_to_who_listens_alone():
-    told: list[str] = []
-    announce("data: before")
-    with announce_to(told.append):
-        announce("data: within")
-    announce("data: after")
-    assert told == ["data: within"]
-
-
 def test_long_work_tells_how_far_it_is(monkeypatch: pytest.MonkeyPatch):
     told: list[str] = []
     monkeypatch.setattr(progress, "INTERVAL", 0.0)
@@ -63,14 +53,6 @@ def test_quick_work_tells_nothing_of_how_far_it_is():
     with announce_to(told.append):
         assert list(progress_bar("abc", "reading")) == ["a", "b", "c"]
     assert told == []
-
-
-def test_work_of_unknown_length_tells_what_is_done(monkeypatch: pytest.MonkeyPatch):
-    told: list[str] = []
-    monkeypatch.setattr(progress, "INTERVAL", 0.0)
-    with announce_to(told.append):
-        list(progress_bar(iter("ab"), "reading"))
-    assert told == ["reading: 1", "reading: 2"]
 
 
 def test_a_line_names_the_unit_and_the_stage(monkeypatch: pytest.MonkeyPatch):
