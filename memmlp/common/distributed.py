@@ -1,8 +1,8 @@
 """Data-parallel training of one run by several processes, as torchrun starts them.
 
-Every process draws the whole batch of a step, from the same seed, and works on its own rows, its share of the
-batch. The gradients are averaged over all processes, so that the run is the same that a single process
-trains. Without torchrun there is one process, and the functions here have no effect.
+Every process draws the whole batch of a step, from the same seed, and works on its own rows. The gradients are
+averaged over all processes, so the run is the same as one trained by a single process. Without torchrun there
+is one process, and the functions here have no effect.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-PATIENCE = timedelta(days=7)  # others may wait while the first process prepares, validates or evaluates
+TIMEOUT = timedelta(days=7)  # others wait while the first process prepares, validates or evaluates
 
 
 class _Step:
@@ -57,7 +57,7 @@ def connect(kind: str) -> None:
         import torch
 
         torch.cuda.set_device(local_rank())
-    distributed.init_process_group("nccl" if kind == "cuda" else "gloo", timeout=PATIENCE)
+    distributed.init_process_group("nccl" if kind == "cuda" else "gloo", timeout=TIMEOUT)
 
 
 def disconnect() -> None:

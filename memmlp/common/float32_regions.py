@@ -1,4 +1,4 @@
-"""Which parts of a mixed-precision training (`optim.precision=bf16`) are computed in float32 anyway."""
+"""Parts of a mixed-precision training (`optim.precision=bf16`) that are computed in float32."""
 
 from __future__ import annotations
 
