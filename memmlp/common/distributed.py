@@ -1,8 +1,8 @@
 """Data-parallel training of one run by several processes, as torchrun starts them.
 
-Every process draws the whole batch of a step, from the same seed, and works on its own rows. The gradients are
-averaged over all processes, so the run is the same as one trained by a single process. Without torchrun there
-is one process, and the functions here have no effect.
+Every process draws the whole batch of a step, from the same seed, and works on its own rows. The gradients
+are averaged over all processes, so the run is the same as one trained by a single process. Without torchrun
+there is one process, and the functions here have no effect.
 """
 
 from __future__ import annotations
