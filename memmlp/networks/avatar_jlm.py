@@ -78,7 +78,7 @@ class AvatarJLMGraph(StreamingGraph):
     """AvatarJLM's streaming graph, which carries the tokens of each frame, in order of time.
 
     The tokens' position embeddings change at every step and attention looks both ways in time, so all layers
-    are computed anew; the last one, over time, is computed for the newest frame alone.
+    are recomputed; the last one, over time, is only computed for the newest frame.
     """
 
     float32_modules = ("model.embedding", "model.coarse", "model.regressor")

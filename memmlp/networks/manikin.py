@@ -53,7 +53,7 @@ from memmlp.networks.motion_model import MotionModel, State, TrainingOutputs
 from memmlp.networks.transformer import draw_weights
 
 KEPT = (1, 2, 3, 6, 9, 12, 13, 14, 16, 17)
-"""The joints whose local rotations are predicted, beside the root's: the trunk's, shoulders and hips."""
+"""The joints whose local rotations are predicted, besides the root's: the trunk's, shoulders and hips."""
 SWIVELS, PLACES = 2 * len(BASES), 3 * (len(ANKLES) + len(TOES))
 PREDICTED = 6 * (1 + len(KEPT)) + SWIVELS + PLACES
 AUXILIARY = 6 * (N_JOINTS - 1)  # rotations that MANIKIN-L predicts in training alone

@@ -177,9 +177,8 @@ class OwnPastMemorySettings(Settings):
     """The keys of the memories of the network's own past.
 
     Attributes:
-        codes: "frozen" for a memory that needs a VQ-VAE that is trained before, "joint" for one with a VQ-VAE
-        of
-            its own, "" without.
+        codes: "frozen" if the memory needs a VQ-VAE that is trained before, "joint" if its VQ-VAE is trained
+            with the network, "" without a VQ-VAE.
     """
 
     # which blocks of the backbone have it: the even ones (Sec. 4.1)
@@ -201,13 +200,13 @@ class OwnPastMemorySettings(Settings):
 @component("memory", "no_codes", builds="NoCodesMemory")
 @dataclass
 class NoCodesMemorySettings(OwnPastMemorySettings):
-    """A memory of the network's own past alone, without code-vectors (Table 11)."""
+    """A memory of the network's own past without code-vectors (Table 11)."""
 
 
 @component("memory", "vq", builds="CodeMemory")
 @dataclass
 class CodeMemorySettings(OwnPastMemorySettings):
-    """The paper's memory: code-vectors beside the network's own past (Sec. 3.2.1)."""
+    """The paper's memory: code-vectors and the network's own past (Sec. 3.2.1)."""
 
     codes: ClassVar[str] = "frozen"
 
@@ -227,18 +226,11 @@ class JointCodeMemorySettings(OwnPastMemorySettings):
 class OwnPastMemory(FeatureMemory):
     """A memory of the network's own past; the base of those with and without code-vectors.
 
+    `memory.blend.value` changes m in a trained network.
+
     Args:
-        layers: the backbone's layers (1-based) that get a memory feature.
-        width: k, the width of the memory feature.
-        shift: which past window is recalled: "frame" for the one that ends one frame ago, "window" for the
-            one that ends T frames ago.
-        history: which estimate of a past frame's motion is recalled: "first" for the one made when that frame
-            was the newest, "latest" for the most recent one.
-        fusion: "residual" or "plain".
-        blend: m at inference, in [0, 1], or "sampled"; `memory.blend.value` changes it in a trained network.
-        hidden: the backbone's d.
-        frames: the backbone's T.
-        depth: the backbone's L.
+        layers, width, shift, history, fusion, blend: see OwnPastMemorySettings.
+        hidden, frames, depth: the backbone's d, T and L.
         codes: the frozen VQ-VAE; not used here.
     """
 

@@ -116,19 +116,15 @@ class RecurrentRecall(Recall):
 class RecurrentMemory(FeatureMemory):
     """A recurrent layer for each memory block in place of the paper's memory (Table 15, reading 19).
 
-    A layer runs once over each frame, and its outputs for the window's older frames are kept beside its
-    states: a stream taken frame by frame is then the same as one taken in larger steps. A training call takes
-    in a whole window. With teacher forcing the hidden state starts from the last input before the window,
-    projected, and the cell at zero (`true_state`); otherwise, and in evaluation, the states are carried from
-    call to call and are zeros at a fresh start.
+    A layer runs once over each frame, and its outputs for the window's older frames are kept with its states.
+    So a stream in single frames is the same as one in larger steps. A training call sees a whole window. With
+    teacher forcing the hidden state starts from the last input before the window, projected, and the cell at
+    zero (`true_state`). Otherwise, and in evaluation, the states are carried from call to call and are zeros
+    at a fresh start.
 
     Args:
-        layers: the backbone's layers (1-based) that get a memory feature.
-        width: k, the hidden size of the recurrent layers and so the width of the memory feature.
-        fusion: "residual" or "plain".
-        hidden: the backbone's d.
-        frames: the backbone's T.
-        depth: the backbone's L.
+        layers, width, fusion: see the memory's settings; k is also the hidden size of the recurrent layers.
+        hidden, frames, depth: the backbone's d, T and L.
         codes: the frozen VQ-VAE; not used here.
     """
 

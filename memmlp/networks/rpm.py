@@ -1,4 +1,4 @@
-"""RPM (Rolling Prediction Model, CVPR 2025): each step predicts the next frames anew.
+"""RPM (Rolling Prediction Model, CVPR 2025): each step predicts the next frames again.
 
 The nearer a predicted frame is, the less a new prediction may change it; the nearest one is shown.
 """

@@ -158,7 +158,7 @@ class RPMLoss(Loss):
 @component("loss", "of_network", builds="LossOfNetwork")
 @dataclass
 class LossOfNetworkSettings(CompleteLossSettings):
-    """No loss beside the network's own, for networks that can train with it alone: BoDiffusion."""
+    """Only the network's own loss, for networks that can train with it: BoDiffusion."""
 
 
 class LossOfNetwork(Loss):
