@@ -95,16 +95,9 @@ def sweep(
         if rounds:
             click.echo("\n".join([describe_schedule(rounds), *describe_progress(rounds, chosen)]))
         if dry_run:
-            show_forecast(spent, wanted, labels, workers.number(workers.shares(devices(wanted))))
-            click.echo(workers.script(sweep_folder(chosen, outputs)), nl=False)
+            show_forecast(spent, wanted, labels, workers, sweep_folder(chosen, outputs))
         return
-    if retry:
-        for task in wanted.tasks:
-            wanted.run_of(task).retry()
-    if again:  # networks, finished or started; prerequisites stay
-        for run in {task.id: wanted.run_of(task) for task in wanted.tasks if task.kind == NETWORK}.values():
-            with run.lock():
-                run.reset()
+    restart(wanted, retry, again)
     work = partial(run_workers, workers=workers)
     given = [name, *overrides]
     if rounds:
@@ -114,10 +107,21 @@ def sweep(
     wanted = replace(wanted, fail_fast=fail_fast)
     if wanted.left():
         work(chosen, wanted)
-    shown = ShownSweep(
-        chosen, replace(plan, fail_fast=fail_fast), None, flag_of_earlier_rounds(chosen, outputs)
-    )
-    show_outcome(shown, given, chosen, labels)
+    flags = flag_of_earlier_rounds(chosen, outputs)
+    show_outcome(ShownSweep(chosen, replace(plan, fail_fast=fail_fast), None, flags), given, chosen, labels)
+
+
+def restart(plan: Plan, failed: bool, networks: bool) -> None:
+    """Prepare a plan's runs to be done again: failed ones, or all networks, finished or started.
+
+    Prerequisites of networks stay.
+    """
+    for task in plan.tasks if failed else ():
+        plan.run_of(task).retry()
+    started = [task for task in plan.tasks if networks and task.kind == NETWORK]
+    for run in {task.id: plan.run_of(task) for task in started}.values():
+        with run.lock():
+            run.reset()
 
 
 def run_workers(chosen: Sweep, plan: Plan, workers: Workers) -> None:
@@ -174,22 +178,24 @@ def count_unprepared(chosen: Sweep, plan: Plan, labels: Collection[str]) -> int:
     return sum(one.label in labels for one in chosen.variant_seeds()) - len(plan.entries)
 
 
-def show_forecast(chosen: Sweep, plan: Plan, labels: Collection[str], workers: int) -> None:
-    """Print how long the remaining runs may take.
+def show_forecast(chosen: Sweep, plan: Plan, labels: Collection[str], workers: Workers, folder: Path) -> None:
+    """Print how long the remaining runs may take, and the file that sbatch would get.
 
     VQ-VAEs are counted only for runs whose data is prepared.
     """
     from memmlp.sweep.plan import forecast
 
+    count = workers.number(workers.shares(devices(plan)))
     left, later = plan.left(), count_unprepared(chosen, plan, labels)
     besides = ", and the VQ-VAEs that they need" if later else ""
-    line = f"{len(left) + later} of {len(plan.tasks) + later} runs to do{besides}, {workers} at once"
+    line = f"{len(left) + later} of {len(plan.tasks) + later} runs to do{besides}, {count} at once"
     if not later and (found := forecast(plan)):
-        minutes = found.seconds / workers / 60
+        minutes = found.seconds / count / 60
         line += f": about {minutes:.0f} min, estimated from {found.finished} finished runs"
         if found.unlike:
             line += f" ({found.unlike} runs are of variants without a finished one, estimated from others)"
     click.echo(line)
+    click.echo(workers.script(folder), nl=False)
 
 
 def show_outcome(shown: ShownSweep, given: Sequence[str], chosen: Sweep, labels: Collection[str]) -> None:

@@ -84,9 +84,7 @@ def find_flags(
     yield from older_code((label, run.code, run.origin.plugins) for label, run in every)
     if set(TIMES) & set(sweep.metrics):
         timed = [(run.origin.timed_on, label) for label, run in every if run.latency or run.costs]
-        yield from differences(
-            "machine of the times", [(machine, label) for machine, label in timed if machine != UNKNOWN]
-        )
+        yield from differences("machine of the times", [one for one in timed if one[0] != UNKNOWN])
         yield from _busy_machine(sweep, runs)
     if has_errors:
         yield from _hardly_trained(every)
@@ -99,12 +97,7 @@ def find_flags(
         yield f"made by code with uncommitted changes: {quoted(uncommitted)}"
     if has_errors:
         yield from _replicates(sweep, runs)
-        bare = [label for label, run in every if run.origin.body == BUILT_IN]
-        if sweep.table in SMPLH and bare:
-            yield f"on the built-in skeleton; the paper uses SMPL-H bodies (data.body=FILE): {quoted(bare)}"
-        less_precise = [label for label, run in every if run.origin.deployed != "fp32"]
-        if less_precise:
-            yield f"size and times are of a file of less precision, errors of float32: {quoted(less_precise)}"
+        yield from _other_bodies_and_files(sweep, every)
 
 
 def early_tables(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
@@ -414,6 +407,15 @@ def _unequal_recipes(every: Labelled) -> Iterator[str]:
     for name in sorted({name for _, run in every for name in run.origin.plugins}):
         having = [(run.origin.plugins[name], label) for label, run in every if name in run.origin.plugins]
         yield from differences(f"code of {name}", having)
+
+
+def _other_bodies_and_files(sweep: Sweep, every: Labelled) -> Iterator[str]:
+    bare = [label for label, run in every if run.origin.body == BUILT_IN]
+    if sweep.table in SMPLH and bare:
+        yield f"on the built-in skeleton; the paper uses SMPL-H bodies (data.body=FILE): {quoted(bare)}"
+    less_precise = [label for label, run in every if run.origin.deployed != "fp32"]
+    if less_precise:
+        yield f"size and times are of a file of less precision, errors of float32: {quoted(less_precise)}"
 
 
 def _replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
