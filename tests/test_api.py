@@ -105,7 +105,7 @@ def test_outputs_are_those_of_the_command_line(
 
 def test_what_is_no_trained_network_is_refused(run: memmlp.TrainedRun):
     (codes,) = [found for found in list_runs("outputs") if found.id != run.id]
-    none = "not a finished run of a motion network"
+    none = "a finished run of a motion network"
     for name, word in (("nobody", "nobody"), ("", "''"), (codes.id, none)):
         with refused("run", word):
             memmlp.load_run(name)

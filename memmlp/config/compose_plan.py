@@ -180,32 +180,30 @@ def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[s
     """Make the plan, and list the data that it relies on; the list is None if some data is not prepared."""
     planned: list[tuple[Entry, list[RunTask]]] = []
     data: dict[str, dict[str, Any]] = {}
-    complete = True
     for variant in sweep.runnable():
         for seed, request in _requests(sweep, variant, outputs):
-            known = _data_digest(request, prepare, data)
-            complete &= known is not None
-            if known is not None:
+            if (known := _data_digest(request, prepare, data)) is not None:
                 found = tasks_of(request, known)
                 planned.append((Entry(variant.label, seed, found[-1].id, found[-1].stages), found))
     planned.sort(key=lambda one: sweep.seeds.index(one[0].seed))  # a half-done sweep then has every variant
     tasks = unique(task for _, found in planned for task in found)
     plan = Plan(sweep.name, outputs, tuple(entry for entry, _ in planned), tasks)
+    complete = all(one["digest"] is not None for one in data.values())
     return plan, list(data.values()) if complete else None
 
 
 def _requests(sweep: Sweep, variant: Variant, outputs: Path) -> Iterable[tuple[int, RunRequest]]:
     """Yield the checked requests of a variant, with their seeds."""
-    from memmlp.config.build_request import build_request
+    from memmlp.config.build_request import build_requests
     from memmlp.config.compose import composed
 
+    seeds = sweep.seeds_of(variant)
     try:
         cfg = composed(list(sweep.all_overrides(variant)))
         if cfg.force:  # variants that share a run would make it again and again
             raise InputError("force=true: use --again, which makes a sweep's finished runs again")
-        for seed in sweep.seeds_of(variant):
-            cfg.seed, cfg.paths.outputs = seed, str(outputs)
-            yield seed, build_request(cfg)
+        cfg.paths.outputs = str(outputs)
+        yield from zip(seeds, build_requests(cfg, seeds), strict=True)
     except InputError as error:
         raise InputError(f"sweep {sweep.name}, variant '{variant.label}': {error}") from None
 
@@ -223,19 +221,17 @@ def tasks_of(request: RunRequest, data: str) -> list[RunTask]:
     return [*tasks, RunTask(own.id, own.kind, request.config, last, request.stage_ids, own.what)]
 
 
-def _data_digest(request: RunRequest, prepare: bool, known: dict[str, dict[str, Any]]) -> str | None:
+def _data_digest(request: RunRequest, prepare: bool, data: dict[str, dict[str, Any]]) -> str | None:
     """Return the digest of the request's prepared data; None if it is not prepared.
 
-    The digest is looked up once for each data config and kept in `known`.
+    The digest is looked up once for each data config and kept in `data`.
     """
     config = {"data": request.config["data"], "paths": request.config["paths"]}
     key = digest(config)
-    if key not in known:
+    if key not in data:
         found = request.motion.prepare().digest if prepare else request.motion.digest()
-        if found is None:
-            return None
-        known[key] = {"config": config, "digest": found, "groups": request.motion.groups_digest}
-    return known[key]["digest"]
+        data[key] = {"config": config, "digest": found, "groups": request.motion.groups_digest}
+    return data[key]["digest"]
 
 
 def _fresh(data: dict[str, Any], prepare: bool) -> bool:

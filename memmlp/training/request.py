@@ -79,10 +79,9 @@ class RunRequest:
         if config["refiner"] is not None:
             bare = without_refiner(config)
             return [*RunRequest(bare, self.motion)._chain, (NETWORK, own)]
-        if config["upstream"] is not None:
-            from memmlp.training.train_sage import PARTS, select_config
-
-            return [*((kind, select_config(kind, config)) for kind in PARTS), (NETWORK, own)]
+        upstream: Any = chosen(config, "upstream")
+        if upstream is not None:
+            return [*upstream.prerequisites(config), (NETWORK, own)]
         if codes == "frozen":
             vqvae = {"normalizer": config["normalizer"], "vqvae": config["vqvae"]}
             vqvae |= {"data": {"mirror": True}} if config["data"].get("mirror") else {}

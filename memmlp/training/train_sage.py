@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -43,17 +43,6 @@ HIDDEN_SHARE = 0.5  # of a half's joints, which its VQ-VAE has to guess
 HIDDEN_COUNT = 2  # joints of the diffusion models' condition, drawn with replacement
 CODE_WEIGHTS = {"orientation": 0.2, "rotation": 1.0, "position": 5.0, "hand": 5.0, "codebook": 0.25}
 
-_SIZES = ("name", "frames", "code_width", "code_depth", "code_heads", "dropout")
-_DENOISER = (*_SIZES, "width", "depth", "heads", "diffusion_steps")
-_ALL = (*_DENOISER, "sampling_steps", "noise", "noise_seed")
-ACTING: dict[str, tuple[str, ...]] = {
-    "upper_codes": _SIZES,
-    "lower_codes": _SIZES,
-    "upper_diffusion": _DENOISER,
-    "lower_diffusion": _ALL,  # it sees what the upper one samples
-    "decoder": _ALL,
-}
-"""The keys of the model that act in the training of each part."""
 WHOLE = ("warmup", "ema", "clip_norm", "weight_decay", "compile")
 """The keys of optim, besides the optimiser, that only act for the whole network: parts have defaults."""
 
@@ -117,6 +106,34 @@ class SAGEUpstreamSettings(Settings):
         PartSettings, steps=sized(20, 1000, 56000), batch="${profile.batch}", lr_drops_at=[], lr_drop=1.0
     )
 
+    _sizes = ("name", "frames", "code_width", "code_depth", "code_heads", "dropout")
+    _denoiser = (*_sizes, "width", "depth", "heads", "diffusion_steps")
+    _all = (*_denoiser, "sampling_steps", "noise", "noise_seed")
+    model_keys: ClassVar = {
+        "upper_codes": _sizes,
+        "lower_codes": _sizes,
+        "upper_diffusion": _denoiser,
+        "lower_diffusion": _all,  # it sees what the upper one samples
+        "decoder": _all,
+    }
+    """The keys of the model that have an effect on the training of each part."""
+
+    @classmethod
+    def prerequisites(cls, config: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Yield each part with those keys of the network's config that determine its result, in order."""
+        for kind in PARTS:
+            loss = {"loss": config["loss"]} if kind == "decoder" else {}
+            yield (
+                kind,
+                {
+                    **{key: config[key] for key in ("profile", "data", "normalizer", "seed")},
+                    **loss,
+                    "model": {key: config["model"][key] for key in cls.model_keys[kind]},
+                    "upstream": {key: config["upstream"][key] for key in ("name", kind)},
+                    "optim": {"precision": config["optim"]["precision"]},
+                },
+            )
+
     def trainings(self, config: Mapping[str, Any], network: NetworkTraining) -> Iterator[PartTraining]:
         """Yield the training of each part, in order.
 
@@ -132,7 +149,7 @@ class SAGEUpstreamSettings(Settings):
             optim = DroppingOptim(**own, **often, betas=betas, validate_every=own["steps"])
             make = DecoderTraining if kind == "decoder" else PartTraining
             unused = list_unused(config["optim"]["name"], network.optim, optim)
-            yield make(kind, select_config(kind, config), replace(network, optim=optim), unused)
+            yield make(kind, replace(network, optim=optim), unused)
 
 
 def list_unused(name: str, whole: Optim, part: Optim) -> tuple[str, ...]:
@@ -142,32 +159,17 @@ def list_unused(name: str, whole: Optim, part: Optim) -> tuple[str, ...]:
     return (*other, *(f"optim.{key}={own[key]}" for key in WHOLE if own[key] != getattr(part, key)))
 
 
-def select_config(kind: str, config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those keys of a network's config that determine the result of training one of its parts."""
-    upstream = {key: config["upstream"][key] for key in ("name", kind)}
-    own = {key: config[key] for key in ("profile", "data", "normalizer", "seed")}
-    own |= {"loss": config["loss"]} if kind == "decoder" else {}
-    return {
-        **own,
-        "model": {key: config["model"][key] for key in ACTING[kind]},
-        "upstream": upstream,
-        "optim": {"precision": config["optim"]["precision"]},
-    }
-
-
 @dataclass(frozen=True)
 class PartTraining:
     """How a part is trained, as a run of its own.
 
     Attributes:
         kind: which of PARTS.
-        config: the part of the resolved config that determines the result.
         network: seed, optimisation, and how windows are drawn.
         unused: settings of optim that act only in the training of the whole network.
     """
 
     kind: str
-    config: dict[str, Any]
     network: NetworkTraining
     unused: tuple[str, ...] = ()
 

@@ -358,6 +358,9 @@ def test_a_config_without_the_schema_is_refused(memmlp: Memmlp, tmp_path: Path):
     "overrides",
     [
         ["model.width=8", "seed=3"],
+        ["model=bodiffusion", "refiner=sage", "profile=paper"],
+        ["model=recurrent_poser", "loss=calm", "optim=adamw", "loggers=all"],
+        ["hand='off'", "predictor=rotation_only", "memory=none", "loss=manual"],
         ["profile=tiny", "memory=gru", "experiment=no_memory", "optim.steps=4"],
         ["model=avatar_poser", "loss.position=2", "~loggers"],
         ["profile.width=16", "data.split.groups=[a,b]", "paths.outputs=elsewhere", "loggers=none"],

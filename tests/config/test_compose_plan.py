@@ -9,6 +9,8 @@ import pytest
 
 from memmlp.common.errors import InputError
 from memmlp.config import plugins
+from memmlp.config.build_request import build_request, build_requests
+from memmlp.config.compose import composed
 from memmlp.config.compose_plan import _stamp, find_sweep, sweep_folder
 from memmlp.sweep.sweep_file import parse_sweep
 
@@ -119,3 +121,18 @@ def test_a_sweep_has_one_folder_in_whatever_order_it_is_asked_for(tmp_path: Path
     assert a == b != c
     assert sweep_folder(replace(sweep, command_line=("seed=4", "seed=3", "threads=1")), tmp_path) != c
     assert sweep_folder(sweep, tmp_path) == tmp_path / "sweeps" / sweep.name
+
+
+def test_requests_of_several_seeds_are_those_of_each_seed():
+    cfg = composed(["vqvae.seed=${seed}", "memory=vq", "data.synth.minutes=0.5"])
+    requests = list(build_requests(cfg, [4, 0, 7]))
+    assert [request.config["vqvae"]["seed"] for request in requests] == [4, 0, 7]
+    for seed, request in zip([4, 0, 7], requests, strict=True):
+        cfg.seed = seed
+        assert (request.config, request.motion.clips) == (
+            build_request(cfg).config,
+            build_request(cfg).motion.clips,
+        )
+    cfg.data.synth.seed = "${seed}"
+    assert [one.config["data"]["synth"]["seed"] for one in build_requests(cfg, [1, 2])] == [1, 2]
+    assert len({str(one.motion.clips.root) for one in build_requests(cfg, [1, 2])}) == 2

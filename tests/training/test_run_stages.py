@@ -211,7 +211,7 @@ def test_export_again_and_bad_names(home, memmlp, monkeypatch):
     assert one_line(memmlp(*full), "--scope full")
     assert one_line(memmlp("eval", "zzz"), "run 'zzz'")
     assert one_line(memmlp("export", run.id, "--out", "no/where.onnx"), "--out")
-    assert one_line(memmlp("eval", run.manifest["upstream"]), "not a finished run of a motion network")
+    assert one_line(memmlp("eval", run.manifest["upstream"]), "a finished run of a motion network")
 
 
 def test_a_nan_on_a_later_clip_is_not_exported(home, memmlp, monkeypatch):

@@ -60,7 +60,7 @@ def test_one_command_trains_each_part_and_then_the_whole(memmlp):
     assert not tensors(whole, "codes")
     stems = [tensors(chain[1], f"codes.{half}.stem.weight") for half in ("upper", "lower")]
     assert [stem.shape[1] for half in stems for stem in half.values()] == [14 * 24, 9 * 24]  # of each joint
-    with pytest.raises(InputError, match="not a finished"):
+    with pytest.raises(InputError, match="must be a finished"):
         check_trained(chain[0])
     # a part alone that is gone is made again, with the same weights
     weights = chain[2].model.read_bytes()
