@@ -94,7 +94,7 @@ class SimulatedLook(NamedTuple):
 
     Attributes:
         noise: the means (K, S) of the noise over clips, by seed.
-        variance: the variance E (K,) of the noise alone (`crossed_seeds_and_groups`).
+        variance: the variance E (K,) of the noise alone (`paired_differences`).
         covariances: covariances (K, 4, 4) between the groups' means of the effects of groups, clips, skewed
             clips and noise.
     """

@@ -88,23 +88,17 @@ def variable(worker) -> str:
     return until(entries, "the process has its environment")[0].removeprefix(name).decode()
 
 
-@pytest.mark.parametrize(
-    ("words", "found"),
-    [
+def test_visible_gpus_are_those_of_the_variable_or_all(monkeypatch: pytest.MonkeyPatch):
+    for text, found in (
         ("0,1", ("0", "1")), (" 3 , GPU-8f2a ", ("3", "GPU-8f2a")), ("", ()), ("-1", ()), ("2,-1,3", ("2",)),
         ("MIG-a,MIG-b", ("MIG-a", "MIG-b")),
-    ],
-)  # fmt: skip
-def test_visible_are_those_of_the_variable(monkeypatch: pytest.MonkeyPatch, words: str, found: tuple):
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", words)
-    assert visible_gpus() == found
-
-
-@pytest.mark.parametrize("count", [0, 2])
-def test_without_the_variable_all_are_visible(monkeypatch: pytest.MonkeyPatch, count: int):
-    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: count)
-    assert visible_gpus() == ("0", "1")[:count]
+    ):  # fmt: skip
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", text)
+        assert visible_gpus() == found
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+    for count in (0, 2):
+        monkeypatch.setattr(torch.cuda, "device_count", lambda count=count: count)
+        assert visible_gpus() == ("0", "1")[:count]
 
 
 def test_shares():

@@ -40,16 +40,13 @@ def test_workers_are_one_array(tmp_path: Path):
     assert "#SBATCH --array=0-7%8" in lines(tmp_path, 8)
 
 
-@pytest.mark.parametrize(
-    ("text", "minutes"),
-    [
+def test_times_are_slurms(tmp_path: Path):
+    for text, minutes in (
         ("90", 90), ("90:30", 91), ("10:00:00", 600), ("1:30:01", 91), ("2-0", 2880), ("7-12:30", 10830),
         ("1-02:03:00", 1563),
-    ],
-)  # fmt: skip
-def test_times_are_slurms(tmp_path: Path, text: str, minutes: int):
-    assert slurm_options({"time": text}).minutes == minutes
-    assert f"#SBATCH --time={text}" in lines(tmp_path, time=text)
+    ):  # fmt: skip
+        assert slurm_options({"time": text}).minutes == minutes
+        assert f"#SBATCH --time={text}" in lines(tmp_path, time=text)
 
 
 def test_a_container_is_srun_s(tmp_path: Path):
@@ -62,34 +59,27 @@ def test_a_container_is_srun_s(tmp_path: Path):
     assert not [line for line in found if line.startswith("#SBATCH --container")]
 
 
-@pytest.mark.parametrize(
-    ("words", "gpu"),
-    [
+def test_whether_a_job_is_to_have_a_gpu():
+    for settings, gpu in (
         ({"gpus": "1"}, True), ({"gpus": "a100:2"}, True), ({"gpus_per_task": "1"}, True),
         ({"gres": "gpu:1"}, True),
         ({"gres": "disk:1"}, False), ({"mem_per_gpu": "8G"}, False), ({}, False),
-    ],
-)  # fmt: skip
-def test_whether_a_job_is_to_have_a_gpu(words: dict[str, str], gpu: bool):
-    assert slurm_options(words).gpu is gpu
+    ):  # fmt: skip
+        assert slurm_options(settings).gpu is gpu, settings
 
 
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        ({"time": "1h"}, "slurm.time=1h: expected MINUTES"),
-        ({"comment": "a\nb"}, "expected the long name"),
-        ({"cpus": "0"}, "slurm.cpus=0: must be a whole"), ({"array": "0-3"}, "set by memmlp"),
-        ({"mem_gb": "x"}, "slurm.mem_gb=x"), ({"gpus": "-1"}, "slurm.gpus=-1"),
-        ({"nodes": "2"}, "slurm.nodes: cannot be set"), ({"ntasks-per-node": "2"}, "cannot be set"),
-        ({"Q": "x"}, "expected the long name"),
+def test_bad_options_are_one_line():
+    for settings, line in (
+        ({"time": "1h"}, "slurm.time=1h: expected MINUTES"), ({"comment": "a\nb"}, "expected the long name"),
+        ({"cpus": "0"}, "slurm.cpus=0"), ({"array": "0-3"}, "set by memmlp"),
+        ({"mem_gb": "x"}, "slurm.mem_gb=x"),
+        ({"gpus": "-1"}, "slurm.gpus=-1"), ({"nodes": "2"}, "slurm.nodes: cannot be set"),
+        ({"ntasks-per-node": "2"}, "cannot be set"), ({"Q": "x"}, "expected the long name"),
         ({"comment": ""}, "expected the long name"),
-    ],
-)  # fmt: skip
-def test_bad_options_are_one_line(words: dict[str, str], line: str):
-    with pytest.raises(InputError, match=line) as error:
-        slurm_options(words)
-    assert "\n" not in str(error.value)
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=line) as error:
+            slurm_options(settings)
+        assert "\n" not in str(error.value)
 
 
 def test_slurm_is_refused_where_it_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
