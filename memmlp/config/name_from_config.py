@@ -77,7 +77,7 @@ def _keys(config: Mapping[str, Any], default: Mapping[str, Any], foreign: list[s
         [*training_config(config), *training_config(default)]
     ):  # either may count it where it is set
         slot, _, last = key.partition(".")
-        if slot in foreign or last in ("name", "_target_", "_partial_") or key in ("seed", "vqvae.seed"):
+        if slot in foreign or last == "name" or key in ("seed", "vqvae.seed"):
             continue
         if key in own and own[key] != usual.get(key):
             yield f"{key}={_word(own[key])}"
