@@ -7,7 +7,6 @@ imported only when a network is used.
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -78,7 +77,7 @@ class Runs(Sequence["TrainedRun"]):
         _use(plugins)
         folder = _outputs(outputs)
         if not (folder / "runs").is_dir():
-            raise InputError(f"outputs {folder}: has no folder runs; allowed is what memmlp train wrote to")
+            raise InputError(f"outputs {folder}: has no folder runs; expected an outputs folder")
         self._runs = [TrainedRun(run) for run in list_runs(folder) if is_trained(run)]
 
     @overload
@@ -284,12 +283,6 @@ class Prediction:
     rest: np.ndarray = field(repr=False)
     position_branch: np.ndarray | None = field(repr=False)
 
-    @property
-    def joints(self) -> np.ndarray | None:
-        """Deprecated: the name of `position_branch` in version 0.1."""
-        warnings.warn("Prediction.joints is now Prediction.position_branch", DeprecationWarning, stacklevel=2)
-        return self.position_branch
-
     def __len__(self) -> int:
         """Return N, the number of frames."""
         return len(self.true_positions)
@@ -331,7 +324,7 @@ class Prediction:
         file = Path(path)
         check_picture(file)
         if poses not in range(1, 21):
-            raise InputError(f"poses {poses}: allowed are 1 to 20")
+            raise InputError(f"poses {poses}: must be 1 to 20")
         first, last = frame_range(len(self), self.clip, begin, end)
         write_picture(file, self._piece(branch, first, last), poses)
         return file
@@ -386,7 +379,7 @@ def _outputs(given: StrPath | None) -> Path:
 def _use(plugins: Sequence[str]) -> None:
     """Use the user's packages. Raises InputError for a single text, or if a package can't be imported."""
     if isinstance(plugins, str):
-        raise InputError(f"plugins {plugins!r}: allowed is a list of names, [{plugins!r}]")
+        raise InputError(f"plugins {plugins!r}: expected a list of names, [{plugins!r}]")
     if plugins:
         from memmlp.config.plugins import activate
 
@@ -397,7 +390,7 @@ def _check(key: str, value: object, allowed: Iterable[object]) -> None:
     """Raise InputError for a value that is not one of the allowed ones."""
     known = list(allowed)
     if value not in known:
-        raise InputError(f"{key} {value}: allowed are {', '.join(map(str, known))}")
+        raise InputError(f"{key} {value}: must be one of {', '.join(map(str, known))}")
 
 
 def _numbers(errors: Mapping[str, Any]) -> dict[str, float]:
@@ -410,11 +403,9 @@ def _frame(rows: Iterable[dict[str, Any]]) -> pd.DataFrame:
     try:
         import pandas as pd
     except ImportError:
-        raise InputError(
-            "per_clip: needs pandas, pip install 'memmlp[notebook]'; allowed without: results"
-        ) from None
+        raise InputError("per_clip: needs pandas: pip install 'memmlp[notebook]', or use results") from None
     every = list(rows)
-    own = {name: None for row in every for name in row if name not in COLUMNS}  # metrics of one's own
+    own = {name: None for row in every for name in row if name not in COLUMNS}  # custom metrics
     frame = pd.DataFrame(every, columns=[*COLUMNS, *own])
     frame.attrs["units"] = dict(UNITS)
     return frame

@@ -128,7 +128,7 @@ def test_runs_are_a_sequence_the_newest_first(three: memmlp.Runs):
 
 
 def test_an_outputs_folder_without_runs_is_refused(tmp_path: Path):
-    with refused(f"outputs {tmp_path / 'no'}", "allowed"):
+    with refused(f"outputs {tmp_path / 'no'}", "outputs"):
         memmlp.Runs(tmp_path / "no")
     (tmp_path / "runs").mkdir()
     assert len(memmlp.Runs(tmp_path)) == 0
@@ -228,10 +228,8 @@ def test_a_network_without_a_position_branch_has_no_joints(
     monkeypatch.setattr(alone.model, "branches", frozenset({"rotation"}))
     found = alone.predict(alone.clips[0], "window")
     assert found.position_branch is None
-    with pytest.warns(DeprecationWarning, match="Prediction.position_branch"):
-        assert found.joints is None
     assert found.errors().shape == (len(found), 22)
-    with refused("branch position", "allowed are rotation"):
+    with refused("branch position", "rotation"):
         found.errors("position")
 
 
@@ -279,7 +277,7 @@ def test_code_of_ones_own_runs_only_where_the_script_names_its_package(
     with registers_kept():
         (found,) = (run for run in memmlp.Runs(tmp_path, plugins=["mine"]) if run.folder == folder)
         assert found.clips
-    with pytest.raises(memmlp.InputError, match=r"plugins 'mine': allowed is a list of names, \['mine'\]"):
+    with pytest.raises(memmlp.InputError, match=r"plugins 'mine': expected a list of names, \['mine'\]"):
         memmlp.load_run(folder, plugins="mine")
     with pytest.raises(memmlp.InputError, match=r"plugin nowhere: not found"):
         memmlp.load_run(folder, plugins=["nowhere"])

@@ -93,7 +93,7 @@ class Commands(click.Group):
         if args[0] not in COMMANDS:
             near = difflib.get_close_matches(args[0], COMMANDS, n=1)
             hint = f"did you mean {near[0]}? " if near else ""
-            raise InputError(f"{args[0]}: no such command; {hint}allowed are {', '.join(COMMANDS)}")
+            raise InputError(f"{args[0]}: no such command; {hint}use one of {', '.join(COMMANDS)}")
         return super().resolve_command(ctx, args)
 
 

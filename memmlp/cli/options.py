@@ -22,7 +22,7 @@ class Finite(click.FloatRange):
         """Return the number; refuse NaN and infinity, which click would accept."""
         number = super().convert(value, param, ctx)
         if not math.isfinite(number):
-            self.fail(f"{value} is no finite number", param, ctx)
+            self.fail(f"{value} must be a finite number", param, ctx)
         return number
 
 
@@ -76,7 +76,7 @@ class Sender(click.ParamType):
         try:
             return IPv4Network(value, strict=False)
         except ValueError as error:
-            self.fail(f"{value}: {error}; allowed is an IPv4 address, or a network as 192.168.1.0/24")
+            self.fail(f"{value}: {error}; expected an IPv4 address, or a network such as 192.168.1.0/24")
 
 
 outputs_option = click.option(

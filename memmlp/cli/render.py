@@ -73,12 +73,12 @@ def render(
     A PNG has a row for each run and a column for each pose. A GIF or MP4 shows them side by side at 30
     pictures a second. All share one colour scale.
     """
+    check_runs(outputs, *runs)
     from memmlp.common.errors import InputError
     from memmlp.common.progress import announce
     from memmlp.config.open_run import open_run
     from memmlp.report.pictures.clip_pictures import check_picture, write_picture
 
-    check_runs(outputs, *runs)
     check_picture(out, "--out")
     if labels and len(labels) != len(runs):
         raise InputError(f"--label: {len(labels)} for {len(runs)} runs; give one for each run, or no label")

@@ -105,8 +105,8 @@ def show_latency(console: Console, record: Mapping[str, Any]) -> None:
         console.print(busy, style="yellow", soft_wrap=True)
     if "pose_median_ms" in measured:  # runs of earlier versions lack it
         console.print(
-            f"a whole pose, trackers to joints: {measured['pose_median_ms']:.2f} ms median, "
-            f"{measured['pose_p95_ms']:.2f} ms p95 (timed alone, so that the caches keep the network)",
+            f"an end-to-end pose, trackers to joints: {measured['pose_median_ms']:.2f} ms median, "
+            f"{measured['pose_p95_ms']:.2f} ms p95 (timed with the network in the caches)",
             soft_wrap=True,
         )
     console.print(size(measured), soft_wrap=True)
@@ -174,7 +174,7 @@ def metrics_table(results: Errors, title: str = "test clips") -> Table:
         table.add_column(f"{mode}\n{branch}", justify="right")
     for name, unit in UNITS.items():
         values = [results[mode][branch].get(name) for mode, branch in columns]
-        if all(value is None for value in values):  # a metric of one's own that was not asked for
+        if all(value is None for value in values):  # a custom metric that was not asked for
             continue
         table.add_row(name, unit, *("-" if value is None else f"{float(value):.2f}" for value in values))
     return table

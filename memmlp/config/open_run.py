@@ -13,6 +13,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from memmlp.common.errors import InputError
+from memmlp.common.overrides import parse_overrides
 from memmlp.config.build import build_experiment, config_of
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.motion_source import Prepared
@@ -83,19 +84,16 @@ def experiment_of(run: Run, device_name: str = "cpu", overrides: Sequence[str] =
     )
     if training_config(run.config) != training_config(experiment.config):
         words = ", ".join(overrides)
-        raise InputError(f"{words}: changes the training; allowed are keys of evaluation and export")
+        raise InputError(f"{words}: changes the training; set keys of evaluation and export only")
     _check_acting(overrides)
     return experiment
 
 
 def _check_acting(overrides: Sequence[str]) -> None:
     """Raise InputError for an override that has no effect on a finished run, such as force=true."""
-    for word in overrides:
-        key = word.partition("=")[0]
-        if key.split(".")[0] not in ACTING and key not in INFERENCE:
-            raise InputError(
-                f"{word}: no effect on a finished run; allowed are keys of evaluation and export"
-            )
+    for word in parse_overrides(overrides):
+        if word.group not in ACTING and word.key not in INFERENCE:
+            raise InputError(f"{word}: no effect on a finished run; set keys of evaluation and export only")
 
 
 def trained_network(run: Run, experiment: Experiment) -> MotionModel:

@@ -28,12 +28,12 @@ def device(name: str) -> torch.device:
     """
     kind, _, index = name.partition(":")
     if kind == "mps" and not torch.backends.mps.is_available():
-        raise InputError(f"device={name}: torch finds no GPU of Apple's; allowed here is device=cpu")
+        raise InputError(f"device={name}: torch does not find an Apple GPU; use device=cpu")
     if kind in ("mps", "cpu"):
         return torch.device(kind)
     if not torch.cuda.is_available():
         if kind == "cuda":
-            raise InputError(f"device={name}: there is no CUDA device; allowed here is cpu or auto")
+            raise InputError(f"device={name}: torch does not find a CUDA device; use cpu or auto")
         return torch.device("cpu")
     torch.backends.cudnn.allow_tf32 = False
     return torch.device("cuda", _checked(name, int(index)) if index else distributed.local_rank())
@@ -47,9 +47,9 @@ def _checked(name: str, index: int) -> int:
     """
     count = torch.cuda.device_count()
     if index >= count:
-        raise InputError(f"device={name}: allowed here is cuda:0{f' to cuda:{count - 1}' * (count > 1)}")
+        raise InputError(f"device={name}: must be cuda:0{f' to cuda:{count - 1}' * (count > 1)}")
     if distributed.world_size() > 1:
-        raise InputError(f"device={name}: allowed with several processes is device=cuda, one GPU for each")
+        raise InputError(f"device={name}: several processes use device=cuda, one GPU each")
     return index
 
 

@@ -38,7 +38,7 @@ def test_with_two_gpus(gpus):
     gpus(2)
     found = {name: str(device(name)) for name in ("auto", "cpu", "cuda", "cuda:1")}
     assert found == {"auto": "cuda:0", "cpu": "cpu", "cuda": "cuda:0", "cuda:1": "cuda:1"}
-    with pytest.raises(InputError, match="device=cuda:2: allowed here is cuda:0 to cuda:1"):
+    with pytest.raises(InputError, match="device=cuda:2: must be cuda:0 to cuda:1"):
         device("cuda:2")
     assert missing_gpu() is None
 
@@ -70,7 +70,7 @@ def test_of_several_processes_each_has_its_own(gpus, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(distributed, "world_size", lambda: 2)
     monkeypatch.setenv("LOCAL_RANK", "1")
     assert str(device("auto")) == "cuda:1"
-    with pytest.raises(InputError, match="device=cuda:1: allowed with several processes is device=cuda"):
+    with pytest.raises(InputError, match="device=cuda:1: several processes use device=cuda"):
         device("cuda:1")
 
 
