@@ -341,7 +341,7 @@ def api() -> str:
             *public,
             "## The rooms",
             "What lies below is used by the commands and may change from version to version; "
-            "[the architecture](../architecture.md) says what each room is for.",
+            "[the architecture](../architecture.md) says what each package is for.",
             f"```{{toctree}}\n:maxdepth: 1\n\n{below}\n```\n",
         ]
     )

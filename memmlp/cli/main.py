@@ -75,7 +75,7 @@ class Commands(click.Group):
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import and return the command with that name; None if there is none."""
+        """Import and return the command with that name; None for an unknown name."""
         if cmd_name not in COMMANDS:
             return None
         command = COMMANDS[cmd_name]
@@ -134,7 +134,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def _run(arguments: list[str]) -> None:
     if distributed.world_size() > 1 and arguments[:1] != ["train"]:
-        raise InputError("torchrun: allowed are several processes for memmlp train alone")
+        raise InputError("torchrun: only memmlp train can use several processes")
     if arguments[:1] in (["-sc"], ["--shell-completion"]):
         _complete(arguments)
     else:

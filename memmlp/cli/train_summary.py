@@ -47,7 +47,7 @@ def show(outcome: Outcome) -> None:
     if "latency" in results:
         show_latency(console, results["latency"])
     console.print(f"run      {run.folder}", soft_wrap=True)
-    if run.picture.exists():  # without matplotlib there is none
+    if run.picture.exists():  # it needs matplotlib
         console.print(f"picture  {run.picture}", soft_wrap=True)
 
 

@@ -263,8 +263,8 @@ def _stamp(sweep: Sweep, outputs: Path) -> str:
     ours = [(str(file), file.read_text(encoding="utf-8")) for file in sorted(files)]
     own = texts_outside_memmlp()
     elsewhere = any(sign in repr((asdict(sweep), own)) for sign in ELSEWHERE)
-    anew = [time.time_ns()] if elsewhere else []
-    return digest([asdict(sweep), str(outputs), ours, *([own] if own else []), *anew])
+    unstable = [time.time_ns()] if elsewhere else []
+    return digest([asdict(sweep), str(outputs), ours, *([own] if own else []), *unstable])
 
 
 ELSEWHERE = ("oc.env", "hydra.searchpath")

@@ -118,7 +118,5 @@ def clip_index(test: MotionDataset, name: str, key: str = "--clip") -> int:
         InputError: if there is no clip with that name; the message lists the names.
     """
     if name not in test.names:
-        raise InputError(
-            f"{key} {name}: no such test clip of the run's data; allowed are {', '.join(test.names)}"
-        )
+        raise InputError(f"{key} {name}: must be a test clip of the run's data: {', '.join(test.names)}")
     return test.names.index(name)

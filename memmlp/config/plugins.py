@@ -211,7 +211,7 @@ def check_allowed(config: Mapping[str, Any], recorded: Mapping[str, Any], where:
 
 
 def located(path: str, key: str) -> Any:
-    """Return the class or function at a dotted path. Raises InputError, naming the key, if there is none."""
+    """Return the class or function at a dotted path. Raises InputError, naming the key, for a missing one."""
     try:
         return pkgutil.resolve_name(path)
     except (ImportError, AttributeError, ValueError) as error:

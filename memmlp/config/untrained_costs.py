@@ -49,7 +49,7 @@ def check_costs(sweep: Sweep) -> None:
     if beyond := [metric for metric in sweep.metrics if metric not in COSTS]:
         raise InputError(
             f"--untrained: sweep {sweep.name} shows {', '.join(beyond)}; "
-            f"allowed are tables of {', '.join(COSTS)} alone"
+            f"must be a table of only {', '.join(COSTS)}"
         )
 
 

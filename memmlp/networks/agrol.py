@@ -177,7 +177,7 @@ class AGRoLDiffusion(WindowModel):
     (3,707,508), a linear layer of each block for the time's embedding (12 x 262,656), the embedding's own two
     linear layers (525,312), and a stem for noisy motion and inputs side by side (95,744). The paper says that
     the embedding enters every block. That two layers come before is our reading of its parameter count; the
-    released code has none, and as many parameters in linear layers for motion and inputs (docs/readings.md).
+    released code differs, with as many parameters in linear layers for motion and inputs (docs/readings.md).
 
     The noise that sampling starts from is always the same, drawn from `noise_seed`: sampling is then a
     function of the inputs alone, in torch as in ONNX, and consecutive windows of a stream do not differ by

@@ -310,7 +310,7 @@ class NoCodesMemory(OwnPastMemory):
         return PastFeature(self.width, None, self.blend)
 
     def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
-        """Return code-vectors of width 0, (B, T, 0), since this memory has none."""
+        """Return code-vectors of width 0, (B, T, 0), since this memory uses no code-vectors."""
         return sparse[..., :0]
 
 

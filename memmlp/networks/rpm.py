@@ -52,7 +52,7 @@ class RPMSettings(NetworkSettings):
     dropout: float = setting(fraction(), 0.1)  # in the encoder, while training
     # frames of its own past motion that it sees; of inputs it sees one more
     context: int = setting(at_least(1), 10)
-    # true: the past that it makes itself in training has dropout, too; its released code has none there
+    # true: the past that it makes itself in training has dropout, too; the released code uses none
     own_dropout: bool = setting(default=False)
     # frames that it predicts: 10 in its paper's reactive setting, 20 in the smooth one
     horizon: int = setting(at_least(1), 10)

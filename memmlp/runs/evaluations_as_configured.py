@@ -42,7 +42,7 @@ class EvaluationsAsConfigured:
         found: dict[str, dict[str, dict[str, float | None]]] = {}
         for report in of_one_solver(self._reports()):
             branches = found.setdefault(report["mode"], {})
-            for branch, errors in report["mean"].items():  # those of one's own metrics may be in one alone
+            for branch, errors in report["mean"].items():  # custom metrics may be in one branch only
                 numbers = {name: to_number(value) for name, value in errors.items()}
                 branches[branch] = {**branches.get(branch, {}), **numbers}
         return found

@@ -335,7 +335,7 @@ def _unused(config: Mapping[str, Any]) -> Iterable[str]:
         config.get("optim", {}).get("vectors") == "muon"
         or option_in_slot(config, "model") == "recurrent_poser"
     ):
-        yield "optim.vectors"  # as in runs before this key, and of a network that has none
+        yield "optim.vectors"  # as in runs before this key, and of a network without vectors
     if not config.get("optim", {}).get("warmup"):
         yield "optim.warmup"
     if config.get("vqvae", {}).get("codebook", "ema") != "ema":

@@ -32,7 +32,7 @@ class LogRecord(NamedTuple):
 
 
 def parsed(line: bytes) -> LogRecord:
-    """Return the record in a line. Raises ValueError, KeyError or TypeError if it has none."""
+    """Return the record in a line. Raises ValueError, KeyError or TypeError for a line without one."""
     entry = json.loads(line)
     values = {key: float(value) for key, value in entry["values"].items()}
     return LogRecord(entry["step"], entry["phase"], values, entry["time"])

@@ -50,7 +50,7 @@ RECIPES: dict[str, int] = {
 
 
 def version_of(component: str) -> int:
-    """Return the version of a component, named SLOT.NAME or as in RECIPES; 0 if there is none in use."""
+    """Return the version of a component, named SLOT.NAME or as in RECIPES; 0 if it is not in use."""
     slot, _, name = component.partition(".")
     found = declared().get((slot, name))
     return RECIPES.get(component, found.version if found else 0)

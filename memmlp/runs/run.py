@@ -169,7 +169,7 @@ class Run:
 
         It is of the file that the config asks for, whatever else was exported since; if there are several,
         one with the present recipe versions, then one with just the config's settings, then the last. Only
-        if there is none, another is shown, and named (`latency_name`).
+        if it is missing, another is shown and named (`latency_name`).
         """
         asked = deployment_settings(config)
         return self._best_deployment(

@@ -227,7 +227,7 @@ def keep_sweep(sweep: Sweep, folder: Path) -> None:
 
 
 def kept_sweep(folder: Path) -> Sweep | None:
-    """Return the sweep kept in a folder; None if there is none. Raises InputError if it is damaged."""
+    """Return the sweep kept in a folder; None without one. Raises InputError if it is damaged."""
     path = folder / SWEEP_FILE
     if not path.exists():
         return None

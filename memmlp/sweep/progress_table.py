@@ -163,7 +163,7 @@ def state_text(plan: Plan, task: RunTask, state: str) -> Text:
 
 
 def result(run: Run) -> str:
-    """Return the stream-mode MPJPE of a finished run, rotation branch, as text; empty if it has none."""
+    """Return the stream-mode MPJPE of a finished run, rotation branch, as text; empty if not measured."""
     value = run.results.get("stream", {}).get("rotation", {}).get("MPJPE")
     return f"{value:.2f} cm" if isinstance(value, int | float) else ""
 

@@ -57,7 +57,7 @@ def described(used: torch.device) -> dict[str, Any]:
     """Return what a manifest says of a device: its kind, the GPU's name, and the GPU's index.
 
     The index, `gpu_index`, is the GPU's entry in CUDA_VISIBLE_DEVICES where that is set, since inside the
-    process the visible GPUs are numbered anew.
+    process the visible GPUs are renumbered.
     """
     if used.type != "cuda":
         return {"device": used.type, "gpu": None, "gpu_index": None}

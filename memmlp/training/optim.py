@@ -196,7 +196,7 @@ class Muon(Optim):
     def check_installed(self) -> None:
         """Raise InputError if torch has no Muon."""
         if not hasattr(torch.optim, "Muon"):
-            raise InputError(f"optim=muon: torch {torch.__version__} has no Muon; allowed is 2.9 or newer")
+            raise InputError(f"optim=muon: torch {torch.__version__} does not have Muon; needs 2.9 or newer")
 
     def build(self, groups: list[dict]) -> torch.optim.Optimizer:
         """Make both optimisers as one; a parameter group's own `lr` and `weight_decay` take precedence."""

@@ -78,5 +78,5 @@ def train_in_turn(learners: Sequence[Learner], every: int) -> Iterator[int]:
 
 
 def find_first(validations: Sequence[Validation], error: float) -> Validation | None:
-    """Return the first validation whose error is at most `error`; None if there is none."""
+    """Return the first validation whose error is at most `error`; None if no validation reaches it."""
     return next((one for one in validations if one.error <= error), None)

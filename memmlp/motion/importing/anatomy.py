@@ -122,7 +122,7 @@ def why_no_stance(pose: np.ndarray) -> str | None:
 
 
 def wrong_sides(pose: np.ndarray, mapped: np.ndarray) -> str | None:
-    """Return a contradiction about left and forward in a stance (22, 3); None if there is none."""
+    """Return a contradiction about left and forward in a stance (22, 3); None without one."""
     left = pose[HIPS[0]] - pose[HIPS[1]]
     if (pose[SHOULDERS[0]] - pose[SHOULDERS[1]]) @ left < 0:
         return "the left shoulder is on the side of the right hip"

@@ -46,7 +46,7 @@ def find_recordings(source: Path) -> dict[Path, Path]:
     """Find the recordings of a folder, or a single one: sorted, by their path below the folder.
 
     Raises:
-        InputError: if there is none.
+        InputError: if it is missing.
     """
     if not source.exists():
         raise InputError(f"{source}: no such file or folder; {EXPECTED}")

@@ -90,7 +90,7 @@ def _is_untied(split: Mapping[str, Any], name: str) -> bool:
 
 
 def _folders(name: str) -> list[str]:
-    """Return the folders that a clip is in, the innermost first; "" if there is none."""
+    """Return the folders that a clip is in, the innermost first; "" at the top."""
     folders = name.split("/")[:-1]
     return ["/".join(folders[:depth]) for depth in range(len(folders), 0, -1)] or [""]
 

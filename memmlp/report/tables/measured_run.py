@@ -56,7 +56,7 @@ class Origin:
         body: whose rest joints the motion is on: "builtin" or the file of a body model.
         recipes: the recipe version of each component.
         upstream: the id of the upstream run: a VQ-VAE's, a part's, or that of the network before a refiner;
-            None if there is none.
+            None if it is missing.
         upstream_recipes: the recipe version of each component of the upstream runs, as far as known.
         upstream_weights: a digest of the weights of each upstream run, by its id, as far as known; two where
             the run was resumed upon others.
@@ -136,13 +136,13 @@ class Measured:
     code: Mapping[str, str] = field(default_factory=dict)
 
     def value(self, mode: str, branch: str, metric: str) -> float | None:
-        """Return a metric's mean over clips, or a cost; None if the run has none."""
+        """Return a metric's mean over clips, or a cost; None if it was not measured."""
         if metric in self.costs:
             return self.costs[metric]
         return _number(self.means, mode, branch, metric)
 
     def by_clip(self, names: Sequence[str], mode: str, branch: str, metric: str) -> np.ndarray:
-        """Return a metric for each of these clips (C,); NaN for clips for which the run has none."""
+        """Return a metric for each of these clips (C,); NaN for clips that the run did not measure."""
         clips = self.clips
         try:
             found = [clips[name][mode][branch][metric] for name in names]

@@ -314,7 +314,7 @@ class VariantProgress:
         label: the variant's label.
         decided, inconclusive: how many of its comparisons are decided and inconclusive.
         seeds: the number of seeds spent on it, or needed for its next analysis.
-        next: the number of seeds of its next analysis; None if it has none.
+        next: the number of seeds of its next analysis; None after the last one.
     """
 
     label: str

@@ -89,7 +89,7 @@ def better(metric: str) -> str:
 
 
 def unit(metric: str) -> str:
-    """Return a metric's unit; empty if it has none."""
+    """Return a metric's unit; empty for a metric without one."""
     return UNITS.get(metric, COST_UNITS.get(metric, "")).replace("10^2", "10²").replace("s^3", "s³")
 
 

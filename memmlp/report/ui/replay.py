@@ -114,7 +114,7 @@ class Replays:
 
 
 def _read(path: Path) -> Motion | None:
-    """Return a stored prediction; None if there is none, or if its file is damaged."""
+    """Return a stored prediction; None if its file is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as file:
             truth, prediction = file["truth"], file["joints"]

@@ -21,7 +21,7 @@ from memmlp.sweep.executors import Work
 TIME = re.compile(r"(?:(?P<days>\d+)-)?(?P<first>\d+)(?::(?P<second>\d+))?(?::(?P<third>\d+))?")
 OURS = ("array", "output", "error", "open_mode", "signal", "wrap", "wait", "parsable", "test_only")
 ONE = ("nodes", "ntasks", "ntasks_per_node", "ntasks_per_gpu")  # a worker is one task
-UNLIMITED = 365 * 24 * 60  # minutes, where submitit wants a limit and there is none
+UNLIMITED = 365 * 24 * 60  # minutes, for submitit, which needs a limit
 
 
 @dataclass(frozen=True)

@@ -152,7 +152,7 @@ class Director:
         """Report the run's new validations to the study, if there is only one objective.
 
         Returns:
-            The step of the last new validation; 0 if there is none.
+            The step of the last new validation; 0 without one.
         """
         (objective, *others) = self.study.search.objectives
         if others:

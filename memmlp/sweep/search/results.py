@@ -37,8 +37,8 @@ def write_trials(study: Study, path: Path) -> None:
     """Write all trials to a CSV file: number, state, objectives, values, runs, and the reason of a failure.
 
     With several seeds the objectives are means, followed by each objective's standard deviation and by the
-    values of the single seeds. A pruned trial has none, since the value of an earlier step is not a result;
-    its reason has it.
+    values of the single seeds. A pruned trial has no value: the value of an
+    earlier step is not a result, and stands in the reason.
     """
     search = study.search
     names, keys = [one.text for one in search.objectives], [one.key for one in search.space]

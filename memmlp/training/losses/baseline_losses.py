@@ -104,7 +104,7 @@ def joint_sums(error: Tensor) -> Tensor:
 
 
 def joint_sums_of_steps(error: Tensor) -> Tensor:
-    """Return the same of an error's steps between frames; the last frame, which has none, counts as right."""
+    """Return the same of an error's steps between frames; the last frame counts as right."""
     frames = error.shape[1]
     return joint_sums(error.diff(dim=1)) * (frames - 1) / frames
 

@@ -305,7 +305,7 @@ class TermsLoss(Loss):
         super().__init__()
         chosen = {name: weight for name, weight in weights.items() if weight is not None}
         if not chosen:
-            raise InputError(f"loss=terms: no term has a weight; allowed are {', '.join(TERMS)}")
+            raise InputError(f"loss=terms: needs a weight for at least one of {', '.join(TERMS)}")
         self.error = ERRORS[error]
         self.weighting = WEIGHTINGS[weighting](chosen, lr)
 

@@ -164,8 +164,8 @@ class EffectEstimates(NamedTuple):
 
     Attributes:
         mean: the mean difference (K,).
-        low, high: the ends of its 95 % interval (K,); NaN if there is none.
-        p: its p-value (K,); NaN if there is none.
+        low, high: the ends of its 95 % interval (K,); NaN if undefined.
+        p: its p-value (K,); NaN if undefined.
         conditional: what there is only one of, so that interval and mean don't cover others: "seeds", "clips"
             (one group of them), "seeds and clips", or "" if there are several of both. Unless it is "", there
             are no p-values.

@@ -48,7 +48,7 @@ def verdict(
     that there is no effect of interest, even if it does not contain 0.
 
     Args:
-        difference: the p-value of a difference, corrected over the table; NaN if there is none.
+        difference: the p-value of a difference, corrected over the table; NaN if undefined.
         equivalence: the p-value of `equivalence_p`, corrected in the same way.
         mean: the measured mean difference.
         paper: the paper's difference; None or 0 if the paper claims no sign.
@@ -95,7 +95,7 @@ def sequential(p: np.ndarray, claimed: np.ndarray, closed: np.ndarray) -> np.nda
     was fixed beforehand: the levels add up.
 
     Args:
-        p: p-values (K,) of this analysis; NaN if there is none, which never decides.
+        p: p-values (K,) of this analysis; NaN if undefined, which never decides.
         claimed: what this family claimed at earlier analyses, (K,) bool.
         closed: which comparisons are closed without such a claim, (K,) bool.
     """
