@@ -114,7 +114,7 @@ def test_what_is_no_trained_network_is_refused(run: memmlp.TrainedRun):
 def test_an_unfinished_run_is_none_of_the_runs(run: memmlp.TrainedRun, three: memmlp.Runs, tmp_path: Path):
     (tmp_path / "runs" / run.id / "DONE").unlink()
     assert [found.seed for found in memmlp.Runs(tmp_path)] == [1, 2]
-    with refused(f"run {run.id}", "not a finished"):
+    with refused(f"run {run.id}", "finished"):
         memmlp.load_run(run.id, tmp_path)
 
 

@@ -68,14 +68,14 @@ def test_a_films_branch_mode_and_times(memmlp: Memmlp, finished: Run, clips: lis
     [
         (
             ["--clip", "nobody", "--out", "a.png"],
-            ("--clip nobody", "no such test clip of the run's data; allowed are "),
+            ("--clip nobody", "test clip"),
         ),
         (["--out", "a.avi"], ("--out a.avi", ".mp4")),
         (["--out", "no/a.png"], ("no folder no",)),
         (["--from", "900", "--out", "a.png"], ("--from 900", "no frame between")),
         (["--from", "1", "--to", "1", "--out", "a.png"], ("--from 1 --to 1",)),
-        (["--from", "nan", "--out", "a.png"], ("--from", "no finite number")),
-        (["--to", "inf", "--out", "a.png"], ("--to", "no finite number")),
+        (["--from", "nan", "--out", "a.png"], ("--from", "finite number")),
+        (["--to", "inf", "--out", "a.png"], ("--to", "finite number")),
         (["--label", "a", "--label", "b", "--out", "a.png"], ("2 for 1 runs",)),
     ],
 )
@@ -130,12 +130,12 @@ def test_without_pyav_nothing_is_computed(memmlp: Memmlp, finished: Run, monkeyp
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--clip", "nobody"], ("--clip nobody", "no such test clip")),
+        (["--clip", "nobody"], ("--clip nobody", "test clip")),
         (["--clip", "no.npz"], ("no.npz",)),
         (["--udp", "9000", "--osc", "9001"], ("--clip, --udp, --osc",)),
         (["--udp", "9000", "--clip", "a"], ("--clip, --udp, --osc",)),
         (["--send"], ("--send", "--udp PORT or --osc PORT")),
-        (["--hz", "nan"], ("--hz", "no finite number")),
+        (["--hz", "nan"], ("--hz", "finite number")),
     ],
 )
 def test_bad_input_to_live_is_one_line(memmlp: Memmlp, finished: Run, arguments, words):

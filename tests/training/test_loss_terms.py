@@ -152,7 +152,7 @@ def test_a_weight_of_none_leaves_a_term_out_and_the_others_are_summed():
     total, parts = loss(MADE, TRUE[..., SPARSE_DIM:], TRUE[..., :SPARSE_DIM], NORMALIZER)
     assert list(parts) == ["rotation", "hand"]
     assert float(total) == pytest.approx(2 * float(parts["rotation"]) + 0.5 * float(parts["hand"]))
-    with pytest.raises(InputError, match="no term has a weight"):
+    with pytest.raises(InputError, match="needs a weight"):
         TermsLoss(rotation=None)
 
 
