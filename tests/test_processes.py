@@ -78,7 +78,7 @@ def test_a_wait_fails_when_its_process_has_ended_or_in_the_end(monkeypatch: pyte
 
 def told(path: Path) -> None:
     """Write down what a forked process finds done, its search path, and a variable."""
-    done = environment._code_digests.cache_info().currsize
+    done = environment._package_code.cache_info().currsize
     path.write_text(f"{done} {os.environ.get('PYTHONPATH')} {os.environ.get('MEMMLP_OUTPUTS')}")
 
 

@@ -21,6 +21,6 @@ else:
     del os.environ["PYTHONPATH"]
 
 remember()
-environment._code_digests()
+environment.code_digests()
 for words in (TINY, []):
     composed(words)

@@ -88,8 +88,7 @@ outputs_option = click.option(
     help="Folder in which runs and caches of data are kept.",
 )
 source_option = click.option(
-    "--source",
-    help="Source whose test clips are shown, where the data has several.  [default: all together]",
+    "--source", help="Source whose test clips are shown, where the data has several.  [default: all together]"
 )
 
 together_option = click.option(

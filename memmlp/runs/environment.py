@@ -21,20 +21,15 @@ from typing import Any
 import memmlp
 
 PACKAGE = Path(memmlp.__file__).parent
-NOT_NUMBERS = (
-    "cli",
-    "config",
-    "live",
-    "report",
-    "runs/loggers",
-    "sweep",
-)
+NOT_NUMBERS = ("cli", "config", "live", "report", "runs/loggers", "sweep")
 """Folders of the package whose code does not affect results; only `live` measures one, the time of a pose."""
 WIRING = ("config/build.py", "config/build_motion.py")
 """Files of these folders that count nevertheless, since they decide what reaches the constructors."""
 PATCH = 1_000_000  # at most so many characters of changes are kept with a run
 INSTALLED = ("site-packages", "dist-packages")
 """Folders of installed packages, which are identified by their versions."""
+MIXED = "mixed"
+"""Stands in place of a digest for a file whose code changed while the run was made."""
 NOT_USERS = ("memmlp", "torch", "numpy", *sys.stdlib_module_names)
 """Modules that are not the user's, wherever they lie."""
 
@@ -106,10 +101,43 @@ def code_digests(packages: Iterable[str] = ()) -> dict[str, str]:
     Comments and docstrings don't matter. Files of users' packages, and of what these import, are named
     PACKAGE:FILE.
     """
-    users = user_code_digests(packages).items()
-    return _code_digests() | {
-        f"{name}:{file}": digest for name, files in users for file, digest in files.items()
+    return {name: code_digest(content) for name, content in code_files(packages).items()}
+
+
+def code_files(packages: Iterable[str] = ()) -> dict[str, bytes]:
+    """Return the content of each file of which `code_digests` has a digest, as this process runs it."""
+    users = _user_files(packages).items()
+    return _package_code() | {f"{name}:{file}": code for name, files in users for file, code in files.items()}
+
+
+def describe_sources(packages: Iterable[str] = ()) -> dict[str, dict[str, str]]:
+    """Return what a run's manifest has on its code: digests of each file's code and of its bytes."""
+    files = code_files(packages)
+    return {
+        "sources": {name: code_digest(content) for name, content in files.items()},
+        "source_bytes": {name: byte_digest(content) for name, content in files.items()},
     }
+
+
+def byte_digest(content: bytes) -> str:
+    """Return a digest of a file's content, 12 hex digits."""
+    return hashlib.sha256(content).hexdigest()[:12]
+
+
+def changed_since(manifest: Mapping[str, Any]) -> list[str]:
+    """Return the files whose code has changed since a run with this manifest began (see `changed`).
+
+    A file is parsed only if its bytes differ from those of the run: parsing all takes half a second.
+    """
+    before, unread = manifest.get("sources", {}), manifest.get("source_bytes", {})
+    files = code_files(manifest.get("plugins", ())) if before else {}
+    return sorted(
+        name
+        for name, content in files.items()
+        if name in before
+        and (before[name] == MIXED or unread.get(name) != byte_digest(content))
+        and before[name] != code_digest(content)
+    )
 
 
 def changed(before: Mapping[str, str], after: Mapping[str, str]) -> list[str]:
@@ -122,12 +150,9 @@ def changed(before: Mapping[str, str], after: Mapping[str, str]) -> list[str]:
 
 
 @functools.cache
-def _code_digests() -> dict[str, str]:
-    """Return the digests of this package's files."""
+def _package_code() -> dict[str, bytes]:
     files = {path.relative_to(PACKAGE): path for path in sorted(PACKAGE.rglob("*.py"))}
-    return {
-        name.as_posix(): code_digest(path.read_text("utf-8")) for name, path in files.items() if _counts(name)
-    }
+    return {name.as_posix(): path.read_bytes() for name, path in files.items() if _counts(name)}
 
 
 def _counts(path: Path) -> bool:
@@ -136,9 +161,16 @@ def _counts(path: Path) -> bool:
     return path.as_posix() in WIRING or not unused
 
 
-def code_digest(text: str) -> str:
-    """Return a digest of Python code, 12 hex digits, that ignores layout, comments and docstrings."""
-    tree = ast.parse(text)
+@functools.cache
+def code_digest(code: bytes) -> str:
+    """Return a digest of Python code, 12 hex digits, that ignores layout, comments and docstrings.
+
+    It is a digest of the bytes if they are not Python of this version.
+    """
+    try:
+        tree = ast.parse(code.decode())
+    except (SyntaxError, ValueError):
+        return byte_digest(code)
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):
             node.body = node.body[1:] or [ast.Pass()]
@@ -151,11 +183,19 @@ def user_code_digests(packages: Iterable[str]) -> dict[str, dict[str, str]]:
     Other modules of the user that these import follow, each by itself: of a package only its __init__, as
     PACKAGE.__init__. A package that is not found does not have files.
     """
+    return {
+        name: {file: code_digest(code) for file, code in files.items()}
+        for name, files in _user_files(packages).items()
+    }
+
+
+def _user_files(packages: Iterable[str]) -> dict[str, dict[str, bytes]]:
+    """Return the content of the files that `user_code_digests` describes."""
     files = {name: _package_files(name) for name in packages}
     modules = {_module(name, file): path for name, paths in files.items() for file, path in paths.items()}
     for name, path in _imported_modules(modules).items():
         files[f"{name}.__init__" if path.stem == "__init__" else name] = {path.name: path}
-    return {name: {file: _user_digest(path) for file, path in paths.items()} for name, paths in files.items()}
+    return {name: {file: _user_code(path) for file, path in paths.items()} for name, paths in files.items()}
 
 
 def user_packages(names: Iterable[str]) -> dict[str, dict[str, str | None]]:
@@ -185,15 +225,9 @@ def _distributions() -> Mapping[str, list[str]]:
 
 
 @functools.cache
-def _user_digest(path: Path) -> str:
-    """Return a digest of a file's code, or of its bytes if it is not Python of this version.
-
-    It stays as it was when this process first asked: later edits are not what the process runs.
-    """
-    try:
-        return code_digest(path.read_text("utf-8"))
-    except (SyntaxError, ValueError):
-        return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+def _user_code(path: Path) -> bytes:
+    """Return a file's content when this process first asked: later edits are not what the process runs."""
+    return path.read_bytes()
 
 
 def _package_files(name: str) -> dict[str, Path]:

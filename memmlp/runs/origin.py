@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from memmlp.runs.environment import changed
+from memmlp.runs.environment import MIXED, changed
 
 MACHINE = ("device", "gpu", "gpu_index", "threads", "processes", "precision", "cpu")
 """What can change a result's last digits, and which of a machine's GPUs it was."""
@@ -65,12 +65,12 @@ def join_origins(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[st
         other = old.get("before") or (old["commit"] if old["commit"] != new["commit"] else None)
         found["git"] = {**new, "dirty": old["dirty"] or new["dirty"]} | ({"before": other} if other else {})
     known = before.get("sources", after["sources"])
-    found["sources"] = after["sources"] | dict.fromkeys(changed(known, after["sources"]), "mixed")
+    found["sources"] = after["sources"] | dict.fromkeys(changed(known, after["sources"]), MIXED)
     upstream = after.get(UPSTREAM, [])
     if earlier := [one for one in before.get(UPSTREAM, []) if one not in upstream]:
         found[UPSTREAM] = [*upstream, *earlier]
     for name, package in (before.get("plugins") or {}).items():
         now = (after.get("plugins") or {}).get(name, package)
         if now["digest"] != package["digest"]:
-            found["plugins"] = {**found["plugins"], name: {**now, "digest": "mixed"}}
+            found["plugins"] = {**found["plugins"], name: {**now, "digest": MIXED}}
     return found

@@ -18,26 +18,14 @@ from typing import Any
 import yaml
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import (
-    atomic_write,
-    file_digest,
-    now,
-    read_json,
-    sync_folder,
-    write_json,
-)
+from memmlp.common.files import atomic_write, file_digest, now, read_json, sync_folder, write_json
 from memmlp.common.lease import Lease, Lock, check_owner
 from memmlp.runs import deployment_folder
 from memmlp.runs.deployment_folder import DeploymentFolder
-from memmlp.runs.environment import changed, changes, code_digests, environment, host
+from memmlp.runs.environment import changed_since, changes, describe_sources, environment, host
 from memmlp.runs.evaluation_file import intact
 from memmlp.runs.evaluations_as_configured import EvaluationsAsConfigured
-from memmlp.runs.identity import (
-    belongs,
-    deployment_settings,
-    exported_otherwise,
-    used_as_configured,
-)
+from memmlp.runs.identity import belongs, deployment_settings, exported_otherwise, used_as_configured
 from memmlp.runs.metrics_log import LogRecord, MetricsLog
 from memmlp.runs.origin import join_origins
 
@@ -305,9 +293,8 @@ class Run:
             atomic_write(self.folder / "code.patch", patch)
         identity = {"id": self.id, "kind": kind, "data": data, "upstream": upstream}
         before = self.manifest if self.checkpoint.exists() else {}
-        made = join_origins(
-            before, {**facts, **environment(), "sources": code_digests(facts.get("plugins", ()))}
-        )
+        sources = describe_sources(facts.get("plugins", ()))
+        made = join_origins(before, {**facts, **environment(), **sources})
         self.attempt("training")
         times = {"started": self.manifest.get("started", now()), "finished": None, "seconds": {}}
         self.write_manifest(identity | times | made)
@@ -386,8 +373,7 @@ class Run:
 
         Files of the user's packages that are found, and of what these import, are included.
         """
-        before, packages = self.manifest.get("sources", {}), self.manifest.get("plugins", ())
-        return changed(before, code_digests(packages)) if before else []
+        return changed_since(self.manifest)
 
     def log(self, step: int, values: Mapping[str, float], phase: str = "train") -> None:
         """Append one line to the metrics log, in one write: a kill damages at most that line."""

@@ -46,7 +46,7 @@ def write(folder: Path, files: dict[str, str]) -> None:
     for name, text in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
-    environment._user_digest.cache_clear()  # as in a process that starts now
+    environment._user_code.cache_clear()  # as in a process that starts now
 
 
 @pytest.mark.parametrize("how", ["overrides", "environment", "entry point"])
@@ -360,7 +360,7 @@ def test_code_that_changed_since_is_told(folder: Path):
     plugins.activate(["mine"])
     run = Run(folder / "run")
     run.begin("memmlp", {}, data="d", upstream=None, plugins={"mine": {"version": None, "digest": "d"}})
-    assert run.manifest["sources"]["mine:mine.py"] == code_digest("A = 1")
+    assert run.manifest["sources"]["mine:mine.py"] == code_digest(b"A = 1")
     assert run.changed_sources == []
     write(folder, {"mine.py": "A = 2\n"})
     assert run.changed_sources == ["mine:mine.py"]

@@ -75,7 +75,7 @@ def error_of(action: Callable[[], object]) -> Exception | None:
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small records, written quickly."""
-    monkeypatch.setattr("memmlp.runs.run.code_digests", lambda packages: {"a.py": "0"})
+    monkeypatch.setattr("memmlp.runs.environment.code_files", lambda packages: {"a.py": b"0"})
     monkeypatch.setattr("memmlp.runs.run.changes", lambda: "")
     for module in ("run", "evaluation_file", "deployment_folder"):
         monkeypatch.setattr(f"memmlp.runs.{module}.environment", lambda: {"host": "h"})

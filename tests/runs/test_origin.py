@@ -66,9 +66,8 @@ def test_a_training_that_is_resumed_elsewhere_says_so(tmp_path: Path, monkeypatc
     def begin(device: str, commit: str, dirty: bool, losses: str) -> dict:
         made = {"git": {"commit": commit, "dirty": dirty}, "cpu": "A"}
         monkeypatch.setattr("memmlp.runs.run.environment", lambda: made)
-        monkeypatch.setattr(
-            "memmlp.runs.run.code_digests", lambda packages: {"losses.py": losses, "ik.py": "i"}
-        )
+        files = {"losses.py": losses.encode(), "ik.py": b"i"}
+        monkeypatch.setattr("memmlp.runs.environment.code_files", lambda packages: files)
         run.begin("memmlp", {}, data="d", upstream=None, device=device, threads=2)
         return run.manifest
 

@@ -187,8 +187,8 @@ def seed_of(run: Run) -> list[str]:
 
 def test_a_run_of_other_code_under_the_same_recipes_is_said(home, monkeypatch):
     run = motion_run(home)
-    changed = {**run.manifest["sources"], "training/losses/terms.py": "0" * 12}
-    monkeypatch.setattr("memmlp.runs.run.code_digests", lambda packages: changed)
+    changed = {**environment.code_files(), "training/losses/terms.py": b"A = 1"}
+    monkeypatch.setattr("memmlp.runs.environment.code_files", lambda packages: changed)
     assert run.changed_sources == ["training/losses/terms.py"]
     said = " ".join(command(home, "train", *TINY, INT8, *seed_of(run)).split())
     assert "before the code of training/losses/terms.py changed" in said
@@ -336,5 +336,5 @@ def test_metrics_of_other_code_are_measured_again(tmp_path: Path, monkeypatch: p
         assert run_stages.unmeasured(experiment, run) == []
         code.write_text("A = 2\n")
         assert run_stages.unmeasured(experiment, run) == []  # this process would measure them as before
-        environment._user_digest.cache_clear()
+        environment._user_code.cache_clear()
         assert run_stages.unmeasured(experiment, run) == ["stream"]

@@ -25,8 +25,8 @@ SHORT = 8  # characters of a shortened id
 MAX_LENGTH = 36  # characters of a shortened value
 SUMMARY = ("kind", "started", "finished")
 HIDDEN = (
-    "id", "name", "what", "data", "upstream", "upstream_runs", "sources", "attempts", "forgiven", "stages",
-    *SUMMARY,
+    "id", "name", "what", "data", "upstream", "upstream_runs", "sources", "source_bytes", "attempts",
+    "forgiven", "stages", *SUMMARY,
 )  # fmt: skip
 ORIGIN = (
     "device", "gpu", "threads", "processes", "precision", "version", "git", "python", "packages", "recipes",
