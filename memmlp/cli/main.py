@@ -9,7 +9,7 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple
 
 import click
 
@@ -54,16 +54,9 @@ COMMANDS = {
 
 INTERRUPTED = 130  # exit code after a Ctrl-C
 REFUSED = {
-    errno.EACCES,
-    errno.EPERM,
-    errno.EROFS,
-    errno.ENOTDIR,
-    errno.EISDIR,
-    errno.ENOENT,
-    errno.ENAMETOOLONG,
-    errno.ENOSPC,
-    errno.EDQUOT,
-}
+    errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR, errno.ENOENT, errno.ENAMETOOLONG,
+    errno.ENOSPC, errno.EDQUOT,
+}  # fmt: skip
 """Errors of the operating system that are about a path given by the user, or about its disk."""
 
 
@@ -125,11 +118,11 @@ def main(argv: Sequence[str] | None = None) -> None:
         sys.exit(2)
     except Exception as error:
         code = _exit_code(error)
-        if code is None and _interrupted(error):
-            error, code = click.Abort(), INTERRUPTED
         if code is None or os.environ.get("MEMMLP_TRACEBACK") == "1":
             raise
-        _fail(_line(error, arguments), code)
+        line = _line(error if code != INTERRUPTED else click.Abort(), arguments)
+        print(f"memmlp: {' '.join(line.split())}", file=sys.stderr)
+        sys.exit(code)
 
 
 def _run(arguments: list[str]) -> None:
@@ -150,18 +143,15 @@ def _exit_code(error: Exception) -> int | None:
         return error.exit_code
     if isinstance(error, OSError) and error.strerror:
         return 2 if error.errno in REFUSED else 1
-    return {InputError: 2, TrainingDiverged: 1, LeaseLost: 1}.get(type(error))
-
-
-def _interrupted(error: BaseException | None) -> bool:
-    """Return whether an error came up because of a Ctrl-C, as where it cuts an import of a library short."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__ or error.__context__
-    return error is not None
+    if type(error) in (InputError, TrainingDiverged, LeaseLost):
+        return 2 if type(error) is InputError else 1
+    cause: BaseException | None = error  # an error after a Ctrl-C, such as one that cut an import short
+    while cause is not None and not isinstance(cause, KeyboardInterrupt):
+        cause = cause.__cause__ or cause.__context__
+    return None if cause is None else INTERRUPTED
 
 
 def _line(error: Exception, arguments: Sequence[str]) -> str:
-    """Return the error of a command line in one line."""
     if isinstance(error, click.Abort):
         command = COMMANDS.get(arguments[0]) if arguments else None
         resumed = "; the same command goes on from the last checkpoint" if command and command.resumes else ""
@@ -189,12 +179,6 @@ def _complete(arguments: list[str]) -> None:
 
         os.environ["COMP_LINE"] = " ".join([words[0], *words[2:]])
         train(arguments)
-
-
-def _fail(line: str, code: int) -> NoReturn:
-    """Print one line to stderr and exit."""
-    print(f"memmlp: {' '.join(line.split())}", file=sys.stderr)
-    sys.exit(code)
 
 
 if __name__ == "__main__":

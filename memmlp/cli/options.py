@@ -101,17 +101,12 @@ together_option = click.option(
 
 def page_options(port: int) -> Callable[[Command], Command]:
     """Give a command that serves a page the options --port, by default `port`, and --no-browser."""
-    options = (
-        click.option(
-            "--port",
-            default=port,
-            show_default=True,
-            type=click.IntRange(0, 65535),
-            help="Port of the page; 0 takes a free one.",
-        ),
-        click.option("--no-browser", is_flag=True, help="Print the page's address, and open no browser."),
+    limits, help_text = click.IntRange(0, 65535), "Port of the page; 0 takes a free one."
+    number = click.option("--port", default=port, show_default=True, type=limits, help=help_text)
+    browser = click.option(
+        "--no-browser", is_flag=True, help="Print the page's address, and open no browser."
     )
-    return lambda command: options[0](options[1](command))
+    return lambda command: number(browser(command))
 
 
 host_option = click.option(
@@ -126,7 +121,6 @@ token_option = click.option(
 
 
 def _use(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
-    """Use the users' packages that the option names, and those in the environment."""
     from memmlp.config.plugins import activate, split_names
 
     if not ctx.resilient_parsing:
@@ -134,7 +128,6 @@ def _use(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
 
 
 def _search(ctx: click.Context, param: click.Parameter, value: Path | None) -> None:
-    """Search the option's folder of configs while the command runs."""
     from memmlp.config.plugins import searching
 
     if not ctx.resilient_parsing:

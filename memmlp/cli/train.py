@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import click
@@ -67,9 +66,10 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
     _check_predictions(jobs)
     failures: list[Exception] = []
     task = _collecting(job or run_training, failures)
-    if shows or _needs_hydra(args):
-        with _raising(args.overrides):
-            _run_hydra(args, task)
+    keys = [override.key for override in parse_overrides(args.overrides)]
+    hydras = any(key.startswith(("hydra.", "hydra/")) for key in keys)
+    if shows or args.multirun or args.config_name or hydras:  # for Hydra's launchers and its own keys
+        _run_hydra(args, task)
     else:
         task(jobs[0])
     for failure in failures[:-1]:
@@ -78,22 +78,26 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
         raise failures[-1]
 
 
-def _needs_hydra(args: argparse.Namespace) -> bool:
-    """Return whether Hydra must run the jobs: for its launchers and for its own keys."""
-    keys = [override.key for override in parse_overrides(args.overrides)]
-    return bool(
-        args.multirun or args.config_name or any(key.startswith(("hydra.", "hydra/")) for key in keys)
-    )
-
-
 def _run_hydra(args: argparse.Namespace, task: Callable[[DictConfig], None]) -> None:
-    """Run or show the jobs by Hydra, which reads its arguments from `sys.argv`."""
+    """Run or show the jobs by Hydra, which reads its arguments from `sys.argv`.
+
+    Hydra raises its errors instead of printing them; its own messages become one line.
+    """
     main = hydra.main(config_path=str(packaged("conf")), config_name=CONFIG, version_base=VERSION_BASE)
-    before, sys.argv = sys.argv, ["memmlp train", *hydra_arguments(args)]
+    argv, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
+    sys.argv, os.environ["HYDRA_FULL_ERROR"] = ["memmlp train", *hydra_arguments(args)], "1"
     try:
         main(task)()
+    except Exception as error:
+        if type(error).__module__.split(".")[0] in ("hydra", "omegaconf"):
+            raise InputError(explain(error, args.overrides)) from error
+        raise
     finally:
-        sys.argv = before
+        sys.argv = argv
+        if full_error is None:
+            del os.environ["HYDRA_FULL_ERROR"]
+        else:
+            os.environ["HYDRA_FULL_ERROR"] = full_error
 
 
 def _check_predictions(jobs: Sequence[DictConfig]) -> None:
@@ -107,24 +111,6 @@ def _check_predictions(jobs: Sequence[DictConfig]) -> None:
                 f"save_predictions={folder}: {folders.count(folder)} jobs would overwrite each other; "
                 "give each its own folder, such as predictions/${seed}"
             )
-
-
-@contextmanager
-def _raising(overrides: Sequence[str]) -> Iterator[None]:
-    """Make Hydra raise its errors instead of printing them, and put its own messages into one line."""
-    before = os.environ.get("HYDRA_FULL_ERROR")
-    os.environ["HYDRA_FULL_ERROR"] = "1"
-    try:
-        yield
-    except Exception as error:
-        if type(error).__module__.split(".")[0] in ("hydra", "omegaconf"):
-            raise InputError(explain(error, overrides)) from error
-        raise
-    finally:
-        if before is None:
-            del os.environ["HYDRA_FULL_ERROR"]
-        else:
-            os.environ["HYDRA_FULL_ERROR"] = before
 
 
 def _collecting(

@@ -59,17 +59,11 @@ def show_side_by_side(outcomes: Mapping[str, Outcome]) -> None:
     """
     found = {name: outcome.results for name, outcome in outcomes.items()}
     mode = "stream" if all("stream" in results for results in found.values()) else "window"
-    columns = [(name, branch) for name, results in found.items() for branch in _differing(results[mode])]
-    table = Table(title=f"side by side, {mode}", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column("metric")
-    table.add_column("unit")
-    for name, branch in columns:
-        several = len(_differing(found[name][mode])) > 1
-        table.add_column(f"{name}\n{branch}" if several else name, justify="right")
-    for metric, unit in UNITS.items():
-        values = [found[name][mode][branch].get(metric) for name, branch in columns]
-        if any(value is not None for value in values):
-            table.add_row(metric, unit, *("-" if value is None else f"{value:.2f}" for value in values))
+    branches = {name: _differing(results[mode]) for name, results in found.items()}
+    columns = [(name, branch) for name, own in branches.items() for branch in own]
+    headers = [f"{name}\n{branch}" if len(branches[name]) > 1 else name for name, branch in columns]
+    errors = [found[name][mode][branch] for name, branch in columns]
+    table = _error_table(f"side by side, {mode}", headers, errors)
     if all("latency" in results for results in found.values()):
         costs = [as_deployed(found[name]["latency"]) for name, _ in columns]
         table.add_row("a frame", "ms", *(f"{cost['median_ms']:.2f}" for cost in costs))
@@ -167,14 +161,23 @@ def source_tables(run: Run, stages: Sequence[str]) -> Iterator[Table]:
 def metrics_table(results: Errors, title: str = "test clips") -> Table:
     """Make a table of the metrics on test clips, with a column for each mode and branch."""
     columns = [(mode, branch) for mode, branch in COLUMNS if branch in results.get(mode, {})]
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    headers = [f"{mode}\n{branch}" for mode, branch in columns]
+    errors = [results[mode][branch] for mode, branch in columns]
+    return _error_table(title, headers, errors, padding=(0, 1, 0, 0))
+
+
+def _error_table(
+    title: str, headers: Sequence[str], errors: Sequence[Mapping[str, Any]], **style: Any
+) -> Table:
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, **style)
     table.add_column("metric")
     table.add_column("unit")
-    for mode, branch in columns:
-        table.add_column(f"{mode}\n{branch}", justify="right")
-    for name, unit in UNITS.items():
-        values = [results[mode][branch].get(name) for mode, branch in columns]
-        if all(value is None for value in values):  # a custom metric that was not asked for
-            continue
-        table.add_row(name, unit, *("-" if value is None else f"{float(value):.2f}" for value in values))
+    for header in headers:
+        table.add_column(header, justify="right")
+    for metric, unit in UNITS.items():
+        values = [column.get(metric) for column in errors]
+        if any(value is not None for value in values):  # a custom metric may not have been asked for
+            table.add_row(
+                metric, unit, *("-" if value is None else f"{float(value):.2f}" for value in values)
+            )
     return table

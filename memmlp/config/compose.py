@@ -18,7 +18,6 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, OverrideType
-from hydra.core.override_parser.types import Override as HydraOverride
 from hydra.core.plugins import Plugins
 from hydra.errors import ConfigCompositionException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
@@ -162,8 +161,7 @@ def preflight(args: argparse.Namespace) -> list[DictConfig]:
             with _explained(overrides):
                 configs.append(_compose(args, overrides))
             check(configs[-1])
-            _check_plugins(configs[-1])
-            _check_fractions(configs[-1], overrides)
+            _check_effects(configs[-1], overrides)
     _check_texts(configs[0], args.overrides)
     return configs
 
@@ -186,10 +184,18 @@ def _compose(args: argparse.Namespace, overrides: list[str]) -> DictConfig:
     values alone. Users' own folders may change meanwhile, so they are read each time.
     """
     parsed = OverridesParser.create().parse_overrides(overrides)
-    options = [override for override in parsed if _chooses_option(override)]
+    options = [
+        override
+        for override in parsed
+        if not isinstance(override.value(), dict)
+        and (is_group(group := override.key_or_group) or (packaged("conf") / group).is_dir())
+    ]
     values = [override for override in parsed if override not in options]
-    own = args.config_name or args.config_path or args.config_dir or any(plugins.folders())
-    if own or not all(_sets_value(override) for override in values):
+    special = args.config_name or args.config_path or args.config_dir or any(plugins.folders())
+    for one in values:
+        special = special or one.type != OverrideType.CHANGE or one.package
+        special = special or one.is_sweep_override() or one.is_hydra_override()
+    if special:
         return compose(args.config_name or CONFIG, overrides)
     cfg = cast(DictConfig, pickle.loads(_with_options(*(str(override.input_line) for override in options))))
     for override in values:
@@ -199,20 +205,6 @@ def _compose(args: argparse.Namespace, overrides: list[str]) -> DictConfig:
             message = f"Error merging override {override.input_line}"
             raise ConfigCompositionException(message) from error
     return cfg
-
-
-def _chooses_option(override: HydraOverride) -> bool:
-    """Return whether an override chooses an option of a group; the others set values."""
-    return not isinstance(override.value(), dict) and _is_group(override.key_or_group)
-
-
-def _is_group(name: str) -> bool:
-    return is_group(name) or (packaged("conf") / name).is_dir()
-
-
-def _sets_value(override: HydraOverride) -> bool:
-    special = override.package or override.is_sweep_override() or override.is_hydra_override()
-    return override.type == OverrideType.CHANGE and not special
 
 
 @functools.lru_cache(maxsize=128)
@@ -273,17 +265,14 @@ def _make_node(slot: str, name: str) -> DictConfig | None:
     return None
 
 
-def _check_plugins(cfg: DictConfig) -> None:
+def _check_effects(cfg: DictConfig, overrides: Sequence[str]) -> None:
+    """Raise InputError for a package named too late, or a fraction of the split that each source has."""
     for name in cfg.plugins:
         if name not in plugins.active():
             raise InputError(
                 f"plugins=[{name}]: a config file is read too late to name a package; name it on the command "
                 f"line, in the base of a sweep or search, or with {plugins.VARIABLE}={name}"
             )
-
-
-def _check_fractions(cfg: DictConfig, overrides: Sequence[str]) -> None:
-    """Raise InputError for a fraction of the split without effect, since each source has its own."""
     sources = (cfg.data.get("sources") or {}).values()
     for override in parse_overrides(overrides):
         part = override.key.removeprefix("data.split.")
@@ -407,18 +396,14 @@ def _jobs(args: argparse.Namespace) -> list[list[str]]:
             raise InputError(f"{chosen[-1]}: would replace {chosen[0]}; combine them as {EXPERIMENT}=[A,B]")
         if not args.multirun and "hydra.mode=MULTIRUN" not in args.overrides:
             return [args.overrides]
-        words = {override.get_key_element(): _choices(override) for override in parsed}
-        return [list(job) for job in itertools.product(*words.values())]
-
-
-def _choices(override: HydraOverride) -> list[str]:
-    """Return an override of a multirun as one override for each of its values."""
-    key = override.get_key_element()
-    if not override.is_sweep_override():
-        return [f"{key}={override.get_value_element_as_str()}"]
-    if not override.is_discrete_sweep():
-        raise InputError(f"{override.input_line}: must be a list of values, a choice or a range")
-    return [f"{key}={value}" for value in override.sweep_string_iterator()]
+        choices: dict[str, list[str]] = {}
+        for override in parsed:
+            key, sweeps = override.get_key_element(), override.is_sweep_override()
+            if sweeps and not override.is_discrete_sweep():
+                raise InputError(f"{override.input_line}: must be a list of values, a choice or a range")
+            values = override.sweep_string_iterator() if sweeps else [override.get_value_element_as_str()]
+            choices[key] = [f"{key}={value}" for value in values]
+        return [list(job) for job in itertools.product(*choices.values())]
 
 
 @contextmanager

@@ -133,19 +133,20 @@ def kept_or_new_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan
         keep_sweep(sweep, path.parent)
         return Plan.load(path.with_name("plan.json"))
     plan, data = _plan(sweep, outputs, prepare)
-    if prepare or _has_all(sweep, plan, path.with_name("plan.json")):
+    labels = {variant.label for variant in sweep.variants}
+    before = [
+        (e.get("label"), e.get("seed")) for e in read_json(path.with_name("plan.json")).get("entries", ())
+    ]
+    lost = {cell for cell in before if cell[0] in labels} - {(one.label, one.seed) for one in plan.entries}
+    if prepare or not lost:
         keep_sweep(sweep, path.parent)
         plan.save(path.with_name("plan.json"))
         write_json(path, {"stamp": stamp if data is not None else None, "data": data or []})
-        _remember(sweep, plan, path.with_name("entries.json"))
+        ever = path.with_name("entries.json")  # all entries that the sweep has ever had, for `orphans`
+        entries = [*read_json(ever).get("entries", []), *map(asdict, plan.entries)]
+        unique_entries = {(e["label"], e["seed"], e["id"]): e for e in entries}
+        write_json(ever, {"entries": list(unique_entries.values())})
     return plan
-
-
-def _has_all(sweep: Sweep, plan: Plan, path: Path) -> bool:
-    """Return whether a plan has all entries of the kept plan, except those of variants that are gone."""
-    labels = {variant.label for variant in sweep.variants}
-    cells = {(one.get("label"), one.get("seed")) for one in read_json(path).get("entries", ())}
-    return {cell for cell in cells if cell[0] in labels} <= {(one.label, one.seed) for one in plan.entries}
 
 
 def plan_anew(sweep: Sweep, outputs: Path) -> Plan:
@@ -269,10 +270,3 @@ def _stamp(sweep: Sweep, outputs: Path) -> str:
 
 ELSEWHERE = ("oc.env", "hydra.searchpath")
 """What an override or a user's config holds that takes values from the environment, or from other folders."""
-
-
-def _remember(sweep: Sweep, plan: Plan, path: Path) -> None:
-    """Add the plan's entries to the record of all entries that the sweep has ever had."""
-    before = read_json(path).get("entries", [])
-    every = {(e["label"], e["seed"], e["id"]): e for e in [*before, *map(asdict, plan.entries)]}
-    write_json(path, {"entries": list(every.values())})
