@@ -13,7 +13,7 @@ from memmlp.motion.network_coordinates import Heading
 from memmlp.networks.memory import NoMemory
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.own_past_memory import CodeMemory
-from memmlp.networks.predictor import RotationOnly
+from memmlp.networks.predictor import RotationOnlySettings
 from memmlp.networks.recurrent_memory import LSTMMemory
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ NETWORKS: dict[str, Callable[[], MotionModel]] = {
     "mem_mlp": partial(tiny.model, CodeMemory, coordinates=Heading()),
     "lstm": partial(tiny.model, LSTMMemory, coordinates=Heading()),
     "no_memory": partial(tiny.model, NoMemory),
-    "rotation_only": partial(tiny.model, NoMemory, RotationOnly),
+    "rotation_only": partial(tiny.model, NoMemory, RotationOnlySettings),
     "refined": lambda: tiny.refined(tiny.model(NoMemory, coordinates=Heading())),
     **{name: partial(tiny.baseline, name, depth=1) for name in BASELINES},
     **{name: partial(tiny.baseline, name, depth=1, sampling_steps=2) for name in DIFFUSIONS},

@@ -34,7 +34,12 @@ from memmlp.motion.synthetic import ACTIVITIES, synthesize, synthesize_clip
 from memmlp.networks.memory import NoMemory
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, NoCodesMemory
-from memmlp.networks.predictor import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
+from memmlp.networks.predictor import (
+    RotationOnlyMemorySettings,
+    RotationOnlySettings,
+    TwoBranchMemorySettings,
+    TwoBranchSettings,
+)
 from memmlp.networks.recurrent_memory import GRUMemory, LSTMMemory
 from memmlp.networks.recurrent_poser import CELLS
 from memmlp.networks.still_pose import StillPose, StillPoseSettings
@@ -231,7 +236,7 @@ CASES: dict[str, Callable[[], Numbers]] = {
         f"coordinates.{name}": partial(coordinates, kind)
         for name, kind in (("heading", Heading), ("head_relative", HeadRelative), ("world", World))
     },
-    "model.mem_mlp": lambda: network(tiny.model(NoMemory, RotationOnly)),
+    "model.mem_mlp": lambda: network(tiny.model(NoMemory, RotationOnlySettings)),
     **{
         f"model.{name}": partial(lambda name: network(tiny.baseline(name)), name)
         for name in tiny.BASELINES
@@ -252,8 +257,8 @@ CASES: dict[str, Callable[[], Numbers]] = {
     **{
         f"predictor.{name}": partial(lambda kind: network(tiny.model(NoCodesMemory, kind)), kind)
         for name, kind in {
-            "two_branch": TwoBranch, "two_branch_memory": TwoBranchMemory, "rotation_only": RotationOnly,
-            "rotation_only_memory": RotationOnlyMemory,
+            "two_branch": TwoBranchSettings, "two_branch_memory": TwoBranchMemorySettings,
+            "rotation_only": RotationOnlySettings, "rotation_only_memory": RotationOnlyMemorySettings,
         }.items()
     },
     "refiner.sage": refiner,

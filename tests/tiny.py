@@ -19,9 +19,8 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import Memory, NoMemory
 from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory
-from memmlp.networks.predictor import Predictor, TwoBranch
-from memmlp.networks.recurrent_memory import RecurrentMemory
+from memmlp.networks.own_past_memory import CodeMemory, CodeMemorySettings, JointCodeMemory
+from memmlp.networks.predictor import TwoBranchSettings
 from memmlp.networks.recurrent_poser import RecurrentPoser, RecurrentPoserSettings
 from memmlp.networks.refiner import Refined
 from memmlp.networks.vqvae import VQVAE
@@ -72,19 +71,18 @@ def memory(kind: type[Memory] = CodeMemory, **changes) -> Memory:
     """Make a memory for the tiny network, with changed settings."""
     if kind is NoMemory:
         return NoMemory(depth=DEPTH, **SIZES)
-    settings = {"layers": (2, 4), "width": 6, "fusion": "residual"}
-    if not issubclass(kind, RecurrentMemory):
-        settings |= {"shift": "window", "history": "first", "blend": 0.5}
+    given: dict[str, Any] = {"layers": (2, 4), "width": 6, "shift": "window", "history": "first"}
+    more: dict[str, Any] = {"depth": DEPTH, **SIZES}
     if kind is CodeMemory:
-        settings |= {"codes": vqvae()}
+        more["codes"] = changes.pop("codes", None) or vqvae()
     if kind is JointCodeMemory:
-        settings |= {"vqvae": vqvae}
-    return kind(**settings | changes, depth=DEPTH, **SIZES)
+        more["vqvae"] = changes.pop("vqvae", vqvae)
+    return kind(CodeMemorySettings(**given | changes), **more)
 
 
 def model(
     kind: type[Memory] = CodeMemory,
-    predictor: type[Predictor] = TwoBranch,
+    predictor: type[TwoBranchSettings] = TwoBranchSettings,
     coordinates: World | None = None,
     seed: int = 0,
     **changes,
@@ -93,7 +91,7 @@ def model(
     torch.manual_seed(seed)
     slot = memory(kind, **changes)
     torch.manual_seed(seed)
-    head = predictor(1, memory_block=slot.make_memory_block, **SIZES)
+    head = find("predictor", predictor.name).build({"depth": 1}, memory_block=slot.make_memory_block, **SIZES)
     return MemMLP(normalizer(coordinates), slot, head, depth=DEPTH, **SIZES).eval()
 
 

@@ -14,6 +14,7 @@ import ast
 import copy
 import functools
 import importlib
+import inspect
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping
@@ -46,8 +47,8 @@ def component(
         name: the component's name in the config, which enters the id of runs.
         version: the component version, to be raised when the component's results change: then its runs are
             made again.
-        builds: the name of the class in the same module that is built with the keys as arguments; None if
-            it is the decorated class.
+        builds: the name of the class in the same module that is built, either with the argument `settings`
+            or with the keys as arguments; None if it is the decorated class.
     """
 
     def declare(kind: _Kind) -> _Kind:
@@ -103,7 +104,12 @@ class Component:
         return getattr(module, self.builds) if self.builds else _of_option(vars(module), self)
 
     def build(self, node: Mapping[str, Any], *given: Any, **more: Any) -> Any:
-        """Build the component from its keys in the config, which are the arguments besides those given."""
+        """Build the component from its keys in the config, besides the arguments given.
+
+        A class that has the parameter `settings` takes the keys as an object, others as arguments.
+        """
+        if self.builds and "settings" in inspect.signature(self.kind).parameters:
+            return self.kind(*given, settings=self.make_settings(node), **more)
         return self.kind(*given, **{key: value for key, value in node.items() if key != "name"}, **more)
 
     def make_settings(self, node: Mapping[str, Any]) -> Any:

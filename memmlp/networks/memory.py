@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 from torch import Tensor, nn
 
 from memmlp.common.components import component
 from memmlp.common.errors import InputError
+from memmlp.common.settings import Settings, at_least, each, one_of, setting
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.layers import MLPBlock, PlainFusion, ResidualFusion
 from memmlp.networks.motion_model import State
@@ -206,28 +208,37 @@ class NoMemory(Memory):
         raise InputError("memory=none: must be a memory with blocks for this predictor, which uses them")
 
 
+@dataclass
+class FeatureMemorySettings(Settings):
+    """The keys of the memories that give some blocks a feature to take in."""
+
+    # which blocks of the backbone have it: the even ones (Sec. 4.1)
+    layers: list[int] = setting(each(at_least(1)), "${even_layers:${model.depth}}")
+    # k, the width of the memory feature (reading 3), and the hidden size of a recurrent memory
+    width: int = setting(at_least(1), tiny=8, small=48, paper=192, width_fraction=0.375)
+    # residual: x + f([x; z]); plain: f([x; z]) (reading 3)
+    fusion: str = setting(one_of("residual", "plain"), "residual")
+
+
 class FeatureMemory(Memory):
     """A memory that gives some blocks a feature to take in.
 
     Args:
-        layers: the backbone's layers (1-based) that get a memory feature.
-        width: k, the width of the memory feature.
-        fusion: "residual" or "plain".
+        settings: the memory's keys, of which `layers`, `width` and `fusion` are used here.
         hidden: the backbone's d.
         frames: the backbone's T.
         depth: the backbone's L.
+        codes: the frozen VQ-VAE; not used here.
 
     Raises:
         InputError: if a layer is not one of the backbone's.
     """
 
-    def __init__(
-        self, layers: Sequence[int], width: int, fusion: str, *, hidden: int, frames: int, depth: int
-    ):
+    def __init__(self, settings: Any, *, hidden: int, frames: int, depth: int, codes: VQVAE | None = None):
         super().__init__()
-        if not set(layers) <= set(range(1, depth + 1)):
-            raise InputError(f"memory.layers={list(layers)}: must be layers of the backbone, 1 to {depth}")
-        self.layers, self.width, self.fusion = tuple(layers), width, FUSIONS[fusion]
+        self.layers, self.width, self.fusion = settings.layers, settings.width, FUSIONS[settings.fusion]
+        if not set(self.layers) <= set(range(1, depth + 1)):
+            raise InputError(f"memory.layers={self.layers}: must be layers of the backbone, 1 to {depth}")
         self.hidden, self.frames = hidden, frames
 
     def make_block(self, layer: int) -> nn.Module:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -13,10 +13,10 @@ from torch import Tensor, nn
 
 from memmlp.common import distributed
 from memmlp.common.components import component
-from memmlp.common.settings import Settings, at_least, each, one_of, setting, within
+from memmlp.common.settings import one_of, setting, within
 from memmlp.motion.body import MOTION_DIM, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.memory import FeatureMemory, Past, Recall, RecurrentPast
+from memmlp.networks.memory import FeatureMemory, FeatureMemorySettings, Past, Recall, RecurrentPast
 from memmlp.networks.motion_model import State
 from memmlp.networks.vqvae import VQVAE, straight_through
 
@@ -173,7 +173,7 @@ class CodeRecall(OwnPastRecall):
 
 
 @dataclass
-class OwnPastMemorySettings(Settings):
+class OwnPastMemorySettings(FeatureMemorySettings):
     """The keys of the memories of the network's own past.
 
     Attributes:
@@ -181,16 +181,10 @@ class OwnPastMemorySettings(Settings):
             with the network, "" without a VQ-VAE.
     """
 
-    # which blocks of the backbone have it: the even ones (Sec. 4.1)
-    layers: list[int] = setting(each(at_least(1)), "${even_layers:${model.depth}}")
-    # k, the width of the memory feature (reading 3)
-    width: int = setting(at_least(1), tiny=8, small=48, paper=192, width_fraction=0.375)
     # window: the past window ends T frames ago; frame: it ends one frame ago (reading 6)
     shift: str = setting(one_of("frame", "window"), "window", literal="frame")
     # first: a past frame's estimate from when it was the newest; latest: its latest estimate (reading 6)
     history: str = setting(one_of("first", "latest"), "first", literal="latest")
-    # residual: x + f([x; z]); plain: f([x; z]) (reading 3)
-    fusion: str = setting(one_of("residual", "plain"), "residual")
     # m at inference: a number in [0, 1], or sampled as in training, for which ONNX has 0.5 (reading 7)
     blend: int | float | str = setting(within(0, 1, "sampled"), 0.5)
 
@@ -229,32 +223,18 @@ class OwnPastMemory(FeatureMemory):
     `memory.blend.value` changes m in a trained network.
 
     Args:
-        layers, width, shift, history, fusion, blend: see OwnPastMemorySettings.
-        hidden, frames, depth: the backbone's d, T and L.
-        codes: the frozen VQ-VAE; not used here.
+        settings: the memory's keys.
+        sizes: the other arguments of FeatureMemory.
     """
 
     streaming_recall = OwnPastRecall
 
-    def __init__(
-        self,
-        layers: Sequence[int],
-        width: int,
-        shift: str,
-        history: str,
-        fusion: str,
-        blend: float | str,
-        *,
-        hidden: int,
-        frames: int,
-        depth: int,
-        codes: VQVAE | None = None,
-    ):
-        super().__init__(layers, width, fusion, hidden=hidden, frames=frames, depth=depth)
-        self.history, self.blend = history, Blend(blend)
-        self.settled = history == "first"
-        self.shift = {"frame": 1, "window": frames}[shift]
-        self.past_frames = frames + self.shift - 1
+    def __init__(self, settings: OwnPastMemorySettings, **sizes: Any):
+        super().__init__(settings, **sizes)
+        self.history, self.blend = settings.history, Blend(settings.blend)
+        self.settled = self.history == "first"
+        self.shift = {"frame": 1, "window": self.frames}[settings.shift]
+        self.past_frames = self.frames + self.shift - 1
 
     def initial_state(self, batch: int) -> State:
         """Return zeros as the past motion, the paper's fallback where there is no previous prediction."""
@@ -333,8 +313,8 @@ class VQMemory(OwnPastMemory):
 class CodeMemory(VQMemory):
     """The paper's memory, whose VQ-VAE is trained beforehand and frozen."""
 
-    def __init__(self, *args, codes: VQVAE | None = None, **kwargs):
-        super().__init__(*args, **kwargs)
+    def __init__(self, settings: CodeMemorySettings, *, codes: VQVAE | None = None, **sizes: Any):
+        super().__init__(settings, **sizes)
         assert codes is not None
         self.codes = codes.requires_grad_(False)
 
@@ -353,12 +333,13 @@ class JointCodeMemory(VQMemory):
     network's own loss reaches the encoder by the straight-through gradient of the code-vectors.
 
     Args:
+        settings: the memory's keys.
         vqvae: makes the VQ-VAE.
-        codes: ignored; there is no frozen VQ-VAE.
+        sizes: the other arguments of FeatureMemory.
     """
 
-    def __init__(self, *args, vqvae: Callable[[], VQVAE], codes: VQVAE | None = None, **kwargs):
-        super().__init__(*args, **kwargs)
+    def __init__(self, settings: JointCodeMemorySettings, *, vqvae: Callable[[], VQVAE], **sizes: Any):
+        super().__init__(settings, **sizes)
         self.codes = vqvae()
 
     def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:

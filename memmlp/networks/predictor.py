@@ -57,7 +57,7 @@ class TwoBranchSettings(Settings):
     memory_blocks: ClassVar[bool] = False
 
 
-@component("predictor", "two_branch_memory", builds="TwoBranchMemory")
+@component("predictor", "two_branch_memory", builds="TwoBranch")
 @dataclass
 class TwoBranchMemorySettings(TwoBranchSettings):
     """Rotations and positions, with a branch of memory blocks for each (Table 8, "MHP w/ MB").
@@ -78,7 +78,7 @@ class RotationOnlySettings(TwoBranchSettings):
     positions: ClassVar[bool] = False
 
 
-@component("predictor", "rotation_only_memory", builds="RotationOnlyMemory")
+@component("predictor", "rotation_only_memory", builds="RotationOnly")
 @dataclass
 class RotationOnlyMemorySettings(TwoBranchMemorySettings):
     """Rotations alone, by a branch of memory blocks. It needs a memory, and hand=fk or hand=off."""
@@ -90,7 +90,7 @@ class Predictor(nn.Module):
     """A branch for the rotations, and one for the positions where `branches` has them.
 
     Args:
-        depth: number of blocks in each branch.
+        settings: the predictor's keys, and whether its branches consist of memory blocks.
         hidden: the backbone's d.
         frames: the backbone's T.
         memory_block: makes a memory block.
@@ -98,18 +98,18 @@ class Predictor(nn.Module):
     Attributes:
         branches: the parts of the motion that have a branch, "rotation" and perhaps "position". Without the
             latter, positions follow by forward kinematics, without gradients.
-        memory_blocks: whether the branches consist of memory blocks.
     """
 
     branches: ClassVar[frozenset[str]] = frozenset({"rotation", "position"})
-    memory_blocks: ClassVar[bool] = False
 
-    def __init__(self, depth: int, *, hidden: int, frames: int, memory_block: MakeBlock | None = None):
+    def __init__(
+        self, settings: TwoBranchSettings, *, hidden: int, frames: int, memory_block: MakeBlock | None = None
+    ):
         super().__init__()
-        make = memory_block if self.memory_blocks else None
-        self.rotation = Branch(ROTATION.stop, depth, hidden, frames, make)
+        make = memory_block if settings.memory_blocks else None
+        self.rotation = Branch(ROTATION.stop, settings.depth, hidden, frames, make)
         if "position" in self.branches:
-            self.position = Branch(MOTION_DIM - ROTATION.stop, depth, hidden, frames, make)
+            self.position = Branch(MOTION_DIM - ROTATION.stop, settings.depth, hidden, frames, make)
 
     def forward(self, h: Tensor, past: object, sparse: Tensor, normalizer: Normalizer, newest: int) -> Tensor:
         """Predict the newest frames' motion.
@@ -137,19 +137,7 @@ class TwoBranch(Predictor):
     """One branch for the rotations and one for the positions."""
 
 
-class TwoBranchMemory(Predictor):
-    """Two branches, both of memory blocks (Table 8, "MHP w/ MB")."""
-
-    memory_blocks = True
-
-
 class RotationOnly(Predictor):
     """One branch for the rotations."""
 
     branches = frozenset({"rotation"})
-
-
-class RotationOnlyMemory(RotationOnly):
-    """One rotation branch of memory blocks: Table 8's comparison without a position branch."""
-
-    memory_blocks = True

@@ -12,12 +12,10 @@ from torch import Tensor, nn
 
 from memmlp.common.components import component
 from memmlp.common.float32_regions import in_float32
-from memmlp.common.settings import Settings, at_least, each, one_of, setting
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.networks.memory import FeatureMemory, Past, Recall, RecurrentPast
+from memmlp.networks.memory import FeatureMemory, FeatureMemorySettings, Past, Recall, RecurrentPast
 from memmlp.networks.motion_model import State
 from memmlp.networks.streaming import FrameGRU
-from memmlp.networks.vqvae import VQVAE
 
 
 class Recurrence(nn.Module):
@@ -123,30 +121,19 @@ class RecurrentMemory(FeatureMemory):
     at a fresh start.
 
     Args:
-        layers, width, fusion: see the memory's settings; k is also the hidden size of the recurrent layers.
-        hidden, frames, depth: the backbone's d, T and L.
-        codes: the frozen VQ-VAE; not used here.
+        settings: the memory's keys; k is also the hidden size of the recurrent layers.
+        sizes: the other arguments of FeatureMemory.
     """
 
     streaming_recall = RecurrentRecall
     recurrence: ClassVar[type[Recurrence]]
     settled = True
 
-    def __init__(
-        self,
-        layers: Sequence[int],
-        width: int,
-        fusion: str,
-        *,
-        hidden: int,
-        frames: int,
-        depth: int,
-        codes: VQVAE | None = None,
-    ):
-        super().__init__(layers, width, fusion, hidden=hidden, frames=frames, depth=depth)
+    def __init__(self, settings: LSTMMemorySettings, **sizes: Any):
+        super().__init__(settings, **sizes)
         self.recurrences = nn.ModuleList()
-        self.shift = frames
-        self.past_frames = frames - 1
+        self.shift = self.frames
+        self.past_frames = self.frames - 1
 
     def make_feature(self) -> nn.Module:
         """Add one more recurrent layer and make the module that looks up its output."""
@@ -190,17 +177,11 @@ class RecurrentMemory(FeatureMemory):
 
 @component("memory", "lstm", builds="LSTMMemory")
 @dataclass
-class LSTMMemorySettings(Settings):
+class LSTMMemorySettings(FeatureMemorySettings):
     """An LSTM for each memory block (Table 15, reading 19): LayerNorm of the sparse features, LSTM, SiLU.
 
     Teacher forcing starts its states from the input before the window; evaluation carries them on.
     """
-
-    # which blocks of the backbone have it: the even ones (Sec. 4.1)
-    layers: list[int] = setting(each(at_least(1)), "${even_layers:${model.depth}}")
-    width: int = setting(at_least(1), tiny=8, small=48, paper=192, width_fraction=0.375)  # the hidden size
-    # residual: x + f([x; z]); plain: f([x; z]) (reading 3)
-    fusion: str = setting(one_of("residual", "plain"), "residual")
 
 
 @component("memory", "gru", builds="GRUMemory")

@@ -12,8 +12,14 @@ from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import NoMemory
-from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, NoCodesMemory
-from memmlp.networks.predictor import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
+from memmlp.networks.own_past_memory import CodeMemory, CodeMemorySettings, JointCodeMemory, NoCodesMemory
+from memmlp.networks.predictor import (
+    RotationOnlyMemorySettings,
+    RotationOnlySettings,
+    TwoBranch,
+    TwoBranchMemorySettings,
+    TwoBranchSettings,
+)
 from memmlp.networks.recurrent_memory import GRUMemory, LSTMMemory
 from memmlp.networks.vqvae import VQVAE
 from memmlp.training.rollout import TeacherForcing
@@ -45,11 +51,10 @@ def run(model: MemMLP, sparse: torch.Tensor, new: int = 1) -> list[torch.Tensor]
 def test_paper_profile_has_the_papers_parameters():
     """4.10 M within 3 %: trainable parameters, the frozen VQ-VAE not counted (Table 16)."""
     sizes = {"hidden": 512, "frames": 41}
-    memory = CodeMemory(
-        (2, 4, 6, 8), 192, "window", "first", "residual", 0.5, codes=VQVAE(), depth=8, **sizes
-    )
+    keys = CodeMemorySettings(layers=[2, 4, 6, 8], width=192, shift="window", history="first")
+    memory = CodeMemory(keys, codes=VQVAE(), depth=8, **sizes)
     normalizer = Normalizer.raw(HeadRelative(), torch.tensor(builtin_rest_joints()))
-    model = MemMLP(normalizer, memory, TwoBranch(2, **sizes), depth=8, **sizes)
+    model = MemMLP(normalizer, memory, TwoBranch(TwoBranchSettings(2), **sizes), depth=8, **sizes)
     assert model.count_parameters() == 4_117_118
     assert abs(model.count_parameters() / 4.10e6 - 1) < 0.03
 
@@ -164,9 +169,9 @@ def variant(**changes) -> torch.Tensor:
 
 SWITCHES = [
     {"kind": NoMemory}, {"kind": NoCodesMemory}, {"kind": LSTMMemory}, {"kind": GRUMemory},
-    {"predictor": TwoBranchMemory}, {"shift": "frame"}, {"history": "latest"}, {"fusion": "plain"},
+    {"predictor": TwoBranchMemorySettings}, {"shift": "frame"}, {"history": "latest"}, {"fusion": "plain"},
     {"layers": (2,)}, {"width": 5}, {"blend": 0.0}, {"blend": 1.0}, {"blend": "sampled"},
-    {"predictor": RotationOnly}, {"predictor": RotationOnlyMemory}, {"coordinates": World()},
+    {"predictor": RotationOnlySettings}, {"predictor": RotationOnlyMemorySettings}, {"coordinates": World()},
     {"coordinates": Heading()},
 ]  # fmt: skip
 
@@ -199,7 +204,7 @@ def test_codes_stay_frozen_while_the_rest_learns():
 
 @torch.no_grad()
 def test_rotation_only_positions_are_forward_kinematics():
-    model = tiny.model(predictor=RotationOnly)
+    model = tiny.model(predictor=RotationOnlySettings)
     motion = run(model, SPARSE)[-1]
     window = SPARSE[:, -model.frames :]
     expected = model.normalizer.pose(motion, window).flatten(-2)
@@ -208,8 +213,9 @@ def test_rotation_only_positions_are_forward_kinematics():
 
 
 PREDICTORS = [
-    *((kind, changes, TwoBranch) for kind, changes in MEMORIES),
-    (CodeMemory, {}, RotationOnly), (CodeMemory, {}, TwoBranchMemory), (LSTMMemory, {}, TwoBranchMemory),
+    *((kind, changes, TwoBranchSettings) for kind, changes in MEMORIES),
+    (CodeMemory, {}, RotationOnlySettings), (CodeMemory, {}, TwoBranchMemorySettings),
+    (LSTMMemory, {}, TwoBranchMemorySettings),
 ]  # fmt: skip
 
 

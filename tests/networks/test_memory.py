@@ -13,7 +13,7 @@ from memmlp.motion.dataset import WindowSampler
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import NoMemory
 from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, NoCodesMemory
-from memmlp.networks.predictor import RotationOnlyMemory, TwoBranchMemory
+from memmlp.networks.predictor import RotationOnlyMemorySettings, TwoBranchMemorySettings
 from memmlp.networks.recurrent_memory import GRUMemory, LSTMMemory
 from memmlp.networks.vqvae import VQVAE
 from memmlp.runs.run import Run
@@ -36,7 +36,7 @@ def outputs(model: MemMLP, sparse: torch.Tensor, new: int) -> tuple[torch.Tensor
     return motion, state
 
 
-@pytest.mark.parametrize("predictor", [None, TwoBranchMemory])
+@pytest.mark.parametrize("predictor", [None, TwoBranchMemorySettings])
 @pytest.mark.parametrize(("kind", "new"), [(LSTMMemory, 2), (GRUMemory, 5), (LSTMMemory, 7)])
 @torch.no_grad()
 def test_a_recurrent_stream_is_the_same_however_it_is_cut(kind, new, predictor):
@@ -218,7 +218,11 @@ def test_parameters_count_a_joint_vqvae_and_not_a_frozen_one():
 
 @pytest.mark.parametrize(
     ("kind", "predictor"),
-    [(NoCodesMemory, TwoBranchMemory), (CodeMemory, RotationOnlyMemory), (LSTMMemory, TwoBranchMemory)],
+    [
+        (NoCodesMemory, TwoBranchMemorySettings),
+        (CodeMemory, RotationOnlyMemorySettings),
+        (LSTMMemory, TwoBranchMemorySettings),
+    ],
 )
 @torch.no_grad()
 def test_the_branches_look_at_the_memory(kind, predictor):
@@ -235,7 +239,7 @@ def test_the_branches_look_at_the_memory(kind, predictor):
 
 def test_no_memory_has_no_blocks_for_the_branches():
     with pytest.raises(InputError, match="memory=none"):
-        tiny.model(NoMemory, TwoBranchMemory)
+        tiny.model(NoMemory, TwoBranchMemorySettings)
 
 
 @torch.no_grad()

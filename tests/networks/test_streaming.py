@@ -10,6 +10,7 @@ import pytest
 import tiny
 import torch
 
+from memmlp.common.components import find
 from memmlp.common.errors import InputError
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import parity
@@ -20,7 +21,7 @@ from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import NoMemory
 from memmlp.networks.motion_model import StreamingGraph
 from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, NoCodesMemory
-from memmlp.networks.predictor import RotationOnly, TwoBranch, TwoBranchMemory
+from memmlp.networks.predictor import RotationOnlySettings, TwoBranchMemorySettings, TwoBranchSettings
 from memmlp.networks.recurrent_memory import GRUMemory, LSTMMemory
 from memmlp.networks.streaming import has_stream, streaming
 
@@ -52,9 +53,10 @@ def largest_difference(model, sparse: torch.Tensor) -> float:
 @pytest.mark.parametrize(
     ("kind", "changes", "predictor"),
     [
-        *((kind, changes, TwoBranch) for kind, changes in MEMORIES),
-        (NoMemory, {}, RotationOnly), (CodeMemory, {}, RotationOnly), (CodeMemory, {}, TwoBranchMemory),
-        (NoCodesMemory, {"fusion": "plain"}, TwoBranchMemory), (LSTMMemory, {}, TwoBranchMemory),
+        *((kind, changes, TwoBranchSettings) for kind, changes in MEMORIES),
+        (NoMemory, {}, RotationOnlySettings), (CodeMemory, {}, RotationOnlySettings),
+        (CodeMemory, {}, TwoBranchMemorySettings), (LSTMMemory, {}, TwoBranchMemorySettings),
+        (NoCodesMemory, {"fusion": "plain"}, TwoBranchMemorySettings),
     ],
 )  # fmt: skip
 @torch.no_grad()
@@ -63,11 +65,11 @@ def test_the_stream_is_the_network(kind, changes, predictor):
     assert largest_difference(model, CLIP[:, :TWICE].double()) < 1e-11
 
 
-@pytest.mark.parametrize("predictor", [TwoBranch, RotationOnly])
+@pytest.mark.parametrize("predictor", [TwoBranchSettings, RotationOnlySettings])
 @torch.no_grad()
 def test_of_branches_without_blocks(predictor):
     slot = tiny.memory()
-    head = predictor(0, **tiny.SIZES)
+    head = find("predictor", predictor.name).build({"depth": 0}, **tiny.SIZES)
     model = MemMLP(tiny.normalizer(), slot, head, depth=tiny.DEPTH, **tiny.SIZES).eval().double()
     assert largest_difference(model, CLIP.double()) < 1e-11
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -12,7 +12,6 @@ from memmlp.common.settings import Settings, at_least, each, one_of, setting
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.networks.memory import FeatureMemory
 from memmlp.networks.motion_model import State
-from memmlp.networks.vqvae import VQVAE
 
 
 class MeanFeature(nn.Module):
@@ -47,28 +46,13 @@ class MeanMemory(FeatureMemory):
     """A memory without a state: what a frame recalls is the mean of the inputs up to it.
 
     Args:
-        layers: the backbone's layers (1-based) that get the feature.
-        width: k, the width of the feature.
-        fusion: "residual" or "plain".
-        hidden: the backbone's d.
-        frames: the backbone's T.
-        depth: the backbone's L.
-        codes: the frozen VQ-VAE; not used here.
+        settings: the memory's keys.
+        sizes: the other arguments of FeatureMemory.
     """
 
-    def __init__(
-        self,
-        layers: Sequence[int],
-        width: int,
-        fusion: str,
-        *,
-        hidden: int,
-        frames: int,
-        depth: int,
-        codes: VQVAE | None = None,
-    ):
-        super().__init__(layers, width, fusion, hidden=hidden, frames=frames, depth=depth)
-        self.shift, self.past_frames = 0, frames - 1
+    def __init__(self, settings: MeanMemorySettings, **sizes: Any):
+        super().__init__(settings, **sizes)
+        self.shift, self.past_frames = 0, self.frames - 1
 
     def make_feature(self) -> nn.Module:
         """Make the module that computes a block's memory feature."""
