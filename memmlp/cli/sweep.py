@@ -347,6 +347,7 @@ def describe_schedule(rounds: Rounds) -> str:
 
 def describe_progress(rounds: Rounds, sweep: Sweep, last: Analysis | None = None) -> list[str]:
     """Describe each variant's progress: its verdicts, its seeds so far, and its next interim analysis."""
+    from memmlp.cli.table import aligned
     from memmlp.report.tables.seed_rounds import progress
 
     variants = progress(rounds, sweep)
@@ -356,10 +357,8 @@ def describe_progress(rounds: Rounds, sweep: Sweep, last: Analysis | None = None
     for one in variants:
         following = f"at {one.next}" if one.next else ""
         rows.append((one.label, str(one.decided), str(one.inconclusive), str(one.seeds), following))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)) for row in rows]
     count = f"{head}{decided} of {len(rounds.comparisons(sweep))} comparisons decided"
-    return [count, *(line.rstrip() for line in lines)]
+    return [count, *(line.rstrip() for line in aligned(rows, left=len(rows[0])))]
 
 
 def describe_end(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> list[str]:

@@ -286,19 +286,21 @@ def _describe_needs(wanted: Sequence[Need]) -> str:
     for need in wanted:
         numbers = (f"{need.paper:+.2f}", f"{need.measured:+.2f}", str(need.have))
         rows.append((need.label, need.mode, need.metric, *numbers, str(need.seeds or "no number")))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = [
-        "  ".join(
-            text.ljust(width) if i < 3 else text.rjust(width)
-            for i, (text, width) in enumerate(zip(row, widths, strict=True))
-        )
-        for row in rows
-    ]
+    lines = aligned(rows, left=3)
     note = (
         "needed: seeds for an effect of the paper's size to be significant with 80 % power, after Holm's "
         "correction over this table, with these test clips; no number: the clips alone are too uncertain"
     )
     return "\n".join([*lines, note])
+
+
+def aligned(rows: Sequence[Sequence[str]], left: int) -> list[str]:
+    """Return rows as lines of columns, of which the first `left` are aligned to the left."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(f"{text:{'<' if i < left else '>'}{widths[i]}}" for i, text in enumerate(row))
+        for row in rows
+    ]
 
 
 def _formatted(tables: Sequence[Table], form: str, alone: bool) -> str:

@@ -63,15 +63,12 @@ class Workers:
             from memmlp.sweep.executors.slurm import slurm_options
 
             return slurm_options(self.settings)
-        if self.executor == "ray":
-            from memmlp.sweep.executors.ray_cluster import ray_options
+        if self.executor not in ("ray", "dask"):
+            return None
+        from memmlp.sweep.executors import dask_cluster, parse_settings, ray_cluster
 
-            return ray_options(self.settings)
-        if self.executor == "dask":
-            from memmlp.sweep.executors.dask_cluster import dask_options
-
-            return dask_options(self.settings)
-        return None
+        module = ray_cluster if self.executor == "ray" else dask_cluster
+        return parse_settings(self.executor, self.settings, module.SETTINGS)
 
     def script(self, folder: Path) -> str:
         """Return the file that sbatch would get; empty for executors without one."""

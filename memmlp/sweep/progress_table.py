@@ -56,22 +56,28 @@ class Screen:
     def show(
         self,
         whole: Callable[[], RenderableType],
+        count: str,
         changes: Sequence[str],
         progress: Callable[[], Sequence[str]],
     ) -> None:
         """Show the whole content on a terminal; elsewhere print the lines about what changed.
 
-        `whole` and `progress` are called only if their results are shown.
+        `whole` and `progress` are called only if their results are shown. `count` precedes each line.
         """
         if self.console.is_terminal:
             self.live.update(whole())
             return
         now = time.monotonic()
         if not changes and (self.last_line is None or now - self.last_line >= QUIET):
-            changes = progress()
+            changes = progress() or ["workers are starting"]
         for line in changes:
-            self.console.print(line, soft_wrap=True, markup=False)
+            self.console.print(f"{count}; {line}", soft_wrap=True, markup=False)
             self.last_line = now
+
+
+def titled_table(title: str) -> Table:
+    """Return an empty table with a title."""
+    return Table(box=box.SIMPLE_HEAD, pad_edge=False, title=title, title_justify="left")
 
 
 class Board(Screen):
@@ -85,17 +91,16 @@ class Board(Screen):
         changed = [
             task for task in plan.tasks if self.before and self.before.get(task.key) != states[task.key]
         ]
-        changes = [f"{done}; {_describe_change(plan, task, states[task.key])}" for task in changed]
+        changes = [_describe_change(plan, task, states[task.key]) for task in changed]
 
         def progress() -> list[str]:
-            lines = [
+            return [
                 f"{task_name(plan, task)}: {progress_text(plan.run_of(task), total_steps(task))}"
                 for task in plan.tasks
                 if states[task.key] == "running"
             ]
-            return [f"{done}; {line}" for line in lines or ["workers are starting"]]
 
-        self.show(lambda: render(plan, states), changes, progress)
+        self.show(lambda: render(plan, states), done, changes, progress)
         self.before = states
 
 
@@ -123,7 +128,7 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
     """Draw variants by seeds, prerequisite runs, the counts of states, and the reasons of failures."""
     tasks = {task.key: task for task in plan.tasks}
     seeds = sorted({entry.seed for entry in plan.entries})
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=f"sweep {plan.name}", title_justify="left")
+    table = titled_table(f"sweep {plan.name}")
     labels = list(dict.fromkeys(entry.label for entry in plan.entries))
     width = min(VARIANT_WIDTH, max(map(len, labels), default=0))
     table.add_column("variant", overflow="fold", min_width=width)

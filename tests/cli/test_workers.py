@@ -67,7 +67,7 @@ def test_words_of_an_executor_are_its_own(name: str):
     words = (f"executor={name}", f"{name}.address=head:1", f"{name}.resources.big=2", "seed=1")
     executor, own, rest = split_executor(words)
     assert (executor, rest) == (name, ("seed=1",))
-    assert Workers(executor, own).options().address == "head:1"
+    assert Workers(executor, own).options() == {"address": "head:1", "resources": {"big": 2.0}}
     with pytest.raises(InputError, match=f"{name}.address: is for executor={name}"):
         split_executor(words[1:])
 

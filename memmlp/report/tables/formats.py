@@ -9,7 +9,6 @@ import re
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
-from typing import Any
 
 from rich.console import Console
 
@@ -56,7 +55,8 @@ def latex(table: Table) -> str:
         lines += [r"\midrule"] if number else []
         lines += [rf"\multicolumn{{{columns}}}{{l}}{{\emph{{{grid.mode} mode}}}} \\"] if grid.mode else []
         lines += [" & ".join(map(_tex, grid.header)) + r" \\", r"\midrule"]
-        lines += [_tex_line(line) for line in _all(grid)]
+        rows = ([*line.head, *map(" ".join, line.cells)] for line in _all(grid))
+        lines += [" & ".join(map(_tex, row)) + r" \\" for row in rows]
     lines += [r"\bottomrule", r"\end{tabular}"]
     lines += [rf"\par\smallskip\raggedright\footnotesize {_tex(line)}." for line in _remarks(table)]
     return "\n".join([*lines, r"\end{table}"]) + "\n"
@@ -64,7 +64,13 @@ def latex(table: Table) -> str:
 
 def as_json(table: Table) -> str:
     """Return the table's whole content as JSON, including the values of each seed."""
-    return json.dumps(plain(_with_summaries(table)), indent=2, ensure_ascii=False) + "\n"
+    fields = asdict(table)
+    for row, words in zip(table.rows, fields["rows"], strict=True):
+        for mode, cells in row.cells.items():
+            for metric, cell in cells.items():
+                summary = {"mean": cell.mean, "sd": cell.sd, "agrees": cell.agrees}
+                words["cells"][mode][metric] |= summary
+    return json.dumps(plain(fields), indent=2, ensure_ascii=False) + "\n"
 
 
 def as_html(table: Table) -> str:
@@ -109,11 +115,6 @@ def _tex(text: str) -> str:
     return "".join(TEX.get(letter, letter) for letter in text)
 
 
-def _tex_line(line: VariantLine) -> str:
-    words = [*line.head, *map(" ".join, line.cells)]
-    return " & ".join(map(_tex, words)) + r" \\"
-
-
 def _html(text: str | None) -> str:
     return html.escape(text or "")
 
@@ -125,17 +126,12 @@ def _html_head(name: str) -> str:
 
 def _html_group(group: Sequence[VariantLine]) -> str:
     label = f'<th scope="rowgroup" rowspan="{len(group)}">{_html(group[0].head[0])}</th>'
-    heads = [label, *[""] * (len(group) - 1)]
-    rows = [
-        f'<tr class="{line.kind}">{head}{_html_line(line)}</tr>'
-        for head, line in zip(heads, group, strict=True)
-    ]
+    rows = []
+    for number, line in enumerate(group):
+        cells = "".join(f"<td>{'<br>'.join(map(_html_mark, cell))}</td>" for cell in line.cells)
+        seeds = f'<td class="seeds">{_html(line.head[1])}</td>'
+        rows.append(f'<tr class="{line.kind}">{"" if number else label}{seeds}{cells}</tr>')
     return f"<tbody>{''.join(rows)}</tbody>"
-
-
-def _html_line(line: VariantLine) -> str:
-    cells = "".join(f"<td>{'<br>'.join(map(_html_mark, cell))}</td>" for cell in line.cells)
-    return f'<td class="seeds">{_html(line.head[1])}</td>{cells}'
 
 
 def _html_mark(text: str) -> str:
@@ -207,13 +203,3 @@ def _header(name: str) -> list[str]:
     metric, _, rest = name.partition(" [")
     unit, _, arrow = rest.partition("] ")
     return [f"{metric} {arrow}", unit] if rest else [name]
-
-
-def _with_summaries(table: Table) -> dict[str, Any]:
-    fields = asdict(table)
-    for row, words in zip(table.rows, fields["rows"], strict=True):
-        for mode, cells in row.cells.items():
-            for metric, cell in cells.items():
-                summary = {"mean": cell.mean, "sd": cell.sd, "agrees": cell.agrees}
-                words["cells"][mode][metric] |= summary
-    return fields

@@ -139,7 +139,8 @@ class Measured:
         """Return a metric's mean over clips, or a cost; None if it was not measured."""
         if metric in self.costs:
             return self.costs[metric]
-        return _number(self.means, mode, branch, metric)
+        found = self.means.get(mode, {}).get(branch, {}).get(metric)
+        return None if found is None else float(found)  # files hold NaN as a word
 
     def by_clip(self, names: Sequence[str], mode: str, branch: str, metric: str) -> np.ndarray:
         """Return a metric for each of these clips (C,); NaN for clips that the run did not measure."""
@@ -212,12 +213,8 @@ def _means(values: Mapping[str, np.ndarray]) -> dict[str, float]:
     shortest clip.
     """
     diverged = SHARED in values and bool(np.isnan(values[SHARED]).any())
-    return {metric: math.nan if diverged else _known_mean(each) for metric, each in values.items()}
-
-
-def _known_mean(values: np.ndarray) -> float:
-    known = values[~np.isnan(values)]
-    return float(known.mean()) if len(known) else math.nan
+    known = {metric: each[~np.isnan(each)] for metric, each in values.items()}
+    return {m: float(each.mean()) if len(each) and not diverged else math.nan for m, each in known.items()}
 
 
 def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
@@ -238,7 +235,9 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     clips: dict[str, dict[str, Any]] = {}
     groups: dict[str, str] = {}
     sources: dict[str, str] = {}
-    reports = of_one_solver(list(map(_read, _evaluations(run, stages))))
+    wanted = [path for name in stages or () if (path := run.evaluation(name)).is_file()]
+    paths = wanted or run.evaluations_as_configured.paths
+    reports = of_one_solver(list(map(_read, paths)))
     for report in reports:
         _join(means.setdefault(report["mode"], {}), report["mean"])
         for clip in report["clips"]:
@@ -251,8 +250,10 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     origin = _evaluated(_with_upstream(_origin(manifest), run), reports)
     origin = replace(origin, deployed=deployed_precision(latency))
     origin = replace(origin, recipes={**origin.recipes, **deployed.recipes}, timed_on=timed_on(latency))
-    training, code = _training(run, manifest), _code(manifest)
-    costs = _costs(latency)
+    seconds, frames = (manifest.get("seconds") or {}).get("train"), frames_seen(run)
+    training = {"seconds": float(seconds)} if seconds is not None else {}
+    training |= {"frames": frames} if frames else {}
+    costs, code = _costs(latency), _code(manifest)
     return Measured(run.id, means, clips, groups, costs, origin, latency, run, sources, training, code)
 
 
@@ -270,27 +271,10 @@ def of_untrained(
     return Measured(digest, {}, {}, {}, _costs(record), _origin(environment), record)
 
 
-def _training(run: Run, manifest: Mapping[str, Any]) -> dict[str, float]:
-    seconds, frames = (manifest.get("seconds") or {}).get("train"), frames_seen(run)
-    took = {"seconds": float(seconds)} if seconds is not None else {}
-    return took | ({"frames": frames} if frames else {})
-
-
 def _join(known: dict[str, Any], more: Mapping[str, Any]) -> None:
     """Merge a report into known ones: its facts, and the errors of its branches, which others may lack."""
     for name, value in more.items():
         known[name] = {**known.get(name, {}), **value} if isinstance(value, Mapping) else value
-
-
-def _evaluations(run: Run, stages: Sequence[str] | None) -> list[Path]:
-    """Return the files of some evaluations.
-
-    If none of these stages exist, return the files of all evaluations that use the network as the run's own
-    config does.
-    """
-    if wanted := [path for name in stages or () if (path := run.evaluation(name)).is_file()]:
-        return wanted
-    return run.evaluations_as_configured.paths
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -334,24 +318,18 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
     git = manifest.get("git") or {}
     # A training that other code resumed names the commit that it began with, too.
     before = [git["before"][:7]] if git.get("before") else []
+    copied: dict[str, Any] = {name: of(name) for name in ("device", "gpu", "threads", "precision", "body")}
+    for name in ("upstream", "partial", "divided", "resampled", "unusual"):
+        copied[name] = manifest.get(name)
     return Origin(
         code=", ".join([*before, git["commit"][:7]]) if git else f"version {of('version')}",
         changed=bool(git.get("dirty")),
         data=of("data")[:8],
         hardware=of("cpu"),
-        device=of("device"),
-        gpu=of("gpu"),
-        threads=of("threads"),
         processes=str(manifest.get("processes") or 1),
         torch=str((manifest.get("packages") or {}).get("torch") or UNKNOWN),
-        precision=of("precision"),
-        body=of("body"),
         recipes=manifest.get("recipes") or {},
-        upstream=manifest.get("upstream"),
-        partial=manifest.get("partial"),
-        divided=manifest.get("divided"),
-        resampled=manifest.get("resampled"),
-        unusual=manifest.get("unusual"),
+        **copied,
         plugins={
             name: f"{one['version'] or 'no version'} ({one['digest']})"
             for name, one in (manifest.get("plugins") or {}).items()
@@ -400,12 +378,6 @@ def _words(parts: Iterable[str]) -> str:
 def _both(known: Mapping[str, str], more: Mapping[str, str]) -> dict[str, str]:
     words = {name: dict.fromkeys([*([known[name]] if name in known else []), more[name]]) for name in more}
     return {**known, **{name: ", ".join(each) for name, each in words.items()}}
-
-
-def _number(errors: Errors, mode: str, branch: str, metric: str) -> float | None:
-    """Return a value of nested errors as a number; None if it is missing. (Files hold NaN as a word.)"""
-    value = errors.get(mode, {}).get(branch, {}).get(metric)
-    return None if value is None else float(value)
 
 
 def core_share(run: Measured) -> float | None:

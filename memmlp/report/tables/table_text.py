@@ -11,17 +11,7 @@ from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table import STEADY, Cell, Row, Table
 from memmlp.sweep.definition import COSTS
 
-COST_UNITS = {
-    "FLOPs": "G",
-    "MACs": "G",
-    "parameters": "M",
-    "size": "MB",
-    "ms": "",
-    "network ms": "",
-    "pose ms": "",
-    "ratio": "",
-    "FPS": "",
-}
+COST_UNITS = {"FLOPs": "G", "MACs": "G", "parameters": "M", "size": "MB"}
 MISSING = "-"
 MINUS = "\N{MINUS SIGN}"
 ARROWS = {"lower": "↓", "higher": "↑"}
@@ -58,14 +48,11 @@ def grids(table: Table) -> list[Grid]:
     """
     timeless = set(table.metrics) <= set(COSTS) or not any(row.found for row in table.rows)
     header = ("variant", "seeds", *map(heading, table.metrics))
-    return [
-        Grid(
-            None if timeless else mode,
-            header,
-            tuple(tuple(_lines(table, row, mode)) for row in table.rows),
-        )
-        for mode in (table.modes[:1] if timeless else table.modes)
-    ]
+    found = []
+    for mode in table.modes[:1] if timeless else table.modes:
+        groups = tuple(tuple(_lines(table, row, mode)) for row in table.rows)
+        found.append(Grid(None if timeless else mode, header, groups))
+    return found
 
 
 def heading(metric: str) -> str:
@@ -83,7 +70,7 @@ def better(metric: str) -> str:
 
     It is unknown for a custom metric whose package is not in use.
     """
-    if metric not in UNITS and metric not in COST_UNITS:
+    if metric not in UNITS and metric not in COSTS:
         return ""
     return "higher" if metric == "FPS" or metric in HIGHER else "lower"
 

@@ -11,49 +11,19 @@ import os
 import sys
 import tempfile
 import uuid
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError, require
-from memmlp.sweep.executors import Work
+from memmlp.sweep.executors import Work, parse_amount
 from memmlp.sweep.executors.local import LINE, VISIBLE, start_process
 
-KEYS = ("address", "resources.NAME")
+SETTINGS: Mapping[str, Callable[[str], Any]] = {"address": str, "resources.NAME": parse_amount}
+"""The settings `dask.KEY`: the scheduler's address, by default that in DASK_SCHEDULER_ADDRESS; and how much
+each of our workers takes of the resources of Dask's workers, by name."""
 GPU = "GPU"  # the resource by which Dask's workers declare their GPU
 PAUSE = 1.0  # seconds between checks whether a worker is to be ended
-
-
-@dataclass(frozen=True)
-class DaskOptions:
-    """Which cluster is used, and what each worker requests from it.
-
-    Attributes:
-        address: the scheduler's address; None for the address in DASK_SCHEDULER_ADDRESS.
-        resources: how much each of our workers takes of the resources of Dask's workers, by name.
-    """
-
-    address: str | None = None
-    resources: Mapping[str, float] = field(default_factory=dict)
-
-
-def dask_options(settings: Mapping[str, str]) -> DaskOptions:
-    """Return the options that `dask.KEY=VALUE` on a command line set.
-
-    Raises:
-        InputError: for an unknown key or a value of the wrong kind.
-    """
-    resources = {}
-    for key, value in settings.items():
-        name = key.removeprefix("resources.")
-        if name != key:
-            if not value.replace(".", "", 1).isdecimal():
-                raise InputError(f"dask.{key}={value}: must be a number, at least 0")
-            resources[name] = float(value)
-        elif key != "address":
-            raise InputError(f"dask.{key}: no such key; expected one of {', '.join(KEYS)}")
-    return DaskOptions(settings.get("address"), resources)
 
 
 class DaskTask:
@@ -85,16 +55,16 @@ class Dask:
     """Starts workers as tasks of a running Dask cluster.
 
     Args:
-        options: the cluster, and what each worker requests from it.
+        options: the parsed SETTINGS.
         gpus: whether workers get a GPU, if the options do not say so and the cluster declares GPUs.
 
     Raises:
         InputError: if Dask is not installed, or the cluster is not named or can't be reached.
     """
 
-    def __init__(self, options: DaskOptions, gpus: bool = True):
+    def __init__(self, options: Mapping[str, Any], gpus: bool = True):
         self.distributed: Any = require("distributed", "dask", "executor=dask")
-        address = options.address or os.environ.get("DASK_SCHEDULER_ADDRESS")
+        address = options.get("address") or os.environ.get("DASK_SCHEDULER_ADDRESS")
         if not address:
             raise InputError("executor=dask: dask.address=HOST:PORT of a scheduler is missing")
         try:
@@ -102,7 +72,7 @@ class Dask:
         except (OSError, ValueError) as error:
             raise InputError(f"dask.address={address}: {' '.join(str(error).split())}") from None
         declared = any(GPU in there for there in self._declared_resources())
-        self.resources = ({GPU: 1.0} if gpus and declared else {}) | dict(options.resources)
+        self.resources = ({GPU: 1.0} if gpus and declared else {}) | options.get("resources", {})
         self.gpus = self.resources.get(GPU, 0) > 0
         self.tasks: list[DaskTask] = []
         if gpus and not self.gpus:

@@ -5,80 +5,39 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from memmlp.common.errors import InputError, require, why_unreadable
-from memmlp.sweep.executors import Work
+from memmlp.sweep.executors import Work, parse_amount
 from memmlp.sweep.executors.local import VISIBLE
 
-KEYS = ("address", "num_cpus", "num_gpus", "memory_gb", "accelerator_type", "runtime_env", "resources.NAME")
 
-
-@dataclass(frozen=True)
-class RayOptions:
-    """Which cluster is used, and what each worker requests from it.
-
-    Attributes:
-        address: the cluster's address; None for the address in RAY_ADDRESS, or else a cluster on this
-            machine.
-        num_gpus: GPUs of a worker, less than 1 if several workers share one; None for 1 if the cluster has
-            GPUs.
-        task: Ray's other options of a task.
-        runtime_env: Ray's description of the environment in which workers run.
-    """
-
-    address: str | None = None
-    num_gpus: float | None = None
-    task: Mapping[str, Any] = field(default_factory=dict)
-    runtime_env: Mapping[str, Any] = field(default_factory=dict)
-
-
-def ray_options(settings: Mapping[str, str]) -> RayOptions:
-    """Return the options that `ray.KEY=VALUE` on a command line set.
-
-    Raises:
-        InputError: for an unknown key or a value of the wrong kind.
-    """
-    task: dict[str, Any] = {"num_cpus": 1.0}
-    resources = {}
-    for key, value in settings.items():
-        if key.startswith("resources."):
-            resources[key.removeprefix("resources.")] = _number(key, value)
-        elif key == "num_cpus":
-            task[key] = _number(key, value)
-        elif key == "memory_gb":
-            task["memory"] = _number(key, value) * 2**30
-        elif key == "accelerator_type":
-            task[key] = value
-        elif key not in KEYS:
-            raise InputError(f"ray.{key}: no such key; expected one of {', '.join(KEYS)}")
-    return RayOptions(
-        address=settings.get("address"),
-        num_gpus=_number("num_gpus", settings["num_gpus"]) if "num_gpus" in settings else None,
-        task=task | ({"resources": resources} if resources else {}),
-        runtime_env=_runtime_env(Path(settings["runtime_env"])) if "runtime_env" in settings else {},
-    )
-
-
-def _number(key: str, value: str) -> float:
-    if value.replace(".", "", 1).isdecimal():
-        return float(value)
-    raise InputError(f"ray.{key}={value}: must be a number, at least 0")
-
-
-def _runtime_env(path: Path) -> Mapping[str, Any]:
+def _read_runtime_env(path: str) -> Mapping[str, Any]:
     try:
-        found = yaml.safe_load(path.read_text(encoding="utf-8"))
+        found = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"ray.runtime_env={path}: {why_unreadable(error)}") from None
+        raise ValueError(why_unreadable(error)) from None
     if not isinstance(found, dict):
-        raise InputError(f"ray.runtime_env={path}: expected a YAML file of Ray's keys, such as env_vars")
+        raise ValueError("expected a YAML file of Ray's keys, such as env_vars")
     return found
+
+
+SETTINGS: Mapping[str, Callable[[str], Any]] = {
+    "address": str,
+    "num_cpus": parse_amount,
+    "num_gpus": parse_amount,
+    "memory_gb": parse_amount,
+    "accelerator_type": str,
+    "runtime_env": _read_runtime_env,
+    "resources.NAME": parse_amount,
+}
+"""The settings `ray.KEY`: the cluster's address, by default that in RAY_ADDRESS, or else a cluster on this
+machine; what each worker requests, where less than 1 GPU is a part of one; and a YAML file of Ray's keys for
+the environment in which workers run."""
 
 
 class RayTask:
@@ -107,21 +66,22 @@ class Ray:
     """Starts workers as tasks of a Ray cluster: a running one, or one on this machine.
 
     Args:
-        options: the cluster, and what each worker requests from it.
+        options: the parsed SETTINGS.
         gpus: whether workers get GPUs, if the options do not say so.
 
     Raises:
         InputError: if Ray is not installed or the cluster can't be reached.
     """
 
-    def __init__(self, options: RayOptions, gpus: bool = True):
+    def __init__(self, options: Mapping[str, Any], gpus: bool = True):
         self.ray: Any = require("ray", "ray", "executor=ray")
         if not self.ray.is_initialized():
             self._connect(options)
         there = self.ray.cluster_resources()
         least = 1.0 if gpus and there.get("GPU") else 0.0
-        self.num_gpus = least if options.num_gpus is None else options.num_gpus
-        asked = {"GPU": self.num_gpus, "CPU": options.task["num_cpus"], **options.task.get("resources", {})}
+        self.num_gpus = options.get("num_gpus", least)
+        num_cpus = options.get("num_cpus", 1.0)
+        asked = {"GPU": self.num_gpus, "CPU": num_cpus, **options.get("resources", {})}
         for name, amount in asked.items():
             if amount > there.get(name, 0):  # a cluster that grows by itself may get it
                 print(
@@ -131,16 +91,19 @@ class Ray:
                     flush=True,
                 )
         self.gpus = self.num_gpus > 0
+        self.task = {key: options[key] for key in ("accelerator_type", "resources") if key in options}
+        if "memory_gb" in options:
+            self.task["memory"] = options["memory_gb"] * 2**30
         # A task that is run again by Ray would be one beside the worker that replaces it.
-        self.task = {**options.task, "num_gpus": self.num_gpus, "max_retries": 0, "max_calls": 1}
+        self.task |= {"num_cpus": num_cpus, "num_gpus": self.num_gpus, "max_retries": 0, "max_calls": 1}
 
-    def _connect(self, options: RayOptions) -> None:
+    def _connect(self, options: Mapping[str, Any]) -> None:
         quiet: dict[str, Any] = {"log_to_driver": False, "configure_logging": False}
-        if not options.address and not os.environ.get("RAY_ADDRESS"):
+        if not options.get("address") and not os.environ.get("RAY_ADDRESS"):
             quiet["include_dashboard"] = False
         logging.getLogger("ray").setLevel(logging.ERROR)
         try:
-            self.ray.init(options.address, runtime_env=dict(options.runtime_env) or None, **quiet)
+            self.ray.init(options.get("address"), runtime_env=options.get("runtime_env") or None, **quiet)
         except (ConnectionError, RuntimeError, ValueError, TypeError) as error:
             raise InputError(f"executor=ray: {' '.join(str(error).split())}") from None
 

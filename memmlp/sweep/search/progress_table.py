@@ -7,13 +7,12 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from optuna.trial import FrozenTrial, TrialState
-from rich import box
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
 from memmlp.runs.run import Run
-from memmlp.sweep.progress_table import Screen, device_name, devices, progress_text
+from memmlp.sweep.progress_table import Screen, device_name, devices, progress_text, titled_table
 from memmlp.sweep.search.search_file import Search, Value
 from memmlp.sweep.search.study import Study, deviations, reason
 
@@ -37,29 +36,18 @@ class SearchBoard(Screen):
         """Show the study, and the runs of its trials, in their present state."""
         ended = [trial for trial in study.trials if trial.state in ENDS]
         numbers = {trial.number for trial in ended}
-        new = [
-            trial
-            for trial in ended
-            if trial.number not in (numbers if self.printed is None else self.printed)
-        ]
-        count = f"{len(ended)} of {study.search.n_trials}; "
+        printed = numbers if self.printed is None else self.printed
+        changes = [describe_end(one, self.outputs) for one in ended if one.number not in printed]
 
         def progress() -> list[str]:
-            running = [
-                (trial, runs_of(trial, self.outputs)) for trial in study.trials if trial.state not in ENDS
-            ]
-            lines = [
+            return [
                 f"trial {trial.number}: {_describe_runs(trial, runs)}"
-                for trial, runs in running
+                for trial, runs in running_trials(study, self.outputs)
                 if any(run.doing for run in runs)
             ]
-            return [count + line for line in lines or ["workers are starting"]]
 
-        self.show(
-            lambda: render(study, self.outputs),
-            [count + describe_end(trial, self.outputs) for trial in new],
-            progress,
-        )
+        count = f"{len(ended)} of {study.search.n_trials}"
+        self.show(lambda: render(study, self.outputs), count, changes, progress)
         self.printed = numbers
 
 
@@ -77,6 +65,11 @@ def runs_of(trial: FrozenTrial, outputs: Path) -> list[Run]:
     return [Run.of(outputs, run_id) for run_id in trial.user_attrs.get("runs", ())]
 
 
+def running_trials(study: Study, outputs: Path) -> list[tuple[FrozenTrial, list[Run]]]:
+    """Return the trials that have not ended, each with its runs."""
+    return [(trial, runs_of(trial, outputs)) for trial in study.trials if trial.state not in ENDS]
+
+
 def figures(trial: FrozenTrial) -> str:
     """Return a trial's objective values as text, with standard deviations if it has several seeds."""
     shown = [f"{value:.3f}" for value in trial.values or []]
@@ -88,7 +81,7 @@ def figures(trial: FrozenTrial) -> str:
 def render(study: Study, outputs: Path) -> Group:
     """Draw the running trials, the best ones, the counts, and the devices in use."""
     table = trials_table(study.search, f"search {study.search.name}")
-    running = [(trial, runs_of(trial, outputs)) for trial in study.trials if trial.state not in ENDS]
+    running = running_trials(study, outputs)
     for trial, runs in running:
         add_row(table, study.search, trial, _describe_runs(trial, runs))
     ranked = sorted((t for t in study.trials if t.state == TrialState.COMPLETE), key=lambda t: t.values)
@@ -109,7 +102,7 @@ def _describe_runs(trial: FrozenTrial, runs: Sequence[Run]) -> Text:
 
 def trials_table(search: Search, title: str) -> Table:
     """Make an empty table of trials, with a column for each searched key."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=title, title_justify="left")
+    table = titled_table(title)
     table.add_column("trial", justify="right")
     table.add_column(", ".join(objective.text for objective in search.objectives))
     for name in shorten(one.key for one in search.space):

@@ -25,19 +25,14 @@ import itertools
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from memmlp.common.errors import InputError
+from memmlp.common.settings import Rule, matching, one_of
 from memmlp.evaluation.metric_facts import HIGHER, UNITS
 
-SAMPLERS = ("tpe", "random", "grid")
-PRUNERS = ("median", "none")
 OBJECTIVE_BRANCHES = ("rotation", "position")
-KEYS = (
-    "name", "base", "space", "objectives", "n_trials", "seeds", "sampler", "startup", "seed", "pruner",
-    "prune_after", "storage",
-)  # fmt: skip
 RANGE_KEYS = ("low", "high", "log", "step", "choices", "first")
 
 Value = float | int | str | bool | None
@@ -135,45 +130,61 @@ def typed(value: Value) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
+def _whole(least: int) -> Rule:
+    def allows(value: Any) -> bool:
+        return isinstance(value, int) and not isinstance(value, bool) and value >= least
+
+    return Rule(f"a whole number of at least {least}", allows)
+
+
+def _texts(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(item, str) for item in value)
+
+
+RULES = {
+    "name": matching(r"[\w-]{1,64}", "up to 64 letters, digits, - and _"),
+    "storage": Rule("a URL, or null", lambda value: value is None or isinstance(value, str)),
+    "objectives": Rule("a list of texts", _texts),
+    "base": Rule("a list of texts", _texts),
+    "n_trials": _whole(1),
+    "seeds": _whole(1),
+    "sampler": one_of("tpe", "random", "grid"),
+    "startup": _whole(1),
+    "seed": _whole(0),
+    "pruner": one_of("median", "none"),
+    "prune_after": _whole(1),
+}
+
+
 def parse_search(content: Mapping[str, Any]) -> Search:
     """Return the search that a config describes. Raises InputError, which names the key, if it is wrong."""
+    keys = [one.name for one in fields(Search)]
     for key in content:
-        if key not in KEYS:
-            raise InputError(f"search.{key}: no such key; expected one of {', '.join(KEYS)}")
-    for key in KEYS:
+        if key not in keys:
+            raise InputError(f"search.{key}: no such key; expected one of {', '.join(keys)}")
+    for key in keys:
         if key not in content:
             raise InputError(f"search.{key}: has no value; give one with search.{key}=...")
-    name, storage = str(content["name"]), content["storage"]
-    if not re.fullmatch(r"[\w-]{1,64}", name):
-        raise InputError(f"search.name={name}: expected up to 64 letters, digits, - and _")
-    if storage is not None and not isinstance(storage, str):
-        raise InputError(f"search.storage={storage}: expected a URL, or null")
-    space = tuple(_ranges(content["space"], ""))
+    values = {**content, "name": str(content["name"])}
+    optional = {"startup": values["sampler"] != "tpe", "prune_after": values["pruner"] == "none"}
+    for key, rule in RULES.items():
+        allowed = (values[key] is None and optional.get(key)) or rule.allows(values[key])
+        if not allowed:
+            raise InputError(f"search.{key}={values[key]}: must be {rule.words}")
+    values["base"] = tuple(values["base"])
+    values["space"] = space = tuple(_ranges(values["space"], ""))
+    values["objectives"] = objectives = tuple(map(_objective, values["objectives"]))
     if not space:
         raise InputError("search.space: empty; expected config keys with low and high, or with choices")
-    objectives = tuple(_objective(text) for text in _texts(content["objectives"], "search.objectives"))
     if len(objectives) not in (1, 2) or len({one.text for one in objectives}) < len(objectives):
         raise InputError("search.objectives: expected one, or two different ones for a Pareto front")
-    if len(objectives) > 1 and content["pruner"] != "none":
-        raise InputError(f"search.pruner={content['pruner']}: must be none with two objectives")
-    if content["seeds"] != 1 and any(one.key == "seed" for one in space):
-        raise InputError(f"search.seeds={content['seeds']}: must be 1 if the space has the seed")
-    if content["sampler"] == "grid":
-        _check_grid(space, content["n_trials"])
-    return Search(
-        name=name,
-        base=tuple(_texts(content["base"], "search.base")),
-        space=space,
-        objectives=objectives,
-        n_trials=_whole(content, "n_trials"),
-        seeds=_whole(content, "seeds"),
-        sampler=_one_of(content, "sampler", SAMPLERS),
-        startup=_whole(content, "startup", needed=content["sampler"] == "tpe"),
-        seed=_whole(content, "seed", least=0),
-        pruner=_one_of(content, "pruner", PRUNERS),
-        prune_after=_whole(content, "prune_after", needed=content["pruner"] != "none"),
-        storage=storage,
-    )
+    if len(objectives) > 1 and values["pruner"] != "none":
+        raise InputError(f"search.pruner={values['pruner']}: must be none with two objectives")
+    if values["seeds"] != 1 and any(one.key == "seed" for one in space):
+        raise InputError(f"search.seeds={values['seeds']}: must be 1 if the space has the seed")
+    if values["sampler"] == "grid":
+        _check_grid(space, values["n_trials"])
+    return Search(**values)
 
 
 def _check_grid(space: Sequence[Range], n_trials: Any) -> None:
@@ -266,25 +277,4 @@ def _term(part: str, text: str) -> tuple[float, str]:
 def _number(value: Any, name: str) -> float | int:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{name}: {'nothing' if value is None else value}; expected a number")
-    return value
-
-
-def _whole(content: Mapping[str, Any], name: str, least: int = 1, needed: bool = True) -> Any:
-    value = content[name]
-    if value is None and not needed:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise InputError(f"search.{name}={value}: must be a whole number of at least {least}")
-    return value
-
-
-def _one_of(content: Mapping[str, Any], name: str, options: Sequence[str]) -> str:
-    if content[name] not in options:
-        raise InputError(f"search.{name}={content[name]}: expected {' or '.join(options)}")
-    return content[name]
-
-
-def _texts(value: Any, name: str) -> list[str]:
-    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-        raise InputError(f"{name}={value}: expected a list of texts")
     return value

@@ -14,13 +14,17 @@ from dask_work import stay
 from processes import until
 
 from memmlp.common.errors import InputError
-from memmlp.sweep.executors.dask_cluster import Dask, DaskOptions, dask_options
+from memmlp.sweep.executors import parse_settings
+from memmlp.sweep.executors.dask_cluster import SETTINGS, Dask
+
+
+def parse(words: dict[str, str]):
+    return parse_settings("dask", words, SETTINGS)
 
 
 def test_options():
-    found = dask_options({"address": "head:8786", "resources.GPU": "1", "resources.memory": "2.5"})
-    assert found == DaskOptions("head:8786", {"GPU": 1.0, "memory": 2.5})
-    assert dask_options({}) == DaskOptions()
+    found = parse({"address": "head:8786", "resources.GPU": "1", "resources.memory": "2.5"})
+    assert found == {"address": "head:8786", "resources": {"GPU": 1.0, "memory": 2.5}}
 
 
 @pytest.mark.parametrize(
@@ -32,14 +36,14 @@ def test_options():
 )
 def test_bad_options_are_one_line(words: dict[str, str], line: str):
     with pytest.raises(InputError, match=line):
-        dask_options(words)
+        parse(words)
 
 
 def test_a_cluster_must_be_named(monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("distributed")
     monkeypatch.delenv("DASK_SCHEDULER_ADDRESS", raising=False)
     with pytest.raises(InputError, match=r"dask.address=HOST:PORT of a scheduler is missing"):
-        Dask(DaskOptions())
+        Dask({})
 
 
 @pytest.fixture
@@ -57,7 +61,7 @@ def connect(cluster: Any) -> Iterator[Callable[..., Dask]]:
     made: list[Dask] = []
 
     def connected(gpus: bool = True, **words: str) -> Dask:
-        made.append(Dask(dask_options({"address": cluster.scheduler_address, **words}), gpus))
+        made.append(Dask(parse({"address": cluster.scheduler_address, **words}), gpus))
         return made[-1]
 
     yield connected

@@ -13,9 +13,14 @@ import pytest
 from processes import until
 
 from memmlp.common.errors import InputError
-from memmlp.sweep.executors.ray_cluster import Ray, RayOptions, ray_options
+from memmlp.sweep.executors import parse_settings
+from memmlp.sweep.executors.ray_cluster import SETTINGS, Ray
 
 RAY = importlib.util.find_spec("ray") is not None
+
+
+def parse(words: dict[str, str]):
+    return parse_settings("ray", words, SETTINGS)
 
 
 def test_options(tmp_path: Path):
@@ -23,11 +28,10 @@ def test_options(tmp_path: Path):
     environment.write_text("env_vars: {A: b}\n")
     words = {"address": "ray://head:10001", "num_gpus": "0.5", "num_cpus": "4", "memory_gb": "2"}
     words |= {"resources.a100": "1", "runtime_env": str(environment)}
-    found = ray_options(words)
-    assert (found.address, found.num_gpus) == ("ray://head:10001", 0.5)
-    assert found.task == {"num_cpus": 4.0, "memory": 2 * 2**30, "resources": {"a100": 1.0}}
-    assert found.runtime_env == {"env_vars": {"A": "b"}}
-    assert ray_options({}) == RayOptions(task={"num_cpus": 1.0})
+    assert parse(words) == {
+        "address": "ray://head:10001", "num_gpus": 0.5, "num_cpus": 4.0, "memory_gb": 2.0,
+        "resources": {"a100": 1.0}, "runtime_env": {"env_vars": {"A": "b"}},
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -42,14 +46,14 @@ def test_options(tmp_path: Path):
 )
 def test_bad_options_are_one_line(words: dict[str, str], line: str):
     with pytest.raises(InputError, match=line) as error:
-        ray_options(words)
+        parse(words)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.skipif(RAY, reason="Ray is installed")
 def test_ray_is_refused_where_it_is_not():
     with pytest.raises(InputError, match="executor=ray"):
-        Ray(RayOptions())
+        Ray({})
 
 
 @pytest.fixture
@@ -72,7 +76,7 @@ def test_workers_have_a_gpu_each_and_the_dead_are_known(two_gpus, tmp_path: Path
         mine.rename(mine.with_suffix(".txt"))
         time.sleep(6000)
 
-    cluster = Ray(ray_options({}))
+    cluster = Ray(parse({}))
     assert (cluster.gpus, cluster.num_gpus) == (True, 1)
     workers = cluster.submit(partial(os.getenv, "CUDA_VISIBLE_DEVICES"), 1)
     until(lambda: not workers[0].alive(), "the worker ends")
@@ -89,7 +93,7 @@ def test_workers_have_a_gpu_each_and_the_dead_are_known(two_gpus, tmp_path: Path
     (alive,) = (worker for worker in both if worker.alive())
     alive.cancel()
     until(lambda: not alive.alive(), "the other is ended")
-    bare = Ray(ray_options({"num_gpus": "0"}))
+    bare = Ray(parse({"num_gpus": "0"}))
     assert not bare.gpus
     (worker,) = bare.submit(partial(os.getenv, "CUDA_VISIBLE_DEVICES"))
     until(lambda: not worker.alive(), "the worker ends")
