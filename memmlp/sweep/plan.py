@@ -119,12 +119,10 @@ class Plan:
                 their runs.
         """
         known = {key for key, state in (before or {}).items() if state == "done"}
-        return self.with_blocked(
-            {
-                task.key: "done" if task.key in known else self.run_of(task).state(self.complete(task))
-                for task in self.tasks
-            }
-        )
+        found = {}
+        for task in self.tasks:
+            found[task.key] = "done" if task.key in known else self.run_of(task).state(self.complete(task))
+        return self.with_blocked(found)
 
     def with_blocked(self, states: Mapping[str, str]) -> dict[str, str]:
         """Return the states with "blocked" for tasks that have a failed prerequisite."""
@@ -202,9 +200,7 @@ def forecast(plan: Plan) -> Forecast | None:
         None if nothing is left, or if no run of the kinds that are left has finished.
     """
     left = plan.left()
-    unfinished = {
-        task.id for task in left
-    }  # a trained run may lack an evaluation, so its time says too little
+    unfinished = {task.id for task in left}  # the time of a trained run may lack that of an evaluation
     times: dict[str, float] = {}
     kinds: dict[str, list[str]] = defaultdict(list)
     for task in plan.tasks:

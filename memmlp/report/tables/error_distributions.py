@@ -25,9 +25,8 @@ class Distribution(NamedTuple):
             none.
         middle: the errors' interquartile mean; None if there are none.
         improvement: the probability that a run of the variant has a better value than one of its control on
-            the
-            same clip: a smaller error, or a larger value of a metric for which higher is better; None without
-            a control or a shared clip.
+            the same clip: a smaller error, or a larger value of a metric for which higher is better; None
+            without a control or a shared clip.
     """
 
     label: str
@@ -48,11 +47,7 @@ def distributions(sweep: Sweep, runs: Mapping[str, RunsBySeed], mode: str) -> di
     clips = [clip for clip in every[0].clips if all(clip in run.clips for run in every)] if every else []
     metrics = [metric for metric in sweep.metrics if metric not in COSTS]
     found = {metric: _of_metric(seen, runs, clips, mode, metric) for metric in metrics}
-    return {
-        metric: variants
-        for metric, variants in found.items()
-        if any(variant.errors.size for variant in variants)
-    }
+    return {metric: rows for metric, rows in found.items() if any(row.errors.size for row in rows)}
 
 
 def _of_metric(

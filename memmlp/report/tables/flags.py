@@ -63,8 +63,7 @@ def find_flags(
     yield from _older_runs(sweep, runs, older)
     if has_errors:
         yield from _branches(sweep, asked, runs, command)
-    offline = [label for label, run in every if run.origin.offline]
-    if offline:
+    if offline := [label for label, run in every if run.origin.offline]:
         yield f"offline: uses future frames: {quoted(offline)}"
     yield from _same_runs(sweep, runs)
     yield from _unequal_clips(sweep, runs)
@@ -92,8 +91,7 @@ def find_flags(
     yield from _data_warnings(every, "partial", ", and no more")
     yield from _data_warnings(every, "divided")
     yield from _unequal_recipes(every)
-    uncommitted = [label for label, run in every if run.origin.changed]
-    if uncommitted:
+    if uncommitted := [label for label, run in every if run.origin.changed]:
         yield f"made by code with uncommitted changes: {quoted(uncommitted)}"
     if has_errors:
         yield from _replicates(sweep, runs)
@@ -105,10 +103,8 @@ def early_tables(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
 
     Testing them now and again later inflates the false-positive rate.
     """
-    early = [
-        one.label for one in sweep.runnable() if len(runs[one.label]) > 1 and missing_seeds(sweep, one, runs)
-    ]
-    if early:
+    several = [one for one in sweep.runnable() if len(runs[one.label]) > 1]
+    if early := [one.label for one in several if missing_seeds(sweep, one, runs)]:
         yield (
             "seeds are missing: repeated tests as they come give false positives more often than 1 in 20 "
             f"(--until-decided corrects for this): {quoted(early)}"
@@ -212,10 +208,8 @@ def _branches(sweep: Sweep, asked: Sweep, runs: Mapping[str, RunsBySeed], comman
     if other:
         labels, branches = quoted(one.label for one in other), listed(unique(one.branch for one in other))
         yield f"the network has no other branch, so the row shows {branches}: {labels}"
-    lacking = [
-        one for one in sweep.runnable() if any(not run.has(one.branch) for run in runs[one.label].values())
-    ]
-    if lacking:
+    every = [(one, run) for one in sweep.runnable() for run in runs[one.label].values()]
+    if lacking := [one for one, run in every if not run.has(one.branch)]:
         branches, labels = listed(unique(a.branch for a in lacking)), quoted(a.label for a in lacking)
         yield f"not evaluated in the branch {branches}: {labels}; do so with: {command}"
 
@@ -248,8 +242,7 @@ def _unequal_groups(every: Labelled) -> Iterator[str]:
     for _, run in every:
         for clip in run.clips:
             groups[clip].add(run.group(clip))
-    several = [clip for clip, names in groups.items() if len(names) > 1]
-    if several:
+    if several := [clip for clip, names in groups.items() if len(names) > 1]:
         yield f"runs differ in the groups of test clips (data.split.groups): {quoted(several)}"
 
 
@@ -309,14 +302,11 @@ def _smoother_than_truth(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterat
     for variant in sweep.runnable():
         found = list(runs[variant.label].values())
         for mode in sorted({mode for run in found for mode in run.means}):
-            made, true = (
-                [
-                    value
-                    for run in found
-                    if (value := run.value(mode, variant.branch, metric)) is not None and math.isfinite(value)
-                ]
+            values = (
+                [run.value(mode, variant.branch, metric) for run in found]
                 for metric in ("Jitter", "GT Jitter")
             )
+            made, true = ([one for one in some if one is not None and math.isfinite(one)] for some in values)
             if made and true and np.mean(made) < np.mean(true):
                 smoother[mode, f"{np.mean(true):.2f}"].append(f"'{variant.label}' {np.mean(made):.2f}")
     for (mode, truth), texts in smoother.items():

@@ -101,11 +101,8 @@ def with_rows(table: Table, measured: BrowserBench) -> Table:
     """
     if table.number != NUMBER:
         raise InputError(f"--add: {table.name} is not Table {NUMBER}; expected memmlp table {NUMBER}")
-    bases = {
-        row["backend"]: row
-        for row in measured.rows
-        if (row["network"], row["graph"], row["precision"]) == BASE
-    }
+    own = [row for row in measured.rows if (row["network"], row["graph"], row["precision"]) == BASE]
+    bases = {row["backend"]: row for row in own}
     rows = [_row(table, measured, row, bases.get(row["backend"])) for row in measured.rows]
     about = measured.about
     threads, steps = (

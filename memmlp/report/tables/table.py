@@ -188,17 +188,10 @@ class Table:
 
         Comparisons that could not have found anything, such as those with one seed, are left out (`blind`).
         """
-        known = [
-            effect.detectable
-            for _, name, _, effect in self.effects(mode)
-            if name == metric and effect.detectable is not None
-        ]
-        return max(known, default=None)
+        known = [effect.detectable for _, name, _, effect in self.effects(mode) if name == metric]
+        return max((one for one in known if one is not None), default=None)
 
     def blind(self, mode: str, metric: str) -> list[str]:
         """Return the labels of the variants whose comparison could not have found any difference."""
-        return [
-            row.label
-            for row in self.rows
-            if (effect := row.cells[mode][metric].effect) is not None and effect.detectable is None
-        ]
+        found = [(row.label, row.cells[mode][metric].effect) for row in self.rows]
+        return [label for label, effect in found if effect is not None and effect.detectable is None]
