@@ -7,7 +7,6 @@ import os
 import signal
 import sys
 from pathlib import Path
-from unittest import mock
 
 import click
 import pytest
@@ -54,50 +53,31 @@ def test_a_request_to_end_is_a_ctrl_c(monkeypatch: pytest.MonkeyPatch, capsys: p
     assert seen == [before]
 
 
-def test_an_answer_that_is_broken_off_is_a_ctrl_c(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def interrupt() -> None:
+    raise KeyboardInterrupt
+
+
+def answer() -> None:
     """What click raises where somebody presses Ctrl-C at a question."""
-    monkeypatch.setattr("memmlp.runs.lookup.list_runs", mock.Mock(side_effect=click.Abort))
-    with pytest.raises(SystemExit) as ended:
-        main(["runs", "list"])
-    assert ended.value.code == 130
-    assert capsys.readouterr().err == "memmlp: interrupted\n"
+    raise click.Abort
 
 
-def test_only_what_is_resumed_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("memmlp.runs.lookup.list_runs", interrupted)
-    with pytest.raises(SystemExit) as ended:
-        main(["runs", "list"])
-    assert ended.value.code == 130
-    assert capsys.readouterr().err.strip() == "memmlp: interrupted"
-
-
-def test_an_error_of_a_library_that_was_interrupted_is_an_interruption(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def export() -> None:
     """As torch's exporter, which names errors of a module whose import a Ctrl-C cut short."""
-
-    def export(*_: object) -> None:
+    try:
         try:
-            raise KeyboardInterrupt
+            interrupt()
         except KeyboardInterrupt:
             raise AttributeError("no such attribute of a module that was half imported")  # noqa: B904
+    except AttributeError as error:
+        raise RuntimeError("failed to export") from error
 
-    def wrapped(*_: object) -> None:
-        try:
-            export()
-        except AttributeError as error:
-            raise RuntimeError("failed to export") from error
 
-    monkeypatch.setattr("memmlp.runs.lookup.list_runs", wrapped)
-    with pytest.raises(SystemExit) as ended:
-        main(["runs", "list"])
-    assert ended.value.code == 130
-    assert capsys.readouterr().err.strip() == "memmlp: interrupted"
+@pytest.mark.parametrize("fail", [interrupt, answer, export])
+def test_every_interruption_is_one_and_only_what_is_resumed_says_so(memmlp: Memmlp, monkeypatch, fail):
+    monkeypatch.setattr("memmlp.runs.lookup.list_runs", lambda *_: fail())
+    ran = memmlp("runs", "list")
+    assert (ran.code, ran.err.strip()) == (130, "memmlp: interrupted")
 
 
 QUICK = """
@@ -120,35 +100,31 @@ def test_help_imports_nothing_slow():
     assert all(f"  {name} " in ran.stdout for name in COMMANDS)
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["evaluate"],
-        ["export", "--out", "a.onnx"],
-        ["live"],
-        ["predict", "clip", "--out", "folder"],
-        ["render", "--out", "a.png"],
-        ["web", "--out", "site"],
-    ],
-)
-def test_an_unknown_run_is_told_at_once(tmp_path: Path, words: list[str]):
+def test_an_unknown_run_is_told_at_once(tmp_path: Path):
     """That is, before torch is imported, which takes seconds."""
-    line = [words[0], "0123", *words[1:], "--outputs", str(tmp_path)]
+    lines = (
+        "evaluate",
+        "export --out a.onnx",
+        "live",
+        "predict clip --out folder",
+        "render --out a.png",
+        "web --out site",
+    )
+    words = [[name, "0123", *more, "--outputs", str(tmp_path)] for name, *more in map(str.split, lines)]
     code = (
         "import sys; from memmlp.cli.main import main\n"
-        f"try: main({line})\n"
-        "except SystemExit as ended: print(ended.code, 'torch' in sys.modules)"
+        f"for line in {words}:\n"
+        "    try: main(line)\n"
+        "    except SystemExit as ended: print(line[0], ended.code, 'torch' in sys.modules)"
     )
     ran = finished([sys.executable, "-c", code])
-    assert ran.stdout == "2 False\n", ran.stderr
+    assert ran.stdout.splitlines() == [f"{line.split()[0]} 2 False" for line in lines], ran.stderr
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_has_help(memmlp: Memmlp, name: str):
-    ran = memmlp(name, "--help")
-    assert ran.code == 0
-    assert "memmlp" in ran.out
-    assert ran.err == ""
+def test_every_command_has_help(memmlp: Memmlp):
+    for name in COMMANDS:
+        ran = memmlp(name, "--help")
+        assert (ran.code, ran.err, "memmlp" in ran.out) == (0, "", True), name
 
 
 def test_help_of_train_lists_what_can_be_chosen_and_nothing_else(memmlp: Memmlp):
@@ -159,10 +135,6 @@ def test_help_of_train_lists_what_can_be_chosen_and_nothing_else(memmlp: Memmlp)
     for inner in ("schema", "hydra", "search"):
         assert f"\n{inner}" not in groups
     assert "\ndevice: cpu\n" in said
-
-
-def test_version(memmlp: Memmlp):
-    assert memmlp("--version").out == f"memmlp, version {package.__version__}\n"
 
 
 def test_no_command_shows_the_help(memmlp: Memmlp):
@@ -195,6 +167,7 @@ def test_bad_usage_is_one_line(memmlp: Memmlp, arguments: list[str], words: list
         (KeyboardInterrupt(), 130),
         (NotADirectoryError(errno.ENOTDIR, "Not a directory", "/dev/null/runs"), 2),
         (OSError(errno.ENOSPC, "No space left on device", "checkpoint.safetensors"), 2),
+        (FileNotFoundError(errno.ENOENT, "No such file or directory", "nope.npz"), 2),
     ],
 )
 def test_exit_codes(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int):
@@ -203,11 +176,6 @@ def test_exit_codes(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch, error: Base
     assert ran.code == code
     assert [line[:8] for line in ran.err.splitlines() if line] == ["memmlp: "]
     assert ran.out == ""
-
-
-def test_a_missing_file_is_told_in_our_words(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
-    failing(monkeypatch, FileNotFoundError(errno.ENOENT, "No such file or directory", "nope.npz"))
-    assert memmlp("train", "profile=tiny").err == "memmlp: nope.npz: no such file or folder\n"
 
 
 def test_a_bug_shows_where_it_is(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
@@ -275,40 +243,18 @@ def test_cfg_job_prints_the_config(memmlp: Memmlp, jobs: list[DictConfig]):
     assert jobs == []
 
 
-@pytest.mark.slow
-def test_help_says_what_can_be_chosen(memmlp: Memmlp):
-    assert "memory: gru, lstm, no_codes, none, vq, vq_joint" in memmlp("train", "--help").out
-
-
-@pytest.mark.slow
-def test_info_says_where_configs_are_sought(tmp_path: Path):
-    command = [sys.executable, "-m", "memmlp.cli.main", "train", "--info", "searchpath"]
-    ran = finished(command, cwd=tmp_path)
-    assert "conf" in ran.stdout, ran.stderr
-    assert "structured://" in ran.stdout
-
-
-def test_hydras_environment_is_left_as_it_was(memmlp: Memmlp, jobs: list[DictConfig]):
-    memmlp("train")
-    assert "HYDRA_FULL_ERROR" not in os.environ
-
-
-@pytest.mark.parametrize(
-    ("line", "expected"),
-    [
+def test_completion(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
+    for line, expected in (
         ("memmlp train memory=n", {"memory=no_codes", "memory=none"}),
         ("memmlp train memory=none optim.preci", {"optim.precision="}),
         ("memmlp train memory=none memory.wid", set()),
         ("memmlp tr", {"train"}),
         ("memmlp ", set(COMMANDS)),
         ("memmlp runs sh", set()),
-    ],
-)
-def test_completion(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch, line: str, expected: set[str]):
-    monkeypatch.setenv("COMP_LINE", line)
-    ran = memmlp("-sc", "query=bash")
-    assert ran.code == 0
-    assert set(ran.out.split()) == expected
+    ):
+        monkeypatch.setenv("COMP_LINE", line)
+        ran = memmlp("-sc", "query=bash")
+        assert (ran.code, set(ran.out.split())) == (0, expected), line
 
 
 @pytest.mark.slow

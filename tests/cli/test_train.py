@@ -21,18 +21,6 @@ def test_a_failure_in_a_process_of_a_launcher_is_not_lost(monkeypatch: pytest.Mo
         train(["-m", "seed=3,4"], job)
 
 
-def test_failures_in_this_process_let_the_others_run():
-    seeds = []
-
-    def job(cfg: DictConfig) -> None:
-        seeds.append(cfg.seed)
-        raise InputError(f"seed {cfg.seed} fails")
-
-    with pytest.raises(InputError, match="seed 4 fails"):
-        train(["-m", "seed=3,4"], job)
-    assert seeds == [3, 4]
-
-
 def test_threads_that_one_job_asks_for_are_not_those_of_the_next(monkeypatch: pytest.MonkeyPatch):
     before, used = torch.get_num_threads(), []
     monkeypatch.setattr("memmlp.config.build.build_experiment", lambda cfg: cfg)

@@ -101,6 +101,7 @@ def test_named_sources_have_groups_of_their_own():
         ({"sources": {**MIX["sources"], "other": {"root": "a"}}}, [], "data.sources: must have a weight"),
         (with_source(root="nowhere"), [], "data.sources.cmu.root=nowhere"),
         (with_source(weight=0), [], "data.sources.cmu.weight=0"),
+        (with_source(weigt=3), [], "data.sources.cmu.weigt: no such key; did you mean weight"),
         (with_source(test=2), [], "data.sources.cmu.test=2"),
         (with_source(groups_file="none.csv"), [], "data.sources.cmu.groups_file=none.csv"),
         ({}, ["data.split.groups_file=conf/data/my_mix.yaml"], "data.sources.NAME.groups_file"),
@@ -116,17 +117,10 @@ def test_what_does_not_go_together_is_one_line(changes, words, said):
         composed(["data=mocap", "data.root=null"])
 
 
-@pytest.mark.parametrize(
-    "word", ["+data.sources.x={root: a}", "data.sources={x: {root: a}}", "+data.sources.x.root=a"]
-)
-def test_sources_on_the_command_line_are_told_where_they_go(word):
-    with pytest.raises(InputError, match=r"^data\.sources: "):
-        composed(["data=mocap", "data.root=null", word])
-
-
-def test_a_wrong_key_of_a_source_is_named():
-    with pytest.raises(InputError, match=r"data\.sources\.cmu\.weigt: no such key; did you mean weight"):
-        mix(with_source(weigt=3))
+def test_sources_on_the_command_line_are_told_where_they_go():
+    for word in ("+data.sources.x={root: a}", "data.sources={x: {root: a}}", "+data.sources.x.root=a"):
+        with pytest.raises(InputError, match=r"^data\.sources: .*config file"):
+            composed(["data=mocap", "data.root=null", word])
 
 
 def test_weights_are_drawn_by_and_enter_the_identity_where_there_are_any():

@@ -27,10 +27,8 @@ from memmlp.sweep.sweep_file import parse_sweep
 def test_a_plan_that_depends_on_the_environment_or_on_other_folders_is_made_anew(
     words: list[str], kept: bool, tmp_path: Path
 ):
-    for sweep in (
-        parse_sweep("s", {"variants": {"a": words}}),
-        parse_sweep("s", {"base": words, "variants": {"a": []}}),
-    ):
+    for content in ({"variants": {"a": words}}, {"base": words, "variants": {"a": []}}):
+        sweep = parse_sweep("s", content)
         assert (_stamp(sweep, tmp_path) == _stamp(sweep, tmp_path)) == kept
 
 
@@ -44,59 +42,39 @@ NESTED = {
 
 
 @pytest.mark.parametrize("place", ["--config-dir", "hydra.searchpath"])
-@pytest.mark.parametrize("name", NESTED)
-def test_nothing_undoes_what_an_variants_experiment_sets_by_another_one(
-    tmp_path: Path, place: str, name: str
-):
+def test_nothing_undoes_what_a_variants_experiment_sets_by_another_one(tmp_path: Path, place: str):
     folder = tmp_path / "conf/experiment"
     folder.mkdir(parents=True)
     for option, text in NESTED.items():
         (folder / f"{option}.yaml").write_text(f"# @package _global_\n{text}")
     path, near = tmp_path / "s.yaml", place == "--config-dir"
-    path.write_text(f"variants: {{a: [], b: [experiment={name}]}}\n")
     words = [] if near else [f"hydra.searchpath=[file://{folder.parent}]"]
-    with plugins.searching(folder.parent if near else None):
-        for own in ("memory=lstm", "model.width=16"):
-            said = f"experiment={name} sets {own.partition('=')[0]}, and {own} would override it"
-            with pytest.raises(InputError, match=said):
-                find_sweep(str(path), [*words, own])
-        assert find_sweep(str(path), [*words, "optim.lr=0.1"])
-    assert find_sweep(str(path), ["memory=lstm"])  # where it is not there, composing says so
+    for name in NESTED:
+        path.write_text(f"variants: {{a: [], b: [experiment={name}]}}\n")
+        with plugins.searching(folder.parent if near else None):
+            for own in ("memory=lstm", "model.width=16"):
+                said = f"experiment={name} sets {own.partition('=')[0]}, and {own} would override it"
+                with pytest.raises(InputError, match=said):
+                    find_sweep(str(path), [*words, own])
+            assert find_sweep(str(path), [*words, "optim.lr=0.1"])
+        assert find_sweep(str(path), ["memory=lstm"])  # where it is not there, composing says so
 
 
-@pytest.mark.parametrize(
-    ("content", "words", "said"),
-    [
-        (
-            "variants: {a: [], b: [experiment=no_memory]}",
-            ["memory=gru"],
-            "variant 'b': experiment=no_memory sets memory, and memory=gru would override it",
-        ),
-        (
-            "base: [memory=gru]\nvariants: {a: [], b: [experiment=no_memory]}",
-            [],
-            "memory=gru would override it",
-        ),
-        (
-            "variants: {a: [], b: [experiment=paper]}",
-            ["data.drawn_by=frames"],
-            "sets data.drawn_by, and",
-        ),
-        (
-            "base: [experiment=paper]\nvariants: {a: [], b: [experiment=no_memory]}",
-            [],
-            "experiment=no_memory would replace experiment=paper; use experiment=[paper,no_memory]",
-        ),
-        ("variants: {a: [memory=gru]}\naxes: {experiment: [no_memory]}", [], "memory=gru would"),
-        ("base: [experiment=paper]\nvariants: {a: [], b: ['experiment=[paper,no_memory]']}", [], None),
-        (
-            "base: [memory=gru]\nvariants: {a: [], b: [experiment=no_memory, memory=none]}",
-            ["optim=muon"],
-            None,
-        ),
-        ("base: [memory=gru]\nvariants: {a: [], b: [memory=none]}", ["experiment=paper"], None),
-    ],
-)
+NO_MEMORY = "variants: {a: [], b: [experiment=no_memory]}"
+REPLACED = "experiment=no_memory would replace experiment=paper; use experiment=[paper,no_memory]"
+SWEEPS: list[tuple[str, list[str], str | None]] = [
+    (NO_MEMORY, ["memory=gru"], "variant 'b': experiment=no_memory sets memory, and memory=gru would"),
+    (f"base: [memory=gru]\n{NO_MEMORY}", [], "memory=gru would override it"),
+    ("variants: {a: [], b: [experiment=paper]}", ["data.drawn_by=frames"], "sets data.drawn_by, and"),
+    (f"base: [experiment=paper]\n{NO_MEMORY}", [], REPLACED),
+    ("variants: {a: [memory=gru]}\naxes: {experiment: [no_memory]}", [], "memory=gru would"),
+    ("base: [experiment=paper]\nvariants: {a: [], b: ['experiment=[paper,no_memory]']}", [], None),
+    ("base: [memory=gru]\nvariants: {a: [], b: [experiment=no_memory, memory=none]}", ["optim=muon"], None),
+    ("base: [memory=gru]\nvariants: {a: [], b: [memory=none]}", ["experiment=paper"], None),
+]
+
+
+@pytest.mark.parametrize(("content", "words", "said"), SWEEPS)
 def test_nothing_undoes_the_experiment_of_an_variant(
     tmp_path: Path, content: str, words: list[str], said: str | None
 ):

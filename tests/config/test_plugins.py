@@ -26,7 +26,7 @@ from memmlp.config.compose_plan import find_sweep
 from memmlp.config.schema import restored
 from memmlp.report.tables.table_text import heading
 from memmlp.runs import environment
-from memmlp.runs.environment import code_digest, user_packages
+from memmlp.runs.environment import user_packages
 from memmlp.runs.identity import evaluation_id, evaluation_settings
 from memmlp.runs.run import Run
 from memmlp.sweep.search.search_file import parse_search
@@ -64,21 +64,22 @@ def test_a_package_is_used_where_somebody_names_it(on_path: Path, how: str, monk
     assert (cfg.memory.name, cfg.term.name, list(cfg.evaluation.metrics)) == ("mean", "skate", ["FootSkate"])
 
 
-def test_nothing_is_there_of_a_package_that_nobody_names(on_path: Path):
-    with pytest.raises(InputError, match=r"memory=mean: no such option"):
-        composed(["memory=mean"])
-    assert PACKAGE not in sys.modules
-    with pytest.raises(InputError, match=r"evaluation.metrics="):
-        composed(["evaluation.metrics=[FootSkate]"])
-
-
 def test_keys_of_a_custom_component_are_checked(on_path: Path):
-    with pytest.raises(InputError, match=r"memory.width=0: must be at least 1"):
-        composed([*OWN, "memory.width=0"])
-    with pytest.raises(InputError, match=r"memory.depth: no such key"):
-        composed([*OWN, "memory.depth=2"])
-    with pytest.raises(InputError, match=r"term.weight=-1.0: must be at least 0"):
-        composed([*OWN, "term.weight=-1"])
+    """Nothing is there of a package that nobody names."""
+    for words, line in (
+        (["memory=mean"], "memory=mean: no such option"),
+        (["evaluation.metrics=[FootSkate]"], "evaluation.metrics="),
+    ):
+        with pytest.raises(InputError, match=line):
+            composed(words)
+        assert PACKAGE not in sys.modules
+    for word, line in (
+        ("memory.width=0", "memory.width=0: must be at least 1"),
+        ("memory.depth=2", "memory.depth: no such key"),
+        ("term.weight=-1", "term.weight=-1.0: must be at least 0"),
+    ):
+        with pytest.raises(InputError, match=line):
+            composed([*OWN, word])
 
 
 def raise_version(monkeypatch: pytest.MonkeyPatch, slot: str, name: str) -> None:
@@ -93,12 +94,9 @@ def test_an_experiment_knows_packages_and_versions(on_path: Path, monkeypatch: p
     before = experiment.identity("d").id
     raise_version(monkeypatch, "memory", "mean")
     assert experiment.identity("d").id != before
-    assert build_experiment(composed([])).config["plugins"] == []
-
-
-def test_naming_a_package_changes_no_run(on_path: Path):
-    plain = build_experiment(composed([])).identity("d").id
-    assert build_experiment(composed([f"plugins=[{PACKAGE}]"])).identity("d").id == plain
+    plain, named = (build_experiment(composed(words)) for words in ([], [f"plugins=[{PACKAGE}]"]))
+    assert plain.config["plugins"] == []
+    assert named.identity("d").id == plain.identity("d").id
 
 
 def test_custom_metrics_make_another_evaluation(on_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -112,22 +110,14 @@ def test_custom_metrics_make_another_evaluation(on_path: Path, monkeypatch: pyte
     assert evaluation_id(config, "stream") != before
 
 
-def test_the_weight_of_a_term_counts_where_it_is_not_learned(on_path: Path):
-    def ids(*words: str) -> set[str]:
-        weights = ("term.weight=0.1", "term.weight=0.2")
-        return {build_experiment(composed([*OWN, *words, word])).identity("d").id for word in weights}
-
-    assert len(ids("loss=manual")) == 2
-    assert len(ids("loss=uncertainty")) == 1
-
-
-def test_a_loss_has_the_term_with_its_weight(on_path: Path):
-    branches = frozenset({"rotation", "position"})
-    manual = build_experiment(composed([*OWN, "loss=manual", "term.weight=0.7"])).training.loss(branches)
-    learned = build_experiment(composed([*OWN, "loss=uncertainty"])).training.loss(branches)
-    assert manual.weighting.weights()["skate"] == 0.7
-    assert learned.weighting.weights()["skate"] == 1.0
-    assert len(learned.weighting.parameter_groups()[0]["params"]) == 6
+def test_a_loss_has_the_term_with_its_weight_which_counts_where_it_is_not_learned(on_path: Path):
+    for loss, weights, groups in (("manual", [0.1, 0.7], 0), ("uncertainty", [1.0, 1.0], 6)):
+        words = [[*OWN, f"loss={loss}", f"term.weight={weight}"] for weight in (0.1, 0.7)]
+        experiments = [build_experiment(composed(one)) for one in words]
+        losses = [one.training.loss(frozenset({"rotation", "position"})) for one in experiments]
+        assert [one.weighting.weights()["skate"] for one in losses] == weights
+        assert sum(len(group["params"]) for group in losses[0].weighting.parameter_groups()) == groups
+        assert len({one.identity("d").id for one in experiments}) == len(set(weights))
     whole = composed([*OWN, "predictor=rotation_only", "hand=off", "loss=agrol", "evaluation.ik=off"])
     with pytest.raises(InputError, match=r"term=skate: .*loss=agrol"):
         build_experiment(whole)
@@ -187,52 +177,37 @@ from memmlp.common.settings import MetricSettings, Settings, setting
 """
 
 
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
+def test_wrong_declarations_are_one_line(folder: Path):
+    metric = '@component("metric", "A")\nclass ASettings'
+    for number, (text, line) in enumerate((
         ('@component("memory", "gru")\nclass Mine: pass\n', "memory=gru: "),
         ('@component("metric", "MPJPE")\nclass S(MetricSettings): smallest = 1\n', "metric MPJPE: "),
-        ('@component("metric", "A")\nclass ASettings(MetricSettings): smallest = 0\n', "metric A: "),
-        (
-            '@component("metric", "A")\nclass ASettings(MetricSettings): smallest, better = 1, "more"\n',
-            "metric A: better",
-        ),
-        (
-            '@component("metric", "A")\nclass ASettings(torch.nn.Module): pass\n',
-            "name 'torch' is not defined",
-        ),
-    ],
-)
-def test_wrong_declarations_are_one_line(folder: Path, text: str, line: str):
-    write(folder, {"mine.py": HEAD + text})
-    with pytest.raises(InputError) as error:
-        composed(["plugins=[mine]"])
-    assert line in str(error.value)
-    assert str(error.value).startswith("plugin mine: ")
-    assert "mine" not in plugins.active()
-    assert composed(["memory=gru"]).memory.name == "gru"
+        (f"{metric}(MetricSettings): smallest = 0\n", "metric A: "),
+        (f'{metric}(MetricSettings): smallest, better = 1, "more"\n', "metric A: better"),
+        (f"{metric}(torch.nn.Module): pass\n", "name 'torch' is not defined"),
+    )):  # fmt: skip
+        name = f"mine{number}"
+        write(folder, {f"{name}.py": HEAD + text})
+        with pytest.raises(InputError) as error:
+            composed([f"plugins=[{name}]"])
+        assert line in str(error.value)
+        assert str(error.value).startswith(f"plugin {name}: ")
+        assert name not in plugins.active()
+        assert composed(["memory=gru"]).memory.name == "gru"
 
 
-def test_names_that_are_no_packages(folder: Path):
-    for name, line in (
-        ("nowhere_at_all", "not found"),
-        ("memmlp.cli", "plugins: 'memmlp.cli'"),
-        ("os", "plugins: 'os'"),
+def test_packages_that_cannot_be_used_are_named(folder: Path):
+    write(folder, {"mine/__init__.py": "", "mine/conf/memory/gru.yaml": "name: gru"})
+    write(folder, {"conf/experiment/own.yaml": "# @package _global_\nplugins: [mine]"})
+    for words, line in (
+        (["plugins=[nowhere_at_all]"], "not found"),
+        (["plugins=[memmlp.cli]"], "plugins: 'memmlp.cli'"),
+        (["plugins=[os]"], "plugins: 'os'"),
+        (["plugins=[mine]"], "gru.yaml: must have another name"),
+        (["--config-dir", str(folder / "conf"), "experiment=own"], r"plugins=\[mine\]"),
     ):
         with pytest.raises(InputError, match=line):
-            composed([f"plugins=[{name}]"])
-
-
-def test_an_option_hides_no_other(folder: Path):
-    write(folder, {"mine/__init__.py": "", "mine/conf/memory/gru.yaml": "name: gru"})
-    with pytest.raises(InputError, match=r"gru.yaml: must have another name"):
-        composed(["plugins=[mine]"])
-
-
-def test_a_config_file_names_a_package_too_late(folder: Path):
-    write(folder, {"mine.py": "", "conf/experiment/own.yaml": "# @package _global_\nplugins: [mine]"})
-    with pytest.raises(InputError, match=r"plugins=\[mine\]: a config file is read too late"):
-        composed(["--config-dir", str(folder / "conf"), "experiment=own"])
+            composed(words)
 
 
 def test_a_folder_of_configs_is_searched_while_a_command_runs(folder: Path):
@@ -243,24 +218,6 @@ def test_a_folder_of_configs_is_searched_while_a_command_runs(folder: Path):
         assert any("own.yaml" in name for name, _ in plugins.texts_outside_memmlp())
     with pytest.raises(InputError, match=r"experiment=own: no such option"):
         composed(["experiment=own"])
-
-
-COORDINATES = """
-import torch
-from memmlp.common.components import component
-from memmlp.motion.network_coordinates import World
-
-@component("coordinates", "floor")
-class Floor(World): pass
-"""
-
-
-def test_custom_coordinates(folder: Path):
-    write(folder, {"mine.py": COORDINATES})
-    experiment = build_experiment(composed(["plugins=[mine]", "normalizer.coordinates=floor"]))
-    assert type(experiment.architecture.coordinates).__name__ == "Floor"
-    assert experiment.config["plugins"] == ["mine"]
-    assert experiment.identity("d").id != build_experiment(composed([])).identity("d").id
 
 
 WALKS = """
@@ -297,14 +254,6 @@ def test_a_custom_data_source(folder: Path):
     assert restored(config).data == cfg.data
 
 
-def test_a_new_version_of_a_data_source_makes_its_clips_again(folder: Path):
-    write(
-        folder, {"mine/__init__.py": WALKS.replace("VERSION", "2"), "mine/conf/data/walks.yaml": WALKS_YAML}
-    )
-    source = build_motion(composed(["plugins=[mine]", "data=walks"]))
-    assert source.clips.root == Path("made/walks-minutes1.0-seed0-v2")
-
-
 def test_an_executor_of_ones_own(folder: Path):
     from memmlp.cli.workers import Workers
 
@@ -332,14 +281,10 @@ def test_reading_a_run_imports_nothing_by_itself(on_path: Path, monkeypatch: pyt
     assert f"{PACKAGE} 0.1.0" in str(error.value)
     assert f"--plugins {PACKAGE} or MEMMLP_PLUGINS={PACKAGE}" in str(error.value)
     assert PACKAGE not in sys.modules
-    monkeypatch.setattr(sys, "path", [one for one in sys.path if one != str(on_path)])
-    with pytest.raises(InputError, match=rf"{PACKAGE} 0.1.0, which is not found"):
-        config_of(recorded(config, "0.1.0"))
-
-
-def test_a_run_is_read_again_once_its_package_is_named(on_path: Path):
-    with registers_kept():
-        config = build_experiment(composed(OWN)).config
+    with monkeypatch.context() as elsewhere:
+        elsewhere.setattr(sys, "path", [one for one in sys.path if one != str(on_path)])
+        with pytest.raises(InputError, match=rf"{PACKAGE} 0.1.0, which is not found"):
+            config_of(recorded(config, "0.1.0"))
     read = config_of(recorded(config), [f"plugins=[{PACKAGE}]"])
     assert build_experiment(read).identity("d").id == build_experiment(composed(OWN)).identity("d").id
 
@@ -353,17 +298,6 @@ def test_a_record_cannot_reach_beyond_the_package(on_path: Path):
     ):
         with pytest.raises(InputError, match=line):
             config_of(recorded({**config, **change}))
-
-
-def test_code_that_changed_since_is_told(folder: Path):
-    write(folder, {"mine.py": "A = 1\n"})
-    plugins.activate(["mine"])
-    run = Run(folder / "run")
-    run.begin("memmlp", {}, data="d", upstream=None, plugins={"mine": {"version": None, "digest": "d"}})
-    assert run.manifest["sources"]["mine:mine.py"] == code_digest(b"A = 1")
-    assert run.changed_sources == []
-    write(folder, {"mine.py": "A = 2\n"})
-    assert run.changed_sources == ["mine:mine.py"]
 
 
 IMPORTING = {

@@ -9,7 +9,7 @@ import pytest
 from memmlp.common.files import write_json
 from memmlp.common.lease import current_process
 from memmlp.runs.garbage_runs import delete, garbage
-from memmlp.runs.notes import add_tags
+from memmlp.runs.notes import add_tags, remove_tags
 from memmlp.runs.recipe_versions import RECIPES
 from memmlp.runs.run import Run
 
@@ -61,19 +61,16 @@ def test_what_people_marked_or_somebody_is_at_or_a_run_builds_upon_stays(outputs
         assert {FAILED, OLD, USED} & set(found(outputs)) == set()
 
 
-def test_deleted_is_the_folder_and_no_other(outputs: Path):
+def test_deleted_is_the_folder_and_no_other_unless_it_was_marked_meanwhile(outputs: Path):
     before = {path.name for path in (outputs / "runs").iterdir()}
     (one,) = garbage(outputs, ["failed"])
     assert one.size > 0
-    assert delete(one)
-    assert {path.name for path in (outputs / "runs").iterdir()} == before - {FAILED}
-
-
-def test_a_run_that_was_marked_meanwhile_stays(outputs: Path):
-    (one,) = garbage(outputs, ["failed"])
     add_tags(one.run, ["keep"])
     assert not delete(one)
-    assert one.run.folder.exists()
+    assert {path.name for path in (outputs / "runs").iterdir()} == before
+    remove_tags(one.run, ["keep"])
+    assert delete(one)
+    assert {path.name for path in (outputs / "runs").iterdir()} == before - {FAILED}
 
 
 @pytest.mark.parametrize(

@@ -28,32 +28,24 @@ def test_the_newest_run_is_first(tmp_path: Path):
     assert [run.manifest["started"] for run in list_runs(tmp_path)] == ["2022", "2021", "2020"]
 
 
-@pytest.mark.parametrize("name", ["zz", "", "no/such"])
-def test_no_such_run_is_one_line(tmp_path: Path, name: str):
+def test_no_such_run_is_one_line(tmp_path: Path):
     begun(tmp_path)
-    with pytest.raises(InputError, match=f"run '{name}'"):
-        find_run(tmp_path, name)
+    for name in ("zz", "", "no/such"):
+        with pytest.raises(InputError, match=f"run '{name}'"):
+            find_run(tmp_path, name)
 
 
-def test_a_run_by_the_bare_name_of_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    made = Run.of(tmp_path, "ab" + "0" * 14)
-    made.begin("memmlp", {}, data="d", upstream=None)
-    monkeypatch.chdir(made.folder.parent)
-    assert find_run("outputs", made.id).folder == made.folder.resolve()
-
-
-def test_an_ambiguous_beginning_lists_the_runs(tmp_path: Path):
-    for name in ("ab" + "0" * 14, "ab" + "1" * 14):
-        Run.of(tmp_path, name).begin("memmlp", {}, data="d", upstream=None)
+def test_a_bare_folder_name_is_found_and_an_ambiguous_beginning_lists_the_runs(tmp_path: Path, monkeypatch):
+    runs = [Run.of(tmp_path, "ab" + digit * 14) for digit in "01"]
+    for run in runs:
+        run.begin("memmlp", {}, data="d", upstream=None)
     with pytest.raises(InputError, match=r"2 ids .*: ab0+, ab1+"):
         find_run(tmp_path, "ab")
+    monkeypatch.chdir(runs[0].folder.parent)
+    assert find_run("outputs", runs[0].id).folder == runs[0].folder.resolve()
 
 
 SEEN = {"optim": {"steps": 100, "batch": 8}, "model": {"frames": 11}}
-
-
-def test_a_network_saw_a_batch_of_windows_at_each_step(tmp_path: Path):
-    assert frames_seen(fake_run(tmp_path, "a", config=SEEN)) == 100 * 8 * 11
 
 
 def test_a_refiner_saw_its_network_s_frames_and_its_own_pieces(tmp_path: Path):
@@ -63,10 +55,10 @@ def test_a_refiner_saw_its_network_s_frames_and_its_own_pieces(tmp_path: Path):
     assert frames_seen(fake_run(tmp_path, "refiner", config=config, origin=above)) == 100 * 8 * (11 + 20)
 
 
-@pytest.mark.parametrize("lacking", ["optim", "model"])
-def test_what_is_not_known_is_0(tmp_path: Path, lacking: str):
-    config = {key: value for key, value in SEEN.items() if key != lacking}
-    assert frames_seen(fake_run(tmp_path, lacking, config=config)) == 0
+def test_what_is_not_known_is_0(tmp_path: Path):
+    for lacking in ("optim", "model"):
+        config = {key: value for key, value in SEEN.items() if key != lacking}
+        assert frames_seen(fake_run(tmp_path, lacking, config=config)) == 0
 
 
 def test_less_than_half_an_hour_of_motion_is_warned_of():

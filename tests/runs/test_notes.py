@@ -23,24 +23,20 @@ def test_tags_and_note_are_kept_and_survive_a_reset(tmp_path: Path):
     assert set_note(run, "") == Notes(("a/b",), "")
 
 
-@pytest.mark.parametrize("tag", ["", "two words", "x" * 65, "a,b", "a\nb"])
-def test_a_tag_is_a_short_word(tmp_path: Path, tag: str):
+def test_bad_tags_and_notes_are_refused(tmp_path: Path):
     run = begun(tmp_path)
-    with pytest.raises(InputError, match="must be up to 64"):
-        add_tags(run, ["good", tag])
+    for tag in ("", "two words", "x" * 65, "a,b", "a\nb"):
+        with pytest.raises(InputError, match="must be up to 64"):
+            add_tags(run, ["good", tag])
     assert read_notes(run) == Notes()
-
-
-def test_what_is_not_there_or_too_long_is_refused(tmp_path: Path):
-    run = begun(tmp_path)
     with pytest.raises(InputError, match="tag 'good'"):
         remove_tags(run, ["good"])
     with pytest.raises(InputError, match="note: "):
         set_note(run, "x" * 10001)
 
 
-@pytest.mark.parametrize("content", ["", "[]", '{"tags": 5, "note": []}', '{"tags": [3], "note": null}'])
-def test_a_damaged_file_says_nothing(tmp_path: Path, content: str):
+def test_a_damaged_file_says_nothing(tmp_path: Path):
     run = begun(tmp_path)
-    notes_path(run).write_text(content)
-    assert read_notes(run) == Notes()
+    for content in ("", "[]", '{"tags": 5, "note": []}', '{"tags": [3], "note": null}'):
+        notes_path(run).write_text(content)
+        assert read_notes(run) == Notes()

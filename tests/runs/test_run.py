@@ -34,6 +34,8 @@ from memmlp.runs.run import Run
 
 def test_a_run_is_done_when_its_marker_is_whole(tmp_path: Path):
     run = begun(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        run.finish(["results.json"])
     write_json(run.results_path, {})
     assert not run.done
     run.finish(["results.json"])
@@ -55,36 +57,26 @@ def test_a_folder_under_anothers_id_is_no_run(tmp_path: Path):
     assert (run.has("int8-0"), other.has("int8-0"), copy.has("int8-0")) == (True, False, True)
 
 
-@pytest.mark.parametrize("name", ["stream-0", "stream-1"])
-def test_an_evaluation_of_another_run_or_name_is_refused(tmp_path: Path, name: str):
-    run = complete(tmp_path)
-    other = run if name == "stream-1" else complete(tmp_path, CONFIG | {"seed": 1})
-    shutil.copy(run.evaluation("stream-0"), other.evaluation(name))
-    load(run.folder, ["stream-0"])
-    with pytest.raises(InputError, match=rf"evaluations/{name}\.json: cannot be read"):
-        load(other.folder, [name])
-    assert other.verify() == [f"evaluations/{name}.json"]
+def test_an_evaluation_of_another_run_or_name_is_refused(tmp_path: Path):
+    run, other = complete(tmp_path), complete(tmp_path, CONFIG | {"seed": 1})
+    for holder, name in ((run, "stream-1"), (other, "stream-0")):
+        shutil.copy(run.evaluation("stream-0"), holder.evaluation(name))
+        load(run.folder, ["stream-0"])
+        with pytest.raises(InputError, match=rf"evaluations/{name}\.json: cannot be read"):
+            load(holder.folder, [name])
+        assert holder.verify() == [f"evaluations/{name}.json"]
 
 
-def test_an_onnx_file_that_is_not_the_exported_one_is_refused(tmp_path: Path):
+def test_changed_weights_and_deployments_are_refused_and_lost_ones_are_made_again(tmp_path: Path):
     run = complete(tmp_path)
-    run.deployment("int8-0").int8.write_bytes(b"another network's")
+    place = run.deployment("int8-0")
+    assert (run.preferred_onnx, run.weights()) == (place.int8, run.model)
+    place.int8.write_bytes(b"another network's")
     with pytest.raises(InputError, match=r"int8\.onnx: not the file that was exported"):
         _ = run.preferred_onnx
-
-
-def test_a_deployment_that_lost_a_file_is_made_again(tmp_path: Path):
-    """And is not, in silence, the float32 one."""
-    run = complete(tmp_path)
-    assert run.preferred_onnx == run.deployment("int8-0").int8
-    run.deployment("int8-0").int8.unlink()
+    place.int8.unlink()
     assert not run.has("int8-0")
-    assert run.preferred_onnx != run.deployment("int8-0").onnx
-
-
-def test_weights_that_changed_since_are_refused(tmp_path: Path):
-    run = complete(tmp_path)
-    assert run.weights() == run.model
+    assert run.preferred_onnx != place.onnx  # which would be used in its place in silence
     run.model.write_bytes(b"other")
     with pytest.raises(InputError, match="not the weights that were trained"):
         run.weights()
@@ -166,13 +158,6 @@ def test_todays_recipes_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert run.preferred_onnx.read_bytes() == b"new"
 
 
-def test_a_run_without_its_artifact_cannot_finish(tmp_path: Path):
-    run = begun(tmp_path)
-    with pytest.raises(FileNotFoundError):
-        run.finish(["model.safetensors"])
-    assert not run.done
-
-
 def test_verify_names_what_changed(tmp_path: Path):
     run = begun(tmp_path)
     for name in ("results.json", "clips.json", "latency.json"):
@@ -194,12 +179,16 @@ def test_verify_names_what_changed(tmp_path: Path):
     ]  # fmt: skip
 
 
-def test_reset_removes_the_runs_files_and_no_others(tmp_path: Path):
-    run = begun(tmp_path)
+def write_every_file(run: Run) -> None:
     for name in Run.FILES:
         path = run.folder / name.replace("*", "0")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text('{"any": 1}')
+
+
+def test_reset_removes_the_runs_files_and_no_others(tmp_path: Path):
+    run = begun(tmp_path)
+    write_every_file(run)
     (run.folder / ".checkpoint.safetensors.123.tmp").touch()
     (run.folder / "notes.txt").touch()
     run.finish(["results.json"])
@@ -221,13 +210,12 @@ def test_cleared_stages_leave_no_file_of_any_precision(tmp_path: Path):
 def test_a_reset_that_is_cut_short_leaves_no_results_of_what_is_gone(tmp_path: Path, monkeypatch):
     """At any moment, what is removed first is what was made from the rest."""
     run = begun(tmp_path)
-    for name in Run.FILES:
-        path = run.folder / name.replace("*", "0")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("{}")
-    unlink, left = Path.unlink, []
+    write_every_file(run)
+    run.finish([])
+    unlink, left, removed = Path.unlink, [], []
 
     def spy(path: Path, missing_ok: bool = False) -> None:
+        removed.append(path.name)
         unlink(path, missing_ok=missing_ok)
         results = [
             run.checkpoint,
@@ -239,23 +227,9 @@ def test_a_reset_that_is_cut_short_leaves_no_results_of_what_is_gone(tmp_path: P
 
     monkeypatch.setattr(Path, "unlink", spy)
     run.reset()
+    assert removed[0] == "DONE"
     assert (False, True) not in left
     assert left[-1] == (False, False)
-
-
-def test_reset_removes_the_marker_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    run = begun(tmp_path)
-    run.finish(["config.yaml"])
-    removed = []
-    unlink = Path.unlink
-
-    def spy(path: Path, missing_ok: bool = False) -> None:
-        removed.append(path.name)
-        unlink(path, missing_ok=missing_ok)
-
-    monkeypatch.setattr(Path, "unlink", spy)
-    run.reset()
-    assert removed[0] == "DONE"
 
 
 def test_a_resumed_run_keeps_its_start(tmp_path: Path):
@@ -267,12 +241,12 @@ def test_a_resumed_run_keeps_its_start(tmp_path: Path):
     assert run.config == CONFIG
 
 
-@pytest.mark.parametrize("text", ["a: [b", "5", "[]"])
-def test_a_damaged_config_is_named(tmp_path: Path, text: str):
+def test_a_damaged_config_is_named(tmp_path: Path):
     run = begun(tmp_path)
-    run.config_path.write_text(text)
-    with pytest.raises(InputError, match=r"config\.yaml: cannot be read"):
-        _ = run.config
+    for text in ("a: [b", "5", "[]"):
+        run.config_path.write_text(text)
+        with pytest.raises(InputError, match=r"config\.yaml: cannot be read"):
+            _ = run.config
 
 
 def test_a_retry_of_a_run_that_never_began_leaves_it_new(tmp_path: Path):
@@ -316,18 +290,12 @@ def test_a_run_that_was_killed_before_its_evaluation_is_trained_and_not_done(tmp
 
 
 def test_a_run_of_which_nothing_but_training_is_asked_is_done_then(tmp_path: Path):
-    run = begun(tmp_path, CONFIG | {"evaluation": {"modes": []}})
-    run.model.write_bytes(b"weights")
-    run.finish(["model.safetensors"])
+    run, codes = begun(tmp_path, CONFIG | {"evaluation": {"modes": []}}), begun(tmp_path, kind="vqvae")
+    for one in (run, codes):
+        one.model.write_bytes(b"weights")
+        one.finish(["model.safetensors"])
     run.want([])
-    assert run.status == "done"
-
-
-def test_a_vqvae_s_run_is_done_without_an_evaluation(tmp_path: Path):
-    run = begun(tmp_path, kind="vqvae")
-    write_json(run.results_path, {})
-    run.finish(["results.json"])
-    assert run.status == "done"
+    assert run.status == codes.status == "done"
 
 
 def test_runs_need_neither_torch_nor_hydra():

@@ -207,12 +207,3 @@ def test_schedules():
 def test_perplexity():
     assert perplexity(torch.ones(8)) == pytest.approx(8)
     assert perplexity(torch.tensor([5.0, 0, 0])) == pytest.approx(1)
-
-
-def test_what_is_counted_in_a_validation_says_so(monkeypatch: pytest.MonkeyPatch):
-    told: list[str] = []
-    monkeypatch.setattr(progress, "INTERVAL", 0.0)
-    task = mock.MagicMock(validate=lambda: list(progress.progress_bar(iter("a"), "stream", unit="frames")))
-    with progress.announce_to(told.append):
-        loop.validate(task, mock.MagicMock())
-    assert told == ["validation, stream: 1 frames"]

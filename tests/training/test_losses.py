@@ -7,7 +7,7 @@ import tiny
 import torch
 
 from memmlp.motion.body import LOWER, SPARSE_DIM
-from memmlp.training.losses import HandFK, HandPosition, Loss, Manual, MotionLoss, NoHand, Uncertainty
+from memmlp.training.losses import HandFK, HandPosition, Manual, MotionLoss, NoHand, Uncertainty
 
 BOTH = frozenset({"rotation", "position"})
 DRAW = torch.Generator().manual_seed(0)
@@ -68,23 +68,22 @@ def test_manual_weights_are_the_papers_and_each_counts():
         assert float(Manual(**{name: 7.0})(ones)) != pytest.approx(float(Manual()(ones)))
 
 
+def train(weighting: Uncertainty, optimiser: type, steps: int, **losses: float) -> None:
+    weights = optimiser(weighting.parameter_groups())
+    for _ in range(steps):
+        weights.zero_grad()
+        weighting({name: torch.tensor(loss) for name, loss in losses.items()}).backward()
+        weights.step()
+
+
 def test_uncertainty_settles_where_the_weight_is_one_over_the_loss():
     """The minimum of e^-s L + s is s = ln L."""
     weighting = Uncertainty(lr=0.05)
     weighting.build(["rotation_all", "position_branch"])
-    optimiser = torch.optim.Adam(weighting.parameter_groups())
-    assert optimiser.param_groups[0]["lr"] == 0.05
-    for _ in range(400):
-        optimiser.zero_grad()
-        weighting({"rotation_all": torch.tensor(4.0), "position_branch": torch.tensor(0.1)}).backward()
-        optimiser.step()
+    assert weighting.parameter_groups()[0]["lr"] == 0.05
+    train(weighting, torch.optim.Adam, 400, rotation_all=4.0, position_branch=0.1)
     assert weighting.weights() == pytest.approx({"rotation_all": 1 / 4, "position_branch": 10}, rel=1e-2)
     assert weighting.s["rotation_all"].item() == pytest.approx(math.log(4), rel=1e-2)
-
-
-def test_a_loss_without_terms_is_none():
-    with pytest.raises(NotImplementedError):
-        Loss()(MOTION, TRUTH[..., SPARSE_DIM:], SPARSE, NORMALIZER)
 
 
 def test_a_custom_term_has_its_own_weight_also_under_the_name_of_a_term_that_is_not_there():
@@ -98,10 +97,6 @@ def test_a_term_that_is_0_keeps_its_weight():
     """The regulariser alone would make the weight of a term without an error grow for ever."""
     weighting = Uncertainty(lr=0.05)
     weighting.build(["position_branch", "penetration"])
-    optimiser = torch.optim.AdamW(weighting.parameter_groups())
-    for _ in range(50):
-        optimiser.zero_grad()
-        weighting({"position_branch": torch.tensor(0.3), "penetration": torch.tensor(0.0)}).backward()
-        optimiser.step()
+    train(weighting, torch.optim.AdamW, 50, position_branch=0.3, penetration=0.0)
     assert weighting.weights()["penetration"] == 1
     assert weighting.weights()["position_branch"] > 1.5

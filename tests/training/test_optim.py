@@ -113,17 +113,13 @@ def test_muon_has_the_matrices_and_adamw_the_rest():
     assert [group["weight_decay"] for group in optimiser.param_groups] == [1e-4, 1e-4, 0]
 
 
-@pytest.mark.parametrize(("vectors", "of_muon"), [("adamw", 1), ("muon", 3)])
-def test_what_has_one_column_or_row_is_no_matrix(vectors: str, of_muon: int):
-    """The bias of a time mix is a column."""
+def test_what_has_one_column_or_row_is_no_matrix():
+    """As the bias of a time mix. RecurrentPoser has none, so its identity is without optim.vectors."""
     mix, gate = TimeMix(7), torch.nn.Linear(4, 1, bias=False)
     group = {"params": [*mix.parameters(), *gate.parameters()]}
-    muon = replace(OPTIMS["muon"], vectors=vectors).build([group]).parts[0]
-    assert len(muon.param_groups[0]["params"]) == of_muon
-
-
-def test_recurrent_poser_has_no_matrix_of_one_column_or_row():
-    """So optim.vectors changes nothing of it, and does not count for its identity."""
+    for vectors, of_muon in (("adamw", 1), ("muon", 3)):
+        muon = replace(OPTIMS["muon"], vectors=vectors).build([group]).parts[0]
+        assert len(muon.param_groups[0]["params"]) == of_muon
     for cell in CELLS:
         matrices = [one for one in tiny.recurrent_poser(cell=cell, members=2).parameters() if one.dim() == 2]
         assert all(min(one.shape) > 1 for one in matrices)
@@ -134,12 +130,8 @@ def test_the_warm_up_grows_in_equal_parts_and_then_the_schedule_is_what_it_was()
     warm = replace(plain, warmup=4)
     parts = [warm.compute_factor(step) / plain.compute_factor(step) for step in range(10)]
     assert parts == pytest.approx([0.25, 0.5, 0.75, *[1.0] * 7])
-    assert [replace(OPTIMS["schedule_free"], warmup=2).compute_factor(step) for step in range(4)] == [
-        0.5,
-        1,
-        1,
-        1,
-    ]
+    free = replace(OPTIMS["schedule_free"], warmup=2)
+    assert [free.compute_factor(step) for step in range(4)] == [0.5, 1, 1, 1]
 
 
 def test_at_another_rate_the_course_is_the_same():
