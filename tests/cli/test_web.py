@@ -19,7 +19,6 @@ pytestmark = pytest.mark.slow
 
 
 def test_a_site_to_play_and_wear(home: Path):
-    """Without the bench, whose AvatarPoser takes many seconds to export."""
     try:
         tarball(ONNXRUNTIME_WEB), tarball(THREE)
     except InputError as error:

@@ -61,7 +61,7 @@ def exported(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_latency_and_size(exported, small_yardstick):
+def test_latency_and_size(exported, small_yardstick, monkeypatch):
     model, path = exported
     measured = latency.measure_step(path, steps=1)
     assert measured["steps"] == 200
@@ -71,22 +71,18 @@ def test_latency_and_size(exported, small_yardstick):
     size = latency.size(model, model, path)
     assert size["flops"] == 2 * size["macs"] > 0
     assert size["onnx_bytes"] == path.stat().st_size
-
-
-@pytest.mark.parametrize("codebook", ["ema", "gradient"])
-def test_code_vectors_are_counted_however_they_are_learned(codebook, tmp_path):
-    model = tiny.model(codes=VQVAE(codes=5, width=16, encoder_depth=1, codebook=codebook))
-    (file := tmp_path / "step.onnx").touch()
-    size = latency.size(model, model, file)
-    encoder, decoder = 252 * 16 + 16 + 2 * 16 + 16 * 16 + 16, 2 * 16 + 16 * 16 + 16 + 16 * 132 + 132
-    assert size["parameters_with_vqvae"] - size["parameters"] == encoder + 5 * 16 + decoder
-
-
-@pytest.mark.slow
-def test_a_thread_without_a_core_is_seen(exported, small_yardstick, monkeypatch):
-    clock = iter([5.0, 5.0 + 1e-9])
+    clock = iter([5.0, 5.0 + 1e-9])  # a thread without a core
     monkeypatch.setattr(latency.time, "thread_time", lambda: next(clock))
-    assert latency.measure_step(exported[1], steps=1)["core_share"] < 1e-6
+    assert latency.measure_step(path, steps=1)["core_share"] < 1e-6
+
+
+def test_code_vectors_are_counted_however_they_are_learned(tmp_path):
+    (file := tmp_path / "step.onnx").touch()
+    encoder, decoder = 252 * 16 + 16 + 2 * 16 + 16 * 16 + 16, 2 * 16 + 16 * 16 + 16 + 16 * 132 + 132
+    for codebook in ("ema", "gradient"):
+        model = tiny.model(codes=VQVAE(codes=5, width=16, encoder_depth=1, codebook=codebook))
+        size = latency.size(model, model, file)
+        assert size["parameters_with_vqvae"] - size["parameters"] == encoder + 5 * 16 + decoder
 
 
 def test_the_order_of_files_is_reversed_and_each_rounds_share_of_a_core_is_kept(monkeypatch):
@@ -109,9 +105,6 @@ def test_the_order_of_files_is_reversed_and_each_rounds_share_of_a_core_is_kept(
 
 
 def test_macs_are_counted_by_hand():
-    """The network has a stem, 4 blocks of time and channel mixing, and two branches of a block and a
-    linear.
-    """
     model = tiny.model(NoMemory)
     frames, hidden = model.frames, model.hidden
     block = frames * frames * hidden + frames * hidden * hidden

@@ -14,19 +14,13 @@ from memmlp.motion.body import SPARSE_DIM
 pytestmark = pytest.mark.slow
 
 
-def test_zeros_are_a_fresh_start(step_files):
-    path = step_files("mem_mlp")
-    stream = OnnxStream(path)
+def test_a_reset_is_a_fresh_start_and_a_peek_keeps_the_state(step_files):
+    stream = OnnxStream(step_files("mem_mlp"))
     sparse = tiny.clip(5)[:, None, :SPARSE_DIM].numpy()
     first = [stream.step(frame)[1] for frame in sparse]
     stream.reset()
     again = [stream.step(frame)[1] for frame in sparse]
     assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
-
-
-def test_a_peek_keeps_the_state(step_files):
-    stream, sparse = OnnxStream(step_files("mem_mlp")), tiny.clip(3)[:, None, :SPARSE_DIM].numpy()
-    stream.step(sparse[0])
     before = stream.state
     stream.inputs["sparse"][:] = sparse[1]
     stream.peek()
@@ -36,19 +30,13 @@ def test_a_peek_keeps_the_state(step_files):
     assert not all(np.array_equal(stream.state[name], array) for name, array in before.items())
 
 
-@pytest.mark.parametrize(
-    ("name", "kind", "shape"),
-    [
-        ("x", onnx.TensorProto.FLOAT, ["batch", 3]),
-        ("x", onnx.TensorProto.STRING, [3]),
-        ("state.x", onnx.TensorProto.FLOAT, [3]),
-    ],
-)
-def test_networks_of_other_programs_are_rejected(name, kind, shape, tmp_path):
-    ends = [onnx.helper.make_tensor_value_info(end, kind, shape) for end in (name, "y")]
-    node = onnx.helper.make_node("Identity", [name], ["y"])
-    graph = onnx.helper.make_graph([node], "foreign", ends[:1], ends[1:])
-    model = onnx.helper.make_model(graph, ir_version=9, opset_imports=[onnx.helper.make_opsetid("", 18)])
-    onnx.save(model, tmp_path / "foreign.onnx")
-    with pytest.raises(InputError, match=r"foreign\.onnx"):
-        OnnxStream(tmp_path / "foreign.onnx")
+def test_networks_of_other_programs_are_rejected(tmp_path):
+    real, text = onnx.TensorProto.FLOAT, onnx.TensorProto.STRING
+    for name, kind, shape in (("x", real, ["batch", 3]), ("x", text, [3]), ("state.x", real, [3])):
+        ends = [onnx.helper.make_tensor_value_info(end, kind, shape) for end in (name, "y")]
+        node = onnx.helper.make_node("Identity", [name], ["y"])
+        graph = onnx.helper.make_graph([node], "foreign", ends[:1], ends[1:])
+        model = onnx.helper.make_model(graph, ir_version=9, opset_imports=[onnx.helper.make_opsetid("", 18)])
+        onnx.save(model, tmp_path / "foreign.onnx")
+        with pytest.raises(InputError, match=r"foreign\.onnx"):
+            OnnxStream(tmp_path / "foreign.onnx")

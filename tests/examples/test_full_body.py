@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -72,7 +71,6 @@ def cpp(folder: Path) -> Command:
 
 @pytest.fixture(scope="module", params=[python, node, cpp], ids=lambda make: make.__name__)
 def command(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Command:
-    """The words of a command line before the example's own."""
     return request.param(tmp_path_factory.mktemp("example"))
 
 
@@ -108,8 +106,3 @@ def test_it_refuses_a_lost_tracker_and_another_network(
     done = ran(command, step_files("mem_mlp"), clip.trackers)
     assert done.returncode == 1
     assert re.fullmatch(r"[^\n]*not written by memmlp export with --scope full\n", done.stderr)
-
-
-def test_versions_are_those_that_are_tested():
-    package = json.loads((EXAMPLES / "node/package.json").read_text())
-    assert package["dependencies"] == {npm.ONNXRUNTIME_WEB.name: npm.ONNXRUNTIME_WEB.version}

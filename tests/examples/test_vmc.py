@@ -70,7 +70,6 @@ def test_it_prints_where_bones_are(words):
 
 
 def by_matrices(frame: np.ndarray) -> dict[str, np.ndarray]:
-    """Where each bone is."""
     world: dict[str | None, np.ndarray] = {None: np.eye(4)}
     for (name, parent), values in zip(PARENTS.items(), frame, strict=True):
         local = np.eye(4)

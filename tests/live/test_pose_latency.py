@@ -17,8 +17,5 @@ def test_a_whole_pose_is_timed(step_files):
     both = alternate(stream, stream.network, 5)
     assert both.shape == (5, 2)
     assert (both > 0).all()
-
-
-def test_poses_are_timed_in_turn(step_files):
-    (times,) = time_poses_in_turn({"one": step_files("no_memory")}, 2, 3).values()
+    (times,) = time_poses_in_turn({"one": file}, 2, 3).values()
     assert (times.seconds.shape, times.core_shares.shape) == ((2, 3), (2,))

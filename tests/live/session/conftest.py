@@ -27,5 +27,4 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def clip() -> TrackedClip:
-    """Return a clip of two seconds."""
     return TrackedClip("person", PERSON.frames.numpy())

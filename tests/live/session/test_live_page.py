@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,17 +24,23 @@ SHOWN = "Number(document.documentElement.dataset.shown)"
 NEWEST = "Number(document.querySelector('#scrub').max)"
 
 
+@contextlib.contextmanager
+def playing(stream: Stream, source: ClipSource, hub: Hub, *rest: Any) -> Iterator[None]:
+    stopped = threading.Event()
+    parts = (stream, source, hub.publish, stopped, *rest)
+    loop = threading.Thread(target=run_loop, args=parts, daemon=True)
+    loop.start()
+    yield
+    stopped.set()
+    loop.join(PATIENCE)
+
+
 @pytest.fixture
 def url(network: Path, clip: TrackedClip) -> Iterator[str]:
-    """Serve a page on which a clip plays, and yield its address."""
-    stopped, source = threading.Event(), ClipSource(clip, 60)
-    with LiveServer(Hub(make_greeting(source, "tiny")), 0) as server:
-        parts = (Stream(network), source, server.hub.publish, stopped)
-        loop = threading.Thread(target=run_loop, args=parts, daemon=True)
-        loop.start()
+    source = ClipSource(clip, 60)
+    hub = Hub(make_greeting(source, "tiny"))
+    with LiveServer(hub, 0) as server, playing(Stream(network), source, hub):
         yield server.url
-        stopped.set()
-        loop.join(PATIENCE)
 
 
 @pytest.fixture
@@ -42,7 +50,6 @@ def browser() -> Iterator[Browser]:
 
 
 def stage(browser: Browser) -> np.ndarray:
-    """Return the part of the picture with the person."""
     x, y, width, height = browser.value(
         "(b => [b.x, b.y, b.width, b.height])(document.querySelector('#stage').getBoundingClientRect())"
     )
@@ -100,7 +107,6 @@ def test_it_says_what_it_waits_for_and_when_the_command_has_ended(
 
 
 def frame(number: int) -> dict[str, object]:
-    """Return a frame's message."""
     counts = {"held": [], "jumping": False, "dropped": 0, "malformed": 0, "foreign": 0}
     positions = {"positions": np.random.default_rng(0).integers(0, 1500, 66).tolist(), "truth": None}
     return {"number": number, "time": 0.0, "ms": 1.0, "whole": 1.0, **positions, **counts}
@@ -134,13 +140,10 @@ def test_the_wearer_fits_the_stream_from_the_page(
     browser: Browser, network: Path, clip: TrackedClip, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr("memmlp.live.stream.FAR", 0.0)  # nobody stands so well in a T-pose
-    stopped, source, stream = threading.Event(), Worn(clip, 60), Stream(network)
+    source, stream = Worn(clip, 60), Stream(network)
     hub = Hub(make_greeting(source, "tiny"))
     fitting = Fitting(stream, "amass", None, hub.tell, clock=lambda: 0.0)  # a countdown ends when cancelled
-    with LiveServer(hub, 0, ask=fitting.ask) as server:
-        parts = (stream, source, hub.publish, stopped, None, fitting)
-        loop = threading.Thread(target=run_loop, args=parts, daemon=True)
-        loop.start()
+    with LiveServer(hub, 0, ask=fitting.ask) as server, playing(stream, source, hub, None, fitting):
         browser.open(server.url)
         browser.wait("document.querySelector('#height').value == '172'")
         for name, value in (("height", 186), ("floor", 5)):
@@ -160,8 +163,6 @@ def test_the_wearer_fits_the_stream_from_the_page(
         browser.wait("document.querySelector('#said').classList.contains('failed')")
         whole = "Number(document.querySelector('#latency [data-key=whole] td').textContent)"
         assert browser.wait(whole) > 0
-        stopped.set()
-        loop.join(PATIENCE)
     assert browser.errors == []
 
 
@@ -178,16 +179,3 @@ def test_the_printed_address_opens_the_page_for_others(browser: Browser, clip: T
         until(lambda: asked, "an order")
     assert asked == [{"action": "calibrate", "value": None}]
     assert browser.errors == []
-
-
-def test_it_fits_a_phone_in_the_dark(url: str):
-    with Browser(390, 780, dark=True) as browser:
-        browser.open(url)
-        browser.wait(f"{SHOWN} > 5")
-        slow = "document.querySelectorAll('#latency td').forEach(e => { e.textContent = '9999'; })"
-        outside = (
-            "[...document.querySelectorAll('body *')].filter(e => e.getBoundingClientRect().right > 390)"
-        )
-        assert browser.value(f"{slow}; {outside}.length") == 0
-        assert browser.value("document.querySelector('#stage').clientHeight") > 300
-        assert stage(browser)[5, 5].max() < 60

@@ -26,14 +26,17 @@ def server(clip: TrackedClip) -> Iterator[LiveServer]:
         yield server
 
 
-def get(server: LiveServer, path: str) -> http.client.HTTPResponse:
+def request(server: LiveServer, method: str, path: str, content: bytes | None = None, **headers: str):
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=PATIENCE)
-    connection.request("GET", path)
+    connection.request(method, path, content, {name.replace("_", "-"): v for name, v in headers.items()})
     return connection.getresponse()
 
 
+def get(server: LiveServer, path: str, **headers: str) -> http.client.HTTPResponse:
+    return request(server, "GET", path, **headers)
+
+
 def events(response: http.client.HTTPResponse) -> Iterator[tuple[str, dict]]:
-    """Yield the events of a stream."""
     name = ""
     for line in response:
         key, _, value = line.decode().strip().partition(": ")
@@ -57,59 +60,42 @@ def test_two_watchers_get_all_frames(server: LiveServer):
     assert [list(stream) for stream in streams] == [[], []]
 
 
-def test_a_slow_watcher_loses_the_oldest_frames(monkeypatch):
+def test_a_slow_watcher_loses_the_oldest_frames_and_no_state(monkeypatch):
     monkeypatch.setattr(module, "QUEUED", 4)
     hub = Hub({})
+    hub.tell("wearer", {"height": 170})
+    hub.tell("wearer", {"height": 180})
     with hub.watch() as watcher:
-        watcher.get_nowait()  # the greeting
+        first = [watcher.get_nowait() for _ in range(2)]
+        assert first[1] == b'event: wearer\ndata: {"height":180}\n\n'  # the newest state
         for number in range(10):
             hub.publish({"number": number})
         assert [watcher.get_nowait() for _ in range(4)] == [
             f'event: frame\ndata: {{"number":{n}}}\n\n'.encode() for n in range(6, 10)
         ]
-    assert hub.watchers == set()
-
-
-def test_a_slow_watcher_loses_no_state(monkeypatch):
-    monkeypatch.setattr(module, "QUEUED", 4)
-    hub = Hub({})
-    with hub.watch() as watcher:
         hub.tell("wearer", {"calibrated": True})
         for number in range(10):
             hub.publish({"number": number})
         found = [watcher.get_nowait().split(b"\n")[0] for _ in range(4)]
-        assert found == [b"event: greeting", b"event: wearer", b"event: frame", b"event: frame"]
+        assert found == [b"event: wearer", *3 * [b"event: frame"]]
         for _ in range(6):
             hub.tell("wearer", {})
         assert watcher.qsize() == 4
+    assert hub.watchers == set()
 
 
-def test_the_pages_files_are_there(server: LiveServer):
+def test_the_pages_files_are_served_and_nothing_else(server: LiveServer):
     for name, file in FILES.items():
         response = get(server, f"/{name}")
         assert (response.status, response.headers["Content-Type"]) == (200, file.kind), name
-        assert len(response.read()) > 200
-
-
-def test_the_page_needs_no_network(server: LiveServer):
-    """The page loads nothing from elsewhere."""
-    for name in FILES:
-        if not name.startswith("three/"):
-            assert "//" not in get(server, f"/{name}").read().decode().replace("// ", ""), name
-
-
-@pytest.mark.parametrize(
-    "path", ["/../page_server.py", "/three/LICENSE/..", "/%2e%2e/page_server.py", "/main"]
-)
-def test_nothing_else_is_served(server: LiveServer, path: str):
-    assert get(server, path).status == 404
-
-
-def test_a_page_of_another_site_gets_nothing(server: LiveServer):
-    """Whose name was made to mean this machine."""
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=PATIENCE)
-    connection.request("GET", "/events", headers={"Host": f"elsewhere.example:{server.server_port}"})
-    assert connection.getresponse().status == 403
+        content = response.read().decode()
+        assert len(content) > 200
+        if not name.startswith("three/"):  # the page loads nothing from elsewhere
+            assert "//" not in content.replace("// ", ""), name
+    for path in ("/../page_server.py", "/three/LICENSE/..", "/%2e%2e/page_server.py", "/main"):
+        assert get(server, path).status == 404
+    # A page of another site, whose name was made to mean this machine, gets nothing.
+    assert get(server, "/events", Host=f"elsewhere.example:{server.server_port}").status == 403
 
 
 def test_a_taken_port_is_one_line(server: LiveServer):
@@ -118,11 +104,7 @@ def test_a_taken_port_is_one_line(server: LiveServer):
 
 
 def post(server: LiveServer, content: bytes, path: str = "/wearer", **headers: str) -> tuple[int, str]:
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=PATIENCE)
-    connection.request(
-        "POST", path, content, {name.replace("_", "-"): value for name, value in headers.items()}
-    )
-    response = connection.getresponse()
+    response = request(server, "POST", path, content, **headers)
     return response.status, response.read().decode()
 
 
@@ -133,7 +115,6 @@ def asked() -> list[object]:
 
 @pytest.fixture
 def fitted(asked: list[object]) -> Iterator[LiveServer]:
-    """A server that takes orders, of which "no" is refused."""
 
     def ask(fields: object) -> None:
         if fields == "no":
@@ -152,18 +133,10 @@ def test_orders_of_the_page_arrive(fitted: LiveServer, asked: list[object]):
     for content in (b"", b"nonsense", b"[" * 900, b'"' + 2000 * b"x" + b'"', b"\xff"):
         assert post(fitted, content) == (400, "not JSON")
     assert post(fitted, b"{}", "/other")[0] == 404
+    elsewhere = {"Origin": "http://elsewhere.example", "Host": "elsewhere.example"}
+    for name, value in {**elsewhere, "Sec_Fetch_Site": "cross-site"}.items():
+        assert post(fitted, b'{"action": "forget"}', **{name: value})[0] == 403, name
     assert len(asked) == 1
-
-
-@pytest.mark.parametrize(
-    "headers",
-    [{"Origin": "http://elsewhere.example"}, {"Host": "elsewhere.example"}, {"Sec_Fetch_Site": "cross-site"}],
-)
-def test_orders_of_another_site_s_page_do_not(
-    fitted: LiveServer, asked: list[object], headers: dict[str, str]
-):
-    assert post(fitted, b'{"action": "forget"}', **headers)[0] == 403
-    assert asked == []
 
 
 def test_at_another_address_everything_needs_the_token(clip: TrackedClip):
@@ -175,21 +148,10 @@ def test_at_another_address_everything_needs_the_token(clip: TrackedClip):
         entered = get(server, f"/?{server.url.partition('?')[2]}")
         assert (entered.status, entered.headers["Location"]) == (303, "/")
         cookie = entered.headers["Set-Cookie"].partition(";")[0]
-        connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=PATIENCE)
-        connection.request("GET", "/events", headers={"Cookie": cookie})
-        response = connection.getresponse()
+        response = get(server, "/events", Cookie=cookie)
         assert response.status == 200
         assert next(events(response))[0] == "greeting"
         assert "0.0.0.0" not in server.url  # which nobody can open from elsewhere
-
-
-def test_a_later_watcher_gets_the_newest_state():
-    hub = Hub({})
-    hub.tell("wearer", {"height": 170})
-    hub.tell("wearer", {"height": 180})
-    with hub.watch() as watcher:
-        found = [watcher.get_nowait() for _ in range(2)]
-    assert found[1] == b'event: wearer\ndata: {"height":180}\n\n'
 
 
 def test_the_end_leaves_the_port_and_no_thread(clip: TrackedClip):
@@ -204,7 +166,6 @@ def test_the_end_leaves_the_port_and_no_thread(clip: TrackedClip):
 
 
 def vrm(content: object) -> bytes:
-    """A binary glTF file with this JSON."""
     text = json.dumps(content).encode()
     return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON") + text
 

@@ -37,7 +37,6 @@ class Made(NamedTuple):
 
 
 def network() -> MotionModel:
-    """A tiny network of random weights that stands as a person does."""
     return wearer.at_ease(tiny.model(NoMemory), PERSON.frames)
 
 
@@ -89,7 +88,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 @pytest.fixture(scope="session")
 def node() -> Callable[..., str]:
-    """Node, or a skip."""
     path = shutil.which("node")
     if path is None:
         pytest.skip("node is not installed")

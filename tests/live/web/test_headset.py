@@ -24,7 +24,6 @@ def page(tmp_path: Path) -> Path:
 
 
 def value(node: str, page: Path, expression: str) -> Any:
-    """Return an expression of the module's functions."""
     line = f"import * as headset from './headset.js'; console.log(JSON.stringify({expression}));"
     command = [node, "--input-type=module", "-e", line]
     return json.loads(subprocess.run(command, cwd=page, check=True, capture_output=True, timeout=60).stdout)
@@ -45,14 +44,10 @@ def test_each_hand_has_its_own_kind(node: str, page: Path):
 
 
 def test_each_hand_has_the_offset_of_its_kind(node: str, page: Path):
-    mixed, hands, controllers, unknown = value(
-        node,
-        page,
-        "[['hands', 'controllers'], ['hands', 'hands'], ['controllers', 'controllers'], [null, null]]"
-        ".map(headset.usualOffsets)",
-    )
+    kinds = [["hands", "controllers"], ["hands", "hands"], ["controllers", "controllers"], [None, None]]
+    offsets = value(node, page, f"{json.dumps(kinds)}.map(headset.usualOffsets)")
+    mixed, hands, controllers, unknown = offsets
     for key in ("positions", "rotations"):
-        head, left, right = mixed[key]
-        assert (head, left, right) == (hands[key][0], hands[key][1], controllers[key][2])
+        assert mixed[key] == [hands[key][0], hands[key][1], controllers[key][2]]
         assert hands[key][2] != controllers[key][2]
     assert unknown == controllers

@@ -49,7 +49,6 @@ def test_the_yardstick_runs_with_drawn_weights(monkeypatch: pytest.MonkeyPatch):
 
 
 def graph(**tensors: np.ndarray) -> onnx.ModelProto:
-    """A graph with nothing but initializers."""
     made = [numpy_helper.from_array(values, name) for name, values in tensors.items()]
     return helper.make_model(helper.make_graph([], "g", [], [], made))
 

@@ -22,7 +22,7 @@ NOTHING = Site(networks=[], base=None, clips=[], calibration=[], webgpu=False)
 
 
 @pytest.mark.slow
-def test_everything_that_the_page_names_is_there(site: Made):
+def test_everything_that_the_page_names_is_there_and_nothing_elsewhere(site: Made):
     about = json.loads((site.folder / "site.json").read_text())
     entries = [about["base"], *about["networks"]]
     graphs = [graph[part] for entry in entries for graph in entry["graphs"] for part in ("step", "whole")]
@@ -31,31 +31,19 @@ def test_everything_that_the_page_names_is_there(site: Made):
     named += [clip["file"] for clip in about["clips"]]
     assert [name for name in named if not (site.folder / name).is_file()] == []
     assert about["base"]["play"] is None
-    assert [(row["graph"], row["precision"]) for row in about["networks"][0]["graphs"]] == [
-        ("naive", "fp32"),
-        ("streaming", "fp32"),
-        ("streaming", "int8"),
-        ("streaming", "fp16"),
-    ]
+    kinds = [f"{row['graph']} {row['precision']}" for row in about["networks"][0]["graphs"]]
+    assert kinds == ["naive fp32", "streaming fp32", "streaming int8", "streaming fp16"]
     imports = re.compile(r"""(?:from|import\()\s*['"](\./[^'"$]+)['"]""")
     for path in site.folder.glob("*.js"):
         for name in imports.findall(path.read_text()):
             assert (path.parent / name).is_file(), f"{path.name} imports {name}"
-
-
-@pytest.mark.slow
-def test_the_service_worker_keeps_every_file(site: Made):
+    # The service worker keeps every file.
     files = {path.relative_to(site.folder).as_posix() for path in site.folder.rglob("*") if path.is_file()}
-    head = re.match(
-        r'const VERSION = "(\w{16})";\nconst FILES = (\[.*\]);\n', (site.folder / "sw.js").read_text()
-    )
+    worker = (site.folder / "sw.js").read_text()
+    head = re.match(r'const VERSION = "(\w{16})";\nconst FILES = (\[.*\]);\n', worker)
     assert head is not None
     assert set(json.loads(head[2])) == files - {"sw.js"}
-
-
-@pytest.mark.slow
-def test_nothing_of_another_host_is_named(site: Made):
-    """Addresses are relative; the policy allows no other host."""
+    # Addresses are relative; the policy allows no other host.
     page = (site.folder / "index.html").read_text()
     assert "POLICY" not in page
     assert "default-src 'none'" in page
@@ -129,6 +117,10 @@ def test_a_new_version_keeps_other_sites_below_its_address(node: str, tmp_path: 
 def test_it_is_the_middle_of_the_clip_in_the_page_s_axes():
     clip = pack_clip("walk", PERSON.frames.numpy(), 1.0)
     assert (clip.name, clip.frames) == ("walk", 60)
+    frames = PERSON.frames.numpy()
+    whole = pack_clip("a", frames, 9.0)
+    assert whole.key == pack_clip("b", frames, 9.0).key != pack_clip("a", frames[1:], 9.0).key
+    assert whole.frames == len(frames)
     numbers = np.frombuffer(clip.content, "<f4").reshape(60, NUMBERS)
     first = (len(PERSON.frames) - 60) // 2
     space, middle = SPACES["openxr"], slice(first + 1, first + 61)  # frames have no first moment
@@ -139,10 +131,3 @@ def test_it_is_the_middle_of_the_clip_in_the_page_s_axes():
     np.testing.assert_allclose(rotations, space.rotations_out(PERSON.rotations[middle]), atol=1e-5)
     joints = PERSON.frames[first : first + 60, -66:].reshape(-1, 22, 3).numpy()
     np.testing.assert_allclose(numbers[:, 21:].reshape(-1, 22, 3), space.positions_out(joints), atol=1e-6)
-
-
-def test_the_same_frames_have_the_same_key():
-    frames = PERSON.frames.numpy()
-    assert pack_clip("a", frames, 9.0).key == pack_clip("b", frames, 9.0).key
-    assert pack_clip("a", frames, 9.0).key != pack_clip("a", frames[1:], 9.0).key
-    assert pack_clip("a", frames, 9.0).frames == len(frames)

@@ -80,7 +80,6 @@ def gaps() -> np.ndarray:
 
 
 def gone(first: int, end: int, *which: int) -> dict[int, tuple[int, ...]]:
-    """Trackers that are lost from a sample to another."""
     return dict.fromkeys(range(first, end), which)
 
 
@@ -97,24 +96,19 @@ PARTS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-def hanging() -> list[dict[str, Any]]:
-    """The same devices with the arms beside the body."""
-    head, left, right = t_pose()
-    return [
-        head,
-        left | {"position": [0.15, 0.85, 0.45]},
-        right | {"position": [0.15, 0.85, -0.05]},
-    ]
-
-
+HEAD, LEFT, RIGHT = t_pose()
+HANGING = [HEAD, LEFT | {"position": [0.15, 0.85, 0.45]}, RIGHT | {"position": [0.15, 0.85, -0.05]}]
 REFUSED = {
-    "exchanged": {"samples": [], "calibrate": [t_pose()[k] for k in (0, 2, 1)]},
-    "hanging": {"samples": [], "calibrate": hanging()},
+    "exchanged, or is the head's device mounted backwards": [HEAD, RIGHT, LEFT],
+    "cm from its joint in a T-pose": HANGING,
 }
 
 
+def refused(words: str) -> dict[str, Any]:
+    return {"samples": [], "calibrate": REFUSED[words]}
+
+
 def in_python(step: Path, part: dict[str, Any]) -> tuple[Stream, list[Pose]]:
-    """The same by Python's Stream."""
     stream = Stream(step, space="openxr", height=part.get("height"))
 
     def given(trackers: list[dict[str, Any] | None]) -> list[Any]:
@@ -130,6 +124,7 @@ def answers(site: Made, node: str, tmp_path_factory: pytest.TempPathFactory) -> 
     """What node makes of all parts, in one process."""
     folder = tmp_path_factory.mktemp("node")
     entry = json.loads((site.folder / "site.json").read_text())["networks"][0]
+    assert entry["run"] == RUN
     for name, packed in (("model.onnx", entry["play"]["file"]), ("ort.wasm", "ort/wasm.wasm.gz")):
         (folder / name).write_bytes(gzip.decompress((site.folder / packed).read_bytes()))
     page = folder / "page"
@@ -138,37 +133,22 @@ def answers(site: Made, node: str, tmp_path_factory: pytest.TempPathFactory) -> 
     for name in ("onnx_stream.js", "stream.js", "rotations.js", "ort/wasm.js"):
         (page / Path(name).name).write_bytes((site.folder / name).read_bytes())
     job = folder / "job.json"
-    job.write_text(json.dumps({"body": entry["body"], "parts": [*PARTS.values(), *REFUSED.values()]}))
-    command = [
-        node,
-        HERE / "play.mjs",
-        page,
-        page / "wasm.js",
-        folder / "ort.wasm",
-        folder / "model.onnx",
-        job,
-    ]
-    finished([str(word) for word in command])
+    job.write_text(json.dumps({"body": entry["body"], "parts": [*PARTS.values(), *map(refused, REFUSED)]}))
+    files = (HERE / "play.mjs", page, page / "wasm.js", folder / "ort.wasm", folder / "model.onnx", job)
+    finished([node, *map(str, files)])
     names = [*PARTS, *REFUSED]
     return dict(zip(names, json.loads(Path(f"{job}.answer").read_text()), strict=True))
 
 
 @pytest.mark.parametrize("name", PARTS)
 def test_it_is_python_s_stream(name: str, site: Made, answers: dict[str, Any]):
-    assert entry_is_of(site)
     stream, expected = in_python(site.step, PARTS[name])
     found = answers[name]["poses"]
-    for key in ("held", "fresh", "restarted"):
-        told = [
-            list(value) if key == "held" else value for value in (getattr(pose, key) for pose in expected)
-        ]
-        assert [pose[key] for pose in found] == told
+    flags = [(list(pose.held), pose.fresh, pose.restarted) for pose in expected]
+    assert [(pose["held"], pose["fresh"], pose["restarted"]) for pose in found] == flags
     np.testing.assert_allclose([p["time"] for p in found], [p.time for p in expected], atol=1e-9)
-    for theirs, ours in (
-        ("positions", "positions"),
-        ("rotations", "rotations"),
-        ("joints", "position_branch"),
-    ):
+    names = {"positions": "positions", "rotations": "rotations", "joints": "position_branch"}
+    for theirs, ours in names.items():
         made = np.array([pose[theirs] for pose in found])
         wanted = np.array([getattr(pose, ours).ravel() for pose in expected])
         np.testing.assert_allclose(made, wanted, atol=TOLERANCE)
@@ -181,23 +161,13 @@ def test_it_is_python_s_stream(name: str, site: Made, answers: dict[str, Any]):
         np.testing.assert_allclose(turns, 1, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("exchanged", "exchanged, or is the head's device mounted backwards"),
-        ("hanging", "cm from its joint in a T-pose"),
-    ],
-)
-def test_what_is_no_t_pose_is_not_calibrated(name: str, words: str, site: Made, answers: dict[str, Any]):
-    """Both refuse it for the same reason."""
-    with pytest.raises(InputError, match=words) as refused:
-        in_python(site.step, REFUSED[name])
-    said = answers[name]["refused"]
+@pytest.mark.parametrize("words", REFUSED)
+def test_both_refuse_other_poses_than_a_t_pose_for_the_same_reason(
+    words: str, site: Made, answers: dict[str, Any]
+):
+    with pytest.raises(InputError, match=words) as error:
+        in_python(site.step, refused(words))
+    said = answers[words]["refused"]
     assert words in said
-    assert said.split("; ")[0] in str(refused.value)
-    assert answers[name]["offsets"] is None
-
-
-def entry_is_of(site: Made) -> bool:
-    """Whether the site's network is the one that Python has."""
-    return json.loads((site.folder / "site.json").read_text())["networks"][0]["run"] == RUN
+    assert said.split("; ")[0] in str(error.value)
+    assert answers[words]["offsets"] is None
