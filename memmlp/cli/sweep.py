@@ -93,7 +93,10 @@ def sweep(
     if status or dry_run:
         show(spent, plan, labels)
         if rounds:
-            click.echo("\n".join([describe_schedule(rounds), *describe_progress(rounds, chosen)]))
+            shares = zip(rounds.schedule, rounds.levels, strict=True)
+            parts = ", ".join(f"{seeds} ({100 * level:.2g} %)" for seeds, level in shares)
+            click.echo(f"interim analyses at {parts} seeds; together they spend 5 %")
+            click.echo("\n".join(describe_progress(rounds, chosen)))
         if dry_run:
             show_forecast(spent, wanted, labels, workers, sweep_folder(chosen, outputs))
         return
@@ -335,14 +338,6 @@ def analyse(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
         after = advance(rounds, sweep, runs, digests)
         write_json(path, asdict(after))
     return after
-
-
-def describe_schedule(rounds: Rounds) -> str:
-    """Say at how many seeds there are interim analyses, and which share of the 5 % each one spends."""
-    parts = [
-        f"{seeds} ({100 * level:.2g} %)" for seeds, level in zip(rounds.schedule, rounds.levels, strict=True)
-    ]
-    return f"interim analyses at {', '.join(parts)} seeds; together they spend 5 %"
 
 
 def describe_progress(rounds: Rounds, sweep: Sweep, last: Analysis | None = None) -> list[str]:

@@ -23,12 +23,16 @@ from memmlp.sweep.definition import BRANCHES
 
 if TYPE_CHECKING:
     from memmlp.report.tables.build_table import Read
-    from memmlp.report.tables.effects import Need, RunsBySeed
+    from memmlp.report.tables.effects import RunsBySeed
     from memmlp.report.tables.seed_rounds import Rounds
     from memmlp.report.tables.table import Table
     from memmlp.sweep.definition import Sweep
     from memmlp.sweep.plan import Plan
 
+NEEDED = (
+    "needed: seeds for an effect of the paper's size to be significant with 80 % power, after Holm's "
+    "correction over this table, with these test clips; no number: the clips alone are too uncertain"
+)
 SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", "window")}
 
 
@@ -272,26 +276,13 @@ def print_needs(found: Sequence[SweepTable], modes: Sequence[str]) -> None:
     for one in found:
         wanted = needs(one.sweep, one.runs, modes)
         click.echo(caption(one.table))
-        if wanted:
-            click.echo(_describe_needs(wanted))
-        else:
-            click.echo(
-                "no variant with an effect that the paper prints has two seeds and two groups of clips"
-            )
-        click.echo()
-
-
-def _describe_needs(wanted: Sequence[Need]) -> str:
-    rows = [("variant", "mode", "metric", "paper", "here", "seeds", "needed")]
-    for need in wanted:
-        numbers = (f"{need.paper:+.2f}", f"{need.measured:+.2f}", str(need.have))
-        rows.append((need.label, need.mode, need.metric, *numbers, str(need.seeds or "no number")))
-    lines = aligned(rows, left=3)
-    note = (
-        "needed: seeds for an effect of the paper's size to be significant with 80 % power, after Holm's "
-        "correction over this table, with these test clips; no number: the clips alone are too uncertain"
-    )
-    return "\n".join([*lines, note])
+        rows = [("variant", "mode", "metric", "paper", "here", "seeds", "needed")]
+        for need in wanted:
+            numbers = (f"{need.paper:+.2f}", f"{need.measured:+.2f}", str(need.have))
+            rows.append((need.label, need.mode, need.metric, *numbers, str(need.seeds or "no number")))
+        none = "no variant with an effect that the paper prints has two seeds and two groups of clips"
+        lines = [*aligned(rows, left=3), NEEDED] if wanted else [none]
+        click.echo("\n".join([*lines, ""]))
 
 
 def aligned(rows: Sequence[Sequence[str]], left: int) -> list[str]:

@@ -210,19 +210,19 @@ def search(setup: Setup, study: Study, workers: Workers) -> None:
 
     plan = Plan(setup.folder.name, setup.outputs, (), (), open=True)
     base = _requests(setup, {})[0]
-    check = partial(_check_same_clips, base, base.motion.prepare().digest)
+    digest = base.motion.prepare().digest
+
+    def check() -> None:
+        """Raise InputError if the data has another digest now, by which further trials would be judged."""
+        if base.motion.prepare().digest != digest:
+            raise InputError(
+                f"{base.motion.clips.root}: its clips changed since the search started; restore them, or "
+                "start the search again as another one"
+            )
+
     director = Director(study, partial(_tasks, setup), plan, check)
     path, fleet = start_fleet(setup.folder, plan, workers, {base.config["device"]})
     direct(director, fleet, SearchBoard(setup.outputs), path)
-
-
-def _check_same_clips(base: RunRequest, digest: str) -> None:
-    """Raise InputError if the data has another digest now, so that further trials would be judged by it."""
-    if base.motion.prepare().digest != digest:
-        raise InputError(
-            f"{base.motion.clips.root}: its clips changed since the search started; restore them, or start "
-            "the search again as another one"
-        )
 
 
 def write_results(setup: Setup, study: Study) -> None:

@@ -116,14 +116,13 @@ def one_and_the_same(variant: Variant, other: Variant, ours: RunsBySeed, theirs:
 
     One run may have several kinds of errors, such as those after two kinds of inverse kinematics.
     """
-
-    def same(one: Measured, two: Measured) -> bool:
-        return one.id == two.id and str(one.shown(variant.branch)) == str(
-            two.shown(other.branch)
-        )  # NaN is NaN
-
-    shared = any(same(ours[seed], theirs[seed]) for seed in ours.keys() & theirs.keys())
-    return shared and variant.branch == other.branch
+    if variant.branch != other.branch:
+        return False
+    both = [(ours[seed], theirs[seed]) for seed in ours.keys() & theirs.keys()]
+    # As texts, in which NaN equals NaN.
+    same = [pair for pair in both if pair[0].id == pair[1].id]
+    shown = [[str(run.shown(variant.branch)) for run in pair] for pair in same]
+    return any(one == two for one, two in shown)
 
 
 def _paired(
@@ -186,9 +185,8 @@ def tested(
     """
     found: dict[Key, Effect] = {}
     comparisons = max(1, testable(pairs))  # with none, nothing computed by it is shown
-    batches: dict[tuple[int, bytes], list[Key]] = defaultdict(
-        list
-    )  # of equal seeds and groups, computed at once
+    # Those of equal seeds and groups are computed at once.
+    batches: dict[tuple[int, bytes], list[Key]] = defaultdict(list)
     for key, pair in pairs.items():
         batches[len(pair.matrix), pair.groups.tobytes()].append(key)
     for keys in batches.values():
@@ -274,10 +272,8 @@ def with_existing_branches(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Swee
         solved = variant.branch == "combined" and all(run.has("combined") for run in found)
         return bool(found) and not solved and all(run.one_branch for run in found)
 
-    variants = tuple(
-        replace(variant, branch="rotation") if single(variant) else variant for variant in sweep.variants
-    )
-    return replace(sweep, variants=variants)
+    variants = (replace(one, branch="rotation") if single(one) else one for one in sweep.variants)
+    return replace(sweep, variants=tuple(variants))
 
 
 class Need(NamedTuple):

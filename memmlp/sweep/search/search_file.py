@@ -239,10 +239,9 @@ def _interval(key: str, node: Mapping[str, Any], where: str) -> Range:
         raise InputError(f"{where}.low={low}: must be above 0 with log")
     if step is not None and (log or _number(step, f"{where}.step") <= 0):
         raise InputError(f"{where}.step={step}: must be above 0, and does not go with log")
-    if step is not None and isinstance(low, int) and isinstance(high, int) and not isinstance(step, int):
-        raise InputError(f"{where}.step={step}: must be a whole number, as low and high are")
-    if first is not None and isinstance(low, int) and isinstance(high, int) and not isinstance(first, int):
-        raise InputError(f"{where}.first={first}: must be a whole number, as low and high are")
+    for name, value in (("step", step), ("first", first)):
+        if isinstance(low, int) and isinstance(high, int) and not isinstance(value, int | None):
+            raise InputError(f"{where}.{name}={value}: must be a whole number, as low and high are")
     if step is not None and step > high - low:
         raise InputError(f"{where}.step={step}: must be at most high - low")
     if step is not None and first is not None and abs((first - low) / step % 1 - 0.5) < 0.5 - 1e-9:
