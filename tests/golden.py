@@ -59,6 +59,7 @@ from memmlp.training.losses import (
     TermsLoss,
     Uncertainty,
 )
+from memmlp.training.losses.baseline_losses import AGRoLLossSettings, AvatarPoserLossSettings
 from memmlp.training.losses.terms import ERRORS, TERMS
 from memmlp.training.optim import Muon, Optim, ScheduleFree
 from memmlp.training.rollout import OwnPredictions, PersistentStreams, Rollout, TeacherForcing
@@ -282,12 +283,12 @@ CASES: dict[str, Callable[[], Numbers]] = {
     "loss.agrol": lambda: {
         f"{error} {name}": value
         for error in ("norm", "square")
-        for name, value in loss(partial(AGRoLLoss, error)).items()
+        for name, value in loss(partial(AGRoLLoss, AGRoLLossSettings(error))).items()
     },
     "loss.avatar_poser": lambda: {
         f"{anchor} {name}": value
         for anchor in ("pelvis", "head")
-        for name, value in loss(partial(AvatarPoserLoss, anchor=anchor)).items()
+        for name, value in loss(partial(AvatarPoserLoss, AvatarPoserLossSettings(anchor=anchor))).items()
     },
     "loss.rpm": lambda: loss(RPMLoss),
     "loss.own": lambda: {

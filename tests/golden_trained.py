@@ -41,7 +41,7 @@ def vqvae(codebook: str = "ema") -> Numbers:
     """Three steps of its training, and what it then makes of frames."""
     torch.manual_seed(3)
     model = VQVAE(codes=8, width=12, encoder_depth=2, codebook=codebook)
-    optim = vqvae_optim(3, 16, 1e-3, 0.1)
+    optim = vqvae_optim(3, batch=16, lr=1e-3, weight_decay=0.1)
     task = VQVAETask(model, tiny.normalizer(), frames(), frames(), optim, seed=0)
     return _trained(task, optim) | task.validate()
 

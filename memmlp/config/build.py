@@ -239,9 +239,10 @@ def build_ik(cfg: DictConfig) -> IK:
 
 def build_vqvae_optim(cfg: DictConfig, frames: int) -> Optim:
     """Build the optimisation of the VQ-VAE, whose length may be given in epochs of `frames` frames each."""
-    own, often = cfg.vqvae, {name: cfg.optim[name] for name in ("checkpoint_every", "log_every")}
-    steps = own.steps or math.ceil(own.epochs * frames / own.batch)
-    return vqvae_optim(steps, own.batch, own.lr, own.weight_decay, **often)
+    own = cfg.vqvae
+    keys = {name: own[name] for name in ("batch", "lr", "weight_decay")}
+    keys |= {name: cfg.optim[name] for name in ("checkpoint_every", "log_every")}
+    return vqvae_optim(own.steps or math.ceil(own.epochs * frames / own.batch), **keys)
 
 
 def config_of(run: Run, overrides: Sequence[str] = ()) -> DictConfig:

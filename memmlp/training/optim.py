@@ -96,26 +96,13 @@ class ScheduleFreeSettings(OptimSettings):
 class Optim:
     """How a module is optimised: by AdamW, unless a subclass says otherwise.
 
+    The attributes are the keys of AdamWSettings, except for these.
+
     Attributes:
-        steps: number of training steps.
         batch: windows per step; for a VQ-VAE, frames per step.
-        lr: learning rate at the start.
-        final_lr: learning rate at the end of the schedules "step" and "cosine".
-        schedule: "step" (falls to `final_lr` at the fraction `drop_at` of the steps), "cosine", or
-            "milestones" (times 0.2 at 20, 50 and 70 % of the steps, App. A).
-        drop_at: see `schedule`.
-        warmup: over how many first steps the learning rate grows, in equal parts; 0 for no warm-up.
-        ema: decay of an exponential moving average of the weights, which is what is validated and kept; None
-            for the weights of the last step.
-        weight_decay: weight decay.
+        schedule: also "milestones", outside the config: times 0.2 at 20, 50 and 70 % of the steps (App. A).
         betas: Adam's two decay rates.
         decoupled: whether weight decay is AdamW's; otherwise it is Adam's.
-        clip_norm: largest norm of the gradient, 0 for no limit.
-        precision: "fp32" or "bf16" (autocast).
-        compile: whether the model's training call is compiled by torch.compile.
-        checkpoint_every: steps between checkpoints.
-        validate_every: steps between validations.
-        log_every: steps between entries of the log.
     """
 
     steps: int
@@ -172,14 +159,8 @@ class Muon(Optim):
 
     Muon's steps are scaled to the typical length of AdamW's steps (Liu et al. 2025), so that AdamW's learning
     rates and weight decay fit both. The implementation is torch.optim.Muon, which multiplies matrices in
-    bfloat16 (memmlp.training.muon).
-
-    Attributes:
-        momentum: Muon's momentum, which is Nesterov momentum.
-        other_lr: learning rate at the start for parameters that are not matrices, with the same schedule;
-            None for `lr`.
-        vectors: what optimises parameters of two dimensions of which one is 1, such as the biases (T, 1) of
-            TimeMix: "adamw", or "muon", which took them for matrices before.
+    bfloat16 (memmlp.training.muon). Its momentum is Nesterov momentum. The attributes are the keys of
+    MuonSettings.
     """
 
     momentum: float = 0.95
@@ -260,27 +241,11 @@ def _split(groups: list[dict], least: int) -> tuple[list[dict], list[dict]]:
     return parts
 
 
-def vqvae_optim(
-    steps: int,
-    batch: int,
-    lr: float,
-    weight_decay: float,
-    checkpoint_every: int = Optim.checkpoint_every,
-    log_every: int = Optim.log_every,
-) -> Optim:
+def vqvae_optim(steps: int, **keys: Any) -> Optim:
     """Return a VQ-VAE's optimisation: Adam, its rate times 0.2 at 20, 50 and 70 % of the steps (App. A).
 
-    Validation is done once, at the end.
+    Validation is done once, at the end; `keys` are further attributes of Optim.
     """
     return Optim(
-        steps=steps,
-        batch=batch,
-        lr=lr,
-        schedule="milestones",
-        weight_decay=weight_decay,
-        betas=(0.9, 0.99),
-        decoupled=False,
-        checkpoint_every=checkpoint_every,
-        validate_every=steps,
-        log_every=log_every,
+        steps, schedule="milestones", betas=(0.9, 0.99), decoupled=False, validate_every=steps, **keys
     )

@@ -9,6 +9,11 @@ from plain_body import posed
 from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.network_coordinates import World
 from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, RPMLoss
+from memmlp.training.losses.baseline_losses import (
+    AGRoLLossSettings,
+    AvatarPoserLossSettings,
+    RPMLossSettings,
+)
 from memmlp.training.train_refiner import SAGERefinerLoss
 
 CLIP = tiny.clip(40)
@@ -20,7 +25,9 @@ DRAWN = [torch.randn(2, 3, MOTION_DIM, generator=torch.Generator().manual_seed(i
 def test_agrols_loss_is_that_of_its_code_or_of_its_paper(error):
     """The mean over frames and joints of each joint's L2 norm, or the mean of squares, in network space."""
     (motion, truth), normalizer = DRAWN, tiny.normalizer(World())
-    loss, terms = AGRoLLoss(error)(motion, truth, SPARSE[:, :3].expand(2, -1, -1), normalizer)
+    loss, terms = AGRoLLoss(AGRoLLossSettings(error))(
+        motion, truth, SPARSE[:, :3].expand(2, -1, -1), normalizer
+    )
     scaled = (motion - truth)[..., ROTATION].numpy() / normalizer.std[SPARSE_DIM:][ROTATION].numpy()
     norms = [np.sqrt((scaled[b, t, 6 * j : 6 * j + 6] ** 2).sum()) for b, t, j in np.ndindex(2, 3, 22)]
     expected = {"norm": np.mean(norms), "square": np.mean(scaled**2)}
@@ -36,7 +43,7 @@ def test_avatar_posers_loss_compares_bodies_at_the_pelvis_or_at_the_tracker(anch
     """Joint by joint down the tree, in NumPy; by default as its released code has it."""
     (motion, truth), normalizer = DRAWN, tiny.normalizer(World())
     sparse = SPARSE[:, :3].expand(2, -1, -1)
-    loss, terms = AvatarPoserLoss(anchor=anchor)(motion, truth, sparse, normalizer)
+    loss, terms = AvatarPoserLoss(AvatarPoserLossSettings(anchor=anchor))(motion, truth, sparse, normalizer)
     difference = (motion - truth)[..., ROTATION].numpy()
     errors = []
     for b, t in np.ndindex(2, 3):
@@ -85,9 +92,7 @@ def test_rpms_loss_has_l1_norms_of_joints_and_counts_the_last_frames_step_as_rig
     loss, terms = RPMLoss()(motion, truth, sparse, normalizer)
     assert {name: float(term) for name, term in terms.items()} == pytest.approx(expected, rel=1e-4)
     assert float(loss) == pytest.approx(sum(expected.values()), rel=1e-4)
-    weighed, _ = RPMLoss(rotation_all=0.0, rotation_velocity=2.0, world_position=3.0, velocity=0.0)(
-        motion, truth, sparse, normalizer
-    )
+    weighed, _ = RPMLoss(RPMLossSettings(0.0, 2.0, 3.0, 0.0))(motion, truth, sparse, normalizer)
     whole = 2 * expected["rotation_velocity"] + 3 * expected["world_position"]
     assert float(weighed) == pytest.approx(whole, rel=1e-4)
 
@@ -121,5 +126,7 @@ def test_the_refiners_loss_is_mostly_of_how_rotations_move():
 def test_avatar_posers_loss_on_positions_reaches_the_rotations():
     motion = CLIP[None, :3, SPARSE_DIM:].clone().requires_grad_()
     truth = tiny.clip(3, seed=9)[None, :, SPARSE_DIM:]
-    AvatarPoserLoss(0, 0, 1)(motion, truth, SPARSE[:, :3], tiny.normalizer())[0].backward()
+    AvatarPoserLoss(AvatarPoserLossSettings(0, 0, 1))(motion, truth, SPARSE[:, :3], tiny.normalizer())[
+        0
+    ].backward()
     assert float(motion.grad[..., ROTATION].abs().sum()) > 0

@@ -8,6 +8,7 @@ import torch
 
 from memmlp.motion.body import LOWER, SPARSE_DIM
 from memmlp.training.losses import HandFK, HandPosition, Manual, MotionLoss, NoHand, Uncertainty
+from memmlp.training.losses.loss import ManualSettings
 
 BOTH = frozenset({"rotation", "position"})
 DRAW = torch.Generator().manual_seed(0)
@@ -65,7 +66,7 @@ def test_manual_weights_are_the_papers_and_each_counts():
     ones = {name: torch.tensor(1.0) for name in names}
     assert float(Manual()(ones)) == pytest.approx(1 + 30 + 0.5 + 0.1 + 0.1)
     for name in names:
-        assert float(Manual(**{name: 7.0})(ones)) != pytest.approx(float(Manual()(ones)))
+        assert float(Manual(ManualSettings(**{name: 7.0}))(ones)) != pytest.approx(float(Manual()(ones)))
 
 
 def train(weighting: Uncertainty, optimiser: type, steps: int, **losses: float) -> None:

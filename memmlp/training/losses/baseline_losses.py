@@ -12,7 +12,7 @@ from memmlp.common.components import component
 from memmlp.common.settings import at_least, one_of, setting
 from memmlp.motion.body import N_JOINTS, ROOT, ROTATION
 from memmlp.motion.normalizer import Normalizer
-from memmlp.training.losses.loss import CompleteLossSettings, Fixed, Loss, Terms, joints
+from memmlp.training.losses.loss import CompleteLossSettings, Fixed, Loss, Terms, joints, read_weights
 from memmlp.training.losses.terms import Comparison
 
 ERRORS: dict[str, Callable[[Tensor], Tensor]] = {
@@ -43,14 +43,13 @@ class AGRoLLossSettings(CompleteLossSettings):
 class AGRoLLoss(Loss):
     """AGRoL's error of the 6D rotations, in network space, as is the diffusion model's noise.
 
-    Args:
-        error: "norm" for the error with which its released code trains both networks, or
-            "square" for the mean squared error, a possible reading of its paper (Du et al. 2023, L2).
+    The error "norm" is that with which its released code trains both networks; "square" is a possible reading
+    of its paper (Du et al. 2023, L2).
     """
 
-    def __init__(self, error: str = "norm"):
+    def __init__(self, settings: AGRoLLossSettings | None = None):
         super().__init__()
-        self.error = ERRORS[error]
+        self.error = ERRORS[(settings or AGRoLLossSettings()).error]
         self.weighting = Fixed({"rotation_all": 1.0})
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
@@ -78,15 +77,13 @@ class AvatarPoserLoss(Loss):
     """Mean absolute errors of root orientation, local rotations and joint positions (Jiang et al. 2022).
 
     The positions follow by forward kinematics. The mean is over the 22 joints; the authors' mean includes the
-    fingers, which move with the wrists. For the arguments see AvatarPoserLossSettings.
+    fingers, which move with the wrists.
     """
 
-    def __init__(
-        self, orientation: float = 0.02, rotation: float = 1.0, position: float = 1.0, anchor: str = "pelvis"
-    ):
+    def __init__(self, settings: AvatarPoserLossSettings | None = None):
         super().__init__()
-        weights = {"orientation": orientation, "rotation": rotation, "position": position}
-        self.weighting, self.anchored = Fixed(weights), ANCHORS[anchor]
+        settings = settings or AvatarPoserLossSettings()
+        self.weighting, self.anchored = Fixed(read_weights(settings)), ANCHORS[settings.anchor]
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         error = (motion - truth)[..., ROTATION].abs()
@@ -128,19 +125,11 @@ class RPMLoss(Loss):
 
     Rotations are compared in network space, so as z-scores where the network has them; positions by forward
     kinematics with the head on its tracker, metres in the world.
-    For the arguments see RPMLossSettings.
     """
 
-    def __init__(
-        self,
-        rotation_all: float = 1.0,
-        rotation_velocity: float = 1.0,
-        world_position: float = 1.0,
-        velocity: float = 1.0,
-    ):
+    def __init__(self, settings: RPMLossSettings | None = None):
         super().__init__()
-        weights = {"rotation_all": rotation_all, "rotation_velocity": rotation_velocity}
-        self.weighting = Fixed({**weights, "world_position": world_position, "velocity": velocity})
+        self.weighting = Fixed(read_weights(settings or RPMLossSettings()))
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         origin = normalizer.origin(sparse)

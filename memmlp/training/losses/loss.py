@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import ClassVar
 
 import torch
@@ -22,6 +22,11 @@ Terms = dict[str, Tensor]
 def joints(motion: Tensor) -> Tensor:
     """Return the joint positions (B, T, 22, 3) of motion (B, T, 198)."""
     return motion[..., POSITION].unflatten(-1, (N_JOINTS, 3))
+
+
+def read_weights(settings: Settings) -> dict[str, float]:
+    """Return the settings that are numbers, by name: the weights of a loss without other numbers."""
+    return {name: value for name, value in asdict(settings).items() if not isinstance(value, str)}
 
 
 @component("loss", "manual", builds="Manual")
@@ -95,25 +100,10 @@ class Fixed(nn.Module):
 
 
 class Manual(Fixed):
-    """Fixed weights of the paper's terms (reading 8); the defaults are from its grid search (Sec. 4.4)."""
+    """Fixed weights of the paper's terms (reading 8); by default those of its grid search (Sec. 4.4)."""
 
-    def __init__(
-        self,
-        rotation_all: float = 1.0,
-        rotation_velocity: float = 30.0,
-        position_branch: float = 0.5,
-        velocity_lower_body: float = 0.1,
-        hand: float = 0.1,
-    ):
-        super().__init__(
-            {
-                "rotation_all": rotation_all,
-                "rotation_velocity": rotation_velocity,
-                "position_branch": position_branch,
-                "velocity_lower_body": velocity_lower_body,
-                "hand": hand,
-            }
-        )
+    def __init__(self, settings: ManualSettings | None = None):
+        super().__init__(read_weights(settings or ManualSettings()))
 
 
 class Uncertainty(nn.Module):

@@ -7,8 +7,8 @@ velocities.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import cached_property, partial
+from dataclasses import dataclass, fields
+from functools import cached_property, partialmethod
 from typing import Any, ClassVar
 
 import torch
@@ -64,8 +64,21 @@ class Body:
         return self.local[:, :-1].transpose(-1, -2) @ self.local[:, 1:]
 
 
+Error = Callable[[Tensor], Tensor]
+"""Maps differences (..., n) to a number, the mean error."""
+
+ERRORS: dict[str, Error] = {
+    "absolute": lambda difference: difference.abs().mean(),
+    "square": lambda difference: difference.square().mean(),
+    "norm": lambda difference: difference.norm(dim=-1).mean(),
+    "smooth": lambda difference: F.smooth_l1_loss(difference, torch.zeros_like(difference)),
+}
+
+
 class Comparison:
     """A predicted motion and the true one, to be compared.
+
+    Each weight of TermsLossSettings has a method of its name, which returns the term.
 
     Args:
         motion: predicted world motion (B, T, 198).
@@ -99,77 +112,70 @@ class Comparison:
         """Which of the true feet stand (B, T - 1, 4): those that hardly move to the next frame."""
         return self.true_positions[:, :, list(FEET)].diff(dim=1).norm(dim=-1) <= STANDING
 
+    def orientation(self, error: Error) -> Tensor:
+        """Return the error of the root's 6D orientation."""
+        return error((self.made.sixd - self.true.sixd)[..., ROOT, :])
 
-Error = Callable[[Tensor], Tensor]
-"""Maps differences (..., n) to a number, the mean error."""
+    def rotation(self, error: Error) -> Tensor:
+        """Return the error of the other joints' local 6D rotations."""
+        return error((self.made.sixd - self.true.sixd)[..., ROOT + 1 :, :])
 
-ERRORS: dict[str, Error] = {
-    "absolute": lambda difference: difference.abs().mean(),
-    "square": lambda difference: difference.square().mean(),
-    "norm": lambda difference: difference.norm(dim=-1).mean(),
-    "smooth": lambda difference: F.smooth_l1_loss(difference, torch.zeros_like(difference)),
-}
+    def global_rotation(self, error: Error) -> Tensor:
+        """Return the error of all joints' global 6D rotations."""
+        return error(matrix_to_sixd(self.made.posed[0]) - matrix_to_sixd(self.true.posed[0]))
 
+    def angle(self, error: Error) -> Tensor:
+        """Return the mean angle between predicted and true global rotations, in radians."""
+        return geodesic_angle(self.made.posed[0], self.true.posed[0]).mean()
 
-def orientation(pair: Comparison, error: Error) -> Tensor:
-    """Return the error of the root's 6D orientation."""
-    return error((pair.made.sixd - pair.true.sixd)[..., ROOT, :])
+    def sixd_velocity(self, error: Error) -> Tensor:
+        """Return the error of the frame-to-frame differences of all local 6D rotations."""
+        return error((self.made.sixd - self.true.sixd).diff(dim=1))
 
+    def turn(self, error: Error) -> Tensor:
+        """Return the error of the joints' velocities on SO(3): the rotations from frame to frame, in 6D."""
+        return error(matrix_to_sixd(self.made.turns) - matrix_to_sixd(self.true.turns))
 
-def rotation(pair: Comparison, error: Error) -> Tensor:
-    """Return the error of the other joints' local 6D rotations."""
-    return error((pair.made.sixd - pair.true.sixd)[..., ROOT + 1 :, :])
+    def position_from_pelvis(self, error: Error) -> Tensor:
+        """Return the error of the joints by forward kinematics from the pelvis, without translation."""
+        true = self.true_positions - self.true_positions[..., ROOT : ROOT + 1, :]
+        return error(self.made.posed[1] - true)
 
+    def world_position(self, error: Error) -> Tensor:
+        """Return the error of the joints by forward kinematics, with the head on its tracker."""
+        return error(self.positions - self.true_positions)
 
-def global_rotation(pair: Comparison, error: Error) -> Tensor:
-    """Return the error of all joints' global 6D rotations."""
-    return error(matrix_to_sixd(pair.made.posed[0]) - matrix_to_sixd(pair.true.posed[0]))
+    def hand(self, error: Error) -> Tensor:
+        """Return the error of both wrists' positions, with the head on its tracker."""
+        return error((self.positions - self.true_positions)[..., list(HANDS), :])
 
+    def velocity(self, error: Error, step: int = 1) -> Tensor:
+        """Return the error of the joints' movement between every `step`-th frame."""
+        return error((self.positions - self.true_positions)[:, ::step].diff(dim=1))
 
-def angle(pair: Comparison, error: Error) -> Tensor:
-    """Return the mean angle between predicted and true global rotations, in radians."""
-    return geodesic_angle(pair.made.posed[0], pair.true.posed[0]).mean()
+    velocity_3 = partialmethod(velocity, step=3)
+    velocity_5 = partialmethod(velocity, step=5)
 
+    def acceleration(self, error: Error) -> Tensor:
+        """Return the error of the joints' second differences in time."""
+        return error((self.positions - self.true_positions).diff(2, dim=1))
 
-def sixd_velocity(pair: Comparison, error: Error) -> Tensor:
-    """Return the error of the frame-to-frame differences of all local 6D rotations."""
-    return error((pair.made.sixd - pair.true.sixd).diff(dim=1))
+    def jerk(self, error: Error) -> Tensor:
+        """Return the mean norm of the predicted joints' third differences in time; the truth is not used."""
+        return measure_jerk(self.positions)
 
+    def contact(self, error: Error) -> Tensor:
+        """Return the error of the predicted feet's movement while the true feet stand still."""
+        return error(self.positions[:, :, list(FEET)].diff(dim=1) * self.standing[..., None])
 
-def turn(pair: Comparison, error: Error) -> Tensor:
-    """Return the error of the joints' velocities on SO(3): the rotations from frame to frame, in 6D."""
-    return error(matrix_to_sixd(pair.made.turns) - matrix_to_sixd(pair.true.turns))
+    def penetration(self, error: Error) -> Tensor:
+        """Return how far the lowest predicted joint is below the window's floor, averaged over frames."""
+        return F.relu(self.floor - self.positions[..., 2].amin(-1)).mean()
 
-
-def position_from_pelvis(pair: Comparison, error: Error) -> Tensor:
-    """Return the error of the joints by forward kinematics relative to the pelvis, without translation."""
-    true = pair.true_positions - pair.true_positions[..., ROOT : ROOT + 1, :]
-    return error(pair.made.posed[1] - true)
-
-
-def world_position(pair: Comparison, error: Error) -> Tensor:
-    """Return the error of the joints by forward kinematics, with the head on its tracker."""
-    return error(pair.positions - pair.true_positions)
-
-
-def hand(pair: Comparison, error: Error) -> Tensor:
-    """Return the error of both wrists' positions, with the head on its tracker."""
-    return error((pair.positions - pair.true_positions)[..., list(HANDS), :])
-
-
-def velocity(pair: Comparison, error: Error, step: int) -> Tensor:
-    """Return the error of the joints' movement between every `step`-th frame."""
-    return error((pair.positions - pair.true_positions)[:, ::step].diff(dim=1))
-
-
-def acceleration(pair: Comparison, error: Error) -> Tensor:
-    """Return the error of the joints' second differences in time."""
-    return error((pair.positions - pair.true_positions).diff(2, dim=1))
-
-
-def jerk(pair: Comparison, error: Error) -> Tensor:
-    """Return the mean norm of the predicted joints' third differences in time; the truth is not used."""
-    return measure_jerk(pair.positions)
+    def foot_height(self, error: Error) -> Tensor:
+        """Return the mean distance of predicted toes from the floor while the true toes stand still."""
+        standing = self.standing[..., [FEET.index(toe) for toe in TOES]]
+        return ((self.positions[:, 1:, list(TOES), 2] - self.floor[..., None]).abs() * standing).mean()
 
 
 def measure_jerk(positions: Tensor) -> Tensor:
@@ -177,49 +183,11 @@ def measure_jerk(positions: Tensor) -> Tensor:
     return positions.diff(3, dim=1).norm(dim=-1).mean()
 
 
-def contact(pair: Comparison, error: Error) -> Tensor:
-    """Return the error of the predicted feet's movement while the true feet stand still."""
-    return error(pair.positions[:, :, list(FEET)].diff(dim=1) * pair.standing[..., None])
-
-
-def penetration(pair: Comparison, error: Error) -> Tensor:
-    """Return how far the lowest predicted joint is below the window's floor, averaged over frames."""
-    return F.relu(pair.floor - pair.positions[..., 2].amin(-1)).mean()
-
-
-def foot_height(pair: Comparison, error: Error) -> Tensor:
-    """Return the mean distance of predicted toes from the window's floor while the true toes stand still."""
-    standing = pair.standing[..., [FEET.index(toe) for toe in TOES]]
-    return ((pair.positions[:, 1:, list(TOES), 2] - pair.floor[..., None]).abs() * standing).mean()
-
-
 TERM_FRAMES = {
     "sixd_velocity": 2, "turn": 2, "velocity": 2, "velocity_3": 4, "velocity_5": 6, "acceleration": 3,
     "jerk": 4, "contact": 2, "foot_height": 2,
 }  # fmt: skip
 """How many frames the terms need that need several."""
-
-TERMS: dict[str, Callable[[Comparison, Error], Tensor]] = {
-    "orientation": orientation,
-    "rotation": rotation,
-    "global_rotation": global_rotation,
-    "angle": angle,
-    "sixd_velocity": sixd_velocity,
-    "turn": turn,
-    "position_from_pelvis": position_from_pelvis,
-    "world_position": world_position,
-    "hand": hand,
-    "velocity": partial(velocity, step=1),
-    "velocity_3": partial(velocity, step=3),
-    "velocity_5": partial(velocity, step=5),
-    "acceleration": acceleration,
-    "jerk": jerk,
-    "contact": contact,
-    "penetration": penetration,
-    "foot_height": foot_height,
-}
-"""The terms by name."""
-
 
 WEIGHTINGS: dict[str, Callable[[dict[str, float], float], Weighting]] = {
     "fixed": lambda weights, lr: Fixed(weights),
@@ -284,15 +252,15 @@ class TermsLossSettings(CompleteLossSettings):
                 yield f"loss.{name}: must be null, since it needs {needed} frames and there are {frames}"
 
 
+TERMS = tuple(one.name for one in fields(TermsLossSettings) if one.type == "float | None")
+"""The names of the terms: the keys that are weights."""
+
+
 class TermsLoss(Loss):
     """A weighted sum of the library's terms; most baselines' losses are such sums.
 
     Args:
-        error: how differences become a number where a term leaves it open: "absolute" (mean absolute
-            components), "square" (mean squared ones), "norm" (mean L2 norms of joints), "smooth" (Huber's, as
-            torch's smooth L1).
-        weighting: "fixed" for weights that stay, "learned" for learned weights that begin at the given ones.
-        lr: learning rate of the learned weights' s.
+        error, weighting, lr: see TermsLossSettings.
         weights: weights by the names of TERMS; None leaves a term out.
 
     Raises:
@@ -323,5 +291,5 @@ class TermsLoss(Loss):
                 raise InputError(
                     f"loss.{name}: must be null, since it needs {needed} frames; the network learns {frames}"
                 )
-            found[name] = TERMS[name](pair, self.error)
+            found[name] = getattr(pair, name)(self.error)
         return found
