@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 SIGNS = "+~"
 """What an override may begin with: + and ++ add a key, ~ removes it."""
@@ -55,3 +56,12 @@ def parse_overrides(texts: Iterable[str]) -> list[Override]:
 def last_by_key(texts: Iterable[str]) -> dict[str, Override]:
     """Return the last override of each key, in the order in which the keys first appear."""
     return {override.key: override for override in parse_overrides(texts)}
+
+
+def value_text(value: Any) -> str:
+    """Return a value as the text that an override has for it."""
+    if isinstance(value, list):
+        return f"[{','.join(map(value_text, value))}]"
+    if value is None:
+        return "null"
+    return str(value).lower() if isinstance(value, bool) else str(value)

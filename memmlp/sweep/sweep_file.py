@@ -31,6 +31,7 @@ from typing import Any
 import yaml
 
 from memmlp.common.errors import InputError, why_unreadable
+from memmlp.common.overrides import value_text
 from memmlp.evaluation.metric_facts import SMALLEST, UNITS
 from memmlp.sweep.definition import (
     BRANCHES,
@@ -190,7 +191,7 @@ def _cells(grids: Sequence[Mapping[str, Sequence[Any]]]) -> list[tuple[str, ...]
     found: dict[frozenset[str], tuple[str, ...]] = {}
     for grid in grids:
         for values in itertools.product(*grid.values()):
-            cell = tuple(f"{key}={_typed(value)}" for key, value in zip(grid, values, strict=True))
+            cell = tuple(f"{key}={value_text(value)}" for key, value in zip(grid, values, strict=True))
             found.setdefault(frozenset(cell), cell)
     return list(found.values())
 
@@ -217,14 +218,6 @@ def _over_cells(variants: Sequence[Variant], cells: Sequence[tuple[str, ...]]) -
                 series=variant.label,
                 cell=cell,
             )
-
-
-def _typed(value: Any) -> str:
-    if value is None:
-        return "null"
-    if isinstance(value, list):
-        return f"[{','.join(map(_typed, value))}]"
-    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _mapping(value: Any, name: str, keys: Sequence[str] = ()) -> Mapping[str, Any]:
