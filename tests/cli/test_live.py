@@ -21,6 +21,7 @@ from processes import PATIENCE, hearing_interrupts, started
 from memmlp.cli.live import LiveOptions, combine_calibration, load_clip
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
+from memmlp.live.session.sources import require_osc
 from memmlp.live.stream import Stream
 from memmlp.live.wearer import Calibration, Offsets, save_calibration
 from memmlp.motion.body import PARENTS, builtin_rest_joints
@@ -80,6 +81,8 @@ def test_python_osc_is_needed_only_by_the_options_that_use_it(
     assert one_line(memmlp(*line, *udp, "--token", "a token of many letters"), "--token: ")  # the last check
     for needing in (["--osc", "9001"], [*udp, "--vmc", "127.0.0.1"], [*udp, "--vrchat", "127.0.0.1"]):
         assert one_line(memmlp(*line, *needing), f"{needing[-2]}: needs python-osc")
+    with pytest.raises(InputError, match=r"pip install 'memmlp\[osc\]'"):
+        require_osc()
 
 
 def test_a_clip_of_a_file_is_on_the_network_s_body(step: Path, clip: Path, tmp_path: Path):

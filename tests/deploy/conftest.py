@@ -2,10 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
+import tiny
+
+from memmlp.deploy.export import export
+from memmlp.networks.motion_model import MotionModel
 
 
 @pytest.fixture
 def small_yardstick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps are timed in turn with a computation that is over at once, not with 86 M multiply-adds."""
     monkeypatch.setattr("memmlp.deploy.latency.YARDSTICK_SHAPE", (2, 8, 1))
+
+
+@pytest.fixture(scope="package")
+def naive_step(tmp_path_factory: pytest.TempPathFactory) -> tuple[MotionModel, Path]:
+    """A network as it was trained; others are in tests/config/test_build.py, streams in exported.py."""
+    model, path = tiny.model(), tmp_path_factory.mktemp("onnx") / "step.onnx"
+    export(model, path, "0123456789abcdef")
+    return model, path

@@ -8,22 +8,13 @@ import pytest
 import tiny
 import torch
 
-from memmlp.deploy.export import export, save
+from memmlp.deploy.export import save
 from memmlp.deploy.parity import TOLERANCE, parity
 from memmlp.motion.body import JOINTS
 
 pytestmark = pytest.mark.slow
 
 CLIP = tiny.clip(50)
-
-
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory):
-    """A network as it was trained; others are in tests/config/test_build.py, streams in exported.py."""
-    model = tiny.model()
-    path = tmp_path_factory.mktemp("onnx") / "step.onnx"
-    export(model, path, "0123456789abcdef")
-    return model, path
 
 
 def test_an_export_says_nothing_of_its_own_passes(tmp_path, caplog):
@@ -37,8 +28,8 @@ def test_an_export_says_nothing_of_its_own_passes(tmp_path, caplog):
     assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
 
 
-def test_numbers_interface_and_metadata(exported):
-    model, path = exported
+def test_numbers_interface_and_metadata(naive_step):
+    model, path = naive_step
     assert parity(model, path, CLIP) <= TOLERANCE
     graph = onnx.load(path)
     inputs = {i.name: [d.dim_value for d in i.type.tensor_type.shape.dim] for i in graph.graph.input}

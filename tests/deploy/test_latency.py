@@ -7,7 +7,6 @@ import torch
 
 from memmlp.common import processes
 from memmlp.deploy import latency
-from memmlp.deploy.export import export
 from memmlp.deploy.latency import macs, strip_conversions
 from memmlp.motion.body import POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading, World
@@ -53,16 +52,9 @@ def test_rotations_of_the_world_stay_as_members_make_them():
     assert (made[..., POSITION] == 0).all()
 
 
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory):
-    model, path = tiny.model(), tmp_path_factory.mktemp("onnx") / "step.onnx"
-    export(model, path, "0123456789abcdef")
-    return model, path
-
-
 @pytest.mark.slow
-def test_latency_and_size(exported, small_yardstick, monkeypatch):
-    model, path = exported
+def test_latency_and_size(naive_step, small_yardstick, monkeypatch):
+    model, path = naive_step
     measured = latency.measure_step(path, steps=1)
     assert measured["steps"] == 200
     assert 0 < measured["median_ms"] <= measured["p95_ms"]

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
+import onnxruntime
 import pytest
 import wearer
 from engine_clips import EXAMPLES, PERSON, Played, trackers
@@ -36,6 +37,7 @@ Rows = list[tuple[float, np.ndarray, str]]  # a time, trackers (3, 7) with NaN w
 
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The example, compiled."""
     if shutil.which("mcs") is None or shutil.which("mono") is None:
         pytest.skip("Mono is not installed (apt-get install mono-mcs mono-runtime)")
     path = tmp_path_factory.mktemp("unity") / "play.exe"
@@ -63,14 +65,10 @@ class Player:
         names = ("model.txt", "avatar.csv", "samples.csv", "bones.csv")
         model, avatar, samples, out = files = [self.folder / name for name in names]
         parts = (self.session.get_inputs(), self.session.get_outputs())
-        lines = [[" ".join(map(str, (end.name, *end.shape))) for end in part] for part in parts]
-        ends = "\n\n".join(map("\n".join, lines))
+        ends = "\n\n".join("\n".join(described(one) for one in part) for part in parts)
         model.write_text(ends.replace("rotations 1 22 3 3", "rotations 1 22 4") if self.quaternions else ends)
         np.savetxt(avatar, REST, delimiter=",")
-        with samples.open("w") as file:
-            for time, frame, word in rows:
-                places = ["" if np.isnan(value) else repr(float(value)) for value in frame.ravel()]
-                file.write(",".join([repr(time), *places, word]) + "\n")
+        samples.write_text("\n".join(",".join(written(*row)) for row in rows))
         self.taken: list[np.ndarray] = []
         command = ["mono", str(self.program), *map(str, files)]
         with started(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
@@ -87,6 +85,7 @@ class Player:
         return bones[..., :3]
 
     def _inputs(self, stream: IO[bytes]) -> dict[str, np.ndarray]:
+        """The inputs of the next step that the program asks for; none at its end."""
         given = {}
         for one in self.session.get_inputs():
             data = stream.read(4 * int(np.prod(one.shape)))
@@ -99,6 +98,17 @@ class Player:
 @pytest.fixture
 def play(program: Path, played: Callable[[str], Played], tmp_path: Path) -> Player:
     return Player(program, played("unity").network, tmp_path)
+
+
+def described(end: onnxruntime.NodeArg) -> str:
+    """The name and shape of an input or output."""
+    return " ".join(map(str, (end.name, *end.shape)))
+
+
+def written(time: float, frame: np.ndarray, word: str) -> list[str]:
+    """The words of a row."""
+    places = ["" if np.isnan(value) else repr(float(value)) for value in frame.ravel()]
+    return [repr(time), *places, word]
 
 
 def rows(frames: np.ndarray, fps: float = 60) -> Rows:
@@ -135,15 +145,17 @@ def test_bones_are_where_the_stream_has_the_joints(
     np.testing.assert_allclose(play.turned, turns, atol=1e-4)
 
 
-def test_other_rates_gaps_and_samples_that_come_together(play: Player, stream: Stream):
-    """At 90 Hz some samples bring no frame, at 37 some bring two; after a gap the stream restarts."""
+def test_other_rates_and_gaps(play: Player, stream: Stream):
+    """At 90 Hz some samples bring no frame, at 37 some bring two; after a gap all begins anew."""
     fast, slow = rows(trackers("unity")[:40], 90), rows(trackers("unity")[:20], 37)
     samples = fast + [(time + fast[-1][0] + GAP + 0.1, *rest) for time, *rest in slow]
     np.testing.assert_allclose(play(samples), poses(stream, samples), atol=1e-4)
-    # A frame ahead of the second goes a tenth further; on the line through both it would be far away.
+
+
+def test_samples_that_come_together(play: Player, stream: Stream):
+    """A frame ahead of the second goes a tenth further; on the line through both it would be far away."""
     samples = [(max(time - 4e-4, 0.0), *rest) for time, *rest in rows(trackers("unity")[:40])]
     samples[9] = (samples[10][0] - 2e-5, *samples[9][1:])
-    stream.reset()
     np.testing.assert_allclose(play(samples), poses(stream, samples), atol=1e-4)
 
 

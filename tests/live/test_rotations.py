@@ -13,18 +13,12 @@ from memmlp.motion.body import HEAD, JOINTS, PARENTS, builtin_rest_joints
 LOCAL = Rotation.random(22, rng=0).as_matrix()
 
 
-def test_gram_schmidt_is_that_of_torch():
-    sixd = np.random.default_rng(0).normal(size=(22, 6))
-    np.testing.assert_allclose(
-        sixd_to_matrix(sixd), geometry.sixd_to_matrix(torch.tensor(sixd)).numpy(), atol=1e-12
-    )
-
-
-def test_forward_kinematics_are_those_of_torch():
-    rest = builtin_rest_joints()
-    _, expected = geometry.forward_kinematics(
-        torch.tensor(LOCAL), torch.zeros(3).double(), torch.tensor(rest)
-    )
+def test_gram_schmidt_and_forward_kinematics_are_those_of_torch():
+    sixd, rest = np.random.default_rng(0).normal(size=(22, 6)), builtin_rest_joints()
+    expected = geometry.sixd_to_matrix(torch.tensor(sixd)).numpy()
+    np.testing.assert_allclose(sixd_to_matrix(sixd), expected, atol=1e-12)
+    root = torch.zeros(3).double()
+    _, expected = geometry.forward_kinematics(torch.tensor(LOCAL), root, torch.tensor(rest))
     found = BodyTree(JOINTS, PARENTS, rest).positions(LOCAL)
     np.testing.assert_allclose(found, (expected - expected[HEAD]).numpy(), atol=2e-6)
 

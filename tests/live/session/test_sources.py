@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import socket
-import sys
 import threading
 from ipaddress import IPv4Network
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 from processes import PATIENCE
 
@@ -30,7 +28,6 @@ from memmlp.live.session.sources import (
     from_json,
     from_osc,
     npz_frames,
-    require_osc,
     send,
     to_json,
     to_osc,
@@ -86,16 +83,10 @@ def test_bad_packets_are_refused():
     ):  # fmt: skip
         with pytest.raises(ValueError, match=r"."):
             from_json(json.dumps(fields).encode())
-
-
-@given(st.binary(max_size=200))
-@example(b"[" * 60_000)
-@example(b"\xff")
-@example(b"#bundle\0" + b"\0" * 8 + b"\xff\xff\xff\xff")
-def test_any_bytes_are_a_packet_or_refused(data: bytes):
-    for _, back in KINDS.values():
-        with contextlib.suppress(ValueError):
-            assert isinstance(back(data), Packet)
+    for data in (b"", b"[" * 60_000, b"\xff", b"#bundle\0" + b"\0" * 8 + b"\xff\xff\xff\xff"):
+        for _, back in KINDS.values():
+            with pytest.raises(ValueError, match=r"."):
+                back(data)
 
 
 @kinds
@@ -111,12 +102,6 @@ def test_damaged_packets_are_a_packet_or_refused(kind: str, place: int, byte: in
         return
     for tracker in packet.trackers:
         assert tracker is None or np.isfinite(np.concatenate(tracker)).all()
-
-
-def test_without_python_osc_a_line_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pythonosc", None)
-    with pytest.raises(InputError, match=r"pip install 'memmlp\[osc\]'"):
-        require_osc()
 
 
 # Sources
