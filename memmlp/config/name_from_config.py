@@ -66,18 +66,12 @@ def _differences(config: Mapping[str, Any]) -> Iterator[str]:
     known = tuple(f"{slot}={option}" for slot, option in changed.items() if _shipped(slot, option))
     if known:
         default = _default((*profile, *chosen, *known))
-    foreign = [slot for slot, option in changed.items() if not _shipped(slot, option)]
-    yield from _keys(config, default, [*foreign, *([] if chosen else ["model"])])
-
-
-def _keys(config: Mapping[str, Any], default: Mapping[str, Any], foreign: list[str]) -> Iterator[str]:
-    """Yield words for the keys whose values differ from the default; a custom component has no default."""
+    custom = [slot for slot, option in changed.items() if not _shipped(slot, option)]  # without a default
+    custom += [] if chosen else ["model"]
     own, usual = flatten(config), {"data.drawn_by": "frames"} | flatten(default)
-    for key in dict.fromkeys(
-        [*training_config(config), *training_config(default)]
-    ):  # either may count it where it is set
+    for key in training_config(config) | training_config(default):  # either may count it where it is set
         slot, _, last = key.partition(".")
-        if slot in foreign or last == "name" or key in ("seed", "vqvae.seed"):
+        if slot in custom or last == "name" or key in ("seed", "vqvae.seed"):
             continue
         if key in own and own[key] != usual.get(key):
             yield f"{key}={_word(own[key])}"
@@ -94,7 +88,6 @@ def _shipped(slot: str, option: str | None) -> bool:
 
 
 def _word(value: Any) -> str:
-    """Return a value as it is typed on a command line."""
     if isinstance(value, list):
         return f"[{','.join(map(_word, value))}]"
     return json.dumps(value) if value is None or isinstance(value, bool) else str(value)  # 1 is not true
@@ -122,7 +115,6 @@ def _default(overrides: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _sizes(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a config's profile, without the keys that its model has set there."""
     return {key: value for key, value in (config.get("profile") or {}).items() if key not in OF_MODELS}
 
 

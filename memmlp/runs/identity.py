@@ -153,10 +153,18 @@ def evaluation_settings(
     chosen = config.get("evaluation", {})
     ik = chosen.get("ik", "off")
     solver = {"ik": ik} | ({"ik_iterations": chosen.get("ik_iterations")} if ik == "lbfgs" else {})
-    groups = _groups(config.get("data") or {}) | ({"groups_file": groups_digest} if groups_digest else {})
+    data = config.get("data") or {}
+    sources = (data.get("sources") or {}).items()
+    groups = {
+        "groups": (data.get("split") or {}).get("groups"),  # patterns of clips that belong together
+        "source_groups": {name: own for name, source in sources if (own := source.get("groups"))},
+        "groups_file": groups_digest,
+    }
     drawn = {"batch": chosen.get("batch")} if inference(config).get("memory.blend") == "sampled" else {}
-    measured = {"metrics": own} if (own := _own_metrics(chosen.get("metrics") or ())) else {}
-    return {"mode": mode, **solver, **inference(config), **groups, **drawn, **measured}
+    custom = {name: declared().get(("metric", name)) for name in sorted(chosen.get("metrics") or ())}
+    metrics = {name: f"{one.module}.{one.builds}" if one else "" for name, one in custom.items()}
+    further = {key: value for key, value in {**groups, "metrics": metrics}.items() if value}
+    return {"mode": mode, **solver, **inference(config), **drawn, **further}
 
 
 def solver_of(settings: Mapping[str, Any]) -> str | None:
@@ -168,20 +176,6 @@ def solver_of(settings: Mapping[str, Any]) -> str | None:
     if ik in (None, "off"):
         return None
     return f"{ik}-{iterations}" if ik == "lbfgs" and iterations else str(ik)
-
-
-def _own_metrics(names: Iterable[str]) -> dict[str, str]:
-    """Return the paths of custom metrics' functions, by name."""
-    found = {name: declared().get(("metric", name)) for name in sorted(names)}
-    return {name: f"{one.module}.{one.builds}" if one else "" for name, one in found.items()}
-
-
-def _groups(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the patterns of clips that belong together, on which the groups in a report's rows depend."""
-    patterns = (data.get("split") or {}).get("groups")
-    sources = (data.get("sources") or {}).items()
-    own = {name: groups for name, source in sources if (groups := source.get("groups"))}
-    return {key: value for key, value in {"groups": patterns, "source_groups": own}.items() if value}
 
 
 def deployment_id(config: Mapping[str, Any]) -> str:
@@ -220,10 +214,11 @@ def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
     yield from (f"{slot}.{name}" for slot, name in names.items() if name and name != UNNAMED.get(slot))
     if (config.get("loss") or {}).get("weighting") == "learned":
         yield "weighting.learned"
-    if schedule := config.get("optim", {}).get("schedule"):
+    optim = config.get("optim", {})
+    if schedule := optim.get("schedule"):
         yield f"schedule.{schedule}"
-    yield from (name for name in ("warmup", "ema") if config.get("optim", {}).get(name))
-    if config.get("optim", {}).get("precision") == "bf16":
+    yield from (name for name in ("warmup", "ema") if optim.get(name))
+    if optim.get("precision") == "bf16":
         yield "precision.bf16"
     if kind == "vqvae" or names["memory"] == "vq_joint":
         yield from ("vqvae", f"codebook.{config.get('vqvae', {}).get('codebook')}")
@@ -245,8 +240,9 @@ def option_in_slot(config: Mapping[str, Any], slot: str) -> str | None:
 
 def training_config(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the config values that can change a training's result, by dotted key; null counts as no key."""
-    later = (*EVALUATION, *DEPLOYMENT, *(() if _rolls_out(config) else INFERENCE))
-    out = (*NEUTRAL, *later, *_unused(config))
+    rollout = (config.get("rollout") or {}).get("name", "teacher_forcing")
+    as_live = config.get("refiner") or config.get("upstream") or rollout != "teacher_forcing"
+    out = (*NEUTRAL, *EVALUATION, *DEPLOYMENT, *(() if as_live else INFERENCE), *_unused(config))
     flat = {key: _canonical(value) for key, value in flatten(config).items() if value is not None}
     counting = {key: flat[key] for key in flat if not _below(key, out)}
     inert = {key: value for key, value in _inert(config).items() if key in counting}
@@ -319,24 +315,16 @@ def inference(config: Mapping[str, Any]) -> dict[str, Any]:
     return {key: _canonical(flat[key]) for key in INFERENCE if key in flat}
 
 
-def _rolls_out(config: Mapping[str, Any]) -> bool:
-    """Return whether training runs the network as live use does, so that inference keys matter in it too."""
-    rollout = (config.get("rollout") or {}).get("name", "teacher_forcing")
-    return bool(config.get("refiner") or config.get("upstream")) or rollout != "teacher_forcing"
-
-
 def _unused(config: Mapping[str, Any]) -> Iterable[str]:
     """Yield the keys that have no effect, given the values of the others."""
-    if config.get("optim", {}).get("schedule", "step") != "step":
+    optim = config.get("optim", {})
+    if optim.get("schedule", "step") != "step":
         yield "optim.drop_at"
     if option_in_slot(config, "optim") == UNNAMED["optim"]:
         yield "optim.name"
-    if (
-        config.get("optim", {}).get("vectors") == "muon"
-        or option_in_slot(config, "model") == "recurrent_poser"
-    ):
+    if optim.get("vectors") == "muon" or option_in_slot(config, "model") == "recurrent_poser":
         yield "optim.vectors"  # as in runs before this key, and of a network without vectors
-    if not config.get("optim", {}).get("warmup"):
+    if not optim.get("warmup"):
         yield "optim.warmup"
     if config.get("vqvae", {}).get("codebook", "ema") != "ema":
         yield "vqvae.decay"
@@ -365,7 +353,6 @@ def _inert(config: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _below(key: str, names: Iterable[str]) -> bool:
-    """Return whether a dotted key is one of the names, or below one."""
     return any(key == name or key.startswith(f"{name}.") for name in names)
 
 

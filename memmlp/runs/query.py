@@ -88,8 +88,10 @@ def differing(configs: Sequence[Mapping[str, Any]], data: Sequence[str] = ()) ->
         data: the digests of their data.
     """
     flats = [flatten(config) for config in configs]
-    counting = {key for config in configs for key in (*training_config(config), *_later(config))}
-    counting |= _of_data(flats, data)
+    counting = {key for config in configs for key in training_config(config)} | _of_data(flats, data)
+    counting |= {
+        key for flat in flats for key in flat if key.startswith(("evaluation.ik", "export.precision"))
+    }
     names = [key for key in dict.fromkeys(key for flat in flats for key in flat) if key in counting]
     different = [key for key in names if len({repr(flat.get(key)) for flat in flats}) > 1]
     changed = {key.removesuffix(".name") for key in different if key.endswith(".name")}
@@ -113,11 +115,6 @@ def _of_data(flats: Sequence[Mapping[str, Any]], digests: Sequence[str]) -> set[
         for key in set().union(*several.values())
         if key.startswith("data.") and len({repr(flat.get(key)) for flat in several.values()}) > 1
     }
-
-
-def _later(config: Mapping[str, Any]) -> list[str]:
-    """Return the keys of evaluation and export, which change what is made from a trained network."""
-    return [key for key in flatten(config) if key.startswith(("evaluation.ik", "export.precision"))]
 
 
 def as_typed(value: Any) -> str:

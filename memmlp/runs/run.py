@@ -170,7 +170,6 @@ class Run:
     def _best_deployment(
         self, config: Mapping[str, Any], rank: Callable[[DeploymentFolder], tuple[Any, ...]]
     ) -> DeploymentFolder:
-        """Return the deployment of the highest rank that uses the network as the config does."""
         made = [DeploymentFolder(path.parent) for path in self.deployments.glob("*/latency.json")]
         own = [one for one in made if one.done and used_as_configured(one.settings, config)]
         return max(own, key=rank, default=None) or DeploymentFolder(self.deployments / "none")
