@@ -238,13 +238,11 @@ class TrainedRun(os.PathLike[str]):
 
     @cached_property
     def _opened(self) -> OpenedRun:
-        """The run with its experiment and data."""
         from memmlp.config.open_run import open_found
 
         return open_found(self._run)
 
     def _rows(self) -> Iterator[dict[str, Any]]:
-        """Yield the rows of `per_clip`."""
         measured, combined_by = load(self.folder), self.combined_by
         for mode, branches in sorted(measured.means.items()):
             for branch in branches:
@@ -252,8 +250,7 @@ class TrainedRun(os.PathLike[str]):
                 for clip, modes in measured.clips.items():
                     facts = {"clip": clip, "group": measured.group(clip), "frames": modes[mode]["frames"]}
                     about = {"run": self.id, "seed": self.seed, "mode": mode, "branch": branch}
-                    about["combined_by"] = by
-                    yield about | facts | _numbers(modes[mode][branch])
+                    yield about | {"combined_by": by} | facts | _numbers(modes[mode][branch])
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,31 +345,24 @@ class Prediction:
 
         file = Path(path)
         chosen = format_of(file)
-        if truth:
-            clip = motion_clip(self.clip, self.true_rotations, self.true_positions, self.rest)
-        else:
-            clip = motion_clip(self.clip, self.rotations, self.positions, self.rest)
-        write_motion(file, clip, self.rest, chosen)
+        rotations = self.true_rotations if truth else self.rotations
+        positions = self.true_positions if truth else self.positions
+        write_motion(file, motion_clip(self.clip, rotations, positions, self.rest), self.rest, chosen)
         return file
 
     def _piece(self, branch: Branch, first: int = 0, last: int | None = None) -> ClipPiece:
-        """Return the frames of a branch from one index up to another, for drawing."""
         from memmlp.report.pictures.clip_piece import ClipPiece
 
-        _check("branch", branch, [name for name, joints in self._joints.items() if joints is not None])
-        joints = self._joints[branch]
-        assert joints is not None
+        branches = {"rotation": self.positions}
+        branches |= {} if self.position_branch is None else {"position": self.position_branch}
+        _check("branch", branch, branches)
+        joints = branches[branch]
         return ClipPiece(
             self.clip, self.true_positions[first:last], {branch: joints[first:last]}, start=first
         )
 
-    @property
-    def _joints(self) -> dict[str, np.ndarray | None]:
-        return {"rotation": self.positions, "position": self.position_branch}
-
 
 def _outputs(given: StrPath | None) -> Path:
-    """Return the outputs folder given by an argument, or else the command line's."""
     return Path(os.environ.get("MEMMLP_OUTPUTS", "outputs") if given is None else given)
 
 
@@ -387,7 +377,6 @@ def _use(plugins: Sequence[str]) -> None:
 
 
 def _check(key: str, value: object, allowed: Iterable[object]) -> None:
-    """Raise InputError for a value that is not one of the allowed ones."""
     known = list(allowed)
     if value not in known:
         raise InputError(f"{key} {value}: must be one of {', '.join(map(str, known))}")

@@ -271,7 +271,6 @@ def config_of(run: Run, overrides: Sequence[str] = ()) -> DictConfig:
 
 
 def _override(cfg: DictConfig, word: str) -> None:
-    """Set a key of a typed config as given by a word KEY=VALUE."""
     key, equals, _ = word.partition("=")
     if not equals:
         raise InputError(f"{word}: must be KEY=VALUE")

@@ -36,7 +36,8 @@ def explain(error: Exception, overrides: Sequence[str]) -> str:
         return f"{' '.join(overrides)}: {reason}"
     below = error.__cause__ or error.__context__
     if isinstance(below, OmegaConfBaseException):
-        return _typed(below, _offender(error))
+        match = re.match(r"Error merging override (.*)", str(error), re.DOTALL)
+        return _typed(below, match[1] if match else None)
     if isinstance(error, OmegaConfBaseException):
         return _typed(error, None)
     if isinstance(error, ConfigCompositionException):
@@ -46,19 +47,12 @@ def explain(error: Exception, overrides: Sequence[str]) -> str:
 
 
 def _missing_option(error: MissingConfigException) -> str:
-    """Explain that a group lacks an option, or that a config does not exist."""
     group, _, option = (error.missing_cfg_file or "").rpartition("/")
     if not error.options:
         return _first_line(error)
     near = difflib.get_close_matches(option, error.options, n=1)
     hint = f"did you mean {near[0]}? " if near else ""
     return f"{group}={option}: no such option; {hint}must be one of {', '.join(error.options)}"
-
-
-def _offender(error: Exception) -> str | None:
-    """Return the override that Hydra was merging when it failed; None if the error does not say."""
-    match = re.match(r"Error merging override (.*)", str(error), re.DOTALL)
-    return match[1] if match else None
 
 
 def _typed(error: OmegaConfBaseException, override: str | None) -> str:
@@ -95,7 +89,6 @@ def _expected(name: str, schema: Any, error: OmegaConfBaseException) -> str:
 
 
 def _words(hint: Any) -> str:
-    """Return a type, in words."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
         return " or ".join(dict.fromkeys(_words(part) for part in parts))

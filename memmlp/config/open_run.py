@@ -85,15 +85,10 @@ def experiment_of(run: Run, device_name: str = "cpu", overrides: Sequence[str] =
     if training_config(run.config) != training_config(experiment.config):
         words = ", ".join(overrides)
         raise InputError(f"{words}: changes the training; set keys of evaluation and export only")
-    _check_acting(overrides)
-    return experiment
-
-
-def _check_acting(overrides: Sequence[str]) -> None:
-    """Raise InputError for an override that has no effect on a finished run, such as force=true."""
     for word in parse_overrides(overrides):
-        if word.group not in ACTING and word.key not in INFERENCE:
+        if word.group not in ACTING and word.key not in INFERENCE:  # such as force=true
             raise InputError(f"{word}: no effect on a finished run; set keys of evaluation and export only")
+    return experiment
 
 
 def trained_network(run: Run, experiment: Experiment) -> MotionModel:

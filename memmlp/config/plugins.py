@@ -132,7 +132,6 @@ def _use(name: str) -> None:
 
 
 def _root(name: str) -> Path:
-    """Return the folder of a package, or its file. Raises InputError if it does not exist."""
     if not NAME.fullmatch(name) or name.split(".")[0] in ("memmlp", *sys.stdlib_module_names):
         raise InputError(f"plugins: '{name}': must be the name of your own package")
     try:

@@ -73,7 +73,6 @@ def _git() -> dict[str, Any] | None:
 
 
 def _in_git(*args: str) -> str:
-    """Run git in the package's folder and return its output."""
     command = ["git", "-C", str(PACKAGE), *args]
     return subprocess.run(command, capture_output=True, text=True, timeout=20, check=True).stdout.strip()
 
@@ -311,7 +310,6 @@ def _find_spec(module: str) -> ModuleSpec | None:
 
 
 def _cpu() -> str:
-    """Return the processor's model name."""
     with contextlib.suppress(OSError):
         match = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
         if match:

@@ -92,7 +92,7 @@ def read_run(run: Run, running: bool = False) -> RunFacts:
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
     failure, finished = read_json(run.folder / "FAILED"), manifest.get("finished")
-    status = "failed" if failure else "done" if run.complete else "killed"
+    status = "running" if running else "failed" if failure else "done" if run.complete else "killed"
     records = run.metrics()
     started = _seconds(manifest.get("started"))
     ended = _seconds(failure.get("when") or finished) or max((one.time for one in records), default=started)
@@ -110,7 +110,7 @@ def read_run(run: Run, running: bool = False) -> RunFacts:
         id=run.id,
         name=run_name(manifest, flatten(config)),
         folder=run.folder.absolute(),
-        status="running" if running else status,
+        status=status,
         reason=failure.get("reason") if not running else None,
         started=started,
         ended=None if running else ended,

@@ -147,15 +147,11 @@ class Loggers:
         _join(self._start(lambda logger: sync_sweeps(logger, [folder], _warn), f"sweep {folder.name}"))
 
     def _start(self, work: Callable[[RunLogger], object], subject: str) -> list[threading.Thread]:
-        """Start a thread for each logger, whose name says what is shown where."""
-        threads = [
-            threading.Thread(
-                target=work, args=(one,), name=f"{subject} is not shown in {one.name}", daemon=True
-            )
-            for one in self.loggers
-        ]
-        for thread in threads:
-            thread.start()
+        threads = []
+        for one in self.loggers:
+            warning = f"{subject} is not shown in {one.name}"  # see `_join_slow`
+            threads.append(threading.Thread(target=work, args=(one,), name=warning, daemon=True))
+            threads[-1].start()
         return threads
 
 
