@@ -83,9 +83,6 @@ def refused(*words: str) -> contextlib.AbstractContextManager[object]:
     return pytest.raises(memmlp.InputError, match=pattern)
 
 
-# Runs
-
-
 def test_a_run_is_found_by_its_id_its_beginning_and_its_folder(run: memmlp.TrainedRun):
     for name in (run.id, run.id[:6], run.folder, f"outputs/runs/{run.id}", run):
         found = memmlp.load_run(name, "outputs")
@@ -103,18 +100,14 @@ def test_outputs_are_those_of_the_command_line(
         memmlp.Runs()
 
 
-def test_what_is_no_trained_network_is_refused(run: memmlp.TrainedRun):
+def test_what_is_no_finished_network_is_refused(run: memmlp.TrainedRun, three: memmlp.Runs, tmp_path: Path):
     (codes,) = [found for found in list_runs("outputs") if found.id != run.id]
-    none = "a finished run of a motion network"
-    for name, word in (("nobody", "nobody"), ("", "''"), (codes.id, none)):
+    for name, word in (("nobody", "nobody"), ("", "''"), (codes.id, "a finished run of a motion network")):
         with refused("run", word):
             memmlp.load_run(name)
-
-
-def test_an_unfinished_run_is_none_of_the_runs(run: memmlp.TrainedRun, three: memmlp.Runs, tmp_path: Path):
     (tmp_path / "runs" / run.id / "DONE").unlink()
     assert [found.seed for found in memmlp.Runs(tmp_path)] == [1, 2]
-    with refused(f"run {run.id}", "finished"):
+    with refused(f"run {run.id}", "a finished run"):
         memmlp.load_run(run.id, tmp_path)
 
 
@@ -132,9 +125,6 @@ def test_an_outputs_folder_without_runs_is_refused(tmp_path: Path):
         memmlp.Runs(tmp_path / "no")
     (tmp_path / "runs").mkdir()
     assert len(memmlp.Runs(tmp_path)) == 0
-
-
-# Results
 
 
 def test_config_and_results_are_those_of_the_folder(run: memmlp.TrainedRun):
@@ -171,17 +161,12 @@ def test_the_rows_of_all_runs_are_one_frame(three: memmlp.Runs):
     assert list(three[:0].per_clip().columns) == list(whole.columns)
 
 
-def test_a_metric_that_is_no_number_is_nan(three: memmlp.Runs):
-    """As of a clip too short for it; JSON has a word for it."""
+def test_a_metric_that_is_no_number_is_nan_and_a_damaged_file_is_named(three: memmlp.Runs):
     (file,) = three[0].folder.glob("evaluations/stream-*.json")
     report = {key: value for key, value in read_json(file).items() if key != "digest"}
-    report["clips"][0]["rotation"]["Jitter"] = "nan"
-    write_json(file, report)
+    report["clips"][0]["rotation"]["Jitter"] = "nan"  # as of a clip too short for it
+    write_report(file, report)
     assert three.per_clip()["Jitter"].isna().sum() == 1
-
-
-def test_a_damaged_file_of_results_is_named(three: memmlp.Runs):
-    (file,) = three[0].folder.glob("evaluations/stream-*.json")
     file.write_text(file.read_text().replace("squat", "sit"))
     for read in (three.per_clip, lambda: three[0].results):
         with refused(str(file)):
@@ -192,9 +177,6 @@ def test_without_pandas_one_line_says_so(run: memmlp.TrainedRun, monkeypatch: py
     monkeypatch.setitem(sys.modules, "pandas", None)
     with refused("per_clip: needs pandas", "memmlp[notebook]"):
         run.per_clip()
-
-
-# Predictions
 
 
 def test_a_prediction_is_what_was_measured(run: memmlp.TrainedRun, prediction: memmlp.Prediction):
@@ -231,12 +213,6 @@ def test_a_network_without_a_position_branch_has_no_joints(
     assert found.errors().shape == (len(found), 22)
     with refused("branch position", "rotation"):
         found.errors("position")
-
-
-def test_the_model_is_a_torch_module_that_is_ready(run: memmlp.TrainedRun):
-    assert not run.model.training
-    assert run.model.count_parameters() > 0
-    assert run.model is run.model
 
 
 def test_unknown_clips_and_modes_are_one_line(run: memmlp.TrainedRun):
@@ -283,39 +259,32 @@ def test_code_of_ones_own_runs_only_where_the_script_names_its_package(
         memmlp.load_run(folder, plugins=["nowhere"])
 
 
-def test_a_picture_is_drawn(prediction: memmlp.Prediction, tmp_path: Path):
+def test_a_picture_and_a_film_are_drawn(prediction: memmlp.Prediction, tmp_path: Path):
     one, two = (prediction.draw(tmp_path / f"{n}.png", poses=n) for n in (1, 2))
     assert one == tmp_path / "1.png"
     with Image.open(one) as narrow, Image.open(two) as wide:
         assert wide.size[0] > narrow.size[0]
     assert prediction.draw(tmp_path / "3.png", poses=1, branch="position").read_bytes() != one.read_bytes()
-
-
-def test_a_film_is_of_the_piece(prediction: memmlp.Prediction, tmp_path: Path):
-    path = prediction.draw(str(tmp_path / "film.gif"), begin=0.5, end=0.6)
-    with Image.open(path) as film:
+    with Image.open(prediction.draw(str(tmp_path / "film.gif"), begin=0.5, end=0.6)) as film:
         assert film.n_frames == 3
 
 
-@pytest.mark.parametrize(
-    ("name", "options", "words"),
-    [
+def test_bad_input_to_pictures_and_files_is_one_line(prediction: memmlp.Prediction, tmp_path: Path):
+    for name, options, words in (
         ("a.avi", {}, ("path ", "a.avi", ".png, .gif, .mp4")),
-        ("no/a.png", {}, ("path ", "no folder", "no")),
+        ("no/a.png", {}, ("path ", "no")),
         ("a.png", {"branch": "combined"}, ("branch combined", "rotation, position")),
-        ("a.png", {"begin": 900}, ("begin 900", "no frame between")),
-        ("a.png", {"begin": -1}, ("begin -1", "no frame between")),
-        ("a.png", {"begin": float("nan")}, ("begin nan", "no frame between")),
-        ("a.png", {"begin": 1, "end": 1}, ("begin 1 end 1", "no frame between")),
-        ("a.png", {"begin": 0.501, "end": 0.505}, ("begin 0.501 end 0.505", "no frame between")),
+        ("a.png", {"begin": 900}, ("begin 900",)),
+        ("a.png", {"begin": -1}, ("begin -1",)),
+        ("a.png", {"begin": float("nan")}, ("begin nan",)),
+        ("a.png", {"begin": 1, "end": 1}, ("begin 1 end 1",)),
+        ("a.png", {"begin": 0.501, "end": 0.505}, ("begin 0.501 end 0.505",)),
         ("a.png", {"poses": 0}, ("poses 0", "1 to 20")),
-    ],
-)
-def test_bad_input_to_a_picture_is_one_line(
-    prediction: memmlp.Prediction, tmp_path: Path, name: str, options: dict, words: tuple[str, ...]
-):
-    with refused(*words):
-        prediction.draw(tmp_path / name, **options)
+    ):
+        with refused(*words):
+            prediction.draw(tmp_path / name, **options)
+    with refused("path ", "a.fbx", ".bvh, .npz, .glb"):
+        prediction.save(tmp_path / "a.fbx")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -332,33 +301,18 @@ def test_motion_is_saved_for_other_programs(prediction: memmlp.Prediction, tmp_p
             assert (file["poses"].shape, float(file["mocap_framerate"])) == ((len(prediction), 156), 60)
 
 
-def test_motion_of_another_kind_is_refused(prediction: memmlp.Prediction, tmp_path: Path):
-    with refused("path ", "a.fbx", ".bvh, .npz, .glb"):
-        prediction.save(tmp_path / "a.fbx")
-    assert list(tmp_path.iterdir()) == []
-
-
-# Live
-
-
-def test_a_run_streams(run: memmlp.TrainedRun):
+def test_a_run_streams(run: memmlp.TrainedRun, three: memmlp.Runs):
     stream = run.stream(space="unity", rotations="quaternion")
     assert isinstance(stream, memmlp.Stream)
     pose = stream.step(UPRIGHT, None, None, time=0.0)
     assert isinstance(pose, memmlp.Pose)
     assert (pose.rotations.shape, stream.space.name) == ((22, 4), "unity")
     assert memmlp.Stream(run).network.path == stream.network.path
-
-
-def test_streams_refuse_as_ever(run: memmlp.TrainedRun, three: memmlp.Runs):
     with refused("space=blender"):
         run.stream(space="blender")  # type: ignore[arg-type]
     shutil.rmtree(three[0].folder / "deployments")
     with refused(str(three[0].folder), "step.onnx"):
         three[0].stream()
-
-
-# The package
 
 
 def test_dir_is_the_api():
@@ -376,9 +330,6 @@ def test_importing_it_is_quick():
     code = f"import sys, memmlp; {loaded} {later}"
     ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert ran.stdout == "[]\n[]\n"
-
-
-# The guide
 
 
 def test_the_guides_code_runs(home: Path, capsys: pytest.CaptureFixture[str]):

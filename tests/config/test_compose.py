@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import re
-import sys
 from pathlib import Path
 
 import pytest
 from conftest import Memmlp, one_line
 from hydra import compose
 from omegaconf import DictConfig, OmegaConf
-from processes import finished
 
-from memmlp.common.components import SLOTS, declared, names
-from memmlp.common.errors import InputError
+from memmlp.common.components import SLOTS, names
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import _hydra, composed, parse, preflight
 from memmlp.config.package_data import packaged
@@ -56,22 +52,8 @@ def test_a_component_has_the_sizes_of_the_profile():
         assert (cfg.memory.width, list(cfg.memory.layers)) == memory
         assert (cfg.optim.steps, cfg.optim.batch) == optim
     cfg = composed(["profile=tiny", "profile.sizes=small", "profile.width=64", "model.depth=4"])
-    assert (cfg.model.width, cfg.memory.width, list(cfg.memory.layers), cfg.optim.steps) == (
-        64,
-        24,
-        [2, 4],
-        20,
-    )
-
-
-def test_no_key_of_the_profile_names_a_component():
-    named = {name for slot, name in declared()} | set(SLOTS)
-    assert not [key for key in composed([]).profile if any(key.startswith(f"{name}_") for name in named)]
-
-
-def test_a_group_may_differ_from_its_profile():
-    cfg = composed(["profile=tiny", "memory.width=5", "optim.steps=7"])
-    assert (cfg.memory.width, cfg.optim.steps, cfg.profile.steps) == (5, 7, 20)
+    assert (cfg.model.width, cfg.memory.width, list(cfg.memory.layers)) == (64, 24, [2, 4])
+    assert cfg.optim.steps == 20
 
 
 def test_the_most_literal_reading():
@@ -86,17 +68,13 @@ def test_the_most_literal_reading():
     assert (composed([]).data.drawn_by, composed([]).evaluation.ik) == ("frames", "off")
 
 
-def test_the_literal_reading_leaves_other_networks_their_coordinates():
+def test_the_literal_reading_leaves_other_networks_what_they_need():
+    """Their coordinates; and no inverse kinematics of a network that predicts no positions."""
     for experiment in ("profile=paper", "experiment=paper"):
         for model, seen in (("agrol_diffusion", ("world", True)), ("recurrent_poser", ("heading", True))):
             features = composed([experiment, f"model={model}"]).normalizer
             assert (features.coordinates, features.z_scores) == seen
-
-
-def test_a_network_without_positions_has_no_inverse_kinematics_in_the_literal_reading():
     assert composed(["experiment=paper", "model=agrol_mlp"]).evaluation.ik == "off"
-    with pytest.raises(InputError, match=r"evaluation\.ik=lbfgs"):
-        composed(["experiment=paper", "model=agrol_mlp", "evaluation.ik=lbfgs"])
 
 
 def test_a_vqvaes_epochs_are_of_the_training_frames():
@@ -121,10 +99,9 @@ def test_the_last_of_several_choices_wins():
     assert composed(["memory=vq", "memory=none"]).memory.name == "none"
 
 
-@pytest.mark.parametrize("word", ["'2024_11'", "2024", "2024_a", "007", "[x]_1", "True"])
-def test_a_text_is_kept_as_it_was_written(word: str):
-    kept = composed([f"save_predictions={word}"] if "[" not in word else [f"save_predictions='{word}'"])
-    assert kept.save_predictions == word.strip("'")
+def test_a_text_is_kept_as_it_was_written():
+    for word in ("'2024_11'", "2024", "2024_a", "007", "'[x]_1'", "True"):
+        assert composed([f"save_predictions={word}"]).save_predictions == word.strip("'")
 
 
 def test_outputs_come_from_the_environment(monkeypatch: pytest.MonkeyPatch):
@@ -135,7 +112,6 @@ def test_outputs_come_from_the_environment(monkeypatch: pytest.MonkeyPatch):
 BAD = {
     "unknown keys": [
         (["model.widht=3"], ["model.widht", "did you mean width?", "frames, width, depth"]),
-        (["++model.widht=3"], ["model.widht", "width"]),
         (["typo=1"], ["typo", "seed, device"]),
         (["data.split.tset=0.1"], ["data.split.tset", "did you mean test?"]),
         (["memory=none", "memory.width=3"], ["memory.width"]),
@@ -147,70 +123,53 @@ BAD = {
     "wrong types": [
         (["model.width=abc"], ["model.width=abc", "an integer"]),
         (["model.width=1.5"], ["model.width=1.5", "an integer"]),
-        (["model.width=null"], ["model.width=null", "an integer"]),
-        (["model.width=[1]"], ["model.width", "an integer"]),
         (["optim.lr=fast"], ["optim.lr=fast", "a number"]),
         (["force=maybe"], ["force=maybe", "true or false"]),
         (["memory.layers=3"], ["memory.layers=3", "a list"]),
-        (["memory.layers=[1,[2]]"], ["memory.layers", "a list"]),
         (["memory.blend=true"], ["memory.blend=true", "a number"]),
         (["data.split=3"], ["data.split=3", "test"]),
         (["model.width=${profile.schedule}"], ["model.width", "Integer"]),
     ],
     "unknown options": [
-        (["model=big"], ["model=big", "mem_mlp"]),
         (["memory=mamba"], ["memory=mamba", "gru, lstm, no_codes, none, vq, vq_joint"]),
         (["experiment=papr"], ["experiment=papr", "did you mean paper?"]),
         (["lauss=manual"], ["lauss", "did you mean loss?"]),
-        (["optim=sgd"], ["optim=sgd", "adamw, muon, schedule_free"]),
         (["normalizer.coordinates=polar"], ["normalizer.coordinates=polar", "head_relative or world"]),
     ],
     "out of range": [
         (["model.width=0"], ["model.width=0", "at least 1"]),
-        (["seed=-1"], ["seed=-1", "at least 0"]),
         (["device=tpu"], ["device=tpu", "auto or cpu or cuda"]),
         (["optim.lr=nan"], ["optim.lr=nan", "above 0"]),
         (["optim.lr=inf"], ["optim.lr=inf", "above 0"]),
         (["optim.drop_at=1"], ["optim.drop_at=1", "below 1"]),
         (["optim.schedule=linear"], ["optim.schedule=linear", "step or cosine"]),
         (["memory.blend=1.5"], ["memory.blend=1.5", "at most 1 or sampled"]),
-        (["memory.layers=[0]"], ["memory.layers=[0]", "at least 1"]),
         (["memory.layers=[]"], ["memory.layers=[]", "not empty"]),
         (["memory.layers=[2,2]"], ["memory.layers=[2, 2]", "without repetitions"]),
         (["evaluation.modes=[live]"], ["evaluation.modes=['live']", "window or stream"]),
         (["vqvae.steps=null", "vqvae.epochs=0"], ["vqvae.epochs=0", "above 0"]),
-        (["data.synth.minutes=0"], ["data.synth.minutes=0", "above 0"]),
         (["paths.outputs="], ["paths.outputs=", "not empty"]),
         (["memory.name=gru"], ["memory.name=gru", "vq"]),
     ],
     "impossible combinations": [
         (["~memory"], ["memory", "none for no memory"]),
-        (["~hand"], ["hand", "off for no term"]),
         (["~predictor"], ["predictor", "one of its options"]),
         (["memory.layers=[2,9]"], ["memory.layers=[2, 9]", "model.depth=8"]),
         (["optim.final_lr=1"], ["optim.final_lr=1", "optim.lr"]),
         (["optim.warmup=2001"], ["optim.warmup=2001", "at most optim.steps=2000"]),
-        (["predictor=rotation_only"], ["hand=position", "fk or off"]),
-        (["predictor=rotation_only", "hand=fk", "evaluation.ik=lbfgs"], ["evaluation.ik=lbfgs", "positions"]),
-        (["predictor=two_branch_memory", "memory=none"], ["predictor=two_branch_memory", "memory=none"]),
+        (["predictor=two_branch_memory", "predictor.depth=0"], ["predictor.depth=0"]),
         (["loss=avatar_poser"], ["loss=avatar_poser", "uncertainty or manual"]),
-        (["loss=agrol"], ["loss=agrol", "predictor=rotation_only hand=off"]),
-        (["rollout=own_predictions", "memory=none"], ["rollout=own_predictions", "memory=none"]),
-        (["rollout=own_predictions", "memory.shift=frame"], ["rollout.max_passes=3", "model.frames=41"]),
         (["rollout=streams", "rollout.streams=4"], ["rollout.streams=4", "optim.batch"]),
-        (["upstream=sage"], ["upstream=sage", "null"]),
-        (["vqvae.epochs=3"], ["vqvae.epochs=3.0, vqvae.steps=2000", "one of them", "null"]),
-        (["vqvae.steps=null"], ["vqvae.epochs=None, vqvae.steps=None", "one of them"]),
+        (["vqvae.epochs=3"], ["vqvae.epochs=3.0, vqvae.steps=2000", "null"]),
+        (["vqvae.steps=null"], ["vqvae.epochs=None, vqvae.steps=None"]),
         (["data.split.test=0.6", "data.split.val=0.4"], ["data.split.val=0.4", "data.split.test"]),
         (["data=mocap", "data.root=.", "data.synth.minutes=3"], ["data.synth.minutes=3"]),
-        (["export.precision=int8", "export.graph=naive"], ["export.precision=int8", "export.graph=naive"]),
         (["export.precision=int8", "memory.history=latest"], ["export.precision=int8", "memory.history"]),
     ],
     "texts that would be others": [
         (["save_predictions="], ["save_predictions=:", "a folder, or null"]),
         (["save_predictions=2024_11"], ["save_predictions=2024_11", "202411", "='2024_11'\""]),
         (["paths.outputs=1e3"], ["paths.outputs=1e3", "1000.0", "in quotes"]),
-        (["paths.outputs=true"], ["paths.outputs=true", "True", "in quotes"]),
         (["-m", "save_predictions=a,1_0"], ["save_predictions=a,1_0", "10", "in quotes"]),
         (["data=mocap", "data.root=.", "data.split.groups=[a,10_01]"], ["data.split.groups", "1001"]),
     ],
@@ -254,16 +213,6 @@ def test_a_bad_command_line_is_one_line(memmlp: Memmlp, tmp_path: Path, kind: st
     for arguments, words in BAD[kind]:
         ran = memmlp("train", *arguments)
         assert one_line(ran, *words), (arguments, ran)
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.slow
-def test_a_bad_command_line_in_a_process_of_its_own(tmp_path: Path):
-    command = [sys.executable, "-m", "memmlp", "train", "-m", "seed=0,-1"]
-    ran = finished(command, cwd=tmp_path)
-    assert (ran.returncode, ran.stdout) == (2, "")
-    assert ran.stderr.startswith("memmlp: ")
-    assert ran.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
 
@@ -323,14 +272,6 @@ def test_a_folder_hides_no_option_of_another_one(memmlp: Memmlp, tmp_path: Path)
         (tmp_path / name / "experiment" / "own.yaml").write_text(EXTRA.format(width))
     both = ["hydra.searchpath=['file://a', b]", "experiment=own", "optim.lr=-1"]
     assert one_line(memmlp("train", *both), "b/experiment/own.yaml", "a/experiment/own.yaml is used")
-
-
-def test_help_lists_the_groups_and_the_config(memmlp: Memmlp):
-    said = memmlp("train", "--help", "memory=gru").out
-    groups, config = said.split("== Config ==")
-    assert re.search(r"^memory: .*\bgru\b", groups, re.MULTILINE)
-    assert "search" not in re.findall(r"^(\w+): ", groups, re.MULTILINE)
-    assert "name: gru" in config
 
 
 def test_an_experiment_does_not_replace_another_one_in_silence(memmlp: Memmlp):
