@@ -11,8 +11,6 @@ from omegaconf import OmegaConf
 from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment, config_of
 from memmlp.config.compose import composed
-from memmlp.config.compose_plan import tasks_of
-from memmlp.config.worker_process import check_identity
 from memmlp.networks import checkpoint
 from memmlp.networks.sage_net import SAGENet
 from memmlp.runs.lookup import check_trained, list_runs
@@ -105,21 +103,3 @@ def test_a_key_changes_the_runs_in_which_it_acts_and_all_that_build_upon_them():
 def chain_of(cfg) -> list[str]:
     experiment = build_experiment(cfg)
     return [identity.id for identity in experiment.identities("d")]
-
-
-@pytest.mark.slow
-def test_a_refiner_stands_behind_it_and_a_sweep_trains_all_in_order():
-    refined = build_experiment(composed([*SHORT, "refiner=sage"]))
-    tasks = tasks_of(refined, "d")
-    assert [task.kind for task in tasks] == [*PARTS, "memmlp", "memmlp"]
-    assert [task.upstream for task in tasks] == [None, *(task.id for task in tasks[:-1])]
-    assert [task.id for task in tasks[:-1]] == chain_of(composed(SHORT))
-
-    class Data:
-        groups_digest = None
-
-        def prepare(self):
-            return type("Prepared", (), {"digest": "d"})
-
-    object.__setattr__(refined, "motion", Data())
-    check_identity(refined, tasks[-1])
