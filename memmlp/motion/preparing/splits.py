@@ -316,6 +316,7 @@ class ListSplit(PublishedSplit):
 
     @property
     def listed(self) -> Mapping[str, int]:  # type: ignore[override]
+        """The number of the split's entries by subset."""
         return dict(Counter(entry.split("/")[0] for entry in sorted(self.entries)))
 
     def describe(self) -> dict[str, Any]:
@@ -361,6 +362,7 @@ class SubsetSplit(PublishedSplit):
 
     @property
     def listed(self) -> Mapping[str, int]:  # type: ignore[override]
+        """The number of the split's entries by subset."""
         return dict.fromkeys((*self.train, *self.test), 1)
 
     def describe(self) -> dict[str, Any]:
