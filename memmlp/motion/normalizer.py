@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from memmlp.common.float32_regions import in_float32
 from memmlp.motion.body import (
     FRAME_DIM,
     HEAD,
@@ -25,6 +25,15 @@ from memmlp.motion.network_coordinates import Coordinates
 Change = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 """Maps a pose in the world, global rotations (..., 22, 3, 3) and joints (..., 22, 3), to another one. It is
 given the inputs (..., 54) and the rest joints (22, 3), too."""
+
+
+def in_float32(device: torch.device) -> AbstractContextManager[object]:
+    """Compute in float32 within the context, even in a mixed-precision training (`optim.precision=bf16`).
+
+    Without mixed precision it has no effect, and it leaves nothing in an exported graph.
+    """
+    mixed = torch.is_autocast_enabled(device.type)
+    return torch.autocast(device.type, enabled=False) if mixed else nullcontext()
 
 
 class Normalizer(nn.Module):

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 
 from memmlp.common.components import component
-from memmlp.common.float32_regions import in_float32
 from memmlp.common.settings import at_least, fraction, setting
 from memmlp.motion.body import (
     HEAD,
@@ -25,7 +24,7 @@ from memmlp.motion.body import (
     TRACKED,
 )
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
-from memmlp.motion.normalizer import Normalizer
+from memmlp.motion.normalizer import Normalizer, in_float32
 from memmlp.networks.motion_model import (
     State,
     StreamingGraph,

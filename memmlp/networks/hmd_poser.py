@@ -17,7 +17,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common.components import component
-from memmlp.common.float32_regions import in_float32
 from memmlp.common.settings import at_least, fraction, setting
 from memmlp.motion.body import (
     ROTATION,
@@ -28,7 +27,7 @@ from memmlp.motion.body import (
     TRACKED,
 )
 from memmlp.motion.geometry import matrix_to_sixd, sixd_to_matrix
-from memmlp.motion.normalizer import Normalizer
+from memmlp.motion.normalizer import Normalizer, in_float32
 from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel
 from memmlp.networks.settings import NetworkSettings
 from memmlp.networks.transformer import EncoderLayer

@@ -18,7 +18,6 @@ from torch import Tensor
 
 from memmlp.common import distributed
 from memmlp.common.components import component
-from memmlp.common.float32_regions import in_float32
 from memmlp.common.settings import at_least, fraction, setting
 from memmlp.motion.body import (
     HEAD,
@@ -34,7 +33,7 @@ from memmlp.motion.body import (
 )
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.network_coordinates import Heading
-from memmlp.motion.normalizer import Normalizer
+from memmlp.motion.normalizer import Normalizer, in_float32
 from memmlp.networks.avatar_jlm import AvatarJLM, AvatarJLMGraph, AvatarJLMSettings
 from memmlp.networks.avatar_poser import AvatarPoser, AvatarPoserGraph, AvatarPoserSettings, head
 from memmlp.networks.limb_solver import (

@@ -11,8 +11,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common.components import component
-from memmlp.common.float32_regions import in_float32
 from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.normalizer import in_float32
 from memmlp.networks.memory import FeatureMemory, FeatureMemorySettings, Past, Recall, RecurrentPast
 from memmlp.networks.motion_model import State
 from memmlp.networks.streaming import FrameGRU

@@ -11,11 +11,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common.components import component
-from memmlp.common.float32_regions import in_float32
 from memmlp.common.settings import at_least, one_of, setting, sized
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
-from memmlp.motion.normalizer import Normalizer
+from memmlp.motion.normalizer import Normalizer, in_float32
 from memmlp.networks.layers import compute_products, step_gru
 from memmlp.networks.limb_solver import reach_hands, use_tracker_rotations
 from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel

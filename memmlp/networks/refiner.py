@@ -14,10 +14,9 @@ import torch
 from torch import Tensor, nn
 
 from memmlp.common.components import component
-from memmlp.common.float32_regions import in_float32
 from memmlp.common.settings import Settings, at_least, one_of, positive, setting
 from memmlp.motion.body import POSITION, ROTATION
-from memmlp.motion.normalizer import Normalizer
+from memmlp.motion.normalizer import Normalizer, in_float32
 from memmlp.networks.motion_model import MotionModel, State, StreamingGraph
 from memmlp.networks.streaming import FrameGRU, has_stream, streaming
 

@@ -14,8 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from memmlp.common.float32_regions import in_float32
 from memmlp.motion.body import N_JOINTS, ROTATION, TRACKED
+from memmlp.motion.normalizer import in_float32
 from memmlp.networks.avatar_jlm import JOINT_DIM, group_by_tracker
 from memmlp.networks.bodiffusion import SINES
 from memmlp.networks.diffusion import TimeEmbedding

@@ -13,9 +13,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common import distributed
-from memmlp.common.float32_regions import in_float32
 from memmlp.motion.body import FRAME_DIM, ROTATION, SPARSE_DIM
-from memmlp.motion.normalizer import Normalizer
+from memmlp.motion.normalizer import Normalizer, in_float32
 
 
 class Quantised(NamedTuple):

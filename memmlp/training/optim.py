@@ -5,20 +5,23 @@ The classes of the slot `optim` are Optim (AdamW), Muon and ScheduleFree.
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import Any, Self
 
 import torch
-from torch import nn
+from torch import Tensor, nn
+from torch.optim import Optimizer
+from torch.overrides import TorchFunctionMode
 
 from memmlp.common.components import component
 from memmlp.common.errors import InputError
 from memmlp.common.settings import Settings, at_least, fraction, one_of, positive, setting, within
 from memmlp.training.averaging import EMA, Average, ScheduleFreeAverage
-from memmlp.training.muon import ComposedOptimiser
 
 SCHEDULES: dict[str, Callable[[float, float, float], float]] = {
     # Each maps the progress in [0, 1), final rate / first rate and `drop_at` to the factor on the first rate.
@@ -26,6 +29,9 @@ SCHEDULES: dict[str, Callable[[float, float, float], float]] = {
     "cosine": lambda done, final, drop_at: final + (1 - final) * 0.5 * (1 + math.cos(math.pi * done)),
     "milestones": lambda done, final, drop_at: 0.2 ** sum(done >= at for at in (0.2, 0.5, 0.7)),
 }
+
+PRODUCTS = {torch.matmul, torch.Tensor.matmul, torch.Tensor.__matmul__, torch.mm, torch.addmm}
+"""The products of matrices that are computed in float32 where bfloat16 is slow."""
 
 
 @dataclass
@@ -159,7 +165,7 @@ class Muon(Optim):
 
     Muon's steps are scaled to the typical length of AdamW's steps (Liu et al. 2025), so that AdamW's learning
     rates and weight decay fit both. The implementation is torch.optim.Muon, which multiplies matrices in
-    bfloat16 (memmlp.training.muon). Its momentum is Nesterov momentum. The attributes are the keys of
+    bfloat16. Its momentum is Nesterov momentum. The attributes are the keys of
     MuonSettings.
     """
 
@@ -249,3 +255,72 @@ def vqvae_optim(steps: int, **keys: Any) -> Optim:
     return Optim(
         steps, schedule="milestones", betas=(0.9, 0.99), decoupled=False, validate_every=steps, **keys
     )
+
+
+class ComposedOptimiser(Optimizer):
+    """Several optimisers as one, with the parameter groups and the state of all of them.
+
+    Args:
+        parts: the optimisers, which have no parameter in common.
+    """
+
+    def __init__(self, parts: Sequence[Optimizer]):
+        self.parts = tuple(parts)
+        super().__init__([group for part in parts for group in part.param_groups], {})
+        self._share()
+
+    def _share(self) -> None:
+        start = 0
+        for part in self.parts:  # each uses the groups and the state themselves, not copies
+            end = start + len(part.param_groups)
+            part.param_groups, part.state = self.param_groups[start:end], self.state
+            start = end
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None) -> None:  # type: ignore[override]
+        """Take a step of each part; a closure is not supported."""
+        with widen_products():
+            for part in self.parts:
+                part.step()
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Load the groups and the state of all parts."""
+        super().load_state_dict(state_dict)
+        self._share()
+
+
+class WideProducts(TorchFunctionMode):
+    """Within it, products of bfloat16 matrices on the CPU are computed in float32 and rounded.
+
+    A processor without instructions for bfloat16 is six times slower at them than at float32. Products of two
+    bfloat16 numbers are exact in float32, and sums are in float32, so the result is that of the instructions.
+    """
+
+    def __torch_function__(
+        self,
+        func: Callable[..., Any],
+        types: Sequence[type],
+        args: Sequence[Any] = (),
+        kwargs: Mapping[str, Any] | None = None,
+    ) -> Any:
+        """Call a function of torch."""
+        if func in PRODUCTS and all(map(_is_narrow, args)):
+            return func(*(tensor.float() for tensor in args), **(kwargs or {})).bfloat16()
+        return func(*args, **(kwargs or {}))
+
+
+def widen_products() -> AbstractContextManager[object]:
+    """Return `WideProducts` on a processor without instructions for bfloat16, and nothing on others."""
+    return nullcontext() if has_bfloat16_products() else WideProducts()
+
+
+@functools.cache
+def has_bfloat16_products() -> bool:
+    """Return whether this processor has instructions for products of bfloat16; only x86 is asked."""
+    ask: Callable[[], dict[str, Any]] = getattr(torch.cpu, "get_capabilities", dict)  # newer than some torch
+    known = ask()
+    return known.get("architecture") != "x86_64" or bool(known.get("avx512_bf16") or known.get("amx_bf16"))
+
+
+def _is_narrow(tensor: Any) -> bool:
+    return isinstance(tensor, Tensor) and tensor.dtype == torch.bfloat16 and tensor.device.type == "cpu"

@@ -20,11 +20,11 @@ from torch import Tensor, nn
 
 from memmlp.common import distributed
 from memmlp.common.components import component
-from memmlp.common.float32_regions import in_float32
 from memmlp.common.settings import Settings, at_least, each, fraction, group, positive, setting, sized
 from memmlp.motion.body import HANDS, HEAD, N_JOINTS, ROOT, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.dataset import MirroredDataset, MotionDataset, WindowSampler
 from memmlp.motion.motion_source import Prepared
+from memmlp.motion.normalizer import in_float32
 from memmlp.networks import checkpoint
 from memmlp.networks.architectures import Architecture
 from memmlp.networks.sage_net import SAGENet

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from memmlp.training import muon
-from memmlp.training.muon import ComposedOptimiser, WideProducts, has_bfloat16_products, widen_products
+from memmlp.training import optim
+from memmlp.training.optim import ComposedOptimiser, WideProducts, has_bfloat16_products, widen_products
 
 
 def network() -> nn.Linear:
@@ -75,8 +75,8 @@ def test_a_processor_is_asked(monkeypatch):
         known = {"architecture": architecture, "avx512_bf16": False, "amx_bf16": False}
         known |= dict.fromkeys(instructions, True)
         monkeypatch.setattr(torch.cpu, "get_capabilities", lambda known=known: known)
-        monkeypatch.setattr(muon, "has_bfloat16_products", has_bfloat16_products.__wrapped__)
-        assert muon.has_bfloat16_products() is has
+        monkeypatch.setattr(optim, "has_bfloat16_products", has_bfloat16_products.__wrapped__)
+        assert optim.has_bfloat16_products() is has
         assert isinstance(widen_products(), WideProducts) is not has
 
 
@@ -84,7 +84,7 @@ def test_muon_takes_the_same_steps_with_either(monkeypatch):
     """Newton and Schulz' iteration loses what a rounding differs by."""
 
     def stepped(narrow: bool) -> torch.Tensor:
-        monkeypatch.setattr(muon, "has_bfloat16_products", lambda: narrow)
+        monkeypatch.setattr(optim, "has_bfloat16_products", lambda: narrow)
         torch.manual_seed(0)
         weight = torch.nn.Parameter(torch.randn(12, 20))
         optimiser = ComposedOptimiser([torch.optim.Muon([weight], 0.02)])

@@ -11,10 +11,9 @@ from torch import Tensor, nn
 
 from memmlp.common.components import component
 from memmlp.common.errors import InputError
-from memmlp.common.float32_regions import in_float32
 from memmlp.common.settings import Settings, at_least, positive, setting
 from memmlp.motion.body import N_JOINTS, POSITION
-from memmlp.motion.normalizer import Normalizer
+from memmlp.motion.normalizer import Normalizer, in_float32
 
 Terms = dict[str, Tensor]
 
