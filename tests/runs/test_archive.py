@@ -192,6 +192,9 @@ def test_an_archive_cut_anywhere_is_refused(archive: Path, tmp_path: Path):
 def test_another_run_of_that_id_stays(run: Run, archive: Path, tmp_path: Path):
     place = Run.of(tmp_path / "there", NAME)
     place.begin("memmlp", {}, data="d", upstream=None)
-    with pytest.raises(InputError, match="exists already"):
-        import_run(archive, tmp_path / "there")
+    for _ in ("unfinished", "with other weights"):
+        with pytest.raises(InputError, match="exists already"):
+            import_run(archive, tmp_path / "there")
+        place.model.write_bytes(b"other")
+        place.finish([place.model.name])
     assert place.config == {}
