@@ -129,7 +129,7 @@ def storm(
 
 
 def choose(processes: Sequence[subprocess.Popen[bytes]], outputs: Path, dice: random.Random) -> int | None:
-    """Choose a process to kill: a controller, or a worker that holds a run; None if there is none."""
+    """Choose a process to kill: a controller, or a worker that holds a run; None without one."""
     owners = [Lock(folder).owner for folder in sorted(outputs.glob("runs/*/"))]
     workers = [int(owner["pid"]) for owner in owners if owner and is_alive(owner)]
     victims = [*(process.pid for process in processes if process.poll() is None), *workers]

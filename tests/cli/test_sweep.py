@@ -107,7 +107,7 @@ def test_variants_that_are_named_are_run_alone(home: Path):
     assert "wild" not in said
     said = command(
         home, "--variant", "none", "--variant", "full"
-    )  # the failure of another variant is none of theirs
+    )  # the failure of another variant does not count
     assert "3 of 4 runs done" in said
     assert "again with: --retry" in command(home, "--variant", "wild", code=1)
     assert stamps(home) == before

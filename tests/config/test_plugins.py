@@ -220,6 +220,24 @@ def test_a_folder_of_configs_is_searched_while_a_command_runs(folder: Path):
         composed(["experiment=own"])
 
 
+COORDINATES = """
+import torch
+from memmlp.common.components import component
+from memmlp.motion.network_coordinates import World
+
+@component("coordinates", "floor")
+class Floor(World): pass
+"""
+
+
+def test_custom_coordinates(folder: Path):
+    write(folder, {"mine.py": COORDINATES})
+    experiment = build_experiment(composed(["plugins=[mine]", "normalizer.coordinates=floor"]))
+    assert type(experiment.architecture.coordinates).__name__ == "Floor"
+    assert experiment.config["plugins"] == ["mine"]
+    assert experiment.identity("d").id != build_experiment(composed([])).identity("d").id
+
+
 WALKS = """
 from dataclasses import dataclass
 from memmlp.common.components import component
@@ -252,6 +270,14 @@ def test_a_custom_data_source(folder: Path):
     config = build_experiment(cfg).config
     assert config["plugins"] == ["mine"]
     assert restored(config).data == cfg.data
+
+
+def test_a_new_version_of_a_data_source_makes_its_clips_again(folder: Path):
+    write(
+        folder, {"mine/__init__.py": WALKS.replace("VERSION", "2"), "mine/conf/data/walks.yaml": WALKS_YAML}
+    )
+    source = build_motion(composed(["plugins=[mine]", "data=walks"]))
+    assert source.clips.root == Path("made/walks-minutes1.0-seed0-v2")
 
 
 def test_an_executor_of_ones_own(folder: Path):

@@ -39,17 +39,39 @@ def pair(step_files, tmp_path_factory) -> tuple[Path, Path]:
     return exact, quantised
 
 
-def test_inner_layers_are_int8_and_the_ends_are_not(pair):
-    """Other networks' inner layers are those of tests/deploy/test_lower_precision.py."""
-    graph = onnx.load(pair[1]).graph
-    types = {tensor.name: tensor.data_type for tensor in graph.initializer}
-    sources = {node.output[0]: node.input[0] for node in graph.node if node.op_type == "DequantizeLinear"}
-    products = [node.input[1] for node in graph.node if node.op_type in ("Gemm", "MatMul")]
-    names = [sources.get(name, name) for name in products]
-    kinds = {name.removesuffix("_quantized"): types.get(name, 0) for name in names}
+def weights(graph: onnx.ModelProto) -> dict[str, int]:
+    """Return the number type of each layer's weight in a product, taken directly or dequantised."""
+    types = {tensor.name: tensor.data_type for tensor in graph.graph.initializer}
+    sources = {
+        node.output[0]: node.input[0] for node in graph.graph.node if node.op_type == "DequantizeLinear"
+    }
+    found = {}
+    for node in graph.graph.node:
+        if node.op_type in ("Gemm", "MatMul"):
+            name = sources.get(node.input[1], node.input[1])
+            found[name.removesuffix("_quantized")] = types.get(name, 0)
+    return found
+
+
+@pytest.mark.parametrize("network", ["mem_mlp", *exported.BASELINES])
+def test_inner_layers_are_int8_and_the_ends_are_not(step_files, tmp_path, network):
+    quantised, stream = tmp_path / "int8.onnx", streaming(exported.NETWORKS[network]())
+    lower("int8", step_files(network), quantised, stream, [CLIPS[0][:20]])
+    kinds = weights(onnx.load(quantised))
     inner = [kind for name, kind in kinds.items() if ".blocks." in name or ".layers." in name]
+    assert inner
     assert set(inner) == {onnx.TensorProto.INT8}
-    ends = ("model.stem.weight", "model.predictor.rotation.linear.weight")
+    ends = {
+        "mem_mlp": {"model.stem.weight", "model.predictor.rotation.linear.weight"},
+        "avatar_poser": {"model.model.embedding.weight", "model.model.orientation.0.weight"},
+        "ego_poser": {"model.model.embedding.weight", "model.model.orientation.0.weight"},
+        "hmd_poser": {"model.model.pose.0.weight"},
+        "manikin_s": {f"model.model.{head}.0.weight" for head in ("swivel", "places", "rotation")},
+        "avatar_jlm": {"model.model.regressor.0.weight", "model.model.regressor.3.weight"},
+        "bodiffusion": {"model.sparse.weight", "model.motion.weight", "model.made.weight"},
+        "sage": {"model.sparse.weight", "model.decoder.heads.0.2.weight", "model.decoder.heads.1.2.weight"},
+        "vae_hmd": {"model.model.encoder.stem.weight", "model.model.decoder.head.weight"},
+    }.get(network, {"model.model.head.weight"})
     assert {kinds[name] for name in ends} == {onnx.TensorProto.FLOAT}
 
 

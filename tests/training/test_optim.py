@@ -114,7 +114,7 @@ def test_muon_has_the_matrices_and_adamw_the_rest():
 
 
 def test_what_has_one_column_or_row_is_no_matrix():
-    """As the bias of a time mix. RecurrentPoser has none, so its identity is without optim.vectors."""
+    """As the bias of a time mix. RecurrentPoser lacks one, so its identity is without optim.vectors."""
     mix, gate = TimeMix(7), torch.nn.Linear(4, 1, bias=False)
     group = {"params": [*mix.parameters(), *gate.parameters()]}
     for vectors, of_muon in (("adamw", 1), ("muon", 3)):
