@@ -81,7 +81,8 @@ class ShownInTensorBoard:
     def __init__(self, folder: Path):
         from tensorboardX import SummaryWriter
 
-        self.folder, self.writer = folder, SummaryWriter(str(folder))
+        # flush() writes only what the writer's thread has already taken from its queue; 120 s is the default
+        self.folder, self.writer = folder, SummaryWriter(str(folder), flush_secs=1)
 
     def log(self, points: Sequence[CurvePoint]) -> None:
         """Write values to disk."""
