@@ -42,7 +42,7 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
 @click.option(
     "--format",
     "form",
-    type=click.Choice(["md", "tex", "json", "html"]),
+    type=click.Choice(["md", "tex", "json"]),
     help="Format to print in.  [default: a table for the screen]",
 )
 @click.option(
@@ -214,7 +214,6 @@ def table_of_plan(
     from memmlp.report.tables.build_table import (
         finished_runs,
         make_table,
-        older_run_finder,
         on_source,
         run_finder,
         state_finder,
@@ -238,7 +237,7 @@ def table_of_plan(
     runs, tied = together(runs, selection.together)
     flags = (*tied, *flags)
     command = f"{command} --until-decided" if rounds else command
-    table = make_table(sweep, runs, modes, command, state_finder(plan), older_run_finder(plan), rounds)
+    table = make_table(sweep, runs, modes, command, state_finder(plan), rounds)
     table = titled(table, selection.source) if selection.source else table
     return SweepTable(sweep, runs, replace(table, flags=(*table.flags, *flags)))
 

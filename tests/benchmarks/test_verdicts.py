@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from benchmarks.verdicts import SHARES, Shares, Simulated, SimulationSetting, broken, draw, grid, simulate
 
-from memmlp.report.tables.statistics.paired_differences import error
+from memmlp.report.tables.statistics import error
 
 
 @pytest.mark.parametrize("cell", [SimulationSetting(5, 10, 1), SimulationSetting(5, 11, 2)])

@@ -21,8 +21,15 @@ from scipy.special import ndtri
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.common.progress import progress_bar
-from memmlp.report.tables.statistics.paired_differences import LEVEL, Error, by_group
-from memmlp.report.tables.statistics.verdicts import analysis_schedule, holm, sequential, spending
+from memmlp.report.tables.statistics import (
+    LEVEL,
+    Error,
+    analysis_schedule,
+    by_group,
+    holm,
+    sequential,
+    spending,
+)
 
 
 class Shares(NamedTuple):

@@ -68,7 +68,6 @@ def test_command_writes_the_format_of_the_ending(memmlp: Memmlp, planned: None, 
         ("md", "| variant |"),
         ("tex", r"\toprule"),
         ("json", '"rows"'),
-        ("html", "<table>"),
     ):
         ran = memmlp("table", "5", "--out", f"out/t.{ending}")
         assert (ran.code, ran.out) == (0, f"out/t.{ending}\n")
@@ -99,7 +98,7 @@ def test_all_as_json_is_one_list(memmlp: Memmlp, planned: None):
         (["99"], ("no such sweep", "the number of a table of the paper, 1 to 17", "memory_control")),
         (["14", "bad=1"], ("data.root",)),
         (["all", "bad=1"], ("data.root",)),
-        (["14", "--out", "table.pdf"], ("--out table.pdf", "md, tex, json, html")),
+        (["14", "--out", "table.pdf"], ("--out table.pdf", "md, tex, json")),
         (["14", "--out", "/proc/nothing/t.md"], ("--out /proc/nothing/t.md",)),
         (["14", "--mode", "both modes"], ("--mode",)),
         (["14", "--branch", "head"], ("--branch", "rotation", "combined")),

@@ -19,8 +19,7 @@ from memmlp.common.errors import InputError
 from memmlp.report.kept_results import Kept, list_overrides
 from memmlp.report.result_pages import KeptTable, Placeholders, describe_origin, make_pages
 from memmlp.report.tables.build_table import make_table, together
-from memmlp.report.tables.statistics import Verdict
-from memmlp.report.tables.statistics.paired_differences import error
+from memmlp.report.tables.statistics import Verdict, error
 from memmlp.report.tables.table_text import MINUS
 from memmlp.sweep.definition import Sweep
 

@@ -6,7 +6,6 @@ the folder outputs/runs/<id>/, whichever command made it.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,9 +24,6 @@ from memmlp.report.tables.flags import DescribeRun, early_tables, find_flags, no
 from memmlp.report.tables.formats import FORMATS
 from memmlp.report.tables.measured_run import Measured, measured_for
 from memmlp.report.tables.table import Cell, Effect, Key, Row, Table
-from memmlp.runs.lookup import list_runs
-from memmlp.runs.recipe_versions import outdated
-from memmlp.runs.run import Run
 from memmlp.sweep.definition import COSTS, MODES, Sweep, Variant
 from memmlp.sweep.plan import Plan, count_states
 
@@ -67,26 +63,6 @@ def state_finder(plan: Plan) -> DescribeRun:
     return describe
 
 
-def older_run_finder(plan: Plan) -> DescribeRun:
-    """Return a function that names a finished run that differs from a planned one only in recipe versions."""
-    whats = {task.key: task.what for task in plan.tasks}
-    entries = {(entry.label, entry.seed): entry for entry in plan.entries}
-
-    @functools.cache
-    def known() -> dict[str, Run]:
-        return {run.manifest.get("what", ""): run for run in list_runs(plan.outputs) if run.done}
-
-    def describe(variant: Variant, seed: int) -> str | None:
-        entry = entries.get((variant.label, seed))
-        run = known().get(whats.get(entry.key, "?")) if entry else None
-        if entry is None or run is None or run.id == entry.id:
-            return None
-        changed = ", ".join(outdated(run.manifest.get("recipes", {}))) or "its VQ-VAE's"
-        return f"run {run.id}: {changed}"
-
-    return describe
-
-
 def finished_runs(sweep: Sweep, find: Find) -> dict[str, RunsBySeed]:
     """Return the finished runs of each runnable variant, by seed."""
     return {
@@ -103,7 +79,6 @@ def make_table(
     modes: Sequence[str] = MODES,
     command: str | None = None,
     state: DescribeRun = no_description,
-    older: DescribeRun = no_description,
     rounds: Rounds | None = None,
 ) -> Table:
     """Make the table of a sweep.
@@ -115,7 +90,6 @@ def make_table(
             runs have another one.
         command: the command that makes missing runs; `memmlp sweep` with the sweep's name by default.
         state: describes in a word the state of a variant's and seed's unfinished run, or returns None.
-        older: names the run with an earlier recipe that exists in place of a missing one, or returns None.
         rounds: the rounds that decided the verdicts; None for verdicts from a fixed number of seeds.
     """
     has_errors = bool(set(sweep.metrics) - set(COSTS))
@@ -128,7 +102,7 @@ def make_table(
     comparisons = sum(effect.p is not None for effect in found.values())
     if rounds:
         found, comparisons = rounds.apply_verdicts(found), len(rounds.comparisons(sweep))
-    flags = find_flags(shown, sweep, runs, command or f"memmlp sweep {sweep.name}", state, older)
+    flags = find_flags(shown, sweep, runs, command or f"memmlp sweep {sweep.name}", state)
     return Table(
         name=sweep.name,
         title=sweep.title,
@@ -267,10 +241,9 @@ def together(
 
 
 def write_summary(plan: Plan, table: Table, folder: Path) -> None:
-    """Write table.md, table.html and summary.json of a sweep, whose runs need not all be done."""
+    """Write table.md and summary.json of a sweep, whose runs need not all be done."""
     folder.mkdir(parents=True, exist_ok=True)
-    for form in ("md", "html"):
-        atomic_write(folder / f"table.{form}", FORMATS[form](table))
+    atomic_write(folder / "table.md", FORMATS["md"](table))
     write_json(folder / "summary.json", summarize(plan, table))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import itertools
 import math
 from collections import Counter, defaultdict
@@ -44,7 +43,6 @@ def find_flags(
     runs: Mapping[str, RunsBySeed],
     command: str,
     state: DescribeRun,
-    older: DescribeRun,
 ) -> Iterator[str]:
     """Yield the flags of a table.
 
@@ -54,13 +52,11 @@ def find_flags(
         runs: the finished runs of every runnable variant, by seed.
         command: the command that makes missing runs.
         state: describes in a word the state of a variant's and seed's unfinished run.
-        older: names the run with an earlier recipe that exists in place of a missing one.
     """
     every = [(variant.label, run) for variant in sweep.runnable() for run in runs[variant.label].values()]
     has_errors = bool(set(sweep.metrics) - set(COSTS))
     yield from _other_data(sweep)
     yield from _missing_runs(sweep, runs, command, state)
-    yield from _older_runs(sweep, runs, older)
     if has_errors:
         yield from _branches(sweep, asked, runs, command)
     if offline := [label for label, run in every if run.origin.offline]:
@@ -79,7 +75,6 @@ def find_flags(
         unknown = "none" if attribute == "gpu" else UNKNOWN
         values = [(getattr(run.origin, attribute).replace(UNKNOWN, unknown), label) for label, run in every]
         yield from differences(what, values)
-    yield from _unequal_code(every)
     yield from older_code((label, run.code, run.origin.plugins) for label, run in every)
     if set(TIMES) & set(sweep.metrics):
         timed = [(run.origin.timed_on, label) for label, run in every if run.latency or run.costs]
@@ -189,17 +184,6 @@ def _missing_runs(
         gaps = listed([f"'{label}' {gap}" for label, gap in lacking.items()])
         gaps = f"every variant's {next(iter(lacking.values()))}" if alike else gaps
         yield f"missing: {gaps}; fill with: {command}"
-
-
-def _older_runs(sweep: Sweep, runs: Mapping[str, RunsBySeed], older: DescribeRun) -> Iterator[str]:
-    found = [
-        f"'{variant.label}' seed {seed} ({run})"
-        for variant in sweep.runnable()
-        for seed in missing_seeds(sweep, variant, runs)
-        if (run := older(variant, seed))
-    ]
-    if found:
-        yield f"made by an earlier recipe, left out and made again by the sweep: {listed(found)}"
 
 
 def _branches(sweep: Sweep, asked: Sweep, runs: Mapping[str, RunsBySeed], command: str) -> Iterator[str]:
@@ -363,24 +347,6 @@ def _data_warnings(every: Labelled, field: str, ending: str = "") -> Iterator[st
     for warning in unique(text for _, run in every if (text := getattr(run.origin, field))):
         labels = quoted(label for label, run in every if getattr(run.origin, field) == warning)
         yield f"{warning}{ending}: {labels}"
-
-
-def _unequal_code(every: Labelled) -> Iterator[str]:
-    """Flag files of memmlp whose code differs between variants, be it of one commit.
-
-    Users' packages are left to `_unequal_recipes`. Kept results have no digests of files, and are left out.
-    """
-    having = [(run.code, label) for label, run in every if run.code]
-    digests: dict[str, set[str]] = defaultdict(set)
-    for code, _ in having:
-        for name in code:
-            digests[name].add(code[name])
-    names = sorted(name for name, found in digests.items() if len(found) > 1 and ":" not in name)
-    versions = [
-        (hashlib.sha256(repr([code.get(name) for name in names]).encode()).hexdigest()[:7], label)
-        for code, label in having
-    ]
-    yield from differences(f"code of {listed(names, FILES)}", versions)
 
 
 def _unequal_recipes(every: Labelled) -> Iterator[str]:

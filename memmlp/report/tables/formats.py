@@ -1,8 +1,7 @@
-"""A table's output formats: Markdown, LaTeX, HTML, JSON, or lines on a terminal."""
+"""A table's output formats: Markdown, LaTeX, JSON, or lines on a terminal."""
 
 from __future__ import annotations
 
-import html
 import itertools
 import json
 import re
@@ -13,7 +12,6 @@ from dataclasses import asdict
 from rich.console import Console
 
 from memmlp.common.files import plain
-from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table import Table
 from memmlp.report.tables.table_text import MINUS, Grid, VariantLine, caption, grids, legend
 
@@ -73,18 +71,6 @@ def as_json(table: Table) -> str:
     return json.dumps(plain(fields), indent=2, ensure_ascii=False) + "\n"
 
 
-def as_html(table: Table) -> str:
-    """Return the table as a section for an HTML page."""
-    parts = [f'<section class="result" id="{_html(table.name)}"><h3>{_html(caption(table))}</h3>']
-    for grid in grids(table):
-        title = f"<caption>{_html(grid.mode)} mode</caption>" if grid.mode else ""
-        head = "".join(f'<th scope="col">{_html_head(word)}</th>' for word in grid.header)
-        body = "".join(map(_html_group, grid.groups))
-        parts.append(f'<div class="scroll"><table>{title}<thead><tr>{head}</tr></thead>{body}</table></div>')
-    remarks = "".join(f"<li>{_html(line)}</li>" for line in _remarks(table))
-    return "\n".join([*parts, f'<ul class="remarks">{remarks}</ul>' if remarks else "", "</section>"])
-
-
 def show(table: Table, console: Console) -> None:
     """Print the table on a terminal; columns that do not fit are put into further blocks below."""
     console.print(caption(table), style="bold", soft_wrap=True)
@@ -98,9 +84,7 @@ def show(table: Table, console: Console) -> None:
     console.print()
 
 
-FORMATS: dict[str, Callable[[Table], str]] = {
-    "md": markdown, "tex": latex, "json": as_json, "html": as_html
-}  # fmt: skip
+FORMATS: dict[str, Callable[[Table], str]] = {"md": markdown, "tex": latex, "json": as_json}
 
 
 def _all(grid: Grid) -> Iterator[VariantLine]:
@@ -113,40 +97,6 @@ def _remarks(table: Table) -> list[str]:
 
 def _tex(text: str) -> str:
     return "".join(TEX.get(letter, letter) for letter in text)
-
-
-def _html(text: str | None) -> str:
-    return html.escape(text or "")
-
-
-def _html_head(name: str) -> str:
-    metric, *unit = map(_html, _header(name))
-    return "<br>".join([metric, *(f"<small>{word}</small>" for word in unit)])
-
-
-def _html_group(group: Sequence[VariantLine]) -> str:
-    label = f'<th scope="rowgroup" rowspan="{len(group)}">{_html(group[0].head[0])}</th>'
-    rows = []
-    for number, line in enumerate(group):
-        cells = "".join(f"<td>{'<br>'.join(map(_html_mark, cell))}</td>" for cell in line.cells)
-        seeds = f'<td class="seeds">{_html(line.head[1])}</td>'
-        rows.append(f'<tr class="{line.kind}">{"" if number else label}{seeds}{cells}</tr>')
-    return f"<tbody>{''.join(rows)}</tbody>"
-
-
-def _html_mark(text: str) -> str:
-    """Return the HTML of a part of a cell.
-
-    A verdict gets a class with its name; the signs of agreement and significance get one class each.
-    """
-    word = text.partition(" ")[0]
-    if word in set(Verdict):
-        return f'<span class="verdict {word}">{text}</span>'
-    marks = {"✓": "same", "✗": "opposite", "*": "significant"}
-    escaped = _html(text)
-    for mark, name in marks.items():
-        escaped = escaped.replace(mark, f'<span class="{name}">{mark}</span>')
-    return escaped
 
 
 def _fitting(grid: Grid, width: int) -> list[list[int]]:

@@ -81,7 +81,7 @@ def write_page(answers: Answers, sweeps: Iterable[ReportedSweep], about: str, re
 
 
 def _describe_sweep(answers: Answers, one: ReportedSweep) -> dict[str, Any]:
-    results = describe_results(one.sweep, one.runs, one.table)
+    results = describe_results(one.sweep, one.table)
     if one.name in answers.sweeps.known:
         return answers.sweeps.describe(one.name) | results
     return {**_progress_of_unplanned(one), "cells": [], "prerequisites": [], "rounds": None, **results}

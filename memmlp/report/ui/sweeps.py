@@ -1,4 +1,4 @@
-"""The answers about sweeps: progress, remaining time, tables with effects and verdicts, and distributions."""
+"""The answers about sweeps: progress, remaining time, and tables with effects and verdicts."""
 
 from __future__ import annotations
 
@@ -13,14 +13,10 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from memmlp.common.errors import InputError
 from memmlp.common.files import plain
 from memmlp.evaluation.metric_facts import UNITS
 from memmlp.report.tables.build_table import finished_runs, make_table
-from memmlp.report.tables.effects import RunsBySeed
-from memmlp.report.tables.error_distributions import distributions, performance_profile
 from memmlp.report.tables.formats import as_json
 from memmlp.report.tables.measured_run import Measured, load
 from memmlp.report.tables.seed_rounds import ROUNDS_FILE, Rounds, check_same_runs, progress, subject
@@ -36,7 +32,6 @@ from memmlp.sweep.progress_table import task_name
 
 DAMAGED_ROUNDS = "seeds were spent in rounds that cannot be shown here: these verdicts do not keep the 5 %"
 OTHER_ROUNDS = "seeds were spent in rounds, but not of these runs: these verdicts do not keep the 5 %"
-PROFILE_POINTS = 61  # of a performance profile
 
 
 class KnownSweep(NamedTuple):
@@ -234,7 +229,7 @@ class Sweeps:
         table = make_table(sweep, runs, rounds=rounds)
         table = replace(table, flags=(*table.flags, *flag, *flags))
         described = describe_rounds(rounds, sweep) if rounds else None
-        return describe_results(sweep, runs, table) | {"rounds": described, "values": values}
+        return describe_results(sweep, table) | {"rounds": described, "values": values}
 
 
 def name_sweep(name: str, sweep: Sweep) -> dict[str, Any]:
@@ -242,8 +237,8 @@ def name_sweep(name: str, sweep: Sweep) -> dict[str, Any]:
     return {"name": name, "title": f"Table {sweep.table}: {sweep.title}" if sweep.table else sweep.title}
 
 
-def describe_results(sweep: Sweep, runs: Mapping[str, RunsBySeed], table: Table) -> dict[str, Any]:
-    """Return a sweep's results for a page: the table, the distributions, and the metric of its cells."""
+def describe_results(sweep: Sweep, table: Table) -> dict[str, Any]:
+    """Return a sweep's results for a page: the table, and the metric of its cells."""
     branches = {variant.branch for variant in sweep.variants}
     return {
         "metric": _cell_metric(sweep),
@@ -255,33 +250,7 @@ def describe_results(sweep: Sweep, runs: Mapping[str, RunsBySeed], table: Table)
             "better": {metric: better(metric) for metric in table.metrics},
             "legend": legend(table),
         },
-        "distributions": describe_distributions(sweep, runs, table.modes[0]),
     }
-
-
-def describe_distributions(sweep: Sweep, runs: Mapping[str, RunsBySeed], mode: str) -> dict[str, Any]:
-    """Return performance profiles, interquartile means and probabilities of improvement by metric.
-
-    A profile is the fraction of all runs' test clips with at most each of some `thresholds`.
-    """
-    found = {}
-    for metric, variants in distributions(sweep, runs, mode).items():
-        every = np.concatenate([variant.errors.ravel() for variant in variants])
-        every = every[np.isfinite(every)]
-        if not every.size:
-            continue
-        thresholds = np.linspace(every.min(), every.max(), PROFILE_POINTS)
-        rows = [
-            {
-                "variant": one.label,
-                "fractions": list(performance_profile(one.errors, thresholds)) if one.errors.size else [],
-                "middle": one.middle if one.middle is None or math.isfinite(one.middle) else None,
-                "improvement": one.improvement,
-            }
-            for one in variants
-        ]
-        found[metric] = {"mode": mode, "thresholds": thresholds.tolist(), "rows": rows}
-    return found
 
 
 def find_rounds(sweep: Sweep, plan: Plan) -> tuple[Rounds | None, list[str]]:

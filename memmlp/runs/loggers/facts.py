@@ -192,7 +192,7 @@ class SweepFacts:
         found = read_json(folder / cls.RECORD)
         if not {"name", "status", "labels", "aggregates", "verdicts"} <= found.keys():
             return None
-        files = tuple(path for path in (folder / "table.md", folder / "table.html") if path.is_file())
+        files = tuple(path for path in [folder / "table.md"] if path.is_file())
         means = {key: value for key, value in found["aggregates"].items() if _is_number(value)}
         status, labels, verdicts = found["status"], found["labels"], found["verdicts"]
         return cls(folder.name, folder.absolute(), status, labels, means, verdicts, files)

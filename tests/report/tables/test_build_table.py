@@ -153,7 +153,7 @@ def test_table_means_verdicts_labels_and_status(tmp_path: Path):
     assert cell.effect is not None
     assert facts.aggregates["none/stream/MPJPE"] == cell.mean
     assert facts.verdicts["none/stream/MPJPE"] == cell.effect.verdict
-    assert [path.name for path in facts.files] == ["table.md", "table.html"]
+    assert [path.name for path in facts.files] == ["table.md"]
     assert "Mine" in facts.files[0].read_text()
 
 

@@ -1,4 +1,4 @@
-"""Tables on the screen, in Markdown, LaTeX, HTML and JSON."""
+"""Tables on the screen, in Markdown, LaTeX and JSON."""
 
 from __future__ import annotations
 
@@ -82,14 +82,6 @@ def test_latex_escapes(table: Table):
     assert not re.search(r"[±−↓↑✓✗²³]", text)  # noqa: RUF001
     rows = [line for line in text.splitlines() if line.endswith(r"\\") and "multicolumn" not in line]
     assert {len(re.split(r"(?<!\\)&", row)) for row in rows} == {7}
-
-
-def test_html_escapes(table: Table):
-    text = FORMATS["html"](table)
-    assert "Memory &amp; its &lt;parts&gt;" in text
-    assert "<parts>" not in text
-    assert text.count("<tbody>") == 2 * 4
-    assert '<span class="opposite">✗</span>' in text
 
 
 def test_json_has_the_values_of_each_seed(table: Table):

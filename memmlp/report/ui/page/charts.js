@@ -177,21 +177,6 @@ export function scatter(points, { x, y, front, log = false, line = true }) {
   return figure(`${y} against ${x}; ${best.length} of ${points.length} are in the second colour.`, draw, () => [['', x, y], ...points.map(point => [point.id, point.x, point.y])]);
 }
 
-// Performance profiles: the fraction of values that are at most a threshold, a line for each variant.
-export function profiles({ thresholds, rows }, { label }) {
-  const colours = colourOf(rows.map(row => row.variant));
-  const points = rows.flatMap(row => row.fractions.map((fraction, i) => ({ x: thresholds[i], y: fraction, variant: row.variant })));
-  const draw = width => Plot.plot(base(width, Math.min(Math.max(width * 0.42, 220), 320), {
-    x: { label, ticks: Math.min(width / 90, 8), labelAnchor: 'center', labelArrow: 'none' }, y: { label: 'fraction of clips', domain: [0, 1], grid: true, ticks: 5 },
-    marks: [
-      Plot.line(points, { x: 'x', y: 'y', z: 'variant', stroke: point => colours.get(point.variant), strokeWidth: 1.8 }),
-      tip(points, { x: 'x', y: 'y', title: point => `${point.variant}\n${number(point.y, 2)} at ${number(point.x)}` }),
-    ],
-  }));
-  const legend = h('div', { class: 'keys' }, rows.map(row => h('span', { class: 'key still' }, h('i', { style: `background:${colours.get(row.variant)}` }), row.variant)));
-  return h('div', {}, legend, figure(`Performance profiles of ${label}.`, draw));
-}
-
 // Errors over time; a click goes to a moment.
 export function timeline(values, { fps, label, at: when, go, marks, colours }) {
   const points = values.flatMap((one, i) => one.errors.map((error, frame) => ({ time: frame / fps, error, name: one.name, i })));

@@ -1,9 +1,9 @@
-// Sweeps: how far they are, their effects and tables beside the paper's, distributions, and curves by variant.
+// Sweeps: their progress, their effects and tables beside the paper's, and curves by variant.
 
 import { h, replace, link, section, empty, choice, table } from './dom.js';
 import { address, ask, generated, inFile, nameOf, place, remember, runs } from './store.js';
 import { curvePanel } from './compare.js';
-import { forest, profiles, scatter } from './charts.js';
+import { forest, scatter } from './charts.js';
 import { ACTIVE, look, state, STATE_WORDS } from './runs.js';
 import { DASH, decimals, duration, effectDigits, metricNumber, metricText, number, signed } from './format.js';
 
@@ -45,7 +45,7 @@ export async function single(name) {
   function draw() {
     replace(top, h('p', { class: 'trail' }, link('#/sweeps', 'Sweeps')), h('div', { class: 'bar title' }, h('h1', {}, sweep.table.caption)),
       sweep.name === sweep.table.caption ? null : h('p', { class: 'faint sub' }, sweep.name), sweep.counts.done === sweep.tasks ? null : progress(sweep), sweep.cells.length ? board(sweep) : null,
-      effects(sweep.table, draw), section('Table', results(sweep.table)), beyondTheMean(sweep), sweep.rounds ? rounds(sweep.rounds) : null);
+      effects(sweep.table, draw), section('Table', results(sweep.table)), sweep.rounds ? rounds(sweep.rounds) : null);
   }
   async function update() {
     if (!inFile) sweep = await ask(`sweeps/${name}`);
@@ -141,18 +141,6 @@ function effects(found, draw, head = 'h2') {
 }
 
 const significant = effect => Boolean(effect) && effect.holm !== null && effect.holm < effect.level;
-
-function beyondTheMean(sweep) {
-  const metrics = Object.keys(sweep.distributions);
-  if (!metrics.length) return null;
-  const rows = sweep.distributions[metrics[0]].rows.map((row, i) => [row.variant, ...metrics.flatMap(metric => {
-    const { middle, improvement } = sweep.distributions[metric].rows[i];
-    return [middle === null ? DASH : metricNumber(metric, middle), improvement === null ? DASH : number(improvement, 2)];
-  })]);
-  return section('Beyond the mean', h('p', { class: 'faint' }, 'The fraction of all runs’ test clips with at most a value, the mean of the middle half of all seeds and clips (IQM), and how often a run of the variant has a better value than its control’s on the same clip. They are not tests.'),
-    h('div', { class: 'charts' }, metrics.map(metric => h('div', { class: 'panel-chart' }, profiles(sweep.distributions[metric], { label: sweep.table.headings[metric] })))),
-    table(['variant', ...metrics.flatMap(metric => [`${metric}: IQM`, 'P(better)'])], rows));
-}
 
 // Seeds spent in rounds: what each interim analysis decided, and the progress of each variant.
 function rounds(found) {

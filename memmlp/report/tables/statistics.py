@@ -1,4 +1,8 @@
-"""Differences that are paired by seed and clip: mean, interval and p-values, and the error of the mean.
+"""Statistics of differences between two variants with the same seeds and the same test clips.
+
+`differences` are always (K, S, C): for each of K comparisons, one variant's error minus the other's, for seed
+s on clip c. First come intervals and p-values, then the effects that could have been found, then what may be
+claimed about many comparisons. docs/statistics.md explains the method and how well it keeps its promises.
 
 Seeds and groups of clips are crossed: every seed saw every clip. The model is d[s, c] = mean + effect of seed
 s + effect of c's group + effect of clip c + noise, with unknown variances. Clips are first averaged within
@@ -17,14 +21,19 @@ groups have the larger effects.)
 
 from __future__ import annotations
 
+import bisect
+import functools
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import stdtr, stdtrit
+from scipy.special import chdtri, ndtri, stdtr, stdtrit
 
 LEVEL = 0.05
+DRAWS = 4096  # simulated tables; a power of two, as Sobol's sequence wants
 
 Groups = np.ndarray | Sequence[object] | None
 """The group of each clip (C,), as integers or labels; None if each clip is a group of its own."""
@@ -210,3 +219,190 @@ def equivalence_p(differences: np.ndarray, margin: float | np.ndarray, groups: G
     if known.conditional:
         return np.full(len(differences), np.nan)
     return known.level(margin - np.abs(differences.mean((1, 2))))
+
+
+def detectable(
+    differences: np.ndarray, comparisons: int, groups: Groups = None, power: float = 0.8
+) -> np.ndarray:
+    """Return the effects (K,) that tables like these differences (K, S, C) would find with this power.
+
+    "Find" means to call significant at the first, strictest step of Holm's correction over `comparisons`. The
+    measured variances are taken as the true ones, and all effects as normal. The result is NaN with one seed
+    or one group.
+    """
+    known = error(differences, groups)
+    if known.conditional:
+        return np.full(len(differences), np.nan)
+    return found(components(known), differences.shape[1], known.groups, LEVEL / comparisons, power)
+
+
+def seeds_needed(
+    differences: np.ndarray,
+    effect: float,
+    comparisons: int,
+    groups: Groups = None,
+    power: float = 0.8,
+    most: int = 1000,
+) -> int | None:
+    """Return the fewest seeds with which this effect would be found, estimated from differences (S, C).
+
+    It is computed as in `detectable`, with the parts of seeds and noise divided by the number of seeds.
+
+    Args:
+        differences: the differences of one comparison (S, C).
+        effect: the effect to be found, in the unit of the differences.
+        comparisons: how many comparisons Holm's correction is over.
+        groups: the group of each clip (C,).
+        power: the share of tables in which the effect is to be found.
+        most: the largest number of seeds to consider.
+
+    Returns:
+        The number; None if not even `most` seeds are enough, because the groups of clips are too few or too
+        different, and with one seed or one group.
+    """
+    matrix = differences.reshape(1, *differences.shape[-2:])
+    known = error(matrix, groups)
+    if known.conditional:
+        return None
+
+    def enough(seeds: int) -> bool:
+        share = matrix.shape[1] / seeds
+        parts = components(known) * [[share], [1], [share]]
+        return bool(found(parts, seeds, known.groups, LEVEL / comparisons, power)[0] <= abs(effect))
+
+    if not enough(most):
+        return None
+    return bisect.bisect_left(range(most), True, lo=2, key=enough)
+
+
+def components(known: Error) -> np.ndarray:
+    """Return the parts (3, K) of seeds, groups and noise in the variances of the means."""
+    seeds, groups, noise = known.variances
+    return np.stack([np.maximum(seeds - noise, 0), np.maximum(groups - noise, 0), noise])
+
+
+def found(parts: np.ndarray, seeds: int, groups: float, level: float, power: float) -> np.ndarray:
+    """Return the effects (K,) that are found at this level with this power.
+
+    An effect is found if it exceeds half the width of the interval minus the error of the mean. So the result
+    is a quantile of that difference over simulated tables.
+
+    Args:
+        parts: the true parts (3, K) of seeds, groups and noise in the variance of the mean.
+        seeds: the number of seeds.
+        groups: degrees of freedom of B.
+        level: the level of the test.
+        power: the share of tables in which the effect is to be found.
+    """
+    z, estimates = _draws(seeds, groups)
+    true = parts + parts[2] * [[1], [1], [0]]  # the estimates A and B both contain the noise
+    drawn = (true[:, :, None] * estimates[:, None]).reshape(3, -1)
+    half = Error(drawn, seeds - 1, groups).half(level).reshape(-1, DRAWS)
+    return np.quantile(half - np.sqrt(parts.sum(0))[:, None] * z, power, axis=1)
+
+
+@functools.cache
+def _draws(seeds: int, groups: float) -> tuple[np.ndarray, np.ndarray]:
+    """Draw the random quantities that vary between tables.
+
+    Returns:
+        Standard normal errors of the mean (DRAWS,), and estimates of A, B and E divided by their expectations
+        (3, DRAWS), which are chi-squared over their degrees of freedom.
+    """
+    from scipy.stats import qmc  # slow to import, as is all of scipy.stats
+
+    uniform = qmc.Sobol(4, seed=0).random(DRAWS).T
+    freedoms = np.array([[seeds - 1], [groups], [(seeds - 1) * groups]])
+    return ndtri(uniform[0]), chdtri(freedoms, uniform[1:]) / freedoms
+
+
+class Verdict(StrEnum):
+    """What is claimed about a comparison.
+
+    HOLDS and OPPOSITE are about the paper's effect, HIGHER and LOWER about the measured difference if the
+    paper has no effect. INCONCLUSIVE claims nothing.
+    """
+
+    HOLDS = "holds"
+    OPPOSITE = "opposite"
+    HIGHER = "higher"
+    LOWER = "lower"
+    EQUIVALENT = "equivalent"
+    INCONCLUSIVE = "inconclusive"
+
+
+def holm(p: np.ndarray) -> np.ndarray:
+    """Correct p-values (K,) for their number by Holm's step-down method; NaN stays NaN and does not count.
+
+    The probability of any wrong claim of a difference stays below the level (Holm 1979).
+    """
+    p = np.asarray(p, float)
+    order = np.flatnonzero(~np.isnan(p))
+    order = order[np.argsort(p[order])]
+    corrected = np.full_like(p, np.nan)
+    corrected[order] = np.minimum(1, np.maximum.accumulate(p[order] * np.arange(len(order), 0, -1)))
+    return corrected
+
+
+def verdict(
+    difference: float, equivalence: float, mean: float, paper: float | None = None, level: float = LEVEL
+) -> Verdict:
+    """Return the verdict on one comparison of a table.
+
+    Claims of a difference and claims of equivalence are two families, each with 5 % for a wrong claim: they
+    answer different questions, and a mean can't be wrongly called both. An interval within the margin shows
+    that there is no effect of interest, even if it does not contain 0.
+
+    Args:
+        difference: the p-value of a difference, corrected over the table; NaN if undefined.
+        equivalence: the p-value of `equivalence_p`, corrected in the same way.
+        mean: the measured mean difference.
+        paper: the paper's difference; None or 0 if the paper claims no sign.
+        level: the level that either family may spend, less than 5 % for an interim analysis.
+    """
+    if equivalence <= level:
+        return Verdict.EQUIVALENT
+    if not difference <= level:
+        return Verdict.INCONCLUSIVE
+    if paper:
+        return Verdict.HOLDS if mean * paper > 0 else Verdict.OPPOSITE
+    return Verdict.HIGHER if mean > 0 else Verdict.LOWER
+
+
+def analysis_schedule(most: int) -> tuple[int, ...]:
+    """Return the numbers of seeds of the interim analyses: 3, 5, 8, 13, ... up to `most`.
+
+    Two seeds never decide anything at the levels of a table, so the first one is at three.
+    """
+    counts = [3, 5]
+    while counts[-1] < most:
+        counts.append(counts[-1] + counts[-2])
+    return (*itertools.takewhile(lambda count: count < most, counts), most)
+
+
+def spending(number: int) -> tuple[float, ...]:
+    """Return the level that each of `number` interim analyses may spend.
+
+    Together they are 5 %, so that nothing need be assumed about how the analyses depend on each other. Each
+    level is twice the one before: among weights growing by a factor of 1, 2 or 3, these lose few decisions
+    and cost few seeds.
+    """
+    weights = 2.0 ** np.arange(number)
+    return tuple(map(float, LEVEL * weights / weights.sum()))
+
+
+def sequential(p: np.ndarray, claimed: np.ndarray, closed: np.ndarray) -> np.ndarray:
+    """Correct p-values (K,) by Holm at an interim analysis; compare them with the analysis' level.
+
+    What was decided stays decided. Comparisons that this family has claimed are removed from the correction
+    of the others. Comparisons that are closed without such a claim, because the other family decided them or
+    their variant has stopped, stay in the correction, but can no longer be claimed. So a first wrong claim
+    needs a true null whose p-value is below the analysis' level over the number of nulls, at an analysis that
+    was fixed beforehand: the levels add up.
+
+    Args:
+        p: p-values (K,) of this analysis; NaN if undefined, which never decides.
+        claimed: what this family claimed at earlier analyses, (K,) bool.
+        closed: which comparisons are closed without such a claim, (K,) bool.
+    """
+    return holm(np.where(claimed, 0.0, np.where(closed, 1.0, p)))
