@@ -168,7 +168,7 @@ def live(**options: Any) -> None:
 def check_options(given: LiveOptions) -> None:
     """Raise InputError for options that contradict each other, or need something that is not installed."""
     from memmlp.common.errors import InputError
-    from memmlp.common.request_access import check_token
+    from memmlp.common.page_server import check_token
     from memmlp.live.session.sources import require_osc
 
     packets = [number for number in (given.udp, given.osc) if number is not None]
@@ -266,7 +266,7 @@ def serve(given: LiveOptions) -> None:
     import webbrowser
 
     from memmlp.common.processes import finish_uninterrupted
-    from memmlp.live.session import page_server
+    from memmlp.live.session import server as page
     from memmlp.live.session.loop import Fitting, make_greeting, run_loop
     from memmlp.live.stream import Stream
     from memmlp.runs.lookup import find_run, frames_seen, hardly_trained
@@ -277,21 +277,19 @@ def serve(given: LiveOptions) -> None:
         known = combine_calibration(given, source.space, stream)
         stream.fit(known.height, known.floor)
         stream.offsets = known.offsets
-        avatar, files = given.avatar, page_server.FILES
+        avatar, vrm = given.avatar, None
         if avatar is not None:
-            read_vrm = page_server.read_vrm
-            builtin = avatar == BUILTIN
-            vrm = page_server.mannequin_vrm(stream.rest) if builtin else read_vrm(Path(avatar))
-            files = page_server.avatar_files(vrm)
+            vrm = page.mannequin_vrm(stream.rest) if avatar == BUILTIN else page.read_vrm(Path(avatar))
+        files = page.read_files(vrm)
         outputs = make_outputs(given, stream)
         run = None if given.is_file else find_run(given.outputs, given.network)
         remark = hardly_trained(frames_seen(run)) if run else ""
-        hub = page_server.Hub(make_greeting(source, name, outputs, remark, avatar is not None))
-        fitting = Fitting(stream, source.space, given.calibration, hub.tell) if source.worn else None
+        hub = page.Hub(make_greeting(source, name, outputs, remark, avatar is not None))
+        fitting = Fitting(stream, source.space, given.calibration, hub.publish_state) if source.worn else None
         ask = fitting.ask if fitting else None
         with (
             finish_uninterrupted(outputs.close),
-            page_server.LiveServer(hub, given.port, given.host, given.token, files, ask) as server,
+            page.LiveServer(hub, given.port, given.host, given.token, files, ask) as server,
         ):
             if remark:
                 note(f"{name}: {remark}")

@@ -31,7 +31,7 @@ def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path)
     """
     import webbrowser
 
-    from memmlp.common.request_access import check_token
+    from memmlp.common.page_server import check_token
     from memmlp.report.ui.server import Answers, RunsServer
 
     check_token(host, token)

@@ -37,7 +37,7 @@ LONGEST = 60.0  # seconds of a countdown
 ACTIONS = ("calibrate", "touch_floor", "height", "floor", "forget", "cancel")
 
 Publish = Callable[[dict[str, Any]], None]
-Tell = Callable[[str, Mapping[str, Any]], None]
+PublishState = Callable[[str, Mapping[str, Any]], None]
 
 
 def make_greeting(
@@ -194,7 +194,7 @@ class Fitting:
         stream: the stream.
         space: the stream's frame of reference.
         path: the file to which each change is saved; None to save nothing.
-        tell: gets "wearer" and the state whenever the state changes.
+        publish_state: gets "wearer" and the state whenever the state changes.
         clock: returns the time, seconds.
     """
 
@@ -203,11 +203,11 @@ class Fitting:
         stream: Stream,
         space: SpaceName,
         path: Path | None,
-        tell: Tell,
+        publish_state: PublishState,
         clock: Callable[[], float] = time.monotonic,
     ):
         self.stream, self.space, self.path = stream, space, path
-        self.tell, self.clock = tell, clock
+        self.publish_state, self.clock = publish_state, clock
         self.orders: queue.SimpleQueue[Order] = queue.SimpleQueue()
         self.waiting: Order | None = None
         self.due = 0.0
@@ -289,4 +289,4 @@ class Fitting:
             "failed": failed,
             "file": self.path and self.path.name,
         }
-        self.tell("wearer", state)
+        self.publish_state("wearer", state)

@@ -8,10 +8,10 @@ import json
 import re
 from collections.abc import Mapping
 from functools import cache
-from importlib import resources
 from typing import Any
 
-TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css"}
+from memmlp.common.page_server import read_page_file
+
 OWN, LIVE, SHARED = "memmlp.report.ui", "memmlp.live.session", "memmlp.common"
 SCRIPTS = {"theme.js": SHARED, "plot/d3.min.js": OWN, "plot/plot.umd.min.js": OWN}
 MODULES = {
@@ -32,12 +32,7 @@ FILES = {"index.html": OWN, "style.css": SHARED, **SCRIPTS, **MODULES}
 @cache
 def read(name: str) -> bytes:
     """Return a file of the page. Raises KeyError for an unknown name."""
-    return resources.files(FILES[name]).joinpath("page", *name.split("/")).read_bytes()
-
-
-def content_type(name: str) -> str:
-    """Return the content type of a file."""
-    return f"{TYPES[name.rsplit('.', 1)[-1]]}; charset=utf-8"
+    return read_page_file(FILES[name], name)
 
 
 def security_policy() -> str:

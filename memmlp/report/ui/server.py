@@ -1,25 +1,17 @@
-"""The server of the page, made with the standard library alone: files, answers as JSON, and change events.
-
-It serves this machine alone, unless another address is asked for; then every request needs the token. It only
-reads: no request can change a run.
-"""
+"""The server of the page: files, answers as JSON, and change events. No request can change a run."""
 
 from __future__ import annotations
 
-import contextlib
 import json
-import socket
 import threading
 import time
-import urllib.parse
-from collections.abc import Callable, Mapping
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import plain
-from memmlp.common.request_access import LOCAL, Access
+from memmlp.common.page_server import HOST, TEXT, PageHandler, PageServer, content_type
 from memmlp.report.ui import page_files, runs
 from memmlp.report.ui.replay import Predict, Replays, describe_body
 from memmlp.report.ui.run_index import RunIndex
@@ -142,6 +134,18 @@ class Watch:
             with self.condition:
                 self.condition.wait_for(lambda: self.closed, pause)
 
+    def events(self) -> Iterator[bytes]:
+        """Yield the state as an event at each change, until closed; without changes a comment."""
+        self.pages += 1
+        try:
+            known = "-"
+            while not self.closed:
+                state = self.wait(known)
+                yield b": quiet\n\n" if state == known else f"data: {json.dumps(state)}\n\n".encode()
+                known = state
+        finally:
+            self.pages -= 1
+
     def close(self) -> None:
         """End the loop, and wake all waiting threads."""
         with self.condition:
@@ -149,34 +153,20 @@ class Watch:
             self.condition.notify_all()
 
 
-class RunsHandler(BaseHTTPRequestHandler):
+class RunsHandler(PageHandler):
     """Answers one request."""
 
     server: RunsServer
-    protocol_version = "HTTP/1.1"
-    timeout = 60
+    protocol_version = "HTTP/1.1"  # keeps connections open
 
-    def do_GET(self) -> None:
+    def answer(self, path: str, query: Mapping[str, str]) -> None:
         """Send a file of the page, an answer, or the stream of changes until its end."""
-        with contextlib.suppress(ConnectionError, TimeoutError):  # raised when the page was closed
-            url = urllib.parse.urlsplit(self.path)
-            query = dict(urllib.parse.parse_qsl(url.query))
-            access, port = self.server.access, self.server.server_port
-            if not access.allows(self.path, self.headers, port):
-                refusal = b"not allowed; open the address that memmlp ui printed\n"
-                self._send(403, "text/plain; charset=utf-8", refusal)
-            elif "token" in query:
-                self._send(303, "text/plain", b"", access.redirect_headers(query["token"], port))
-            else:
-                self._route(urllib.parse.unquote(url.path).lstrip("/"), query)
-
-    def _route(self, path: str, query: Mapping[str, str]) -> None:
         kind, _, name = path.partition("/")
         if path in ("", *page_files.FILES):
             file = path or "index.html"
-            self._send(200, page_files.content_type(file), page_files.read(file))
+            self.send(200, content_type(file), page_files.read(file))
         elif path == "events":
-            self._send_events()
+            self.send_events(self.server.watch.events())
         elif kind == "api":
             self._send_answer(name, query)
         elif kind == "files":
@@ -201,116 +191,44 @@ class RunsHandler(BaseHTTPRequestHandler):
             text = json.dumps(value, separators=(",", ":"), allow_nan=False)
         except ValueError:  # NaN or infinity
             text = json.dumps(plain(value), separators=(",", ":"), allow_nan=False)
-        self._send(code, "application/json", text.encode())
+        self.send(code, "application/json", text.encode())
 
     def _send_run_file(self, run_id: str, name: str) -> None:
         path = self.server.answers.outputs / "runs" / run_id / name
         if not ID.fullmatch(run_id) or name not in runs.VIEWABLE or not path.is_file():
             self._send_json(404, {"error": "not found"})
             return
-        kind = "image/png" if name.endswith(".png") else "text/plain; charset=utf-8"
-        self._send(200, kind, path.read_bytes(), {"Content-Security-Policy": "default-src 'none'; sandbox"})
-
-    def _send_events(self) -> None:
-        """Send each change until the page or the server is closed."""
-        watch = self.server.watch
-        self._send_head(200, {"Content-Type": "text/event-stream", "Connection": "close"})
-        self.close_connection = True
-        watch.pages += 1
-        try:
-            known = "-"
-            while not watch.closed:
-                state = watch.wait(known)
-                event = b": quiet\n\n" if state == known else f"data: {json.dumps(state)}\n\n".encode()
-                self.wfile.write(event)
-                self.wfile.flush()
-                known = state
-        finally:
-            watch.pages -= 1
-
-    def _send(self, code: int, kind: str, content: bytes, headers: Mapping[str, str] | None = None) -> None:
-        length = {"Content-Type": kind, "Content-Length": str(len(content))}
-        self._send_head(code, {**length, **(headers or {})})
-        self.wfile.write(content)
-
-    def _send_head(self, code: int, headers: Mapping[str, str]) -> None:
-        self.send_response(code)
-        safe = {
-            "Cache-Control": "no-store",
-            "X-Content-Type-Options": "nosniff",
-            "Referrer-Policy": "no-referrer",
-            "Content-Security-Policy": self.server.policy,
-        }
-        for name, value in (safe | dict(headers)).items():
-            self.send_header(name, value)
-        self.end_headers()
-
-    def version_string(self) -> str:
-        """Return the name of the server."""
-        return "memmlp"
-
-    def log_message(self, format: str, *args: Any) -> None:
-        """Log nothing."""
+        kind = "image/png" if name.endswith(".png") else TEXT
+        self.send(200, kind, path.read_bytes(), {"Content-Security-Policy": "default-src 'none'; sandbox"})
 
 
-class RunsServer(ThreadingHTTPServer):
-    """Serves the page, from its own threads, inside a `with` block.
+class RunsServer(PageServer):
+    """Serves the page, as `PageServer` does.
 
     Args:
         answers: the answers about runs, sweeps and searches.
-        port: the port; 0 for any free one.
-        host: the address to serve at; 127.0.0.1 is this machine alone.
-        token: what every request needs at any other address; None for a new random token.
+        port, host, token: as in `PageServer`.
         every: the least number of seconds between two looks at the runs.
-
-    Raises:
-        InputError: if the address does not belong to this machine, or the port is taken.
     """
 
-    daemon_threads = True
-    block_on_close = False
-
     def __init__(
-        self, answers: Answers, port: int, host: str = LOCAL[0], token: str | None = None, every: float = 1.0
+        self, answers: Answers, port: int, host: str = HOST, token: str | None = None, every: float = 1.0
     ):
-        self.answers, self.policy = answers, page_files.security_policy()
-        self.access = Access(host, token)
+        self.answers = answers
+        self.headers = {"Content-Security-Policy": page_files.security_policy()}
         self.watch = Watch(answers.refresh, every)
-        try:
-            super().__init__((host, port), RunsHandler)
-        except (OSError, OverflowError) as error:
-            reason = getattr(error, "strerror", None) or error
-            expected = "expected an address of this machine and a free port (--port 0: any)"
-            raise InputError(f"--host {host} --port {port}: {reason}; {expected}") from None
+        super().__init__(RunsHandler, port, host, token)
 
-    def server_bind(self) -> None:
-        """Bind to the address without a name lookup, even while a page of an earlier server is open."""
-        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        self.socket.bind(self.server_address)
-        self.server_address = name, port, *_ = self.socket.getsockname()
-        self.server_name, self.server_port = name, port
-
-    @property
-    def url(self) -> str:
-        """The page's address, with the token if one is needed."""
-        return self.access.url(self.server_name, self.server_port)
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore the error: a request that one page breaks off does not concern the others."""
-
-    def __enter__(self) -> RunsServer:
-        self.threads = [
-            threading.Thread(target=work, daemon=True)
-            for work in (lambda: self.serve_forever(0.05), self.watch.loop)
-        ]
-        for thread in self.threads:
-            thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def end_events(self) -> None:
+        """End the events of all pages."""
         self.watch.close()
-        self.shutdown()
-        for thread in self.threads:
-            thread.join()
-        self.server_close()
+
+    def __enter__(self) -> Self:
+        self.watcher = threading.Thread(target=self.watch.loop, daemon=True)
+        self.watcher.start()
+        return super().__enter__()
+
+    def __exit__(self, *error: object) -> None:
+        super().__exit__(*error)
+        self.watcher.join()
         self.answers.close()

@@ -16,7 +16,7 @@ from wearer import body_frame
 from memmlp.common.errors import InputError
 from memmlp.live.rotations import BodyTree
 from memmlp.live.session.loop import UNIT, avatar_message, make_greeting, to_millimetres
-from memmlp.live.session.page_server import FILES, Hub, LiveServer, avatar_files, mannequin_vrm
+from memmlp.live.session.server import Hub, LiveServer, mannequin_vrm, read_files
 from memmlp.live.session.sources import ClipSource, TrackedClip
 from memmlp.live.stream import BodyFrame
 from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
@@ -73,7 +73,7 @@ def of_vrm_0(content: dict[str, Any]) -> None:
 def own() -> bytes:
     vrm = mannequin_vrm(REST)
     try:
-        avatar_files(vrm)
+        read_files(vrm)
     except InputError as error:
         pytest.skip(str(error))
     return vrm
@@ -98,7 +98,7 @@ def test_an_avatar_s_bones_are_where_the_joints_are(
 
     An avatar that lacks bones stands otherwise, but all its bones have the right direction.
     """
-    files = avatar_files(edited(own, edit) if edit else own)
+    files = read_files(edited(own, edit) if edit else own)
     person = pose(size)
     words = make_greeting(ClipSource(clip, 60), "tiny", avatar=True)["avatar"]
     given = avatar_message(person)
@@ -137,7 +137,7 @@ def test_an_avatar_s_bones_are_where_the_joints_are(
 @pytest.mark.slow
 def test_an_avatar_is_as_tall_as_the_wearer_of_the_frame(browser: Browser, own: bytes, clip: TrackedClip):
     """Also on a page that was loaded after the wearer's height was changed there."""
-    files = avatar_files(own)
+    files = read_files(own)
     hub = Hub(make_greeting(ClipSource(clip, 60), "tiny", avatar=True))
     with LiveServer(hub, 0, files=files) as server:
         browser.open(server.url)
@@ -166,8 +166,3 @@ def test_the_rotations_of_a_message_are_those_of_vrm_s_t_pose():
     found = np.array(avatar_message(person)["turns"]).reshape(22, 4)
     np.testing.assert_array_equal(np.abs(found), np.tile([0, 0, 0, UNIT], (22, 1)))
     assert to_millimetres(np.array([[1.0, 2, 3]])) == [1000, 3000, -2000]
-
-
-def test_without_an_avatar_the_page_has_nothing_of_npm():
-    assert not any("npm" in name or "vrm" in name for name in FILES)
-    assert b"npm" not in FILES[""].read()

@@ -14,7 +14,7 @@ from chromium import Browser
 from processes import PATIENCE, until
 
 from memmlp.live.session.loop import Fitting, make_greeting, run_loop
-from memmlp.live.session.page_server import Hub, LiveServer
+from memmlp.live.session.server import Hub, LiveServer
 from memmlp.live.session.sources import ClipSource, TrackedClip
 from memmlp.live.stream import Stream
 
@@ -142,8 +142,10 @@ def test_the_wearer_fits_the_stream_from_the_page(
     monkeypatch.setattr("memmlp.live.stream.FAR", 0.0)  # nobody stands so well in a T-pose
     source, stream = Worn(clip, 60), Stream(network)
     hub = Hub(make_greeting(source, "tiny"))
-    fitting = Fitting(stream, "amass", None, hub.tell, clock=lambda: 0.0)  # a countdown ends when cancelled
-    with LiveServer(hub, 0, ask=fitting.ask) as server, playing(stream, source, hub, None, fitting):
+    fitting = Fitting(
+        stream, "amass", None, hub.publish_state, clock=lambda: 0.0
+    )  # a countdown ends when cancelled
+    with LiveServer(hub, 0, take_order=fitting.ask) as server, playing(stream, source, hub, None, fitting):
         browser.open(server.url)
         browser.wait("document.querySelector('#height').value == '172'")
         for name, value in (("height", 186), ("floor", 5)):
@@ -170,7 +172,7 @@ def test_the_printed_address_opens_the_page_for_others(browser: Browser, clip: T
     """Scripts, frames and orders go by the cookie, and the token stands in the address no more."""
     asked: list[object] = []
     hub = Hub(make_greeting(Worn(clip, 60), "tiny"))
-    with LiveServer(hub, 0, "0.0.0.0", ask=asked.append) as server:
+    with LiveServer(hub, 0, "0.0.0.0", take_order=asked.append) as server:
         address = f"http://127.0.0.1:{server.server_port}/"
         browser.call("Page.navigate", url=f"{address}?{server.url.partition('?')[2]}")
         browser.wait(f"location.href == '{address}' && document.readyState == 'complete'")

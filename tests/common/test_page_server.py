@@ -8,7 +8,7 @@ from urllib.parse import quote
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.common.request_access import COOKIE, Access, check_token, is_loopback
+from memmlp.common.page_server import COOKIE, Access, check_token, is_loopback
 
 TOKEN = "a token of many letters"
 

@@ -13,9 +13,8 @@ import pytest
 from processes import PATIENCE
 
 from memmlp.common.errors import InputError
-from memmlp.live.session import page_server as module
 from memmlp.live.session.loop import make_greeting
-from memmlp.live.session.page_server import FILES, Hub, LiveServer, mannequin_vrm, read_vrm
+from memmlp.live.session.server import QUEUED, Hub, LiveServer, mannequin_vrm, read_files, read_vrm
 from memmlp.live.session.sources import ClipSource, TrackedClip
 from memmlp.motion.body import builtin_rest_joints
 
@@ -60,39 +59,32 @@ def test_two_watchers_get_all_frames(server: LiveServer):
     assert [list(stream) for stream in streams] == [[], []]
 
 
-def test_a_slow_watcher_loses_the_oldest_frames_and_no_state(monkeypatch):
-    monkeypatch.setattr(module, "QUEUED", 4)
+def test_a_slow_page_loses_the_oldest_frames_and_no_state():
     hub = Hub({})
-    hub.tell("wearer", {"height": 170})
-    hub.tell("wearer", {"height": 180})
-    with hub.watch() as watcher:
-        first = [watcher.get_nowait() for _ in range(2)]
-        assert first[1] == b'event: wearer\ndata: {"height":180}\n\n'  # the newest state
-        for number in range(10):
-            hub.publish({"number": number})
-        assert [watcher.get_nowait() for _ in range(4)] == [
-            f'event: frame\ndata: {{"number":{n}}}\n\n'.encode() for n in range(6, 10)
-        ]
-        hub.tell("wearer", {"calibrated": True})
-        for number in range(10):
-            hub.publish({"number": number})
-        found = [watcher.get_nowait().split(b"\n")[0] for _ in range(4)]
-        assert found == [b"event: wearer", *3 * [b"event: frame"]]
-        for _ in range(6):
-            hub.tell("wearer", {})
-        assert watcher.qsize() == 4
-    assert hub.watchers == set()
+    hub.publish_state("wearer", {"height": 170})
+    hub.publish_state("wearer", {"height": 180})
+    slow = hub.events()
+    assert next(slow).split(b"\n\n")[1] == b'event: wearer\ndata: {"height":180}'  # the newest state
+    hub.publish_state("wearer", {"calibrated": True})
+    for number in range(QUEUED + 2):
+        hub.publish({"number": number})
+    state, *frames = next(slow).removesuffix(b"\n\n").split(b"\n\n")
+    assert b"calibrated" in state
+    assert [json.loads(frame.split(b"data: ")[1])["number"] for frame in frames] == [*range(2, QUEUED + 2)]
 
 
 def test_the_pages_files_are_served_and_nothing_else(server: LiveServer):
-    for name, file in FILES.items():
+    types = {"js": "text/javascript", "css": "text/css", "html": "text/html"}
+    for name, content in read_files().items():
         response = get(server, f"/{name}")
-        assert (response.status, response.headers["Content-Type"]) == (200, file.kind), name
-        content = response.read().decode()
-        assert len(content) > 200
+        kind = f"{types[name.rsplit('.')[-1]]}; charset=utf-8"
+        assert (response.status, response.headers["Content-Type"]) == (200, kind), name
+        assert response.read() == content
         if not name.startswith("three/"):  # the page loads nothing from elsewhere
-            assert "//" not in content.replace("// ", ""), name
-    for path in ("/../page_server.py", "/three/LICENSE/..", "/%2e%2e/page_server.py", "/main"):
+            assert b"//" not in content.replace(b"// ", b""), name
+            assert b"npm" not in content or name == "avatar.js"
+    assert get(server, "/").read() == read_files()["index.html"]
+    for path in ("/../server.py", "/three/LICENSE/..", "/%2e%2e/server.py", "/main"):
         assert get(server, path).status == 404
     # A page of another site, whose name was made to mean this machine, gets nothing.
     assert get(server, "/events", Host=f"elsewhere.example:{server.server_port}").status == 403
@@ -121,7 +113,7 @@ def fitted(asked: list[object]) -> Iterator[LiveServer]:
             raise InputError("no: not allowed")
         asked.append(fields)
 
-    with LiveServer(Hub({}), 0, ask=ask) as server:
+    with LiveServer(Hub({}), 0, take_order=ask) as server:
         yield server
 
 
@@ -141,7 +133,7 @@ def test_orders_of_the_page_arrive(fitted: LiveServer, asked: list[object]):
 
 def test_at_another_address_everything_needs_the_token(clip: TrackedClip):
     token = "a token of many letters"
-    with LiveServer(Hub({}), 0, "0.0.0.0", token, ask=pytest.fail) as server:
+    with LiveServer(Hub({}), 0, "0.0.0.0", token, take_order=pytest.fail) as server:
         for path in ("/", "/events", "/main.js", "/?token=wrong", "/events?token="):
             assert get(server, path).status == 403, path
         assert post(server, b"{}")[0] == 403

@@ -1,0 +1,227 @@
+"""The HTTP server of a local page: who may send requests, and how files and events are sent.
+
+At the loopback address, a request must name that address (another name would be DNS rebinding), and must not
+come from another site's page. At any other address, each request needs the token: first in the printed
+address, then in a cookie, so that the browser's history does not contain it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+import socket
+import threading
+import urllib.parse
+from collections.abc import Iterable, Mapping
+from email.message import Message
+from http.cookies import CookieError, SimpleCookie
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib import resources
+from ipaddress import ip_address
+from typing import Any, Self
+
+from memmlp.common.errors import InputError
+
+HOST, EVERYWHERE = "127.0.0.1", "0.0.0.0"
+COOKIE = "memmlp_token"
+MIN_LENGTH = 16  # characters of a token
+TEXT = "text/plain; charset=utf-8"
+TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css", "vrm": "model/gltf-binary"}
+
+
+def read_page_file(package: str, name: str) -> bytes:
+    """Return a file of a page, which lies in the folder `page` of a package."""
+    return resources.files(package).joinpath("page", *name.split("/")).read_bytes()
+
+
+def content_type(name: str) -> str:
+    """Return the content type of a page's file."""
+    return f"{TYPES[name.rsplit('.', 1)[-1]]}; charset=utf-8"
+
+
+class Access:
+    """The rules of a server.
+
+    Args:
+        host: the address at which the server listens.
+        token: what requests need at any address but the loopback address; None for a new random token.
+
+    Attributes:
+        token: the token; None at the loopback address, which does not need one.
+    """
+
+    def __init__(self, host: str, token: str | None = None):
+        self.host = host
+        self.token = None if is_loopback(host) else token or secrets.token_urlsafe(24)
+
+    def allows(self, path: str, headers: Message, port: int) -> bool:
+        """Return whether a request may be answered, given its host, its origin and its token."""
+        url = urllib.parse.urlsplit(path)
+        if headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
+            return headers.get("Sec-Fetch-Mode") == "navigate" and url.path == "/"
+        if self.token is None:
+            host = headers.get("Host", "")
+            return (host.rpartition(":")[0] or host) in (HOST, "localhost", self.host)
+        given = dict(urllib.parse.parse_qsl(url.query)).get("token", "") or _cookie(headers, port)
+        return secrets.compare_digest(given.encode(), self.token.encode())
+
+    def allows_change(self, path: str, headers: Message, port: int) -> bool:
+        """Return whether a request may change something: it must not come from another site's page."""
+        origin = headers.get("Origin")  # browsers send it with every POST
+        return origin in (None, f"http://{headers.get('Host', '')}") and self.allows(path, headers, port)
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether an address is 127.0.0.1 or localhost, at which no other machine can reach this one."""
+    try:
+        return host == "localhost" or (ip_address(host).is_loopback and ip_address(host).version == 4)
+    except ValueError:
+        return False
+
+
+def check_token(host: str, token: str | None) -> None:
+    """Raise InputError for a token that is too short, or not needed at an address."""
+    if token is not None and is_loopback(host):
+        raise InputError("--token: is only for --host; the loopback address does not need it")
+    if token is not None and len(token) < MIN_LENGTH:
+        raise InputError(f"--token: must have at least {MIN_LENGTH} characters")
+
+
+def _cookie(headers: Message, port: int) -> str:
+    try:
+        found = SimpleCookie(headers.get("Cookie", "")).get(f"{COOKIE}_{port}")
+    except CookieError:
+        return ""
+    return urllib.parse.unquote(found.value) if found else ""
+
+
+class PageHandler(BaseHTTPRequestHandler):
+    """Answers one request of a page; subclasses define `answer`."""
+
+    server: PageServer
+    timeout = 60
+
+    def answer(self, path: str, query: Mapping[str, str]) -> None:
+        """Send the answer to an allowed GET request; the path does not begin with a slash."""
+        raise NotImplementedError
+
+    def do_GET(self) -> None:
+        """Answer a request, unless the access rules refuse it."""
+        with contextlib.suppress(ConnectionError, TimeoutError):  # raised when the page was closed
+            url, port = urllib.parse.urlsplit(self.path), self.server.server_port
+            query = dict(urllib.parse.parse_qsl(url.query))
+            if not self.server.access.allows(self.path, self.headers, port):
+                self.send(403, TEXT, b"not allowed; open the address that the command printed\n")
+            elif "token" in query:  # it moves to a cookie
+                cookie = f"{COOKIE}_{port}={urllib.parse.quote(query['token'])}"
+                attributes = "HttpOnly; SameSite=Strict; Path=/"
+                self.send(303, TEXT, b"", {"Location": "/", "Set-Cookie": f"{cookie}; {attributes}"})
+            else:
+                self.answer(urllib.parse.unquote(url.path).lstrip("/"), query)
+
+    def send(self, code: int, kind: str, content: bytes, headers: Mapping[str, str] | None = None) -> None:
+        """Send an answer with its content type and further headers."""
+        self._send_head(code, kind, {"Content-Length": str(len(content)), **(headers or {})})
+        self.wfile.write(content)
+
+    def send_events(self, events: Iterable[bytes]) -> None:
+        """Send server-sent events as they come, until their end or that of the page."""
+        self.close_connection = True
+        self._send_head(200, "text/event-stream", {"Connection": "close"})
+        for event in events:
+            self.wfile.write(event)
+
+    def _send_head(self, code: int, kind: str, headers: Mapping[str, str]) -> None:
+        self.send_response(code)
+        safe = {
+            "Content-Type": kind,
+            "Cache-Control": "no-store",
+            "X-Content-Type-Options": "nosniff",
+            "Referrer-Policy": "no-referrer",
+        }
+        for name, value in (safe | dict(self.server.headers) | dict(headers)).items():
+            self.send_header(name, value)
+        self.end_headers()
+
+    def version_string(self) -> str:
+        """Return the name of the server."""
+        return "memmlp"
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Log nothing."""
+
+
+class PageServer(ThreadingHTTPServer):
+    """Serves a page, from its own threads, inside a `with` block.
+
+    Args:
+        handler: the class that answers requests.
+        port: the port; 0 for any free one.
+        host: the address to serve at; at 127.0.0.1 only this machine reaches it.
+        token: what every request needs at any other address; None for a new random token.
+
+    Attributes:
+        headers: headers of every answer, besides those of safety.
+
+    Raises:
+        InputError: if the address does not belong to this machine, or the port is in use.
+    """
+
+    daemon_threads = True
+    block_on_close = False
+    headers: Mapping[str, str] = {}
+
+    def __init__(
+        self, handler: type[PageHandler], port: int, host: str = HOST, token: str | None = None
+    ) -> None:
+        self.access = Access(host, token)
+        try:
+            super().__init__((host, port), handler)
+        except (OSError, OverflowError) as error:
+            reason = getattr(error, "strerror", None) or error
+            expected = "expected an address of this machine and a free port (--port 0: any)"
+            raise InputError(f"--host {host} --port {port}: {reason}; {expected}") from None
+
+    def server_bind(self) -> None:
+        """Bind to the address without a name lookup, even while a page of an earlier server is open."""
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self.socket.bind(self.server_address)
+        self.server_address = name, port, *_ = self.socket.getsockname()
+        self.server_name, self.server_port = name, port
+
+    @property
+    def url(self) -> str:
+        """The page's address, with the token if one is needed.
+
+        A server at all addresses gives one that other machines can reach.
+        """
+        name = own_address() if self.server_name == EVERYWHERE else self.server_name
+        token = self.access.token
+        return f"http://{name}:{self.server_port}/" + (f"?token={urllib.parse.quote(token)}" if token else "")
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Ignore the error: a request that one page breaks off does not concern the others."""
+
+    def end_events(self) -> None:
+        """End the events of all pages; called before the server stops."""
+
+    def __enter__(self) -> Self:
+        self.thread = threading.Thread(target=self.serve_forever, args=(0.05,), daemon=True)
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end_events()
+        self.shutdown()
+        self.thread.join()
+        self.server_close()
+
+
+def own_address() -> str:
+    """Return this machine's address in its network, at which other machines reach it; nothing is sent."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # an address for documentation (RFC 5737)
+        except OSError:
+            return HOST
+        return str(probe.getsockname()[0])

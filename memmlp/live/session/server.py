@@ -1,0 +1,191 @@
+"""The server of the live page: files, frames as server-sent events, and orders from the page.
+
+Pages may be opened and closed at any time; a slow page misses frames, and does not delay the others.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import struct
+import tempfile
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from memmlp.common import npm
+from memmlp.common.errors import InputError, why_unreadable
+from memmlp.common.page_server import HOST, TEXT, PageHandler, PageServer, content_type, read_page_file
+from memmlp.motion.formats.vrm import write_vrm
+
+QUEUED = 240  # the most frames that wait for a page; beyond, the oldest are dropped
+QUIET = 2.0  # seconds without a frame after which a comment shows that the connection lives
+LARGEST = 1000  # bytes of an order
+PAGE = (
+    "index.html", "style.css", "main.js", "stage.js", "history.js", "wearer.js", "avatar.js",
+    "three/three.module.min.js", "three/three.core.min.js", "three/OrbitControls.js",
+)  # fmt: skip
+AVATAR_SCRIPTS = {
+    npm.THREE: ("build/three.module.js", "build/three.core.js", "examples/jsm/loaders/GLTFLoader.js",
+                "examples/jsm/utils/BufferGeometryUtils.js", "examples/jsm/utils/SkeletonUtils.js"),
+    npm.THREE_VRM: ("lib/three-vrm.module.min.js",),
+}  # fmt: skip
+EXTENSIONS = ("VRMC_vrm", "VRM")  # of VRM 1.0, and 0.x
+
+
+def read_files(vrm: bytes | None = None) -> dict[str, bytes]:
+    """Return the files of the page by name, with a VRM avatar and three-vrm if there is an avatar.
+
+    With an avatar, the page's three.js is replaced by that of the npm package to which the loader belongs.
+
+    Raises:
+        InputError: if an npm package can't be downloaded.
+    """
+    files = {name: read_page_file("memmlp.live.session", name) for name in PAGE}
+    if vrm is None:
+        return files
+    page = files["index.html"].replace(b"./three/three.module.min.js", b"./npm/build/three.module.js")
+    scripts = {
+        f"npm/{name}": content
+        for package, names in AVATAR_SCRIPTS.items()
+        for name, content in npm.read(package, names).items()
+    }
+    return files | scripts | {"index.html": page, "avatar.vrm": vrm}
+
+
+def mannequin_vrm(rest: np.ndarray) -> bytes:
+    """Return the built-in avatar as a VRM file, with the given rest joints (22, 3), metres."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "mannequin.vrm"
+        write_vrm(path, rest)
+        return path.read_bytes()
+
+
+def read_vrm(path: Path) -> bytes:
+    """Return a VRM file's content. Raises InputError if the file is not a VRM file."""
+    try:
+        content = path.read_bytes()
+        if content[:4] != b"glTF":
+            raise ValueError("not a binary glTF")
+        (size,) = struct.unpack_from("<I", content, 12)
+        extensions = json.loads(content[20 : 20 + size]).get("extensions", {})
+    except (OSError, ValueError, struct.error, AttributeError) as error:
+        raise InputError(f"--avatar {path}: {why_unreadable(error)}; expected a VRM file") from None
+    if not any(name in extensions for name in EXTENSIONS):
+        raise InputError(f"--avatar {path}: a glTF file without a VRM avatar; expected a VRM file")
+    return content
+
+
+class Hub:
+    """Hands states and frames to all open pages.
+
+    Args:
+        greeting: the first state, which each page gets first.
+    """
+
+    def __init__(self, greeting: Mapping[str, Any]):
+        self.changed = threading.Condition()
+        self.states: dict[str, tuple[int, bytes]] = {}  # the number and the event of each newest state
+        self.frames: deque[tuple[int, bytes]] = deque(maxlen=QUEUED)
+        self.count, self.closed = 0, False
+        self.publish_state("greeting", greeting)
+
+    def publish(self, message: Mapping[str, Any]) -> None:
+        """Hand a frame's message to all current pages."""
+        with self.changed:
+            self.count += 1
+            self.frames.append((self.count, to_event("frame", message)))
+            self.changed.notify_all()
+
+    def publish_state(self, name: str, state: Mapping[str, Any]) -> None:
+        """Hand a state to all current pages, and to later ones until the state changes."""
+        with self.changed:
+            self.count += 1
+            self.states[name] = self.count, to_event(name, state)
+            self.changed.notify_all()
+
+    def events(self) -> Iterator[bytes]:
+        """Yield the states, then all events as they come, until the hub is closed."""
+        seen, frames_from = 0, self.count
+        while not self.closed:
+            with self.changed:
+                if self.count == seen and not self.closed:
+                    self.changed.wait(QUIET)
+                frames = [one for one in self.frames if one[0] > frames_from]
+                news = sorted(one for one in (*self.states.values(), *frames) if one[0] > seen)
+                seen = self.count
+            yield b"".join(event for _, event in news) or b": quiet\n\n"
+
+    def close(self) -> None:
+        """End the events of every page, and of each that comes later."""
+        with self.changed:
+            self.closed = True
+            self.changed.notify_all()
+
+
+def to_event(name: str, value: Mapping[str, Any]) -> bytes:
+    """Return a server-sent event."""
+    return f"event: {name}\ndata: {json.dumps(value, separators=(',', ':'))}\n\n".encode()
+
+
+class LiveHandler(PageHandler):
+    """Answers one request of a page."""
+
+    server: LiveServer
+
+    def answer(self, path: str, query: Mapping[str, str]) -> None:
+        """Send a file of the page, or the stream of events until its end."""
+        name = path or "index.html"
+        if name == "events":
+            self.send_events(self.server.hub.events())
+        elif name in self.server.files:
+            self.send(200, content_type(name), self.server.files[name])
+        else:
+            self.send(404, TEXT, b"not found")
+
+    def do_POST(self) -> None:
+        """Take an order from the page; the answer is empty, or a line about its error."""
+        take, code, line = self.server.take_order, 200, ""
+        with contextlib.suppress(ConnectionError, TimeoutError):
+            if not self.server.access.allows_change(self.path, self.headers, self.server.server_port):
+                code = 403
+            elif self.path != "/wearer" or take is None:
+                code = 404
+            else:
+                try:
+                    size = min(int(self.headers.get("Content-Length", 0)), LARGEST)
+                    take(json.loads(self.rfile.read(size)))
+                except (ValueError, RecursionError) as error:
+                    code, line = 400, str(error) if isinstance(error, InputError) else "not JSON"
+            self.send(code, TEXT, line.encode())
+
+
+class LiveServer(PageServer):
+    """Serves the page, as `PageServer` does.
+
+    Args:
+        hub: gives the frames to the pages.
+        port, host, token: as in `PageServer`.
+        files: the page's files, by their names.
+        take_order: takes an order from the page, or raises InputError; None to reject all orders.
+    """
+
+    def __init__(
+        self,
+        hub: Hub,
+        port: int,
+        host: str = HOST,
+        token: str | None = None,
+        files: Mapping[str, bytes] | None = None,
+        take_order: Callable[[object], None] | None = None,
+    ):
+        self.hub, self.files, self.take_order = hub, files or read_files(), take_order
+        super().__init__(LiveHandler, port, host, token)
+
+    def end_events(self) -> None:
+        """End the events of all pages."""
+        self.hub.close()
