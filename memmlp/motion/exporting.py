@@ -17,7 +17,7 @@ from memmlp.motion.clip import Clip, Skipped, resample
 from memmlp.motion.formats.bvh import write_bvh
 from memmlp.motion.formats.gltf import write_gltf
 from memmlp.motion.formats.npz import NoMotion, read_clip, write_clip
-from memmlp.motion.plausibility import check_plausible, why_unusual
+from memmlp.motion.plausibility import check_plausible
 from memmlp.motion.preparing.find_clips import clip_name, find_clips
 from memmlp.motion.preparing.imported_body import check_imported_body
 
@@ -266,7 +266,6 @@ def read_motion(target: Target, odd: dict[str, str]) -> Clip:
         InputError: if it is damaged or can't be a person's motion.
     """
     clip = read_clip(target.source, target.name)
-    check_plausible(target.source, clip)
-    if reason := why_unusual(clip):
-        odd[target.name] = reason
+    if faults := check_plausible(target.source, clip):
+        odd[target.name] = faults
     return clip

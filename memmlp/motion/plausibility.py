@@ -1,42 +1,46 @@
-"""Whether a clip can be a person's motion in radians, metres and with Z up, as files don't state their units.
+"""The faults of a clip: why it cannot be a person's motion, and what may be wrong with one that can be.
 
-The limits leave room for human motion (jumping, lying, crawling, climbing, dancing far from the origin, on a
-floor of any height): wrong units are off by factors of 39 to 1000, and a wrong axis by 90 degrees.
+Files do not state their units. The limits leave room for human motion (jumping, lying, crawling, climbing,
+dancing far from the origin, on a floor of any height): wrong units are off by factors of 39 to 1000, and a
+wrong axis by 90 degrees.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
-from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
+from memmlp.motion.body import HEAD, JOINTS, PARENTS, builtin_rest_joints
 from memmlp.motion.clip import Clip, is_known_rate, nearest_rate
 
-HEAD, ANKLES = JOINTS.index("head"), [JOINTS.index("left_ankle"), JOINTS.index("right_ankle")]
-KNEES = [JOINTS.index("left_knee"), JOINTS.index("right_knee")]
-ELBOWS = [JOINTS.index("left_elbow"), JOINTS.index("right_elbow")]
+ANKLES, KNEES, ELBOWS = (
+    [JOINTS.index(f"{side}_{joint}") for side in ("left", "right")] for joint in ("ankle", "knee", "elbow")
+)
 MOST_TURN = 4 * math.pi  # rotation vectors need no more than pi; fits wind up to 2 pi and more
 MOST_SPEED = 30.0  # m/s; the fastest runner reached 12.4
 MOST_HEIGHT = 10.0  # metres of the pelvis over z = 0, beyond which feet must stand still at times
-LOWEST = 0.3  # metres of the lowest joint over or below z = 0, beyond which sliding feet are unusual
+LOWEST = 0.3  # metres of the lowest joint over or below z = 0, beyond which sliding feet are a fault
 RATES = (20.0, 500.0)  # Hz between which motion is recorded; others may be mistakes, as 12 for 120
-COARSE = 1e-3  # metres between the values of half precision that show in speeds: 0.06 m/s at 60 Hz
 STIFF = 0.01  # radians by which a joint that does not turn may turn in a clip
-ALONG = math.radians(20)  # largest angle between trunk and legs of a straight body
-LEANS = (30.0, 65.0)  # degrees from Z of a straight body; runners came to 22, people who lie are near 90
 BACKWARDS = 0.3  # radians of knees and elbows that bend the wrong way; stretched ones came to 0.08
 SAMPLES = 50  # frames that are tested for posture
 
 
-def check_plausible(path: Path, clip: Clip) -> None:
-    """Raise InputError, which names the file, for a clip that cannot be a person's motion."""
+def check_plausible(path: Path, clip: Clip) -> str:
+    """Return the faults of a clip that can be a person's motion (`find_faults`), in one line.
+
+    Raises:
+        InputError: for a clip that cannot; the message names the file.
+    """
     reason = why_implausible(clip)
     if reason is not None:
         raise InputError(f"{path}: {reason}")
+    return "; ".join(find_faults(clip))
 
 
 def why_implausible(clip: Clip) -> str | None:
@@ -55,15 +59,31 @@ def why_implausible(clip: Clip) -> str | None:
     return "the person stands along Y and never along Z, so Y is up, not Z" if _is_y_up(clip) else None
 
 
-def why_unusual(clip: Clip) -> str | None:
-    """Return what is odd about a clip that may be sound, or None."""
-    joints = _joints(clip, _spread(clip))
+def find_faults(clip: Clip) -> Iterator[str]:
+    """Yield what may be wrong with a clip that can be a person's motion, one sentence each."""
+    joints = _pose_sample(clip, _spread(clip))
     if (joints[:, HEAD, 2] - joints[:, 0, 2] > 0.2).mean() < 0.02:
-        return "the head is never above the pelvis, so the person lies throughout, or Z is not up"
-    if abs(height := float(np.median(clip.trans[:, 2]))) > MOST_HEIGHT:
-        return f"the pelvis is at z = {height:.0f} m"
-    file_remark = _odd_rate(clip.fps) or _coarse(clip)
-    return file_remark or _stiff(clip) or _backwards(clip) or _leaning(joints) or _off_the_floor(clip, joints)
+        yield "the head is never above the pelvis, so the person lies throughout, or Z is not up"
+    low, high = RATES
+    if not low <= clip.fps <= high:
+        yield f"a frame rate of {clip.fps:g} Hz, which may be wrong; usual are {low:g} to {high:g} Hz"
+    elif not is_known_rate(clip.fps):
+        nearest = f"the nearest usual one is {nearest_rate(clip.fps):g} Hz"
+        yield f"a frame rate of {clip.fps:.6g} Hz, which may be wrong; {nearest}"
+    if len(clip) > 1 and np.ptp(clip.poses[:, 1:], axis=0).max() <= STIFF:
+        yield "no joint but the root turns, so it is a pose for calibration, or its poses are lost"
+    # On SMPL's body knees bend about +X, the left elbow about -Y, and the right one about +Y.
+    poses = clip.poses[_spread(clip)]
+    left, right = poses[:, ELBOWS, 1].T
+    for name, bent in (("knees", poses[:, KNEES, 0]), ("elbows", (right - left) / 2)):
+        if np.median(bent) < -BACKWARDS:
+            yield f"the {name} bend backwards, so left and right are swapped, or an axis is mirrored"
+    # A trans of other axes or units than the poses', or of zeros, lifts or sinks the body and does not fit
+    # the steps. On a floor at another height than zero the feet stand still.
+    lowest = float(np.quantile(joints[:, :, 2].min(1), 0.05))
+    if abs(lowest) > LOWEST and not _feet_hold(clip):
+        where = f"the lowest joint is at z = {lowest:.1f} m and none stands still while the pelvis moves"
+        yield f"{where}, so trans may have other units or axes than metres with Z up, or lack the heights"
 
 
 def _is_y_up(clip: Clip) -> bool:
@@ -72,7 +92,7 @@ def _is_y_up(clip: Clip) -> bool:
     People who lie throughout with the head towards +Y hardly have the feet at y = 0, and do not rise by a
     metre while the feet stay in one plane.
     """
-    joints = _joints(clip, _spread(clip))
+    joints = _pose_sample(clip, _spread(clip))
 
     def standing(axis: int) -> float:
         """Return the share of frames with the head well above the pelvis, and the pelvis above an ankle."""
@@ -85,79 +105,10 @@ def _is_y_up(clip: Clip) -> bool:
     return not (abs(middle) > 0.2 and (high - low > 0.35 or np.ptp(joints[:, 0, 2]) < 1.0))
 
 
-def _odd_rate(fps: float) -> str | None:
-    low, high = RATES
-    if low <= fps <= high and is_known_rate(fps):
-        return None
-    usual = f"the nearest usual one is {nearest_rate(fps):g} Hz"
-    if not low <= fps <= high:
-        usual = f"usual are {low:g} to {high:g} Hz"
-    return f"a frame rate of {fps:g} Hz, which may be wrong; {usual}"
-
-
-def _coarse(clip: Clip) -> str | None:
-    half = clip.trans.astype(np.float16)
-    step = float(np.spacing(np.abs(half).max()))
-    if step < COARSE or (half != clip.trans).any() or not np.ptp(half, axis=0).any():
-        return None
-    return f"trans is in half precision, in steps of {1000 * step:.0f} mm, which its speeds and Jitter show"
-
-
-def _stiff(clip: Clip) -> str | None:
-    if len(clip) < 2 or np.ptp(clip.poses[:, 1:], axis=0).max() > STIFF:
-        return None
-    return "no joint but the root turns, so it is a pose for calibration, or its poses are lost"
-
-
-def _backwards(clip: Clip) -> str | None:
-    """Return which joints bend the wrong way for most of the clip, or None.
-
-    On SMPL's body knees bend about +X, the left elbow about -Y, and the right one about +Y.
-    """
-    poses = clip.poses[_spread(clip)]
-    knees, (left, right) = poses[:, KNEES, 0], poses[:, ELBOWS, 1].T
-    for name, bent in (("knees", knees), ("elbows", (right - left) / 2)):
-        if np.median(bent) < -BACKWARDS:
-            return f"the {name} bend backwards, so left and right are swapped, or an axis is mirrored"
-    return None
-
-
-def _leaning(joints: np.ndarray) -> str | None:
-    """Return a warning if the body leans too far where it is straight, or None."""
-
-    def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        lengths = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
-        return np.arccos(np.clip((a * b).sum(-1) / np.maximum(lengths, 1e-9), -1, 1))
-
-    ankles, pelvis, head = joints[:, ANKLES].mean(1), joints[:, 0], joints[:, HEAD]
-    straight = angles(head - pelvis, pelvis - ankles) < ALONG
-    if straight.mean() < 0.5:
-        return None
-    lean = math.degrees(np.median(angles(head - ankles, np.array([0.0, 0.0, 1.0]))[straight]))
-    return (
-        f"the straight body leans by {lean:.0f} degrees, so Z may not be up"
-        if LEANS[0] < lean < LEANS[1]
-        else None
-    )
-
-
-def _off_the_floor(clip: Clip, joints: np.ndarray) -> str | None:
-    """Return a warning for a clip off the floor whose feet slide, or None.
-
-    A trans of other axes or units than the poses', or of zeros, lifts or sinks the body and does not fit the
-    steps. On a floor at another height than zero the feet stand still.
-    """
-    low = float(np.quantile(joints[:, :, 2].min(1), 0.05))
-    if abs(low) <= LOWEST or _feet_hold(clip):
-        return None
-    where = f"the lowest joint is at z = {low:.1f} m and none stands still while the pelvis moves"
-    return f"{where}, so trans may have other units or axes than metres with Z up, or lack the heights"
-
-
 def _feet_hold(clip: Clip) -> bool:
     """Return whether, in half of the frames in which the pelvis moves, some joint moves at half its speed."""
     frames = _spread(clip, len(clip) - 1)
-    moved = np.linalg.norm(_joints(clip, frames + 1) - _joints(clip, frames), axis=-1)
+    moved = np.linalg.norm(_pose_sample(clip, frames + 1) - _pose_sample(clip, frames), axis=-1)
     moving = moved[:, 0] * clip.fps > 0.01
     return bool(moving.any() and np.median(moved[moving].min(1) / moved[moving, 0]) < 0.5)
 
@@ -168,7 +119,7 @@ def _spread(clip: Clip, last: int | None = None) -> np.ndarray:
     return np.arange(last)[:: max(1, -(-last // SAMPLES))]
 
 
-def _joints(clip: Clip, frames: np.ndarray) -> np.ndarray:
+def _pose_sample(clip: Clip, frames: np.ndarray) -> np.ndarray:
     """Return the joints' positions (n, 22, 3), metres, world, in some frames, on the built-in body."""
     rest, poses = builtin_rest_joints(), clip.poses[frames]
     local = Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(*poses.shape, 3)

@@ -8,7 +8,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from memmlp.motion.formats.expmap import WIDTH
 from memmlp.motion.synthetic import synthesize_clip
 
 NUMBERS = (b"0", b"-1", b"1e999", b"nan", b"99999999999999999999", b"1_0", b"\xff", b"(", b"}", b"\n")
@@ -21,11 +20,6 @@ def sound_npz(packed: bool) -> bytes:
     save = np.savez_compressed if packed else np.savez
     save(buffer, poses=poses, trans=clip.trans, gender="neutral", mocap_framerate=60.0)
     return buffer.getvalue()
-
-
-def sound_expmap() -> bytes:
-    rows = np.random.default_rng(0).uniform(-1, 1, (20, WIDTH))
-    return "".join(",".join(f"{number:.6f}" for number in row) + "\n" for row in rows).encode()
 
 
 def mutated(sound: bytes, rng: np.random.Generator) -> bytes:

@@ -1,4 +1,4 @@
-"""Skeletons of every shipped map, with nodes that the map leaves out: fingers, eyes, folded joints."""
+"""Skeletons of every shipped map, for Mixamo with nodes that its map leaves out."""
 
 from __future__ import annotations
 
@@ -19,48 +19,23 @@ HANDS = "; ".join(
     for side, sign in (("Left", ""), ("Right", "-"))
     for part in (FINGERS, THUMB, TIPS)
 )
-WRISTS = "; ".join(
-    f"{side}_Hand {side}_Wrist {x}9 0 0; *{side}_Hand {x}1 0 0" for side, x in (("L", ""), ("R", "-"))
-)
-# Node, parent, offset in centimetres; * for an end site; a > b: between the two.
-MORE = {
-    "bandai_namco": "*Head 0 10 0",
-    "cmu_daz": "rightEye head -4.1 8 8; *rightEye -1 0 0",
-    "cmu_motionbuilder": "",
-    "memmlp": "*head 0 0 0; *left_wrist 9 0 0; *right_wrist -9 0 0",
-    "lafan1": "*Head 0 0 0; *LeftToe 0 0 0; *RightToe 0 0 0; *LeftHand 0 0 0; *RightHand 0 0 0",
-    "mixamo": "HeadTop_End Head 0 19 6; *HeadTop_End 0 0 0; LeftEye Head 3 8 9; RightEye Head -3 8 9; "
-    f"{HANDS}",
-    "motorica": f"*Head 0 19 0; {HANDS}",
-    "rokoko_newton": "Spine3 Spine2 > Spine4; *Head 0 18 0; *LeftToe 0 0 6; *RightToe 0 0 6; "
-    "LeftFinger1Metacarpal LeftHand 3 0 3; RightFinger1Metacarpal RightHand -3 0 3",
-    "smpl": f"*Head 0 0 0; {WRISTS}",
-    "smpl_humanoid": f"*Head 0 12 0; {WRISTS}",
-    "smpl_words": "*Head 0 0 0; Left_palm Left_wrist 9 0 0; Right_palm Right_wrist -9 0 0",
-    "xsens_mvn": "Chest3 Chest2 > Chest4; *Head 0 17 0; *LeftToe 0 -2 7; *RightToe 0 -2 7; "
-    "*LeftWrist 19 0 0; *RightWrist -19 0 0",
-}
-FAMILIES = tuple(MORE)
+MORE = {"mixamo": "HeadTop_End Head 0 19 6; *HeadTop_End 0 0 0; LeftEye Head 3 8 9; " + HANDS}
+"""Nodes that a map leaves out: node, parent, offset in centimetres; * for an end site."""
 
 
 def family(name: str) -> Sample:
-    """Make the whole skeleton of a map, in a T-pose."""
+    """Make the skeleton of a map, in a T-pose."""
     sample = tree(name) if name in TREES else own_tree(load_skeleton(name))
-    for entry in filter(None, MORE[name].split(";")):
+    for entry in filter(None, MORE.get(name, "").split(";")):
         node, *rest = entry.split()
+        offset = [float(number) for number in rest[-3:]]
         if node.startswith("*"):
-            sample.ends.append((sample.names.index(node[1:]), [float(number) for number in rest]))
+            sample.ends.append((sample.names.index(node[1:]), offset))
             continue
         sample.names.append(node)
         sample.parents.append(sample.names.index(rest[0]))
         sample.channels.append(ZXY)
-        if rest[1] == ">":
-            below = sample.names.index(rest[2])
-            half = [0.5 * number for number in sample.offsets[below]]
-            sample.offsets.append(half)
-            sample.offsets[below], sample.parents[below] = half, len(sample.names) - 1
-        else:
-            sample.offsets.append([float(number) for number in rest[1:]])
+        sample.offsets.append(offset)
     return in_order(sample)
 
 

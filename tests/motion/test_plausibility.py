@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from memmlp.motion.body import JOINTS
 from memmlp.motion.clip import Clip
-from memmlp.motion.plausibility import why_implausible, why_unusual
+from memmlp.motion.plausibility import find_faults, why_implausible
 from memmlp.motion.synthetic import synthesize_clip
 
 SIDES = {"left": "right", "right": "left"}
@@ -43,12 +43,16 @@ def lying(clip: Clip, heading: float = 0.0) -> Clip:
     return replace(clip, poses=poses, trans=0.05 * clip.trans + [0.4, 1.7, 0.1])
 
 
+def faults(clip: Clip) -> str:
+    return "; ".join(find_faults(clip))
+
+
 @pytest.mark.parametrize("activity", ACTIVITIES)
 def test_what_people_do_passes(activity):
     clip = motion(activity)
     for sound in (clip, moved(clip, z=-2.5), moved(clip, z=8.0), moved(clip, 700.0, -300.0)):
         assert why_implausible(sound) is None
-        assert why_unusual(sound) is None
+        assert faults(sound) == ""
     single = replace(clip, poses=clip.poses[:1], trans=clip.trans[:1])
     assert why_implausible(single) is None
 
@@ -56,30 +60,20 @@ def test_what_people_do_passes(activity):
 @pytest.mark.parametrize("heading", [0, 180])
 def test_lying_and_crawling_pass_and_are_reported(heading):
     assert why_implausible(lying(motion("idling"), heading)) is None
-    assert "head" in why_unusual(lying(motion("idling"), heading))
+    assert "head" in faults(lying(motion("idling"), heading))
     crawling = lying(motion("walking"), heading)
     along = np.linspace(0, 3, len(crawling))[:, None] * [0.3, 1.0, 0.0]
     assert why_implausible(replace(crawling, trans=crawling.trans + along)) is None
 
 
-@pytest.mark.parametrize("fps", [12.0, 1000.0])
-def test_a_rate_at_which_hardly_anybody_records_is_reported(fps):
-    clip = replace(motion("idling"), fps=fps)
-    assert why_implausible(clip) is None
-    assert why_unusual(clip).startswith(f"a frame rate of {fps:g} Hz, which may be wrong")
-    assert all(why_unusual(replace(clip, fps=usual)) is None for usual in (20.0, 59.94, 60.0, 250.0, 480.0))
-
-
-def test_a_rate_that_no_camera_has_is_reported():
-    assert "60 Hz" in str(why_unusual(replace(motion("idling"), fps=62.5)))
-
-
-def test_a_translation_in_half_precision_is_reported():
-    clip = moved(motion("walking"), x=6.0)
-    half = clip.trans.astype(np.float16).astype(float)
-    assert "half precision, in steps of 8 mm" in why_unusual(replace(clip, trans=half))
-    for fine in (clip.trans, clip.trans.astype(np.float32), half[:1] + 0 * half):
-        assert "half" not in (why_unusual(replace(clip, trans=fine)) or "")
+def test_a_rate_at_which_hardly_anybody_records_is_reported():
+    clip = motion("idling")
+    for fps, said in ((12.0, "usual are 20 to 500 Hz"), (1000.0, "usual are 20"), (62.5, "60 Hz")):
+        odd = replace(clip, fps=fps)
+        assert why_implausible(odd) is None
+        assert f"a frame rate of {fps:g} Hz" in faults(odd)
+        assert said in faults(odd)
+    assert not any(faults(replace(clip, fps=usual)) for usual in (20.0, 59.94, 60.0, 250.0, 480.0))
 
 
 def test_a_pose_that_is_held_throughout_is_reported():
@@ -88,15 +82,15 @@ def test_a_pose_that_is_held_throughout_is_reported():
     for first in (1, 0):
         poses = np.concatenate([clip.poses[:, :first], np.repeat(clip.poses[:1, first:], len(clip), 0)], 1)
         assert why_implausible(replace(clip, poses=poses)) is None
-        assert why_unusual(replace(clip, poses=poses)).startswith("no joint but the root turns")
+        assert faults(replace(clip, poses=poses)).startswith("no joint but the root turns")
 
 
 def test_left_and_right_swapped_is_reported():
     """Elbows and knees then bend backwards; a true mirror image is a person's motion."""
     clip = motion("walking")
     poses = clip.poses[:, OTHER_SIDE]
-    assert why_unusual(replace(clip, poses=poses)).startswith("the elbows bend backwards")
-    assert why_unusual(replace(clip, poses=poses * [1, -1, -1], trans=clip.trans * [-1, 1, 1])) is None
+    assert faults(replace(clip, poses=poses)).startswith("the elbows bend backwards")
+    assert faults(replace(clip, poses=poses * [1, -1, -1], trans=clip.trans * [-1, 1, 1])) == ""
 
 
 @pytest.mark.parametrize(
@@ -105,21 +99,14 @@ def test_left_and_right_swapped_is_reported():
 def test_a_mirrored_axis_is_reported(signs, joints):
     clip = motion("walking")
     poses = np.concatenate([clip.poses[:, :1], clip.poses[:, 1:] * np.array(signs)], 1)
-    assert why_unusual(replace(clip, poses=poses)).startswith(f"the {joints} bend backwards")
-
-
-@pytest.mark.parametrize("axis", ["x", "y"])
-def test_a_floor_that_is_tilted_is_reported(axis):
-    tilted = turned(motion("walking"), Rotation.from_euler(axis, 40, degrees=True).as_matrix())
-    assert why_implausible(tilted) is None
-    assert "straight body leans by" in why_unusual(tilted)
+    assert faults(replace(clip, poses=poses)).startswith(f"the {joints} bend backwards")
 
 
 def test_a_floor_at_any_height_passes_where_feet_stand_on_it():
     for z in (-40.0, 100.0):
         clip = moved(motion("walking"), z=z)
         assert why_implausible(clip) is None
-        assert f"z = {z + 1:.0f} m" in why_unusual(clip)
+        assert faults(clip) == ""
 
 
 @pytest.mark.parametrize(
@@ -135,7 +122,7 @@ def test_a_translation_that_does_not_fit_the_steps_is_reported(trans, z):
     clip = motion("walking")
     wrong = replace(clip, trans=trans(clip.trans))
     assert why_implausible(wrong) is None
-    assert why_unusual(wrong).startswith(f"the lowest joint is at z = {z} m and none stands still")
+    assert faults(wrong).startswith(f"the lowest joint is at z = {z} m and none stands still")
 
 
 def test_a_glitch_or_a_wound_up_root_passes():

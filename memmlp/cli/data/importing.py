@@ -31,17 +31,12 @@ up_option = click.option(
 @click.option("--fps", multiple=True, metavar="[FOLDER=]HZ", help="True frame rate, for all or one folder.")
 @click.option(
     "--floor",
-    "--ground",
-    "floor",
     default="auto",
     show_default=True,
     metavar="auto|none|METRES",
     help="auto puts the lowest stable contact of the feet at 0; METRES is the floor's height in the files.",
 )
 @up_option
-@click.option(
-    "--take", multiple=True, metavar="REGEX", help="Clips with the same match share one floor; repeatable."
-)
 @body_option
 @strict_option
 @click.option("--sound", is_flag=True, help="Skip faulty clips instead of writing them with a warning.")
@@ -52,12 +47,11 @@ def import_(
     fps: tuple[str, ...],
     floor: str,
     up: str | None,
-    take: tuple[str, ...],
     body: str,
     strict: bool,
     sound: bool,
 ) -> None:
-    """Import BVH files, or exponential maps of the CMU layout (.txt), as AMASS npz.
+    """Import BVH files as AMASS npz.
 
     SOURCE is a folder or one file. The clips are brought to the 22-joint tree, and each is compared with its
     file; faults are reported.
@@ -65,7 +59,7 @@ def import_(
     from memmlp.config.package_data import grouping_to_choose
     from memmlp.motion.importing.import_folder import ImportSettings, import_folder
 
-    settings = ImportSettings(skeleton, _rates(fps), body, _floor(floor), take, strict, sound, up)
+    settings = ImportSettings(skeleton, _rates(fps), body, _floor(floor), strict, sound, up)
     report = import_folder(source, out, settings)
     for note in report.notes:
         click.echo(f"note: {note}")
@@ -116,12 +110,11 @@ def verify(source: Path, skeleton: str | None, body: str, up: str | None, every:
 
     Each file is imported, and the result is compared with the file's own joints: "worst mm" is the largest
     distance of any mapped joint on the file's own bones, "worst degrees" the largest angle between a segment
-    (trunk, neck, arms, legs, feet) on the body and in the file. Impossible postures are faults too: the head
-    below the pelvis, knees that bend forward, feet that point backward or hang above the floor, odd lengths.
-    Goes on past bad files; exits with 1 if any file has a fault or can't be imported.
+    (trunk, neck, arms, legs, feet) on the body and in the file. Impossible postures and lengths are faults
+    too. Goes on past bad files; exits with 1 if any file has a fault or can't be imported.
     """
     from memmlp.motion.clip import Skipped
-    from memmlp.motion.importing.import_folder import verify_folder
+    from memmlp.motion.importing.import_folder import ImportSettings, verify_folder
 
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     table.add_column("file", overflow="fold")
@@ -130,7 +123,7 @@ def verify(source: Path, skeleton: str | None, body: str, up: str | None, every:
         table.add_column(name, justify="right")
     table.add_column("at")
     sound, bad, errors = 0, [], [(0.0, 0.0)]
-    for row in verify_folder(source, skeleton=skeleton, body=body, up=up):
+    for row in verify_folder(source, ImportSettings(skeleton, body=body, up=up)):
         if isinstance(row, Skipped):
             bad.append(f"{row.file}: {row.reason}")
             continue
@@ -176,12 +169,15 @@ def guess(file: Path, out: Path | None) -> None:
     if out is not None:
         write_map(out, text)
     try:
-        stance, faults = check(recording, proposed)
+        done = check(recording, proposed)
     except InputError as error:
         raise click.ClickException(f"the file cannot be imported with this map: {error}") from None
-    for fault in faults:
+    for fault in done.fidelity.faults:
         click.echo(f"warning: {fault}", err=True)
-    click.echo(f"imports from {stance}, with {len(faults)} fault{'s' * (len(faults) != 1)}", err=True)
+    faults = len(done.fidelity.faults)
+    click.echo(
+        f"imports from {done.fitted.stance.source}, with {faults} fault{'s' * (faults != 1)}", err=True
+    )
     click.echo(f"next: memmlp data skeleton show {file} --skeleton {out or 'MAP'} --out PNG", err=True)
 
 

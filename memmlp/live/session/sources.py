@@ -261,14 +261,13 @@ def npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
     from memmlp.motion.clip import resample
     from memmlp.motion.formats.npz import read_clip
     from memmlp.motion.geometry import motion_frames
-    from memmlp.motion.plausibility import check_plausible, why_unusual
+    from memmlp.motion.plausibility import check_plausible
     from memmlp.motion.preparing.imported_body import check_imported_body
 
     recorded = read_clip(path, path.stem)
     check_imported_body([path], rest, "the network")
-    check_plausible(path, recorded)
-    if reason := why_unusual(recorded):
-        notify(f"{path}: unusual, {reason}")
+    if faults := check_plausible(path, recorded):
+        notify(f"{path}: unusual, {faults}")
     clip, _ = resample(recorded)
     if len(clip) < 3:
         raise InputError(f"{path}: {len(clip)} frames at 60 Hz; must have 3 or more")

@@ -28,10 +28,7 @@ AXES = "XYZ"
 CHANNELS = tuple(axis + kind for kind in ("position", "rotation") for axis in AXES)
 LIMIT = 1e6  # the largest size of any number in the file, in its units or degrees
 MAX_JOINTS = 1000
-MAX_BYTES = 2**29
-MAX_HEAD = 2**22  # bytes before MOTION
-MAX_LINE = 200_000  # bytes
-MAX_VALUES = 2**24  # in all frames: 25 minutes of 93 channels at 120 Hz
+MAX_BYTES = 2**28  # about half an hour of 93 channels at 120 Hz
 RATE_DIGITS = 1e-4  # relative: 1 / 0.00833333 s is 120 Hz, as the header has no more digits
 COARSEST = 0.05  # relative: a frame time that is rounded more coarsely does not identify a usual rate
 
@@ -116,13 +113,21 @@ def read_bvh(path: Path) -> Bvh:
     """Read a BVH file; line ends, blanks and letter case of keywords may vary, nothing else.
 
     Raises:
-        InputError: for anything damaged (braces, numbers, counts, names, channels, an absurd frame time, more
-            than 1000 joints, bytes that are not text); the message names the file and where possible the
-            line.
+        InputError: for anything damaged (braces, numbers, counts, names, channels, an impossible frame time,
+            more than 1000 joints, bytes that are not UTF-8) and for files of more than 256 MiB; the message
+            names the file and where possible the line.
     """
-    lines = _lines(path)
-    names, parents, offsets, channels = _hierarchy(_Words(path, _head(path, lines)))
-    fps, values = _motion(path, lines, sum(map(len, channels)))
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{path}: too large; expected at most {MAX_BYTES >> 20} MiB")
+        with open(path, encoding="utf-8-sig") as file:
+            lines = enumerate(file, start=1)
+            names, parents, offsets, channels = _read_hierarchy(_Words(path, lines))
+            fps, values = _read_motion(path, lines, sum(map(len, channels)))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); expected a BVH file") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: byte {error.object[error.start]:#04x}; expected UTF-8 text") from error
     return Bvh(path, tuple(names), tuple(parents), np.array(offsets), fps, values, tuple(channels))
 
 
@@ -130,48 +135,19 @@ def _fail(path: Path, line: int, wrong: str, expected: str) -> NoReturn:
     raise InputError(f"{path}: line {line}: {wrong}; expected {expected}")
 
 
-def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
-    """Yield the file's lines with their numbers, whatever the line ends (LF, CRLF or CR)."""
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: too large; expected at most {MAX_BYTES >> 20} MiB")
-        with open(path, encoding="latin-1") as file:  # Latin-1 keeps every byte
-            for number, line in enumerate(iter(lambda: file.readline(MAX_LINE), ""), start=1):
-                if len(line) == MAX_LINE:
-                    _fail(path, number, "too long", f"at most {MAX_LINE} bytes")
-                yield number, line.encode("latin-1")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); expected a BVH file") from error
-
-
-def _head(path: Path, lines: Iterator[tuple[int, bytes]]) -> list[bytes]:
-    """Take the lines up to MOTION from the file's lines; return those before it."""
-    head: list[bytes] = []
-    size = 0
-    for _, line in lines:
-        if line.strip().upper() == b"MOTION":
-            return head
-        head.append(line)
-        size += len(line)
-        if size > MAX_HEAD:
-            break
-    raise InputError(f"{path}: no MOTION line; expected HIERARCHY, then MOTION")
-
-
 class _Words:
     """The words of the hierarchy, one after the other; `line` is the line of the last one."""
 
-    def __init__(self, path: Path, lines: list[bytes]) -> None:
+    def __init__(self, path: Path, lines: Iterator[tuple[int, str]]) -> None:
         self.path, self.line = path, 1
         self._words = self._split(lines)
 
-    def _split(self, lines: list[bytes]) -> Iterator[str]:
-        for self.line, line in enumerate(lines, start=1):
-            try:
-                text = line.decode("utf-8-sig" if self.line == 1 else "utf-8")
-            except UnicodeDecodeError as error:
-                self.fail(f"byte {line[error.start]:#04x}", "UTF-8 text")
-            yield from text.replace("{", " { ").replace("}", " } ").split()
+    def _split(self, lines: Iterator[tuple[int, str]]) -> Iterator[str]:
+        for self.line, line in lines:
+            if line.strip().upper() == "MOTION":
+                return
+            yield from line.replace("{", " { ").replace("}", " } ").split()
+        raise InputError(f"{self.path}: no MOTION line; expected HIERARCHY, then MOTION")
 
     def fail(self, wrong: str, expected: str) -> NoReturn:
         _fail(self.path, self.line, wrong, expected)
@@ -187,13 +163,10 @@ class _Words:
 
     def offset(self) -> list[float]:
         self.keyword("OFFSET")
-        expected, numbers = f"three numbers up to {LIMIT:g} in size after OFFSET", []
-        for _ in range(3):
-            word = self.next(expected)
-            numbers.append(
-                _number(word) if abs(_number(word)) <= LIMIT else self.fail(_quote(word), expected)
-            )
-        return numbers
+        expected = f"three numbers up to {LIMIT:g} in size after OFFSET"
+        words = [self.next(expected) for _ in range(3)]
+        wrong = [word for word in words if not abs(_parse_number(word)) <= LIMIT]
+        return list(map(_parse_number, words)) if not wrong else self.fail(_quote(wrong[0]), expected)
 
     def channels(self) -> tuple[str, ...]:
         self.keyword("CHANNELS")
@@ -205,37 +178,34 @@ class _Words:
         wrong = next((name for name in names if name not in CHANNELS or names.count(name) > 1), None)
         return names if wrong is None else self.fail(_quote(wrong), expected)
 
-    def finish(self) -> None:
-        word = next(self._words, None)
-        if word is not None:
+    def end(self) -> None:
+        if (word := next(self._words, None)) is not None:
             self.fail(_quote(word), "MOTION after the root's last }")
 
 
-def _hierarchy(words: _Words) -> tuple[list[str], list[int], list[list[float]], list[tuple[str, ...]]]:
+def _read_hierarchy(words: _Words) -> tuple[list[str], list[int], list[list[float]], list[tuple[str, ...]]]:
     names: list[str] = []
     parents: list[int] = []
     offsets: list[list[float]] = []
     channels: list[tuple[str, ...]] = []
-    ends: list[tuple[str, int, list[float]]] = []
+    ends: dict[str, tuple[int, list[float]]] = {}
     open_joints: list[int] = []  # without their closing }
 
     def check(name: str) -> str:
-        if name in ("{", "}") or name in names or any(name == end for end, _, _ in ends):
+        if name in ("{", "}") or name in names or name in ends:
             words.fail(f"name {_quote(name)}", "a name for each joint, and no name (or end site) twice")
         return name
 
     words.keyword("HIERARCHY")
     keyword = words.keyword("ROOT")
-    while True:
+    while keyword != "}" or len(open_joints) > 1:
         if keyword == "}":
             open_joints.pop()
-            if not open_joints:
-                break
         elif keyword == "END":
             name = check(names[open_joints[-1]] + END)
             words.keyword("SITE")
             words.keyword("{")
-            ends.append((name, open_joints[-1], words.offset()))
+            ends[name] = open_joints[-1], words.offset()
             words.keyword("}")
         else:
             if len(names) == MAX_JOINTS:
@@ -247,43 +217,40 @@ def _hierarchy(words: _Words) -> tuple[list[str], list[int], list[list[float]], 
             offsets.append(words.offset())
             channels.append(words.channels())
         keyword = words.keyword("JOINT", "END", "}")
-    words.finish()
-    names += [name for name, _, _ in ends]
-    parents += [joint for _, joint, _ in ends]
-    offsets += [offset for _, _, offset in ends]
-    return names, parents, offsets, channels
+    words.end()
+    parents += [joint for joint, _ in ends.values()]
+    offsets += [offset for _, offset in ends.values()]
+    return [*names, *ends], parents, offsets, channels
 
 
-def _motion(path: Path, lines: Iterator[tuple[int, bytes]], width: int) -> tuple[float, np.ndarray]:
+def _read_motion(path: Path, lines: Iterator[tuple[int, str]], width: int) -> tuple[float, np.ndarray]:
     """Read the frame rate and values (N, width) from the lines after MOTION, without blank ones."""
-    rows = ((number, line) for number, line in lines if line.strip())
+    rows = ((number, line.strip()) for number, line in lines if line.strip())
     first, second = next(rows, None), next(rows, None)
     if first is None or second is None or width == 0:
         raise InputError(f"{path}: no motion; expected channels, Frames:, Frame Time: and the frames")
-    frames = _header(path, *first, "Frames:")
+    frames = _read_header(path, *first, "Frames:")
     if not re.fullmatch(r"0*[1-9]\d{0,8}", frames, re.ASCII):
         _fail(path, first[0], f"Frames: {_quote(frames)}", "a whole number from 1")
     low, high = FRAME_RATE_RANGE
-    seconds = _number(word := _header(path, *second, "Frame Time:"))
-    if not 1 / high <= seconds <= 1 / low:
-        _fail(path, second[0], f"Frame Time: {_quote(word)}", f"{1 / high:g} to {1 / low:g} s")
+    frame_time = _read_header(path, *second, "Frame Time:")
+    if not 1 / high <= _parse_number(frame_time) <= 1 / low:
+        _fail(path, second[0], f"Frame Time: {_quote(frame_time)}", f"{1 / high:g} to {1 / low:g} s")
     values = array("d")  # a list of rows would be much larger than its numbers
     for number, line in rows:
-        values.extend(_frame(path, number, line, width))
-        if len(values) > MAX_VALUES:
-            _fail(path, number, "too many frames", f"at most {MAX_VALUES} values")
+        values.extend(_read_frame(path, number, line.split(), width))
     if len(values) != int(frames) * width:
         wrong = f"Frames: {int(frames)}, but {len(values) // width} lines of values follow"
         _fail(path, first[0], wrong, "one line for each frame")
-    return _frame_rate(word), np.array(values).reshape(-1, width)
+    return _find_rate(frame_time), np.array(values).reshape(-1, width)
 
 
-def _frame_rate(frame_time: str) -> float:
+def _find_rate(frame_time: str) -> float:
     """Return a rate, rounded to a whole number or a usual rate where the frame time's digits allow it.
 
     The time may be rounded to its last digit, or cut off after it: 0.0167 and 0.0166 are 60 Hz.
     """
-    seconds = _number(frame_time)
+    seconds = _parse_number(frame_time)
     if abs(1 / seconds - round(1 / seconds)) <= RATE_DIGITS / seconds:
         return float(round(1 / seconds))
     digit = 10.0 ** int(Decimal(frame_time).as_tuple().exponent)
@@ -294,30 +261,27 @@ def _frame_rate(frame_time: str) -> float:
     return float(usual) if rounded or cut_off else 1 / seconds
 
 
-def _header(path: Path, number: int, line: bytes, key: str) -> str:
+def _read_header(path: Path, number: int, line: str, key: str) -> str:
     """Return the value of `key: value`; letter case and blanks may vary."""
-    text = line.decode("latin-1").strip()
     pattern = key.replace(" ", r"\s*").replace(":", r"\s*:\s*(\S+)")
-    match = re.fullmatch(pattern, text, re.IGNORECASE)
-    return match[1] if match else _fail(path, number, _quote(text), f"{key} and one number")
+    match = re.fullmatch(pattern, line, re.IGNORECASE)
+    return match[1] if match else _fail(path, number, _quote(line), f"{key} and one number")
 
 
-def _frame(path: Path, number: int, line: bytes, width: int) -> np.ndarray:
-    words = line.split()
+def _read_frame(path: Path, number: int, words: list[str], width: int) -> list[float]:
     if len(words) != width:
         _fail(path, number, f"{len(words)} values", f"{width}, one for each channel")
     try:
-        values = np.array([float("nan")] if b"_" in line else list(map(float, words)))
+        values = list(map(float, words))
     except ValueError:
-        values = np.array([float("nan")])
-    if not (np.abs(values) <= LIMIT).all():
-        texts = line.decode("latin-1").split()
-        wrong = next((text for text in texts if not abs(_number(text)) <= LIMIT), texts[0])
+        values = [float("nan")]
+    if not all(abs(value) <= LIMIT for value in values) or any("_" in word for word in words):
+        wrong = next((word for word in words if not abs(_parse_number(word)) <= LIMIT), words[0])
         _fail(path, number, _quote(wrong), f"numbers up to {LIMIT:g} in size")
     return values
 
 
-def _number(word: str) -> float:
+def _parse_number(word: str) -> float:
     """Parse a number as BVH writes it; NaN for anything else, also for `1_0` or `Infinity`."""
     try:
         return float(word) if re.fullmatch(r"[-+.0-9eE]+", word) else float("nan")

@@ -13,17 +13,16 @@ metres:
 | parts as the smplx package names them | `global_orient` (N, 3), `body_pose` (N, 63 or 69) |
 
 The translation is `trans` or `transl` (N, 3); the frame rate `mocap_framerate`, `mocap_frame_rate` or `fps`.
-A file with several of these names, as SMPL-X' files for the rotations, must have the same motion under each.
+Of several names for one thing, the first in this list counts.
 """
 
 from __future__ import annotations
 
 import io
 import math
-import os
 import warnings
 import zipfile
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,9 +47,8 @@ LAYOUTS: tuple[dict[str, tuple[int, ...]], ...] = (
 TRANSLATIONS = ("trans", "transl")
 FRAME_RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 FARTHEST = 1e4  # metres from the origin
-SAME = 0.01  # radians or metres by which two arrays of one motion differ at most, whatever their precisions
 
-BLOCK = 2**23  # the most bytes in a read; the zip's directory must fit into one
+BLOCK = 2**23  # the most bytes in a read
 MAX_HEADER = 10_000  # bytes of an npy header, as in np.load
 MAX_ROWS = 500_000  # frames: an hour at 120 Hz is 432,000
 MAX_SCALAR = 1_024  # bytes of an array that is one number or word
@@ -74,50 +72,40 @@ def read_clip(path: Path, name: str) -> Clip:
             names it. Whether it can be a person's motion is checked elsewhere (`motion.plausibility`).
     """
     with _open_npz(path) as file:
-        layout, trans_key, rate_key = _keys(file)
+        layout, trans_key, rate_key = _find_keys(file)
         parts = [file.columns(key, widths[0], widths) for key, widths in layout.items()]
         trans = file.columns(trans_key, 3, (3,))
-        fps = _frame_rate(path, file.scalar(rate_key))
-        for key in FRAME_RATES:
-            if key in file.names and (other := _frame_rate(path, file.scalar(key))) != fps:
-                raise InputError(f"{path}: two frame rates, {fps:g} and {key}={other:g}; expected one")
-        keys = (*layout, trans_key)
+        fps = _parse_rate(path, file.scalar(rate_key))
         lengths = {len(part) for part in (*parts, trans)}
         if len(lengths) > 1:
-            raise InputError(f"{path}: {', '.join(keys)} have different lengths, {sorted(lengths)}")
+            keys = ", ".join((*layout, trans_key))
+            raise InputError(f"{path}: {keys} have different lengths, {sorted(lengths)}")
         body = np.concatenate(parts, 1) if len(parts) > 1 else parts[0]
         bad = ~(np.isfinite(body).all(1) & np.isfinite(trans).all(1))
         if bad.any():
             raise InputError(f"{path}: NaN or Inf in {bad.sum()} frames, first in frame {bad.argmax()}")
         if np.abs(trans).max() > FARTHEST or np.abs(body).max() > FARTHEST:
             raise InputError(f"{path}: values beyond {FARTHEST:g}, so it is not in metres and radians")
-        _check_copies(file, keys, body, trans)
     return Clip(name, body.reshape(-1, N_JOINTS, 3), trans, fps)
 
 
 def write_clip(path: Path, clip: Clip) -> None:
     """Write a clip in AMASS' SMPL+H layout (hands at rest, zero betas, neutral gender), atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    header = {"descr": "<f4", "fortran_order": False, "shape": (len(clip), SMPLH_POSE_DIM)}
-    others = {
-        "trans": clip.trans.astype(np.float32),
-        "betas": np.zeros(16, np.float32),
-        "gender": np.array("neutral"),
-        "mocap_framerate": np.array(float(clip.fps)),
-    }
-    with atomic_file(path) as file, zipfile.ZipFile(file, "w") as archive:
-        with archive.open("poses.npy", "w", force_zip64=True) as member:  # in pieces: it may be an hour
-            np.lib.format.write_array_header_1_0(member, header)
-            for piece in clip.pieces():
-                poses = np.zeros((len(piece), SMPLH_POSE_DIM), "<f4")
-                poses[:, :BODY_DIM] = piece.poses.reshape(len(piece), -1)
-                member.write(poses.tobytes())
-        for name, array in others.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, array, allow_pickle=False)
+    poses = np.zeros((len(clip), SMPLH_POSE_DIM), np.float32)
+    poses[:, :BODY_DIM] = clip.poses.reshape(len(clip), -1)
+    with atomic_file(path) as file:
+        np.savez(
+            file,
+            poses=poses,
+            trans=clip.trans.astype(np.float32),
+            betas=np.zeros(16, np.float32),
+            gender=np.array("neutral"),
+            mocap_framerate=np.array(float(clip.fps)),
+        )
 
 
-def _keys(file: _Npz) -> tuple[dict[str, tuple[int, ...]], str, str]:
+def _find_keys(file: _Npz) -> tuple[dict[str, tuple[int, ...]], str, str]:
     if not any(key in file.names for layout in LAYOUTS for key in layout):
         raise NoMotion(f"{file.path}: no poses in it, so it is not motion")
     layout = next((layout for layout in LAYOUTS if set(layout) <= file.names), None)
@@ -130,7 +118,7 @@ def _keys(file: _Npz) -> tuple[dict[str, tuple[int, ...]], str, str]:
     return layout, trans, rate
 
 
-def _frame_rate(path: Path, value: np.ndarray) -> float:
+def _parse_rate(path: Path, value: np.ndarray) -> float:
     """Parse the rate from a float, an int, bytes or text, as a 0-d or 1-element array."""
     if value.size != 1 or value.dtype.kind not in "fiuSU":
         raise InputError(f"{path}: the frame rate is {value.dtype} {value.shape}; expected one number")
@@ -143,25 +131,6 @@ def _frame_rate(path: Path, value: np.ndarray) -> float:
     if not low <= fps <= high:
         raise InputError(f"{path}: a frame rate of {fps:g} Hz; must be {low:g} to {high:g}")
     return fps
-
-
-def _check_copies(file: _Npz, read: Sequence[str], body: np.ndarray, trans: np.ndarray) -> None:
-    """Raise InputError if the file has another motion under other names, as when only one was edited.
-
-    Args:
-        file: the file.
-        read: the names under which its motion was read.
-        body: the rotations (N, 66) that were read.
-        trans: the translation (N, 3) that was read.
-    """
-    widths = {key: widths for layout in LAYOUTS for key, widths in layout.items()}
-    roots, bodies = ("root_orient", "global_orient"), ("pose_body", "body_pose")
-    same = {**dict.fromkeys(roots, body[:, :3]), **dict.fromkeys(bodies, body[:, 3:])}
-    same |= dict.fromkeys(TRANSLATIONS, trans)
-    for key in sorted((same.keys() & file.names) - set(read)):
-        copy = file.columns(key, same[key].shape[1], widths.get(key, (3,)))
-        if copy.shape != same[key].shape or not (np.abs(copy - same[key]) <= SAME).all():
-            raise InputError(f"{file.path}: {key} and {', '.join(read)} are different motions; expected one")
 
 
 # Arrays in bounded memory, whatever the file claims. Before an array is allocated, its header must agree with
@@ -208,7 +177,6 @@ class _Npz:
         return header
 
     def scalar(self, name: str) -> np.ndarray:
-        """Read a small array whole."""
         header = self.header(name)
         if header.size > MAX_SCALAR:
             raise InputError(f"{self.path}: {name} is {header}; expected one number")
@@ -234,11 +202,11 @@ class _Npz:
         with self._zip.open(f"{name}.npy") as entry:
             entry.seek(header.offset)
             if header.fortran:
-                for start, block in _lines(entry, header.dtype, width, rows):
+                for start, block in _read_lines(entry, header.dtype, width, rows):
                     some = block[: max(0, count - start)]
                     columns[:, start : start + len(some)] = some.T
             else:
-                for start, block in _lines(entry, header.dtype, rows, width):
+                for start, block in _read_lines(entry, header.dtype, rows, width):
                     columns[start : start + len(block)] = block[:, :count]
         return columns
 
@@ -254,7 +222,7 @@ def _open_npz(path: Path) -> Iterator[_Npz]:
     if magic != b"PK":
         raise InputError(f"{path}: not a zip, so not an npz (memmlp data import makes one of BVH)")
     try:
-        with _Bounded(io.FileIO(path)) as file, zipfile.ZipFile(file) as archive:
+        with zipfile.ZipFile(path) as archive:
             yield _Npz(path, archive)
     except InputError:
         raise
@@ -264,17 +232,6 @@ def _open_npz(path: Path) -> Iterator[_Npz]:
 
 def _brief(error: Exception) -> str:
     return " ".join(str(error).split())[:120] or type(error).__name__
-
-
-class _Bounded(io.BufferedReader):
-    """A file that is read at most a block at a time, so that no zip directory can fill the memory."""
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        left = os.fstat(self.fileno()).st_size - self.tell()
-        count = min(left, size) if size is not None and size >= 0 else left
-        if count > BLOCK:
-            raise ValueError(f"a part of more than {BLOCK >> 20} MiB")
-        return super().read(max(0, count))
 
 
 def _parse_header(start: bytes) -> _Header:
@@ -290,7 +247,9 @@ def _parse_header(start: bytes) -> _Header:
     return _Header(shape, fortran, dtype, stream.tell())
 
 
-def _lines(entry: IO[bytes], dtype: np.dtype, count: int, length: int) -> Iterator[tuple[int, np.ndarray]]:
+def _read_lines(
+    entry: IO[bytes], dtype: np.dtype, count: int, length: int
+) -> Iterator[tuple[int, np.ndarray]]:
     """Yield `count` lines of `length` numbers in blocks (n, length), each with its first line's index."""
     step = max(1, BLOCK // (length * dtype.itemsize))
     for start in range(0, count, step):

@@ -20,7 +20,7 @@ class Recording:
         nodes: the nodes' names, all different; a node comes after its parent.
         node_parents: index of each node's parent; -1 for the root.
         offsets: each node minus its parent in the zero pose (nodes, 3).
-        fps: frames per second, as the file states them.
+        fps: frames per second, as the file states them; None if it does not.
         values: the frames' numbers (N, C), as the file has them.
     """
 
@@ -28,7 +28,7 @@ class Recording:
     nodes: tuple[str, ...]
     node_parents: tuple[int, ...]
     offsets: np.ndarray
-    fps: float
+    fps: float | None
     values: np.ndarray
 
     def __len__(self) -> int:

@@ -7,7 +7,7 @@ kinematics; the file's joints are taken from the file.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,6 @@ from memmlp.motion.body import HEAD, JOINTS, PARENTS
 from memmlp.motion.clip import Clip
 from memmlp.motion.geometry import clip_kinematics
 from memmlp.motion.importing.anatomy import (
-    FEET,
     HINGES,
     HIPS,
     LEG_LENGTH,
@@ -26,23 +25,17 @@ from memmlp.motion.importing.anatomy import (
     angles,
     hinge,
     segments,
-    unit,
 )
 from memmlp.motion.importing.skeleton_map import Z_UP, MappedMotion
-from memmlp.motion.plausibility import why_implausible
+from memmlp.motion.plausibility import find_faults, why_implausible
 
 MOST_MM, MOST_DEGREES = 1.0, 3.0  # the largest errors that an import may have
 SHORTEST = 1e-2  # metres: the direction of a shorter segment does not count
-TRUNK = 25.0  # degrees between pelvis to head on the body and in the file
-UPRIGHT_SHARE = 0.5  # of the frames, in which the head must be above the pelvis
-BENT, FORWARD_SHARE = 0.35, 0.3  # sine of a knee's bend that counts; share of it that may be the wrong way
 LENGTHS = (0.5, 2.0)  # of a limb to the legs' length, over the same on the body
 CHEST, HEAD_TURN, HEAD_SHARE = 9, 110.0, 0.01  # degrees no neck turns up, down or aside; share of the frames
 TORSO, TURN = (3, 6, 9, 12, 13, 14, 15), 60.0  # spine, neck, collars, head; degrees against the joint above
 TWIST = 45.0  # degrees by which a knee's or elbow's axis may be off the body's
 SIDES = 1.1  # left over right
-FLOOR = 0.3  # metres: how far from the floor feet may stay through a whole clip
-FEET_STAY = "the feet stay"  # the beginning of that fault
 STRETCH = 0.02  # metres by which a segment may change its length
 
 
@@ -90,16 +83,14 @@ def compare(clip: Clip, motion: MappedMotion, rest: np.ndarray, skeleton: str) -
     rotations, positions = clip_kinematics(clip, rest)
     expected, mapped = motion.positions @ Z_UP.T, motion.mapped
     mm, degrees = _distance(rotations, expected, mapped), _deviation(positions, expected, mapped)
-    result = Fidelity(clip.name, skeleton, len(clip), mm, degrees, ())
-    faults = [
-        *_file_faults(result, positions, expected, mapped),
-        *_posture_faults(rotations, positions, mapped),
-        *floor_faults(positions),
+    impossible = why_implausible(clip)
+    faults = (
+        *_map_faults(mm, degrees, expected, mapped),
         *_turn_faults(rotations, positions),
         *_length_faults(expected, rest),
-        *filter(None, [why_implausible(clip)]),
-    ]
-    return replace(result, faults=tuple(faults))
+        *([impossible] if impossible else find_faults(clip)),
+    )
+    return Fidelity(clip.name, skeleton, len(clip), mm, degrees, faults)
 
 
 def _distance(rotations: np.ndarray, expected: np.ndarray, mapped: np.ndarray) -> Worst:
@@ -143,52 +134,17 @@ def _worst(errors: np.ndarray, names: list[str] | tuple[str, ...]) -> Worst:
 # Faults, one sentence each
 
 
-def _file_faults(
-    found: Fidelity, positions: np.ndarray, expected: np.ndarray, mapped: np.ndarray
-) -> Iterator[str]:
-    if found.mm.value > MOST_MM:
-        where, frame = found.mm.where, found.mm.frame
-        yield f"{where} is {found.mm.value:.1f} mm off on the file's own bones in frame {frame}"
-    if found.degrees.value > MOST_DEGREES:
-        where, frame = found.degrees.where, found.degrees.frame
-        yield f"{where} points {found.degrees.value:.1f} degrees off the file's in frame {frame}"
-    off = np.median(angles(*(array[:, HEAD] - array[:, 0] for array in (positions, expected))))
-    if off > TRUNK:
-        yield f"pelvis to head points {off:.0f} degrees off the file's in half of the frames"
+def _map_faults(mm: Worst, degrees: Worst, expected: np.ndarray, mapped: np.ndarray) -> Iterator[str]:
+    if mm.value > MOST_MM:
+        yield f"{mm.where} is {mm.value:.1f} mm off on the file's own bones in frame {mm.frame}"
+    if degrees.value > MOST_DEGREES:
+        yield f"{degrees.where} points {degrees.value:.1f} degrees off the file's in frame {degrees.frame}"
     for segment in segments(mapped):
         lengths = np.linalg.norm(expected[:, segment.end] - expected[:, segment.start], axis=-1)
         if np.ptp(lengths) > STRETCH:
             frame = int(np.abs(lengths - np.median(lengths)).argmax())
             change = f"{segment} changes its length by {1000 * np.ptp(lengths):.0f} mm in the file"
             yield f"{change} (most in frame {frame}): a joint between them turns, or the map is wrong"
-
-
-def _posture_faults(rotations: np.ndarray, positions: np.ndarray, mapped: np.ndarray) -> Iterator[str]:
-    upright = (positions[:, HEAD, 2] > positions[:, 0, 2]).mean()
-    if upright < UPRIGHT_SHARE:
-        yield f"the head is below the pelvis in {1 - upright:.0%} of the frames"
-    bends = []
-    for hip in HIPS:
-        knee, ankle = LIMBS[hip], LIMBS[LIMBS[hip]]
-        thigh, shin = positions[:, knee] - positions[:, hip], positions[:, ankle] - positions[:, knee]
-        bends.append((np.cross(unit(thigh), unit(shin)) * rotations[:, 0, :, 0]).sum(-1))
-    strong = np.concatenate(bends)
-    strong = strong[np.abs(strong) > BENT]
-    forward = float((strong < 0).mean()) if len(strong) else 0.0
-    if forward > FORWARD_SHARE:
-        yield f"the knees bend forward in {forward:.0%} of their bends"
-    feet = [positions[:, toes] - positions[:, ankle] for ankle, toes in FEET.items() if mapped[toes]]
-    backward = [(foot * rotations[:, 0, :, 2]).sum(-1) < 0 for foot in feet]
-    if backward and np.mean(backward) > 0.5:
-        yield f"the feet point backward in {np.mean(backward):.0%} of the frames"
-
-
-def floor_faults(positions: np.ndarray) -> Iterator[str]:
-    """Yield the distance of the feet from the floor, if it is large, given joints (N, 22, 3), metres."""
-    lowest = float(np.quantile(positions[:, [7, 8, 10, 11], 2].min(1), 0.05))
-    if abs(lowest) > FLOOR:
-        side = "above" if lowest > 0 else "below"
-        yield f"{FEET_STAY} {abs(lowest):.2f} m {side} the floor"
 
 
 def _turn_faults(rotations: np.ndarray, positions: np.ndarray) -> Iterator[str]:

@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import yaml
 
 from memmlp.common.errors import InputError
-from memmlp.motion.body import JOINTS, load_rest_joints
+from memmlp.motion.body import JOINTS, builtin_rest_joints
 from memmlp.motion.formats.recording import END, Recording
 from memmlp.motion.importing.anatomy import CHAINS
-from memmlp.motion.importing.convert import JUMP, convert, find_unit_and_up, first_step
+from memmlp.motion.importing.convert import JUMP, Converted, convert, first_step
 from memmlp.motion.importing.skeleton_map import REQUIRED, SkeletonMap, without_namespace
 
 LEG = {  # joint of a leg -> words for it, the clearest first
@@ -57,12 +56,15 @@ class Guess:
     Attributes:
         skeleton: the map.
         by_tree: the joints that were found by the tree, without their names.
-        missing: the joints that a map must have and that were not found.
     """
 
     skeleton: SkeletonMap
     by_tree: tuple[str, ...]
-    missing: tuple[str, ...]
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """The joints that a map must have and that were not found."""
+        return tuple(joint for joint in REQUIRED if joint not in self.skeleton.joints)
 
 
 def split_words(name: str) -> NodeWords:
@@ -106,8 +108,7 @@ def guess(recording: Recording, name: str) -> Guess:
         found |= {f"{side}_foot": tips[0]} if len(tips) == 1 else {}
     joints = {joint: recording.nodes[found[joint]] for joint in JOINTS if joint in found}
     skeleton = SkeletonMap(name, joints, calibration_frame=first_step(recording) > JUMP)
-    by_tree = tuple(joint for joint in joints if joint not in by_name)
-    return Guess(skeleton, by_tree, tuple(joint for joint in REQUIRED if joint not in joints))
+    return Guess(skeleton, tuple(joint for joint in joints if joint not in by_name))
 
 
 class _Tree:
@@ -172,18 +173,17 @@ class _Tree:
         return found
 
 
-def check(recording: Recording, proposed: Guess, body: str = "builtin") -> tuple[str, tuple[str, ...]]:
-    """Import a file with a proposed map; return the stance from which it was read, and the faults.
+def check(recording: Recording, proposed: Guess) -> Converted:
+    """Convert a file to the built-in body with a proposed map.
 
     Raises:
         InputError: if the file can't be imported with this map.
     """
-    if proposed.missing:
-        raise InputError(
-            f"joints.{proposed.missing[0]}: not found; add {', '.join(proposed.missing)} by hand"
-        )
-    done = convert(recording, proposed.skeleton, load_rest_joints(body), name=proposed.skeleton.name)
-    return done.stance, done.fidelity.faults
+    if missing := ", ".join(proposed.missing):
+        raise InputError(f"joints.{proposed.missing[0]}: not found; add {missing} by hand")
+    name = proposed.skeleton.name
+    fps = recording.fps or 60.0  # no fault of the map follows from it
+    return convert(recording, proposed.skeleton, builtin_rest_joints(), name=name, fps=fps)
 
 
 def as_yaml(proposed: Guess, recording: Recording) -> str:
@@ -192,33 +192,21 @@ def as_yaml(proposed: Guess, recording: Recording) -> str:
     lines = [
         f"# Proposed for {recording.path.name} by `memmlp data skeleton guess`.",
         "# Check it with `memmlp data skeleton show` before you use it.",
-        f"name: {_scalar(skeleton.name)}",
+        f"name: {json.dumps(skeleton.name)}",
+        "unit: auto",
+        "up: auto",
     ]
-    unit = up = ""
-    try:
-        settled = find_unit_and_up(recording, skeleton)
-        if settled.unit is not None:
-            unit, up = f"  # in this file {settled.unit:.4g} m", f"  # in this file {settled.up}"
-    except InputError as error:
-        lines.append(f"# In doubt: {str(error).removeprefix(f'{recording.path}: ')}.")
-    lines += [f"unit: auto{unit}", f"up: auto{up}"]
     if skeleton.calibration_frame:
         lines.append("calibration_frame: true  # guessed: frame 0 is far from frame 1")
     lines.append("joints:")
     for joint in (JOINTS[index] for chain in CHAINS for index in chain):
         if joint in skeleton.joints:
             comment = "  # guessed from the tree" if joint in proposed.by_tree else ""
-            lines.append(f"  {joint}: {_scalar(skeleton.joints[joint])}{comment}")
+            lines.append(f"  {joint}: {json.dumps(skeleton.joints[joint])}{comment}")
         else:
             required = "is required: add it by hand" if joint in proposed.missing else "has no counterpart"
             lines.append(f"  # {joint} {required}.")
     return "\n".join(lines) + "\n"
-
-
-def _scalar(text: str) -> str:
-    """Return a text as a YAML scalar that is read back as text."""
-    plain = yaml.safe_dump(text, width=1000, allow_unicode=True).splitlines()[0]
-    return plain if yaml.safe_load(plain) == text else json.dumps(text)
 
 
 def write_map(path: Path, text: str) -> None:
@@ -227,6 +215,6 @@ def write_map(path: Path, text: str) -> None:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
-        raise InputError(f"--out {path}: the file exists already; expected a new file") from None
+        raise InputError(f"--out {path}: exists already; must be a new file") from None
     except OSError as error:
-        raise InputError(f"--out {path}: {error.strerror}; expected a new file") from None
+        raise InputError(f"--out {path}: cannot be written ({error.strerror})") from None

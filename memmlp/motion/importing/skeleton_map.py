@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from itertools import takewhile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -38,10 +39,9 @@ class SkeletonMap:
         unit: the file's unit in metres, None if it is to be found from the legs.
         up: the file's up axis, `y` or `z`, None if it is to be found from the motion.
         calibration_frame: whether frame 0 is a calibration pose, not motion.
-        rest: the pose in which the person stands, from which the skeleton is read: `auto` (the zero pose if
-            the person stands in it, else the straightest frame), a frame's number, or the rotation values,
-            degrees, of joints as in a frame of the file.
-        note: advice for users who import such files.
+        rest: the pose in which the person stands, from which the skeleton is read: the rotation values,
+            degrees, of joints as in a frame of the file; None for the zero pose if the person stands in it,
+            else the straightest frame.
     """
 
     name: str
@@ -49,8 +49,7 @@ class SkeletonMap:
     unit: float | None = None
     up: str | None = None
     calibration_frame: bool = False
-    rest: str | int | dict[str, list[float]] = AUTO
-    note: str = ""
+    rest: dict[str, list[float]] | None = None
 
     def with_up(self, up: str | None) -> SkeletonMap:
         """Return the map with an up axis, `y` or `z`, that the user gave; None changes nothing."""
@@ -76,7 +75,7 @@ def load_skeleton(which: str) -> SkeletonMap:
     path = SKELETONS / f"{which}.yaml" if which in shipped_skeletons() else Path(which)
     if not path.is_file():
         known = ", ".join(shipped_skeletons())
-        raise InputError(f"skeleton={which}: must be one of {known}, or the path of a YAML map")
+        raise InputError(f"--skeleton {which}: must be one of {known}, or the path of a YAML map")
     try:
         content = yaml.load(path.read_text("utf-8"), _StrictLoader)
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
@@ -89,14 +88,14 @@ def find_skeleton(recording: Recording, chosen: SkeletonMap | None = None) -> Sk
 
     Of maps with equally many nodes, the one that finds unit and up axis in the file is preferred. Spellings
     and namespaces may differ (`find_nodes`); the returned map has the file's spellings. A map that the user
-    chose is returned with the file's spellings, too, or unchanged if the file lacks some of its nodes.
+    chose is returned with the file's spellings, or unchanged if the file lacks some of its nodes.
 
     Raises:
         InputError: if no map fits, or several fit equally well.
     """
     if chosen is not None:
         return _respell(chosen, recording) or chosen
-    maps = _shipped_maps(SKELETONS)
+    maps = _load_shipped(SKELETONS)
     fitting = [fitted for skeleton in maps if (fitted := _respell(skeleton, recording)) is not None]
 
     def rank(skeleton: SkeletonMap) -> tuple[int, int]:
@@ -111,26 +110,24 @@ def find_skeleton(recording: Recording, chosen: SkeletonMap | None = None) -> Sk
     names = [name for name in recording.nodes if not name.endswith(END)]
     listed = ", ".join(names[:60]) + (", ..." if len(names) > 60 else "")
     raise InputError(
-        f"{recording.path}: {problem} with the joints {listed}; expected {known}, or a map by skeleton="
+        f"{recording.path}: {problem} with the joints {listed}; expected {known}, or a map by --skeleton"
     )
 
 
 @cache
-def _shipped_maps(folder: Path) -> tuple[SkeletonMap, ...]:
+def _load_shipped(folder: Path) -> tuple[SkeletonMap, ...]:
     """Load the maps of the package's folder once: reading YAML takes longer than importing a short clip."""
-    return tuple(load_skeleton(name) for name in shipped_skeletons())
+    return tuple(load_skeleton(path.stem) for path in sorted(folder.glob("*.yaml")))
 
 
 def _respell(skeleton: SkeletonMap, recording: Recording) -> SkeletonMap | None:
     """Return a map with its nodes spelt as in the file; None if the file lacks one of them."""
-    rest = skeleton.rest if isinstance(skeleton.rest, dict) else {}
+    rest = skeleton.rest or {}
     nodes = find_nodes(recording.nodes, sorted({*skeleton.joints.values(), *rest}))
     if nodes is None:
         return None
     joints = {joint: nodes[node] for joint, node in skeleton.joints.items()}
-    return replace(
-        skeleton, joints=joints, rest={nodes[n]: turns for n, turns in rest.items()} or skeleton.rest
-    )
+    return replace(skeleton, joints=joints, rest={nodes[node]: rest[node] for node in rest} or None)
 
 
 # Names of nodes
@@ -192,21 +189,19 @@ def _parse(path: Path, content: object) -> SkeletonMap:
         if not good:
             raise InputError(f"{path}: {key}: must be {expected}")
 
-    required, optional = ("name", "joints"), ("unit", "up", "calibration_frame", "rest", "note")
+    required, optional = ("name", "joints"), ("unit", "up", "calibration_frame", "rest")
     if not isinstance(content, dict) or not set(required) <= set(content) <= {*required, *optional}:
         raise InputError(f"{path}: the keys must be {', '.join(required)}, and any of {', '.join(optional)}")
-    values = {"unit": AUTO, "up": AUTO, "calibration_frame": False, "rest": AUTO, "note": "", **content}
+    values: dict[str, Any] = {key: None if value == AUTO else value for key, value in content.items()}
     require(_is_text(values["name"]), "name", "text")
-    good_unit = values["unit"] == AUTO or is_number(values["unit"], 1e-6, 1e3)
-    require(good_unit, "unit", "a number of metres from 1e-6 to 1000, or auto")
-    require(values["up"] in ("y", "z", AUTO), "up", "y, z or auto")
-    require(isinstance(values["calibration_frame"], bool), "calibration_frame", "true or false")
-    rest = "auto, a frame's number, or JOINT: [degrees, degrees, degrees]"
-    require(_is_rest(values["rest"]), "rest", rest)
-    require(values["note"] == "" or _is_text(values["note"]), "note", "text")
-    joints = values["joints"]
-    if not isinstance(joints, dict):
-        raise InputError(f"{path}: joints: must map {', '.join(JOINTS)} to the file's joints")
+    unit, joints = values.get("unit"), values["joints"] or {}
+    require(
+        unit is None or is_number(unit, 1e-6, 1e3), "unit", "a number of metres from 1e-6 to 1000, or auto"
+    )
+    require(values.get("up") in ("y", "z", None), "up", "y, z or auto")
+    require(isinstance(values.get("calibration_frame", False), bool), "calibration_frame", "true or false")
+    require(_is_rest(values.get("rest")), "rest", "auto, or JOINT: [degrees, degrees, degrees]")
+    require(isinstance(joints, dict), "joints", f"a mapping of {', '.join(JOINTS)} to the file's joints")
     for joint, node in joints.items():
         known = joint in JOINTS and _is_text(node)
         require(known, f"joints.{joint}", f"a joint of the file for one of {', '.join(JOINTS)}")
@@ -214,16 +209,17 @@ def _parse(path: Path, content: object) -> SkeletonMap:
         require(joint in joints, f"joints.{joint}", "the name of a joint; it is required")
     node, count = Counter(joints.values()).most_common(1)[0]
     require(count == 1, f"joints: {node}", "named once")
-    unit, up = (None if values[key] == AUTO else values[key] for key in ("unit", "up"))
-    return SkeletonMap(**{**values, "unit": unit, "up": up})
+    return SkeletonMap(**values)
 
 
 def _is_rest(value: object) -> bool:
-    if not isinstance(value, dict):
-        return value == AUTO or (isinstance(value, int) and not isinstance(value, bool) and value >= 0)
-    return bool(value) and all(
-        _is_text(node) and isinstance(turns, list) and all(is_number(turn, -360, 360) for turn in turns)
-        for node, turns in value.items()
+    return value is None or (
+        isinstance(value, dict)
+        and value != {}
+        and all(
+            _is_text(node) and isinstance(turns, list) and all(is_number(turn, -360, 360) for turn in turns)
+            for node, turns in value.items()
+        )
     )
 
 

@@ -14,7 +14,7 @@ from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS
 from memmlp.motion.clip import LINES, Clip, Skipped, resample
 from memmlp.motion.formats.npz import NoMotion, read_clip
-from memmlp.motion.plausibility import check_plausible, why_unusual
+from memmlp.motion.plausibility import check_plausible
 from memmlp.motion.preparing.duplicates import (
     Marks,
     find_resampled_copies,
@@ -82,7 +82,7 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
         try:
             _check_name(path, file, clips)
             clip = read_clip(path, name)
-            check_plausible(path, clip)
+            faults = check_plausible(path, clip)
             resampled, how = resample(clip, interpolation=LINES)  # the survey is the same with either
             if len(resampled) < min_frames:
                 few = f"{len(resampled)} frames at {FPS} Hz"
@@ -98,7 +98,7 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
             digests = file_digest(path), _content_digest(clip)
             clips[name] = ClipRecord(name, file, "", "", 0, len(resampled) - 1, *digests, clip.fps, how)
             firsts[name], marks[name] = first_frames(clip), mark_frames(resampled)
-            odd |= {name: reason} if (reason := why_unusual(clip)) else {}
+            odd |= {name: faults} if faults else {}
     records = list(clips.values())
     records = merge_contents(records, find_resampled_copies(root, records, firsts))
     records = merge_contents(records, find_shared_stretches(root, records, marks))

@@ -249,7 +249,7 @@ def test_damage_is_named(tmp_path: Path, damage: str) -> None:
 
 def test_bytes_that_are_no_text(tmp_path: Path) -> None:
     assert "0xff" in refusal(write(tmp_path, SMALL.encode().replace(b"knee", b"kn\xffe")))
-    assert "line 20" in refusal(write(tmp_path, SMALL.encode().replace(b" 8", b" \xb2")))
+    assert "0xb2" in refusal(write(tmp_path, SMALL.encode().replace(b" 8", b" \xb2")))
     refusal(write(tmp_path, np.random.default_rng(0).bytes(5000)))
     refusal(write(tmp_path, b"\0" * 5000))
     refusal(write(tmp_path, b""))
@@ -258,18 +258,6 @@ def test_bytes_that_are_no_text(tmp_path: Path) -> None:
 def test_files_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("memmlp.motion.formats.bvh.MAX_BYTES", len(SMALL) - 1)
     assert "too large" in refusal(write(tmp_path, SMALL))
-
-
-@pytest.mark.parametrize(
-    ("limit", "value", "said"),
-    [("MAX_HEAD", 50, "no MOTION line"), ("MAX_LINE", 20, "line 5: too long"),
-     ("MAX_VALUES", 5, "too many frames")],
-)  # fmt: skip
-def test_what_is_read_is_bounded(
-    limit: str, value: int, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(f"memmlp.motion.formats.bvh.{limit}", value)
-    assert said in refusal(write(tmp_path, SMALL))
 
 
 def test_deep_and_wide_hierarchies(tmp_path: Path) -> None:

@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bvh_samples import person
-from mutations import mutated, sound_expmap, sound_npz
+from mutations import mutated, sound_npz
 
 from memmlp.common.errors import InputError, one_line
 from memmlp.motion.formats.bvh import read_bvh
-from memmlp.motion.formats.expmap import read_expmap
 from memmlp.motion.formats.npz import read_clip
 
 MOST = 50e6  # bytes while a file of at most 60 kB is read
@@ -29,7 +28,6 @@ FORMATS: dict[str, tuple[Callable[[], bytes], Callable[[Path], np.ndarray]]] = {
         lambda: person("cmu_motionbuilder", frames=5, seed=0).text().encode(),
         lambda path: read_bvh(path).kinematics()[1],
     ),
-    "a.txt": (sound_expmap, lambda path: read_expmap(path).kinematics()[1]),
 }
 
 

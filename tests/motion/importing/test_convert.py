@@ -1,4 +1,4 @@
-"""Whole imports beside the text of their files, posed by plain NumPy: real families and turned zero poses."""
+"""Recordings to clips: segments point as in the file; axes, scale, stances, floors."""
 
 from __future__ import annotations
 
@@ -8,7 +8,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bvh_samples import own_tree, performed, random_turns, refuse, rest_turns, write
+from bvh_samples import (
+    TREES,
+    Sample,
+    body_rotations,
+    own_tree,
+    performed,
+    person,
+    random_turns,
+    read,
+    refuse,
+    rest_turns,
+    tree,
+    write,
+)
 from plain_kinematics import bvh_positions, to_world, worst_direction, worst_distance
 from scipy.spatial.transform import Rotation
 from skeleton_families import walking as walking_sample
@@ -17,36 +30,37 @@ from memmlp.motion.body import JOINTS, builtin_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.bvh import Bvh, read_bvh
 from memmlp.motion.formats.npz import write_clip
+from memmlp.motion.formats.recording import END
 from memmlp.motion.geometry import clip_kinematics
+from memmlp.motion.importing.anatomy import segments
 from memmlp.motion.importing.convert import (
     JUMP,
+    NONE,
+    STRAIGHTEST,
     UNITS,
     Converted,
-    StanceView,
+    Stance,
     convert,
     find_floor,
+    find_stance,
     find_unit_and_up,
     first_step,
+    fit,
     view_stance,
 )
-from memmlp.motion.importing.skeleton_map import (
-    Z_UP,
-    SkeletonMap,
-    find_skeleton,
-    load_skeleton,
-    shipped_skeletons,
-)
+from memmlp.motion.importing.skeleton_map import Z_UP, SkeletonMap, find_skeleton, load_skeleton, pick_joints
 from memmlp.motion.synthetic import synthesize_clip
 
 REST = builtin_rest_joints()
+JOINT = {name: index for index, name in enumerate(JOINTS)}
 DATA = Path(__file__).parents[3] / ".." / "shared" / "data"
 CMU = [DATA / "cmu" / name for name in ("salsa/15.bvh", "indian/04.bvh", "martial/03.bvh")]
-BANDAI = DATA / "bandai-namco" / "bandai-1.tar.xz"
+BANDAI_CLIPS = DATA / "bandai-namco" / "bandai-1.tar.xz"
 MM, DEGREES = 1.0, 3.0  # the largest errors that an import may have
 
 
 def imported(path: Path, chosen: SkeletonMap) -> Converted:
-    return convert(read_bvh(path), chosen, REST, name=path.stem)
+    return convert(read_bvh(path), chosen, REST, name=path.stem, fps=120.0)
 
 
 def check(path: Path, chosen: SkeletonMap, unit: float, up: str) -> Converted:
@@ -77,9 +91,9 @@ def test_cmu_as_in_the_file(tmp_path: Path, path: Path) -> None:
 
 @pytest.mark.slow
 def test_bandai_namco_as_in_the_file(tmp_path: Path) -> None:
-    if not BANDAI.is_file():
+    if not BANDAI_CLIPS.is_file():
         pytest.skip("Bandai-Namco's clips are not here")
-    with tarfile.open(BANDAI) as archive:
+    with tarfile.open(BANDAI_CLIPS) as archive:
         members = [member for _, member in zip(range(40), archive, strict=False) if member.isfile()]
         paths = [write(tmp_path, archive.extractfile(m).read(), Path(m.name).name) for m in members[::13]]  # type: ignore[union-attr]
     assert len(paths) >= 3
@@ -91,44 +105,27 @@ def test_bandai_namco_as_in_the_file(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def walking() -> Clip:
-    return synthesize_clip("walking", 1, seconds=1.5)
+def walk() -> Clip:
+    return synthesize_clip("walking", 1, seconds=1.0)
 
 
-@pytest.mark.parametrize("skeleton", shipped_skeletons())
-def test_any_zero_pose_is_as_in_the_file(tmp_path: Path, walking: Clip, skeleton: str) -> None:
+@pytest.mark.parametrize("skeleton", ["bandai_namco", "cmu_daz", "cmu_motionbuilder", "mixamo", "smpl_words"])
+def test_any_zero_pose_is_as_in_the_file(tmp_path: Path, walk: Clip, skeleton: str) -> None:
     chosen = load_skeleton(skeleton)
     sample = own_tree(chosen)
-    given = isinstance(chosen.rest, dict)
+    given = chosen.rest is not None
     turns = rest_turns(chosen, sample) if given else random_turns(sample, 1)
-    path = write(tmp_path, performed(chosen, walking, turns=turns).text())
+    path = write(tmp_path, performed(chosen, walk, turns=turns).text())
     converted = check(path, chosen, chosen.unit or 0.01, chosen.up or "y")
     assert converted.fidelity.faults == ()
-    assert ("frame" in converted.stance) == (not given)
-
-
-@pytest.mark.parametrize("skeleton", ["cmu_daz", "mixamo"])
-def test_the_zero_pose_does_not_matter(tmp_path: Path, walking: Clip, skeleton: str) -> None:
-    """Where both are read from the same frame."""
-    chosen = replace(load_skeleton(skeleton), rest=20)
-    plain = write(tmp_path, performed(chosen, walking).text(), "plain.bvh")
-    turns = random_turns(own_tree(chosen), 5)
-    turned = write(tmp_path, performed(chosen, walking, turns=turns).text(), "turned.bvh")
-    expected, found = imported(plain, chosen).clip, imported(turned, chosen).clip
-    np.testing.assert_allclose(found.trans, expected.trans, atol=1e-6)
-    np.testing.assert_allclose(found.poses, expected.poses, atol=1e-5)
+    assert ("frame" in converted.fitted.stance.source) == (not given)
 
 
 # Units and up axes: told, found, or refused
 
 
-TOLD = replace(load_skeleton("cmu_daz"), calibration_frame=False)
-FOUND = replace(TOLD, unit=None, up=None)
-
-
-@pytest.fixture(scope="module")
-def walk() -> Clip:
-    return synthesize_clip("walking", 1, seconds=1.0)
+DAZ = replace(load_skeleton("cmu_daz"), calibration_frame=False)
+FOUND = replace(DAZ, unit=None, up=None)
 
 
 def file(folder: Path, chosen: SkeletonMap, clip: Clip, turned: bool = True) -> Bvh:
@@ -139,25 +136,19 @@ def file(folder: Path, chosen: SkeletonMap, clip: Clip, turned: bool = True) -> 
 @pytest.mark.parametrize("unit", UNITS)
 def test_unit_and_up_are_found(tmp_path: Path, walk: Clip, unit: float) -> None:
     up = "z" if unit < 0.02 else "y"
-    settled = find_unit_and_up(file(tmp_path, replace(TOLD, unit=unit, up=up), walk), FOUND)
+    settled = find_unit_and_up(file(tmp_path, replace(DAZ, unit=unit, up=up), walk), FOUND)
     assert (settled.unit, settled.up) == (unit, up)
 
 
-def test_what_is_told_counts(tmp_path: Path, walk: Clip) -> None:
-    assert find_unit_and_up(file(tmp_path, TOLD, walk), replace(TOLD, up="z", unit=0.012)).up == "z"
-    assert find_unit_and_up(file(tmp_path, TOLD, walk), replace(TOLD, up="z", unit=0.012)).unit == 0.012
-
-
-@pytest.mark.parametrize("unit", [0.3048, 10.0])
-def test_an_unknown_unit_is_refused(tmp_path: Path, walk: Clip, unit: float) -> None:
-    with refuse(tmp_path / "clip.bvh", "the legs are"):
-        find_unit_and_up(file(tmp_path, replace(TOLD, unit=unit), walk), FOUND)
-
-
-@pytest.mark.parametrize("unit", [1.0, 0.001])
-def test_a_wrong_unit_is_refused(tmp_path: Path, walk: Clip, unit: float) -> None:
-    with refuse(tmp_path / "clip.bvh", f"unit={unit:g}"):
-        find_unit_and_up(file(tmp_path, TOLD, walk), replace(TOLD, unit=unit))
+def test_a_given_unit_and_axis_count_and_impossible_units_are_refused(tmp_path: Path, walk: Clip) -> None:
+    given = find_unit_and_up(file(tmp_path, DAZ, walk), replace(DAZ, up="z", unit=0.012))
+    assert (given.up, given.unit) == ("z", 0.012)
+    for unit in (0.3048, 10.0):
+        with refuse(tmp_path / "clip.bvh", "the legs are"):
+            find_unit_and_up(file(tmp_path, replace(DAZ, unit=unit), walk), FOUND)
+    for unit in (1.0, 0.001):
+        with refuse(tmp_path / "clip.bvh", f"unit={unit:g}"):
+            find_unit_and_up(file(tmp_path, DAZ, walk), replace(DAZ, unit=unit))
 
 
 @pytest.mark.parametrize("axis", ["x", "-y"])
@@ -166,7 +157,7 @@ def test_another_up_axis_is_refused(tmp_path: Path, walk: Clip, axis: str) -> No
     poses = walk.poses.astype(float)
     poses[:, 0] = (Rotation.from_rotvec(turn) * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
     with refuse(tmp_path / "clip.bvh", "no up axis found"):
-        find_unit_and_up(file(tmp_path, TOLD, replace(walk, poses=poses)), FOUND)
+        find_unit_and_up(file(tmp_path, DAZ, replace(walk, poses=poses)), FOUND)
 
 
 def lying(clip: Clip, head: str) -> Clip:
@@ -181,25 +172,24 @@ def lying(clip: Clip, head: str) -> Clip:
 def test_who_lies_in_a_file_whose_zero_pose_stands_lies(
     tmp_path: Path, walk: Clip, up: str, head: str
 ) -> None:
-    chosen = replace(TOLD, up=up)
+    chosen = replace(DAZ, up=up)
     assert find_unit_and_up(file(tmp_path, chosen, lying(walk, head), turned=False), FOUND).up == up
 
 
 def test_a_zero_pose_and_a_motion_of_two_minds_are_refused(tmp_path: Path, walk: Clip) -> None:
     """It may be a person who lies, or one who walks while only the root's rotation has Z up."""
-    bvh = file(tmp_path, TOLD, lying(walk, "z"), turned=False)
+    bvh = file(tmp_path, DAZ, lying(walk, "z"), turned=False)
     with refuse(tmp_path / "clip.bvh", "stands along y in the zero pose", "along z in the motion", "--up y"):
         find_unit_and_up(bvh, FOUND)
     assert [find_unit_and_up(bvh, replace(FOUND, up=up)).up for up in "yz"] == ["y", "z"]
     upside_down = lying(lying(walk, "z"), "z")
     with refuse(tmp_path / "clip.bvh", "no up axis found"):
-        find_unit_and_up(file(tmp_path, TOLD, upside_down, turned=False), FOUND)
+        find_unit_and_up(file(tmp_path, DAZ, upside_down, turned=False), FOUND)
 
 
 # The floor under people who stand, climb, jump, lie and fly
 
 
-REST = builtin_rest_joints()
 FEET = [JOINTS.index("left_foot"), JOINTS.index("right_foot")]
 
 
@@ -210,9 +200,8 @@ def standing(frames: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("activity", ["walking", "jumping", "sitting"])
-@pytest.mark.parametrize("height", [1.3])
-def test_the_floor_of_people(activity: str, height: float) -> None:
-    clip = synthesize_clip(activity, 2, seconds=4.0)
+def test_the_floor_of_people(activity: str) -> None:
+    height, clip = 1.3, synthesize_clip(activity, 2, seconds=4.0)
     positions = clip_kinematics(replace(clip, poses=clip.poses.astype(float)), REST)[1]
     found = find_floor(positions + np.array([0, 0, height]), 60.0)
     assert found == pytest.approx(height, abs=0.02)
@@ -266,23 +255,16 @@ def test_what_is_short_or_hardly_moves_has_none():
     assert first_step(replace(sample, values=nearly).hierarchy()) == 0.0
 
 
-# The stance that is shown: the one that importing reads, with all nodes, and the body as it stands alike
-
-
-REST = builtin_rest_joints()
-
-
-def stance(folder: Path, name: str, turned: bool) -> StanceView:
-    bvh = read_bvh(write(folder, walking_sample(name, turned).text()))
-    return view_stance(bvh, find_skeleton(bvh), REST)
+# The stance that is shown: the one that importing reads, with all nodes, and the body in it
 
 
 @pytest.mark.parametrize(
     ("name", "turned", "source"),
-    [("mixamo", False, "zero pose"), ("lafan1", True, "straightest"), ("cmu_daz", False, "zero pose")],
+    [("mixamo", False, "zero pose"), ("lafan1", True, "straightest")],
 )
 def test_the_body_stands_as_the_file_does(tmp_path: Path, name: str, turned: bool, source: str):
-    found = stance(tmp_path, name, turned)
+    bvh = read_bvh(write(tmp_path, walking_sample(name, turned).text()))
+    found = view_stance(bvh, find_skeleton(bvh), REST)
     assert source in found.source
     assert found.positions.shape == (len(found.nodes), 3)
     for start, end in (("left_hip", "left_knee"), ("right_elbow", "right_wrist"), ("neck", "head")):
@@ -292,3 +274,261 @@ def test_the_body_stands_as_the_file_does(tmp_path: Path, name: str, turned: boo
     hips = found.positions[found.mapped["left_hip"]] - found.positions[found.mapped["right_hip"]]
     assert hips[0] > 0
     assert abs(hips[2]) < 1e-6
+
+
+def to_clip(bvh: Bvh, chosen: SkeletonMap, rest: np.ndarray = REST) -> Clip:
+    """The clip, its floor as in the file."""
+    return convert(bvh, chosen, rest, name="clip", fps=120.0, floor=NONE).clip
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def to_z_up(vectors: np.ndarray) -> np.ndarray:
+    return np.stack([vectors[..., 0], -vectors[..., 2], vectors[..., 1]], -1)
+
+
+# Directions
+
+
+@pytest.mark.parametrize("skeleton", TREES)
+def test_segments_point_as_in_the_file(tmp_path: Path, skeleton: str) -> None:
+    """Exactly, and though the unmapped joints between mapped ones turn too."""
+    bvh, chosen = read(tmp_path, skeleton, folded=True), load_skeleton(skeleton)
+    positions = to_z_up(bvh.kinematics()[1])[1:]
+    body = clip_kinematics(to_clip(bvh, chosen), REST)[1]
+    mapped = np.array([name in chosen.joints for name in JOINTS])
+    pairs = [segment for segment in segments(mapped) if segment.start > 0]
+    for joint, child in (*pairs, (JOINT["right_hip"], JOINT["left_hip"])):
+        start, end = (bvh.nodes.index(chosen.joints[JOINTS[index]]) for index in (joint, child))
+        if np.linalg.norm(bvh.zero_pose()[end] - bvh.zero_pose()[start]) < 1e-6:
+            continue
+        expected = unit(positions[:, end] - positions[:, start])
+        np.testing.assert_allclose(unit(body[:, child] - body[:, joint]), expected, atol=1e-9)
+
+
+def test_another_body_keeps_limbs_too(tmp_path: Path) -> None:
+    rest = REST * [1.2, 0.8, 1.1] + [0.1, -0.2, 0.3]
+    rest[JOINT["left_elbow"], 1] -= 0.1
+    bvh, chosen = read(tmp_path, "cmu_daz"), load_skeleton("cmu_daz")
+    body = clip_kinematics(to_clip(bvh, chosen, rest), rest)[1]
+    positions = to_z_up(bvh.kinematics()[1])[1:]
+    start, end = bvh.nodes.index("lShldr"), bvh.nodes.index("lForeArm")
+    hips = [bvh.nodes.index("lThigh"), bvh.nodes.index("rThigh")]
+    middle = positions[:, hips].mean(1) * chosen.unit * fit(bvh, chosen, rest).scale
+    np.testing.assert_allclose(body[:, [1, 2]].mean(1), middle, atol=1e-9)
+    arm = body[:, JOINT["left_elbow"]] - body[:, JOINT["left_shoulder"]]
+    np.testing.assert_allclose(unit(arm), unit(positions[:, end] - positions[:, start]), atol=1e-9)
+
+
+# Axes, scale, calibration
+
+
+@pytest.mark.parametrize("skeleton", TREES)
+def test_a_standing_person_stands(tmp_path: Path, skeleton: str) -> None:
+    """The file's zero pose, on the file's floor: upright in z, facing -y, left on +x, soles on the floor."""
+    sample = person(skeleton, 2, 0)
+    sample.values[:] = 0
+    bvh, chosen = read_bvh(write(tmp_path, sample.text())), load_skeleton(skeleton)
+    toes = bvh.zero_pose()[[bvh.nodes.index(chosen.joints[foot]) for foot in ("left_foot", "right_foot")], 1]
+    sample.values[:, 1] = -toes.mean()
+    clip = to_clip(read_bvh(write(tmp_path, sample.text())), chosen)
+    at = dict(zip(JOINTS, clip_kinematics(clip, REST)[1][0], strict=True))
+    assert 1.3 < at["head"][2] < 1.7
+    assert 0.7 < at["pelvis"][2] - at["left_ankle"][2] < 1.0
+    assert abs(at["left_foot"][2]) < 0.06
+    assert at["left_wrist"][0] > 0.5 and at["right_wrist"][0] < -0.5  # noqa: PT018
+    assert at["left_foot"][1] < at["left_ankle"][1] - 0.05
+    rotations = np.linalg.norm(clip.poses[0], axis=-1)
+    assert rotations[JOINT["pelvis"]] == pytest.approx(np.pi / 2, abs=0.15)
+    assert np.degrees(rotations[1:]).max() < 35
+    wrists = [JOINT["left_wrist"], JOINT["right_wrist"]]
+    np.testing.assert_allclose(rotations[wrists], 0, atol=1e-9)
+
+
+def test_translation_is_scaled_by_the_legs(tmp_path: Path) -> None:
+    sample = person("cmu_daz", 3, 0)
+    sample.values[:] = 0
+    sample.values[2, :3] = [10, 2, -5]
+    bvh = read_bvh(write(tmp_path, sample.text()))
+    legs = [np.linalg.norm(REST[child] - REST[joint]) for joint, child in ((1, 4), (4, 7))]
+    source = np.linalg.norm([0, -36.8, 0.7]) + np.linalg.norm([-0.7, -45.1, -5.1])
+    moved = np.diff(to_clip(bvh, load_skeleton("cmu_daz")).trans, axis=0)[0]
+    np.testing.assert_allclose(moved, np.array([10, 5, 2]) * sum(legs) / source, atol=1e-9)
+
+
+def test_calibration_frame_is_dropped(tmp_path: Path) -> None:
+    bvh, chosen = read(tmp_path, "cmu_daz", frames=6), load_skeleton("cmu_daz")
+    dropped, kept = to_clip(bvh, chosen), to_clip(bvh, replace(chosen, calibration_frame=False))
+    assert (len(dropped), len(kept)) == (5, 6)
+    np.testing.assert_array_equal(dropped.poses, kept.poses[1:])
+    np.testing.assert_array_equal(dropped.trans, kept.trans[1:])
+    with refuse(tmp_path / "clip.bvh", "only the calibration frame"):
+        to_clip(read(tmp_path, "cmu_daz", frames=1), chosen)
+    with refuse(tmp_path / "clip.bvh", "only the calibration frame"):  # from which no up axis is found either
+        to_clip(read(tmp_path, "cmu_daz", frames=1), replace(chosen, up=None))
+
+
+# Motion of people
+
+
+@pytest.mark.parametrize("skeleton", TREES)
+def test_a_performance_comes_back_from_its_file(tmp_path: Path, skeleton: str) -> None:
+    """The embedded motion, written as a file of the skeleton: all joints that it has are where they were."""
+    clip, chosen, sample = (
+        synthesize_clip("reaching", 0, seconds=2.0),
+        load_skeleton(skeleton),
+        tree(skeleton),
+    )
+    corrections = fit(zero_pose(sample), chosen, REST).corrections
+    file = performed(chosen, clip, sample=sample, corrections=corrections)
+    bvh = read_bvh(write(tmp_path, file.text("\r\n")))
+    found = to_clip(bvh, find_skeleton(bvh))
+    assert (len(found), found.fps) == (len(clip), 120)
+    known = [joint for joint, name in enumerate(JOINTS) if not chosen.joints.get(name, END).endswith(END)]
+    turned = body_rotations(found)[:, known].swapaxes(-1, -2) @ body_rotations(clip)[:, known]
+    angles = Rotation.from_matrix(turned.reshape(-1, 3, 3)).magnitude()
+    assert np.degrees(angles.max()) < 0.01
+
+
+def zero_pose(sample: Sample) -> Bvh:
+    return replace(sample, values=np.zeros((2, sample.values.shape[1]))).hierarchy()
+
+
+# The stance from which a skeleton is read, and what is refused by name
+
+
+BANDAI = load_skeleton("bandai_namco")
+ARM = ("collar", "shoulder", "elbow", "wrist")
+LEG = ("hip", "knee", "ankle", "foot")
+
+
+def found(
+    folder: Path, clip: Clip, chosen: SkeletonMap, written: SkeletonMap = DAZ, turns: np.ndarray | None = None
+) -> Stance:
+    """The stance of a file written by one map and read by another."""
+    bvh = read_bvh(write(folder, performed(written, clip, turns=turns).text()))
+    return find_stance(bvh, chosen, pick_joints(bvh, chosen))
+
+
+def whole(turn: Rotation) -> np.ndarray:
+    """A zero pose turned as a whole."""
+    return np.tile(turn.as_matrix(), (len(own_tree(DAZ).names), 1, 1))
+
+
+@pytest.mark.parametrize("degrees", [180, -37])
+def test_a_zero_pose_that_stands_serves(tmp_path: Path, walk: Clip, degrees: float) -> None:
+    """Whichever way it faces, it is turned to face +Z."""
+    stance = found(tmp_path, walk, DAZ, turns=whole(Rotation.from_euler("y", degrees, degrees=True)))
+    assert (stance.source, stance.straight) == ("the zero pose", True)
+    left = stance.positions[1] - stance.positions[2]
+    np.testing.assert_allclose(left / np.linalg.norm(left), [1, 0, 0], atol=1e-6)
+    assert (stance.positions[10] - stance.positions[7])[2] > 0
+
+
+@pytest.mark.parametrize(("axis", "degrees"), [("x", 90), ("z", 180)])
+def test_a_zero_pose_that_lies_does_not_serve(tmp_path: Path, walk: Clip, axis: str, degrees: float) -> None:
+    stance = found(tmp_path, walk, DAZ, turns=whole(Rotation.from_euler(axis, degrees, degrees=True)))
+    assert stance.source.startswith(STRAIGHTEST)
+    assert not stance.straight
+
+
+def test_a_runner_whose_feet_point_back_is_no_stance(tmp_path: Path, walk: Clip) -> None:
+    """The next straightest frame serves."""
+    turns = random_turns(own_tree(DAZ), 1)
+    first = found(tmp_path, walk, DAZ, turns=turns)
+    bvh = read_bvh(tmp_path / "clip.bvh")
+    mapped_motion = pick_joints(bvh, DAZ)
+    frame = int(first.source.split()[-1])
+    for ankle, toes in ((7, 10), (8, 11)):
+        foot = mapped_motion.positions[frame, toes] - mapped_motion.positions[frame, ankle]
+        mapped_motion.positions[frame, toes] -= 2 * foot * [1, 0, 1]
+    other = find_stance(bvh, DAZ, mapped_motion)
+    assert other.source.startswith(STRAIGHTEST)
+    assert other.source != first.source
+
+
+def test_who_never_stands_is_refused(tmp_path: Path, walk: Clip) -> None:
+    turns = random_turns(own_tree(DAZ), 1)
+    with refuse(tmp_path / "clip.bvh", "stands neither in the zero pose (", "nor in any frame (at best, "):
+        found(tmp_path, lying(walk, "z"), DAZ, turns=turns)
+    assert found(tmp_path, lying(walk, "z"), DAZ).source == "the zero pose"
+
+
+def test_a_wrong_up_axis_is_refused(tmp_path: Path, walk: Clip) -> None:
+    with refuse(tmp_path / "clip.bvh", "degrees from up"):
+        found(tmp_path, walk, replace(DAZ, up="z"))
+    with refuse(tmp_path / "clip.bvh", "degrees from up"):
+        found(tmp_path, walk, DAZ, written=replace(DAZ, up="z"))
+
+
+# Left and right
+
+
+def swapped(chosen: SkeletonMap, parts: tuple[str, ...]) -> SkeletonMap:
+    """The map with the left ones of some joints for the right ones."""
+    other = {"left": "right", "right": "left"}
+    joints = {}
+    for joint in chosen.joints:
+        side, _, part = joint.partition("_")
+        joints[joint] = chosen.joints[f"{other[side]}_{part}" if part in parts else joint]
+    return replace(chosen, joints=joints)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize(
+    ("parts", "said"),
+    [
+        ((*ARM, *LEG), "the feet point backward, so left and right may be swapped"),
+        (ARM, "the left shoulder is on the side of the right hip"),
+        (LEG, "the left shoulder is on the side of the right hip"),
+    ],
+)
+def test_swapped_sides_are_refused(
+    tmp_path: Path, walk: Clip, parts: tuple[str, ...], said: str, turned: bool
+) -> None:
+    turns = random_turns(own_tree(DAZ), 1) if turned else None
+    if turned and "hip" in parts:
+        said = "bends forward: left and right"
+    with refuse(tmp_path / "clip.bvh", said):
+        found(tmp_path, walk, swapped(DAZ, parts), turns=turns)
+
+
+def test_joints_of_a_leg_that_stand_for_others_are_refused(tmp_path: Path, walk: Clip) -> None:
+    """The ankle as a knee makes a leg that bends forward."""
+    joints = DAZ.joints | {"left_knee": "lFoot", "left_ankle": "lFoot.end"}
+    del joints["left_foot"]
+    with refuse(tmp_path / "clip.bvh", "left_knee bends forward: left and right, or the joints of the leg"):
+        found(tmp_path, walk, replace(DAZ, joints=joints))
+
+
+# A map's rest
+
+
+def leaning(degrees: float) -> list[float]:
+    """The spine's rotation values in the map's rest, leaning forward."""
+    assert BANDAI.rest is not None
+    hips, spine = (Rotation.from_euler("ZXY", BANDAI.rest[name], degrees=True) for name in ("Hips", "Spine"))
+    lean = Rotation.from_euler("x", degrees, degrees=True)
+    return (hips.inv() * lean * hips * spine).as_euler("ZXY", degrees=True).tolist()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"Spine": leaning(80.0)}, "pelvis to head is 7"),
+        ({"Hips": [0.0, 0.0, 0.0]}, "rest of skeleton bandai_namco"),
+        ({"Foot_R": [-0.6, 186.9, -65.9], "Foot_L": [-0.6, 186.9, -65.9]}, "the feet point backward"),
+        ({"Spine": [90.0, 86.2]}, "rest.Spine has 2 values"),
+    ],
+)
+def test_a_folded_pose_of_a_map_is_refused(
+    tmp_path: Path, walk: Clip, change: dict[str, list[float]], said: str
+) -> None:
+    """Bones along their parents' X axes, as the data's are, in the map's rest but for one joint."""
+    assert BANDAI.rest is not None
+    turns = rest_turns(BANDAI, own_tree(BANDAI))
+    chosen = replace(BANDAI, rest={**BANDAI.rest, **change})
+    with refuse(tmp_path / "clip.bvh", said):
+        found(tmp_path, walk, chosen, BANDAI, turns)

@@ -24,7 +24,7 @@ JOINT = {name: index for index, name in enumerate(JOINTS)}
 
 
 def converted(path: Path, chosen: SkeletonMap) -> Converted:
-    return convert(read_bvh(path), chosen, REST, name="clip")
+    return convert(read_bvh(path), chosen, REST, name="clip", fps=120.0)
 
 
 @pytest.mark.parametrize("skeleton", TREES)
@@ -45,15 +45,8 @@ def walk(tmp_path: Path) -> Converted:
 
 def test_a_right_import_has_no_fault(walk: Converted) -> None:
     assert walk.fidelity.faults == ()
-    again = compare(walk.clip, walk.motion, REST, "cmu_daz")
+    again = compare(walk.clip, walk.fitted.motion, REST, "cmu_daz")
     assert again == walk.fidelity
-
-
-@pytest.mark.parametrize("place", [(60, 0, 0), (0, -60, 0)], ids=str)
-def test_feet_point_forward_wherever_the_walk_is(walk: Converted, place: tuple[float, float, float]) -> None:
-    elsewhere = replace(walk.clip, trans=walk.clip.trans + np.array(place))
-    faults = compare(elsewhere, walk.motion, REST, "cmu_daz").faults
-    assert not any("feet" in fault for fault in faults)
 
 
 def bent(clip: Clip, joint: str, frame: int | slice, vector: list[float]) -> Clip:
@@ -72,7 +65,7 @@ def bent(clip: Clip, joint: str, frame: int | slice, vector: list[float]) -> Cli
 )
 def test_a_joint_that_is_off_in_one_frame_is_named(walk: Converted, joint: str, segment: str) -> None:
     clip = bent(walk.clip, joint, 31, [0.0, 0.1, 0.25])
-    fidelity = compare(clip, walk.motion, REST, "cmu_daz")
+    fidelity = compare(clip, walk.fitted.motion, REST, "cmu_daz")
     assert fidelity.degrees.value > 3
     assert (fidelity.mm.frame, fidelity.degrees.frame) == (31, 31)
     assert any("in frame 31" in fault for fault in fidelity.faults)
@@ -85,20 +78,19 @@ def test_a_joint_that_is_off_in_one_frame_is_named(walk: Converted, joint: str, 
     [
         (lambda c: replace(c, fps=1000.0, trans=20 * c.trans), "the pelvis moves at"),
         (lambda c: bent(c, "head", slice(None), [0.0, np.pi, 0.0]), "the head is turned by"),
-        (lambda c: replace(c, trans=c.trans + np.array([0, 0, 0.7])), "the feet stay 0."),
-        (lambda c: replace(c, trans=c.trans - np.array([0, 0, 0.7])), "m below the floor"),
-        (lambda c: bent(c, "spine1", slice(None), [2.8, 0.0, 0.0]), "the head is below the pelvis in"),
+        (lambda c: replace(c, trans=0 * c.trans), "the lowest joint is at z = -0.9 m"),
+        (lambda c: bent(c, "spine1", slice(None), [2.8, 0.0, 0.0]), "the head is never above the pelvis"),
     ],
 )
 def test_what_no_person_does_is_said(walk: Converted, change: Callable[[Clip], Clip], said: str) -> None:
-    faults = compare(change(walk.clip), walk.motion, REST, "cmu_daz").faults
+    faults = compare(change(walk.clip), walk.fitted.motion, REST, "cmu_daz").faults
     assert any(said in fault for fault in faults)
 
 
 def test_a_head_that_flips_for_a_while_is_said(walk: Converted) -> None:
     """As in CMU's salsa/07, where the head's markers change places; 1 % of the frames is enough."""
     flipped = bent(walk.clip, "head", slice(40, 46), [0.0, 0.0, np.pi])
-    said = compare(flipped, walk.motion, REST, "cmu_daz").faults
+    said = compare(flipped, walk.fitted.motion, REST, "cmu_daz").faults
     assert any(f"{6 / len(flipped):.0%} of the frames, first in frame 40" in fault for fault in said)
 
 
@@ -143,7 +135,7 @@ def test_swapped_sides_without_toes_are_said(tmp_path: Path) -> None:
         if part != "foot":
             joints[joint] = DAZ.joints[f"{other[side]}_{part}" if part else joint]
     said = faults(tmp_path, DAZ, replace(DAZ, joints=joints))
-    assert any(fault.startswith("the knees bend forward in 100%") for fault in said)
+    assert any(fault.startswith("the knees bend backwards") for fault in said)
 
 
 def test_a_small_unit_is_said(tmp_path: Path) -> None:
@@ -161,7 +153,7 @@ def test_a_small_unit_is_said(tmp_path: Path) -> None:
 )
 def test_a_wrong_rest_is_said(tmp_path: Path, joint: str, turn: list[float], said: str) -> None:
     """The map's rest with one joint turned further, about the axes of that joint."""
-    assert isinstance(BANDAI.rest, dict)
+    assert BANDAI.rest is not None
     own = Rotation.from_euler("ZXY", BANDAI.rest[joint], degrees=True)
     values = (own * Rotation.from_euler("ZXY", turn, degrees=True)).as_euler("ZXY", degrees=True).tolist()
     chosen = replace(BANDAI, rest={**BANDAI.rest, joint: values})
