@@ -1,0 +1,322 @@
+"""Reads ASF/AMC, the format of the CMU and HDM05 databases: an AMC has the motion, an ASF the skeleton.
+
+A bone turns about its own axes: its local rotation is C M C^-1, where C is the bone's `axis` and M the
+product of the frame's angles (order X Y Z means Rz Ry Rx, on column vectors, degrees). A node stands at the
+start of each bone and has the bone's rotation; a bone without children also has an end site. Lengths are
+converted to metres: the file's numbers are inches times the factor `length` of its `:units`. Y is up.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from memmlp.common.errors import InputError
+from memmlp.motion.formats.recording import END, Recording
+
+FPS = 120.0  # of both databases, by their indices: the files do not state a frame rate
+INCH = 0.0254  # metres
+LIMIT = 1e6  # the largest size of any number in the files
+MAX_BYTES = 2**28
+ROOT = "root"
+ROTATIONS, POSITIONS = ("rx", "ry", "rz"), ("tx", "ty", "tz")
+
+
+@dataclass(frozen=True)
+class Bone:
+    """A bone of an ASF file.
+
+    Attributes:
+        vector: from its start to its end in the zero pose (3,), metres.
+        axes: the rotation C of its own axes.
+        dofs: its values in a frame, of `rx`, `ry`, `rz` (and `tx`, `ty`, `tz` for the root), in their order.
+    """
+
+    vector: np.ndarray
+    axes: Rotation
+    dofs: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class AsfAmc(Recording):
+    """A take of an ASF/AMC database, in metres. Its nodes are the root, the bones, and then the end sites.
+
+    Attributes:
+        bones: the root and the bones, in the nodes' order; end sites are not included.
+        unit: metres in one of the file's length units.
+        first_frame: the number of the first frame, above 1 in takes that were cut.
+    """
+
+    bones: tuple[Bone, ...]
+    unit: float
+    first_frame: int
+
+    def kinematics(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return global rotations (N, nodes, 3, 3) and positions (N, nodes, 3), metres, of all frames.
+
+        An end site has its bone's rotation.
+        """
+        rotations = np.empty((len(self.nodes), len(self), 3, 3))
+        positions = np.zeros((len(self.nodes), len(self), 3))
+        first = 0
+        for node, parent in enumerate(self.node_parents):
+            above = rotations[parent] if node else np.eye(3)
+            rotations[node], local = above, np.eye(3)
+            if node:
+                positions[node] = positions[parent] + above @ self.offsets[node]
+            if node < len(self.bones):
+                bone = self.bones[node]
+                values = self.values[:, first : first + len(bone.dofs)]
+                first += len(bone.dofs)
+                turns = [column for column, dof in enumerate(bone.dofs) if dof in ROTATIONS]
+                order = "".join(bone.dofs[column][1] for column in turns)
+                if order:
+                    turned = Rotation.from_euler(order, values[:, turns], degrees=True)
+                    local = (bone.axes * turned * bone.axes.inv()).as_matrix()
+                for column, dof in enumerate(bone.dofs):
+                    if dof in POSITIONS:
+                        positions[node, :, POSITIONS.index(dof)] = self.unit * values[:, column]
+            rotations[node] = above @ local
+        return rotations.swapaxes(0, 1), positions.swapaxes(0, 1)
+
+    def pose(self, turns: Mapping[str, Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
+        """Return global rotations (nodes, 3, 3) and positions (nodes, 3) of one pose (`Recording.pose`)."""
+        values: list[float] = []
+        for name, bone in zip(self.nodes, self.bones, strict=False):
+            count = sum(dof in ROTATIONS for dof in bone.dofs)
+            given = list(turns.get(name, [0.0] * count))
+            if len(given) != count:
+                raise InputError(
+                    f"{self.path}: rest.{name} has {len(given)} values; must have {count}, one for each angle"
+                )
+            values += [given.pop(0) if dof in ROTATIONS else 0.0 for dof in bone.dofs]
+        rotations, positions = replace(self, values=np.array([values])).kinematics()
+        return rotations[0], positions[0]
+
+
+# Reading
+
+
+def read_amc(path: Path) -> AsfAmc:
+    """Read a take with its skeleton, which is in the same folder: `05.asf` for `05_01.amc`.
+
+    Raises:
+        InputError: for a missing skeleton, or anything damaged in one of the two files (sections, bones,
+            numbers, a frame without some bone, a gap between frames); the message names the file and where
+            possible the line.
+    """
+    names, parents, bones, unit = _read_asf(find_asf(path))
+    ends = [node for node in range(len(names)) if node not in parents]
+    offsets = [np.zeros(3), *(bones[parent].vector for parent in [*parents[1:], *ends])]
+    widths = {name: len(bone.dofs) for name, bone in zip(names, bones, strict=True) if bone.dofs}
+    first_frame, values = _read_frames(path, widths)
+    return AsfAmc(
+        path=path,
+        nodes=(*names, *(names[node] + END for node in ends)),
+        node_parents=(*parents, *ends),
+        offsets=np.array(offsets),
+        fps=FPS,
+        values=values,
+        bones=tuple(bones),
+        unit=unit,
+        first_frame=first_frame,
+    )
+
+
+def find_asf(path: Path) -> Path:
+    """Return the skeleton of a take: of the folder's ASF files, the one with whose name the take's begins.
+
+    Raises:
+        InputError: if there is none.
+    """
+    files = [file for file in path.parent.glob("*") if file.suffix.lower() == ".asf"]
+    own = [file for file in files if path.stem.lower().startswith(f"{file.stem}_".lower())]
+    if not own:
+        raise InputError(f"{path}: no skeleton beside it; expected {path.stem.partition('_')[0]}.asf")
+    return max(own, key=lambda file: len(file.stem))
+
+
+def _fail(path: Path, line: int, wrong: str, expected: str) -> NoReturn:
+    raise InputError(f"{path}: line {line}: {wrong}; expected {expected}")
+
+
+def _read_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield the numbers and words of a file's lines, without comments and blank lines."""
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{path}: too large; expected at most {MAX_BYTES >> 20} MiB")
+        with open(path, encoding="latin-1") as file:  # comments have names in any encoding
+            for number, line in enumerate(file, start=1):
+                if words := line.partition("#")[0].split():
+                    yield number, words
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); expected an {path.suffix} file"
+        ) from error
+
+
+def _parse_numbers(path: Path, line: int, words: Sequence[str], count: int, key: str) -> list[float]:
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not all(abs(number) <= LIMIT for number in numbers):
+        _fail(path, line, f"{key} {' '.join(words)[:60]}", f"{count} numbers up to {LIMIT:g} in size")
+    return numbers
+
+
+# The skeleton
+
+
+def _read_asf(path: Path) -> tuple[list[str], list[int], list[Bone], float]:
+    """Return the nodes' names and parents, the bones, and metres in a length unit of the file."""
+    sections: dict[str, list[tuple[int, list[str]]]] = {}
+    for line, words in _read_lines(path):
+        if words[0].startswith(":"):
+            sections[words[0].lower()] = rows = []
+        elif not sections:
+            _fail(path, line, words[0][:40], "a section, such as :units")
+        else:
+            rows.append((line, words))
+    if missing := [key for key in (":units", ":root", ":bonedata", ":hierarchy") if not sections.get(key)]:
+        raise InputError(f"{path}: no {missing[0]}; expected :units, :root, :bonedata and :hierarchy")
+    unit = _read_unit(path, sections[":units"])
+    bones = {ROOT: _read_root(path, sections[":root"]), **_read_bones(path, sections[":bonedata"], unit)}
+    names, parents = _read_hierarchy(path, sections[":hierarchy"], bones)
+    return names, parents, [bones[name] for name in names], unit
+
+
+def _read_unit(path: Path, rows: Sequence[tuple[int, list[str]]]) -> float:
+    values = {words[0].lower(): (line, words[1:]) for line, words in rows}
+    line, angle = values.get("angle", (rows[0][0], []))
+    if angle != ["deg"]:
+        _fail(path, line, f"angle {' '.join(angle)}", "angle deg")
+    line, length = values.get("length", (rows[0][0], []))
+    (factor,) = _parse_numbers(path, line, length, 1, "length")
+    if factor <= 0:
+        _fail(path, line, f"length {factor:g}", "a factor above 0")
+    return INCH / factor
+
+
+def _read_root(path: Path, rows: Sequence[tuple[int, list[str]]]) -> Bone:
+    values = {words[0].lower(): (line, words[1:]) for line, words in rows}
+    for key in ("position", "orientation"):
+        line, words = values.get(key, (rows[0][0], []))
+        if any(_parse_numbers(path, line, words, 3, key)):
+            _fail(path, line, f"{key} {' '.join(words)}", "0 0 0")
+    line, order = values.get("order", (rows[0][0], []))
+    axis_line, axis = values.get("axis", (rows[0][0], []))
+    axes = _parse_axes(path, axis_line, ["0", "0", "0", *axis])
+    return Bone(np.zeros(3), axes, _parse_dofs(path, line, order, (*POSITIONS, *ROTATIONS)))
+
+
+def _read_bones(path: Path, rows: Sequence[tuple[int, list[str]]], unit: float) -> dict[str, Bone]:
+    bones: dict[str, Bone] = {}
+    values: dict[str, tuple[int, list[str]]] = {}
+    inside = False
+    for line, words in rows:
+        key = words[0].lower()
+        if (key == "begin") == inside:
+            _fail(path, line, words[0][:40], "begin, the lines of one bone, then end")
+        inside = key != "end"
+        if key not in ("begin", "end"):
+            values[key] = line, words[1:]
+        elif key == "end":
+            name, bone = _read_bone(path, line, values, unit)
+            if name in bones or name == ROOT:
+                _fail(path, line, f"a second bone {name}", "a name for each bone")
+            bones[name], values = bone, {}
+    if inside:
+        raise InputError(f"{path}: the last bone of :bonedata has no end")
+    return bones
+
+
+def _read_bone(
+    path: Path, end: int, values: Mapping[str, tuple[int, list[str]]], unit: float
+) -> tuple[str, Bone]:
+    if missing := [key for key in ("name", "direction", "length", "axis") if key not in values]:
+        _fail(path, end, f"no {missing[0]} in the bone that ends here", "name, direction, length and axis")
+    line, words = values["name"]
+    if len(words) != 1:
+        _fail(path, line, f"name {' '.join(words)[:40]}", "one word")
+    direction = _parse_numbers(path, *values["direction"], 3, "direction")
+    (length,) = _parse_numbers(path, *values["length"], 1, "length")
+    axes = _parse_axes(path, *values["axis"])
+    dofs = _parse_dofs(path, *values["dof"], ROTATIONS) if "dof" in values else ()
+    return words[0], Bone(unit * length * np.array(direction), axes, dofs)
+
+
+def _parse_axes(path: Path, line: int, words: Sequence[str]) -> Rotation:
+    order = words[-1].lower() if words else ""
+    if sorted(order) != ["x", "y", "z"]:
+        _fail(path, line, f"axis {' '.join(words)[:60]}", "an order of axes such as XYZ at its end")
+    return Rotation.from_euler(order, _parse_numbers(path, line, words[:-1], 3, "axis"), degrees=True)
+
+
+def _parse_dofs(path: Path, line: int, words: Sequence[str], known: Sequence[str]) -> tuple[str, ...]:
+    dofs = tuple(word.lower() for word in words)
+    if not dofs or not set(dofs) <= set(known) or len(set(dofs)) < len(dofs):
+        _fail(path, line, " ".join(words)[:60] or "no values", f"different ones of {' '.join(known)}")
+    return dofs
+
+
+def _read_hierarchy(
+    path: Path, rows: Sequence[tuple[int, list[str]]], bones: Mapping[str, Bone]
+) -> tuple[list[str], list[int]]:
+    """Return the nodes' names, each after its parent's, and the parents' indices."""
+    names, parents = [ROOT], [-1]
+    for line, (parent, *children) in rows:
+        if parent.lower() in ("begin", "end") and not children:
+            continue
+        if parent not in names:
+            _fail(path, line, parent[:40], "a bone that is a child in a line above, or root")
+        for child in children:
+            if child not in bones or child in names:
+                _fail(path, line, child[:40], "a bone of :bonedata that has no parent yet")
+            names.append(child)
+            parents.append(names.index(parent))
+    if left := sorted(set(bones) - set(names)):
+        raise InputError(f"{path}: {left[0]} is not in :hierarchy; expected every bone of :bonedata")
+    return names, parents
+
+
+# The motion
+
+
+def _read_frames(path: Path, widths: Mapping[str, int]) -> tuple[int, np.ndarray]:
+    """Return the first frame's number, and the values (N, C) of the bones in the order of `widths`."""
+    values, frame = array("d"), dict[str, list[float]]()
+    first = last = line = 0
+
+    def finish() -> None:
+        if missing := [name for name in widths if name not in frame]:
+            _fail(path, line, f"frame {last} without {missing[0]}", f"{len(widths)} bones in each frame")
+        for name in widths:
+            values.extend(frame[name])
+        frame.clear()
+
+    for line, (word, *numbers) in _read_lines(path):
+        if word.isdigit() and not numbers:
+            if last:
+                finish()
+            if int(word) != last + 1 and last:
+                _fail(path, line, f"frame {word} after frame {last}", f"frame {last + 1}")
+            first, last = first or int(word), int(word)
+        elif word.startswith(":"):
+            if last or word.upper() == ":RADIANS":
+                _fail(path, line, word[:40], "frames in degrees, after all keywords")
+        elif not last or word not in widths or word in frame:
+            expected = "a bone of the skeleton that turns, once in a frame" if last else "a frame's number"
+            _fail(path, line, word[:40], expected)
+        else:
+            frame[word] = _parse_numbers(path, line, numbers, widths[word], word)
+    if not last:
+        raise InputError(f"{path}: no frames; expected a frame's number, then a line for each bone")
+    finish()
+    return first, np.array(values).reshape(-1, sum(widths.values()))

@@ -1,0 +1,171 @@
+"""ASF/AMC files: kinematics against plain NumPy, the databases' quirks, and damaged files."""
+
+from __future__ import annotations
+
+import re
+import tarfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from asf_samples import DOFS, amc_text, asf_text, movement, plain_positions, write_take
+
+from memmlp.common.errors import InputError
+from memmlp.motion.formats.asf_amc import FPS, read_amc
+
+DATA = Path(__file__).parents[4] / "shared" / "data"
+CUTS = {
+    "32_01": 120, "32_02": 120, "35_02": 20, "35_05": 10, "35_09": 10, "35_10": 10, "35_11": 16, "35_12": 20,
+    "35_13": 80, "35_30": 160, "38_02": 50, "39_08": 30, "39_12": 30, "55_04": 150,
+}  # fmt: skip
+"""Takes that were cut at the start -> the number of their first frame, by the data's README."""
+
+
+def assert_posed(take: Path, asf: Path) -> None:
+    """All joints are where plain NumPy puts them."""
+    recording, expected = read_amc(take), plain_positions(asf, take)
+    positions = recording.kinematics()[1]
+    for node, name in enumerate(recording.nodes):
+        assert np.abs(positions[:, node] - expected[name]).max() < 1e-6, name
+
+
+def test_joints_are_where_plain_kinematics_puts_them(tmp_path: Path):
+    take = write_take(tmp_path / "05", movement(12, size=60.0))
+    assert_posed(take, tmp_path / "05" / "05.asf")
+    recording = read_amc(take)
+    assert recording.fps == FPS == 120
+    zero = plain_positions(tmp_path / "05" / "05.asf", write_take(tmp_path / "05", np.zeros((1, 62))))
+    for name, position in zip(recording.nodes, recording.zero_pose(), strict=True):
+        assert np.allclose(position, zero[name][0], atol=1e-9), name
+
+
+def test_a_pose_has_the_given_angles(tmp_path: Path):
+    values = np.zeros((1, 62))
+    columns = [name for name, dofs in DOFS.items() for _ in dofs]
+    values[0, columns.index("lhumerus") + 1] = 35.0
+    recording = read_amc(write_take(tmp_path / "05", values))
+    posed, frames = recording.pose({"lhumerus": [0.0, 35.0, 0.0]}), recording.kinematics()
+    for one, other in zip(posed, frames, strict=True):
+        assert np.allclose(one, other[0])
+    with pytest.raises(InputError, match=r"rest\.lhumerus has 1 values; must have 3"):
+        recording.pose({"lhumerus": [35.0]})
+
+
+def test_cut_starts_line_ends_and_the_order_of_bones_do_not_matter(tmp_path: Path):
+    values = movement(3)
+    plain = read_amc(write_take(tmp_path / "05", values))
+    take = write_take(tmp_path / "05", values, first=120)
+    lines = take.read_text("latin-1").splitlines()
+    lines[4:6] = lines[5:3:-1]  # within the first frame
+    take.write_bytes("\r\n".join([*lines, "", ""]).encode("latin-1"))
+    cut = read_amc(take)
+    assert (plain.first_frame, cut.first_frame) == (1, 120)
+    assert np.array_equal(plain.values, cut.values)
+
+
+def test_the_skeleton_is_that_of_the_same_name(tmp_path: Path):
+    first = write_take(tmp_path / "HDM_bd", movement(1))
+    (tmp_path / "HDM_bd" / "HDM.asf").write_text("another")
+    take = first.rename(first.with_name("HDM_bd_kickRFront1Reps_001_120.AMC"))
+    assert len(read_amc(take)) == 1
+    (tmp_path / "HDM_bd" / "HDM_bd.asf").rename(tmp_path / "bd.asf")
+    (tmp_path / "HDM_bd" / "HDM.asf").unlink()
+    with pytest.raises(InputError, match=r"_120\.AMC: no skeleton beside it; expected HDM\.asf"):
+        read_amc(take)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("angle deg", "angle rad", "line 7: angle rad; expected angle deg"),
+        ("length 0.45", "length 0", "line 6: length 0; expected a factor above 0"),
+        (":bonedata", ":bones", "no :bonedata"),
+        ("direction 0 0 1", "direction 0 zero 1", "direction 0 zero 1; expected 3 numbers"),
+        ("     length 7.1\n", "", "no length in the bone that ends here"),
+        ("dof rx ry rz", "dof rx ry l", "rx ry l; expected different ones of rx ry rz"),
+        ("axis 0 0 20  XYZ", "axis 0 0 20", "axis 0 0 20; expected an order of axes"),
+        ("    ltibia lfoot\n", "", "lfoot; expected a bone that is a child in a line above, or root"),
+        ("lfoot ltoes", "lfoot", "ltoes is not in :hierarchy"),
+        ("name ltibia", "name lfemur", "a second bone lfemur"),
+        ("position 0 0 0", "position 0 1 0", "position 0 1 0; expected 0 0 0"),
+        ("  end\n:hierarchy", ":hierarchy", "the last bone of :bonedata has no end"),
+        (":version", "version", "version; expected a section"),
+    ],
+)
+def test_damaged_skeletons_are_one_line(tmp_path: Path, old: str, new: str, said: str):
+    take = write_take(tmp_path / "05", movement(1))
+    assert old in asf_text()
+    (tmp_path / "05" / "05.asf").write_text(asf_text().replace(old, new, 1), encoding="latin-1")
+    with pytest.raises(InputError, match=re.escape(said)) as error:
+        read_amc(take)
+    assert str(error.value).startswith(f"{tmp_path / '05' / '05.asf'}: ")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (r"\nltoes .*", "", "frame 1 without ltoes"),
+        (r"\n2\n", "\n3\n", "frame 3 after frame 1; expected frame 2"),
+        (r"\nrfoot \S+", "\nrfoot", "rfoot "),
+        (r"\nlowerback \S+", "\nlowerback x", "lowerback x"),
+        (r"\nlowerback \S+", "\nlowerback nan", "lowerback nan"),
+        (r"\nlradius ", "\nlelbow ", "lelbow; expected a bone of the skeleton that turns, once in a frame"),
+        (
+            r"\n(ltibia .*)",
+            r"\n\1\n\1",
+            "ltibia; expected a bone of the skeleton that turns, once in a frame",
+        ),
+        (r"(?s)\n1\n.*", "\n", "no frames"),
+        (r":DEGREES", ":RADIANS", "line 3: :RADIANS; expected frames in degrees"),
+        (r"\n1\n", "\n", "line 4: root; expected a frame's number"),
+    ],
+)
+def test_damaged_takes_are_one_line(tmp_path: Path, old: str, new: str, said: str):
+    take = write_take(tmp_path / "05", movement(2))
+    text, changes = re.subn(old, new, amc_text(movement(2)), count=1)
+    assert changes == 1
+    take.write_text(text, encoding="latin-1")
+    with pytest.raises(InputError, match=re.escape(said)) as error:
+        read_amc(take)
+    assert str(error.value).startswith(f"{take}: ")
+    assert "\n" not in str(error.value)
+
+
+def test_a_take_may_end_anywhere(tmp_path: Path):
+    take = write_take(tmp_path / "05", movement(2))
+    whole = take.read_bytes()
+    for size in range(0, len(whole) - 8, 97):
+        take.write_bytes(whole[:size])
+        with pytest.raises(InputError, match=f"^{re.escape(str(take))}: .*expected"):
+            read_amc(take)
+
+
+# The databases themselves
+
+
+@pytest.fixture(scope="module", params=["cmu-asfamc", "hdm05-asfamc"])
+def database(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    archive = DATA / request.param / f"{request.param}.tar.xz"
+    if not archive.is_file():
+        pytest.skip(f"needs {archive.name}, which is not part of the project")
+    folder = tmp_path_factory.mktemp(request.param)
+    with tarfile.open(archive) as file:
+        file.extractall(folder, filter="data")
+    return folder
+
+
+@pytest.mark.slow
+def test_the_databases_have_the_frames_and_cuts_of_their_readmes(database: Path):
+    numbers = {take: re.findall(rb"(?m)^(\d+)\s*$", take.read_bytes()) for take in database.rglob("*.amc")}
+    frames = sum(map(len, numbers.values()))
+    cuts = {take.stem: int(first) for take, (first, *_) in numbers.items() if first != b"1"}
+    assert (len(numbers), frames, cuts) in ((142, 140_811, CUTS), (233, 57_023, {}))
+    shortest: dict[Path, Path] = {}  # of each person
+    for take in sorted(numbers, key=lambda take: len(numbers[take])):
+        shortest.setdefault(take.parent, take)
+    for person, take in shortest.items():
+        recording = read_amc(take)
+        assert (len(recording), recording.first_frame) == (len(numbers[take]), int(numbers[take][0]))
+        (asf,) = person.glob("*.asf")
+        assert_posed(take, asf)
