@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
+from importlib.util import find_spec
 from ipaddress import IPv4Network
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -25,14 +26,13 @@ from memmlp.cli.options import (
 
 if TYPE_CHECKING:
     from memmlp.live.outputs import Output, Outputs
-    from memmlp.live.session.sources import ClipSource, TrackedClip, TrackerSource
+    from memmlp.live.session.sources import TrackedClip, TrackerSource
     from memmlp.live.spaces import SpaceName
     from memmlp.live.stream import Stream
     from memmlp.live.wearer import Calibration
 
 BUILTIN = "own"  # the value of --avatar for the built-in avatar
 SPACE, HZ = "amass", 60.0  # of clips, and the default of packets
-FILE = click.Path(path_type=Path, dir_okay=False)
 
 
 class LiveOptions(NamedTuple):
@@ -53,7 +53,6 @@ class LiveOptions(NamedTuple):
     vrchat: tuple[tuple[str, int | None], ...] = ()
     record: tuple[Path, ...] = ()
     avatar: str | None = None
-    save_avatar: Path | None = None
     port: int = 0
     host: str = "127.0.0.1"
     token: str | None = None
@@ -64,6 +63,13 @@ class LiveOptions(NamedTuple):
     def is_file(self) -> bool:
         """Whether the network is an ONNX file, not a run."""
         return self.network.endswith(".onnx")
+
+    @property
+    def packets(self) -> tuple[str, int] | None:
+        """The kind and the port of the packets; None for a clip."""
+        if self.udp is not None:
+            return "udp", self.udp
+        return None if self.osc is None else ("osc", self.osc)
 
 
 @click.command("live")
@@ -102,7 +108,7 @@ class LiveOptions(NamedTuple):
 )
 @click.option(
     "--calibration",
-    type=FILE,
+    type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
     help="JSON file of the wearer's calibration, to start with and to save changes on the page to.",
 )
@@ -132,12 +138,6 @@ class LiveOptions(NamedTuple):
     metavar="[FILE.vrm]",
     help="Show a VRM avatar on the page: this file, or the built-in one.",
 )
-@click.option(
-    "--save-avatar",
-    type=FILE,
-    metavar="FILE.vrm",
-    help="Write the built-in avatar with the network's body, and exit.",
-)
 @page_options(port=8765)
 @host_option
 @token_option
@@ -157,9 +157,7 @@ def live(**options: Any) -> None:
     if not given.is_file:
         check_runs(given.outputs, given.network)
     with contextlib.suppress(KeyboardInterrupt):
-        if given.save_avatar is not None:
-            write_avatar(given, given.save_avatar)
-        elif given.send:
+        if given.send:
             send_clip(given)
         else:
             serve(given)
@@ -169,51 +167,48 @@ def check_options(given: LiveOptions) -> None:
     """Raise InputError for options that contradict each other, or need something that is not installed."""
     from memmlp.common.errors import InputError
     from memmlp.common.page_server import check_token
-    from memmlp.live.session.sources import require_osc
 
-    packets = [number for number in (given.udp, given.osc) if number is not None]
-    if len(packets) > 1 or (packets and given.clip is not None and not given.send):
-        raise InputError("--clip, --udp, --osc: expected only one source")
-    if given.send and not packets:
-        raise InputError("--send: needs --udp PORT or --osc PORT")
-    live_only = {
+    live_packets = given.packets and not given.send
+    worn = {
         "--height": given.height is not None,
         "--floor": given.floor is not None,
         "--calibration": given.calibration is not None,
         "--sender": bool(given.senders),
     }
-    if (names := [name for name, said in live_only.items() if said]) and (given.send or not packets):
-        raise InputError(f"{names[0]}: needs --udp PORT or --osc PORT, the packets of a wearer's devices")
-    if given.space != SPACE and not packets:
-        raise InputError(f"--space {given.space}: must be {SPACE} with a clip; others are for packets")
-    if given.hz != HZ and packets and not given.send:
-        raise InputError("--hz: needs a clip or --send; packets arrive at any rate")
-    if given.send and (given.vmc or given.vrchat or given.record or given.avatar):
-        raise InputError("--send: only sends trackers; leave out --vmc, --vrchat, --record and --avatar")
-    if given.osc is not None:
-        require_osc()
-    for option, programs in (("--vmc", given.vmc), ("--vrchat", given.vrchat)):
-        if programs:
-            require_osc(option, "the page, and --record")
+    outputs = given.vmc or given.vrchat or given.record or given.avatar
+    sources = (given.udp is not None) + (given.osc is not None)
+    checks = {
+        "--clip, --udp, --osc: expected only one source": sources > 1 or (given.clip and live_packets),
+        "--send: needs --udp PORT or --osc PORT": given.send and not given.packets,
+        "--send: only sends trackers; leave out --vmc, --vrchat, --record and --avatar": given.send
+        and outputs,
+        f"--space {given.space}: must be {SPACE} with a clip; others are for packets": (
+            given.space != SPACE and not given.packets
+        ),
+        "--hz: needs a clip or --send; packets arrive at any rate": given.hz != HZ and live_packets,
+    } | {
+        f"{name}: needs --udp PORT or --osc PORT, the packets of a wearer's devices": said
+        and not live_packets
+        for name, said in worn.items()
+    }
+    for line, failed in checks.items():
+        if failed:
+            raise InputError(line)
+    osc = {"--osc": given.osc is not None, "--vmc": given.vmc, "--vrchat": given.vrchat}
+    if (needing := [name for name, said in osc.items() if said]) and find_spec("pythonosc") is None:
+        raise InputError(f"{needing[0]}: needs python-osc: pip install 'memmlp[osc]'")
     check_token(given.host, given.token)
 
 
 def make_source(given: LiveOptions) -> TrackerSource:
     """Return the source of the poses: packets at a port, or a clip that is played repeatedly."""
-    from memmlp.live.session.sources import PacketSource, from_json, from_osc
+    from memmlp.live.session.sources import ClipSource, PacketSource, from_json, from_osc
 
-    if given.udp is not None:
-        return PacketSource("UDP", given.udp, from_json, given.space, given.senders, note)
-    if given.osc is not None:
-        return PacketSource("OSC", given.osc, from_osc, given.space, given.senders, note)
-    return clip_source(given)
-
-
-def clip_source(given: LiveOptions, rounds: float = float("inf")) -> ClipSource:
-    """Return a source that plays the clip in real time, `rounds` times."""
-    from memmlp.live.session.sources import ClipSource
-
-    return ClipSource(load_clip(given), given.hz, rounds)
+    if given.packets is None:
+        return ClipSource(load_clip(given), given.hz)
+    kind, port = given.packets
+    parse = from_json if kind == "udp" else from_osc
+    return PacketSource(kind.upper(), port, parse, given.space, given.senders, note)
 
 
 def load_clip(given: LiveOptions) -> TrackedClip:
@@ -244,20 +239,18 @@ def load_clip(given: LiveOptions) -> TrackedClip:
 
 def send_clip(given: LiveOptions) -> None:
     """Send the clip's packets once to the port of the options, in the frame of reference of --space."""
-    from memmlp.live.session.sources import send, to_json, to_osc
+    from memmlp.live.session.sources import ClipSource, send, to_json, to_osc
     from memmlp.live.spaces import space_of
 
-    source = clip_source(given, rounds=1)
-    kind, port, pack = (
-        ("--udp", given.udp, to_json) if given.udp is not None else ("--osc", given.osc, to_osc)
-    )
-    assert port is not None
+    source = ClipSource(load_clip(given), given.hz, rounds=1)
+    assert given.packets is not None  # see check_options
+    kind, port = given.packets
     click.echo(f"sending {source.name} to port {port}")
-    sent, refused = send(source, port, pack, space_of(given.space))
+    sent, refused = send(source, port, to_json if kind == "udp" else to_osc, space_of(given.space))
     late = f" of {source.count}: this machine was too busy for the others" if sent < source.count else ""
     click.echo(f"{sent} packets sent{late}")
     if refused:
-        note(f"nothing listened at port {port} for some packets; start memmlp live RUN {kind} {port}")
+        note(f"nothing listened at port {port} for some packets; start memmlp live RUN --{kind} {port}")
 
 
 def serve(given: LiveOptions) -> None:
@@ -299,7 +292,7 @@ def serve(given: LiveOptions) -> None:
             if not given.no_browser:
                 webbrowser.open(server.url)
             stopped = threading.Event()
-            run_loop(stream, source, hub.publish, stopped, outputs, fitting, avatar is not None, tell=note)
+            run_loop(stream, source, hub.publish, stopped, outputs, fitting, avatar is not None, note)
 
 
 def network_file(given: LiveOptions) -> tuple[Path, str]:
@@ -335,8 +328,7 @@ def combine_calibration(given: LiveOptions, space: SpaceName, stream: Stream) ->
 
 def make_outputs(given: LiveOptions, stream: Stream) -> Outputs:
     """Return the outputs that the options name."""
-    from memmlp.live.outputs import VMC, VMC_PORT, VRCHAT_PORT, Outputs, Receiver, VRChat
-    from memmlp.live.recorder import Recorder
+    from memmlp.live.outputs import VMC, VMC_PORT, VRCHAT_PORT, Outputs, Receiver, Recorder, VRChat
 
     found: list[Output] = [VMC(Receiver(host, port or VMC_PORT, "--vmc")) for host, port in given.vmc]
     found += [VRChat(Receiver(host, port or VRCHAT_PORT, "--vrchat")) for host, port in given.vrchat]
@@ -344,23 +336,6 @@ def make_outputs(given: LiveOptions, stream: Stream) -> Outputs:
         network = stream.network
         found.append(Recorder(given.record, network.body.rest, network.fps, note))
     return Outputs(found, note)
-
-
-def write_avatar(given: LiveOptions, path: Path) -> None:
-    """Write the built-in avatar with the network's body."""
-    from memmlp.common.errors import InputError
-    from memmlp.live.stream import ExportedNetwork
-    from memmlp.motion.formats.vrm import write_vrm
-
-    if path.suffix.lower() != ".vrm":
-        raise InputError(f"--save-avatar {path}: must end in .vrm")
-    if path.exists():
-        raise InputError(f"--save-avatar {path}: already exists; expected a new file")
-    try:
-        write_vrm(path, ExportedNetwork(network_file(given)[0]).body.rest)
-    except OSError as error:
-        raise InputError(f"--save-avatar {path}: cannot be written ({error.strerror})") from error
-    click.echo(f"{path}: an avatar of VRM 1.0, which anybody may use (CC0)")
 
 
 def note(line: str) -> None:

@@ -1,4 +1,4 @@
-"""Outputs of a live body: bones by the VMC protocol, trackers for VRChat, both over OSC.
+"""Outputs of a live body: bones by the VMC protocol, trackers for VRChat, both over OSC, and recorded files.
 
 **VMC** (protocol.vmc.info/english), as VSeeFace, Warudo, EVMC4U and others receive it. Each frame has
 `/VMC/Ext/OK` (version 2.5: loaded, calibrated, normal mode), `/VMC/Ext/T` (seconds since the beginning),
@@ -12,32 +12,40 @@ root's.
 degrees, applied in the order Z, X, Y, in Unity's frame of reference. VRChat assigns the trackers when the
 wearer calibrates in its T-pose. It shifts all trackers so that the head is at its avatar's head bone, and
 turns them to the head's heading.
+
+**Recordings**: all files of a recorder contain the same frames. Formats with a skeleton (BVH, glTF) have the
+wearer's height. An npz does not have a body, and its readers use one of the network's size, so it holds the
+motion of the network's body. Missing frames between two poses are interpolated. Breaks, after which the
+network restarted, are left out of the files, and reported.
 """
 
 from __future__ import annotations
 
 import errno
 import socket
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
-from memmlp.live.rotations import matrix_to_quaternion
+from memmlp.live.rotations import matrix_to_quaternion, slerp
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import BodyFrame
 from memmlp.motion.body import JOINTS, N_JOINTS, PARENTS, ROOT
+from memmlp.motion.clip import Clip
+from memmlp.motion.exporting import format_of, write_motion
 from memmlp.motion.formats.vrm import UNITY_BONES
 
-WORD = 4  # bytes
-HEADER = 16  # bytes of an OSC bundle before its first message
-LARGEST = 1472  # bytes of a datagram that an Ethernet packet holds, so that none is split
 VMC_PORT, VRCHAT_PORT = 39539, 9000
 SPACE = SPACES["unity"]
-HALF = N_JOINTS // 2  # bones of a bundle, so that it is one Ethernet packet
+HALF = 14  # messages of the first datagram; an Ethernet packet holds either half
 LOADED, CALIBRATED, NORMAL = 1, 3, 0
-FIXED_ROOT = np.array([0.0, 0, 0, 0, 0, 0, 1])  # position and quaternion
+LONGEST = 1.0  # seconds without a frame that a recording fills
+FIXED_ROOT = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # position and quaternion
 # The joint where a tracker is, and the joint whose bone it turns with: a knee's with the thigh, an elbow's
 # with the upper arm.
 PLACES = (
@@ -53,7 +61,7 @@ class Output(Protocol):
     """Takes frames without ever waiting: each frame is taken at once, or dropped.
 
     Attributes:
-        name: the output in words.
+        name: the output's description.
     """
 
     name: str
@@ -70,11 +78,11 @@ class Outputs:
 
     Args:
         outputs: the outputs.
-        tell: gets a line about each output that fails.
+        report: gets a line about each output that fails.
     """
 
-    def __init__(self, outputs: Sequence[Output], tell: Callable[[str], None]):
-        self.outputs, self.tell = outputs, tell
+    def __init__(self, outputs: Sequence[Output], report: Callable[[str], None]):
+        self.outputs, self.report = outputs, report
         self.failed: set[str] = set()
 
     def take(self, frame: BodyFrame) -> None:
@@ -85,7 +93,7 @@ class Outputs:
             except OSError as error:
                 if output.name not in self.failed:
                     self.failed.add(output.name)
-                    self.tell(f"{output.name}: {error.strerror or error}; the others continue")
+                    self.report(f"{output.name}: {error.strerror or error}; the others continue")
 
     def close(self) -> None:
         """Close all outputs, even if closing one of them fails; the first error is raised at the end."""
@@ -99,52 +107,18 @@ class Outputs:
             raise errors[0]
 
 
-class Message(NamedTuple):
-    """An OSC message whose last arguments are floats.
+def encode_osc(messages: Iterable[tuple[str, str, Iterable[Any]]]) -> bytes:
+    """Return an OSC bundle of messages: each has an address, a letter of OSC for each argument, and these."""
+    from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
+    from pythonosc.osc_message_builder import OscMessageBuilder
 
-    Attributes:
-        address: the message's OSC address.
-        fixed: the arguments before the floats, each an integer or a text.
-        floats: how many floats follow.
-    """
-
-    address: str
-    fixed: Sequence[int | str] = ()
-    floats: int = 0
-
-
-class Bundle:
-    """An OSC bundle with a fixed layout: python-osc lays it out once, then only its floats change.
-
-    Every element of a bundle is at a multiple of four bytes (Open Sound Control 1.0), so its floats are
-    elements of one array of big-endian float32.
-
-    Args:
-        messages: the messages; `write` takes their floats in this order.
-    """
-
-    def __init__(self, messages: Sequence[Message]):
-        from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
-        from pythonosc.osc_message_builder import OscMessageBuilder
-
-        bundle, places, end = OscBundleBuilder(IMMEDIATELY), [], HEADER
-        for message in messages:
-            builder = OscMessageBuilder(message.address)
-            for value in message.fixed:
-                builder.add_arg(value, "i" if isinstance(value, int) else "s")
-            for _ in range(message.floats):
-                builder.add_arg(0.0, "f")
-            built = builder.build()
-            bundle.add_content(built)
-            end += WORD + len(built.dgram)
-            places.append(end // WORD - np.arange(message.floats, 0, -1))
-        self.data = np.frombuffer(bytearray(bundle.build().dgram), ">f4")
-        self.places = np.concatenate(places).astype(int)
-
-    def write(self, values: np.ndarray) -> bytes:
-        """Return the bundle's datagram with these floats."""
-        self.data[self.places] = values
-        return self.data.tobytes()
+    bundle = OscBundleBuilder(IMMEDIATELY)
+    for address, kinds, arguments in messages:
+        message = OscMessageBuilder(address)
+        for kind, argument in zip(kinds, arguments, strict=True):
+            message.add_arg(argument, kind)
+        bundle.add_content(message.build())
+    return bundle.build().dgram
 
 
 class Receiver:
@@ -195,13 +169,6 @@ class VMC:
         self.name = f"VMC to {receiver}"
         self.receiver, self.close = receiver, receiver.close
         self.start: float | None = None
-        bones = [Message("/VMC/Ext/Bone/Pos", (name,), 7) for name in UNITY_BONES]
-        status = [
-            Message("/VMC/Ext/OK", (LOADED, CALIBRATED, NORMAL)),
-            Message("/VMC/Ext/T", (), 1),
-            Message("/VMC/Ext/Root/Pos", ("root",), 7),
-        ]
-        self.bundles = Bundle([*status, *bones[:HALF]]), Bundle(bones[HALF:])
 
     def take(self, frame: BodyFrame) -> None:
         """Send the frame's bones, in two datagrams."""
@@ -210,10 +177,15 @@ class VMC:
         values[:, :3] = (frame.rest - frame.rest[list(PARENTS)]) * SPACE.body
         values[ROOT, :3] = SPACE.positions_out(frame.positions[ROOT])
         values[:, 3:] = matrix_to_quaternion(SPACE.pose_out(frame.local))
-        first, second = self.bundles
-        status = np.concatenate([[frame.time - self.start], FIXED_ROOT])
-        self.receiver.send(first.write(np.concatenate([status, values[:HALF].ravel()])))
-        self.receiver.send(second.write(values[HALF:].ravel()))
+        messages: list[tuple[str, str, Iterable[Any]]] = [
+            ("/VMC/Ext/OK", "iii", [LOADED, CALIBRATED, NORMAL]),
+            ("/VMC/Ext/T", "f", [frame.time - self.start]),
+            ("/VMC/Ext/Root/Pos", "sfffffff", ["root", *FIXED_ROOT]),
+        ]
+        for name, bone in zip(UNITY_BONES, values.tolist(), strict=True):
+            messages.append(("/VMC/Ext/Bone/Pos", "sfffffff", [name, *bone]))
+        self.receiver.send(encode_osc(messages[:HALF]))
+        self.receiver.send(encode_osc(messages[HALF:]))
 
 
 class VRChat:
@@ -222,12 +194,14 @@ class VRChat:
     def __init__(self, receiver: Receiver):
         self.name = f"VRChat at {receiver}"
         self.receiver, self.close = receiver, receiver.close
-        parts = [f"/tracking/trackers/{name}/{part}" for name in NAMES for part in ("position", "rotation")]
-        self.bundle = Bundle([Message(address, (), 3) for address in parts])
 
     def take(self, frame: BodyFrame) -> None:
         """Send the frame's trackers, in one datagram."""
-        self.receiver.send(self.bundle.write(place_trackers(frame).ravel()))
+        parts = [f"/tracking/trackers/{name}/{part}" for name in NAMES for part in ("position", "rotation")]
+        vectors = place_trackers(frame).reshape(-1, 3).tolist()
+        self.receiver.send(
+            encode_osc((part, "fff", vector) for part, vector in zip(parts, vectors, strict=True))
+        )
 
 
 def place_trackers(frame: BodyFrame) -> np.ndarray:
@@ -240,14 +214,90 @@ def place_trackers(frame: BodyFrame) -> np.ndarray:
 
 
 def euler_degrees(rotations: np.ndarray) -> np.ndarray:
-    """Return Unity's angles (n, 3) about X, Y and Z, degrees, with Ry Rx Rz = rotations (n, 3, 3).
+    """Return Unity's angles (n, 3) about X, Y and Z, degrees, with Ry Rx Rz = rotations (n, 3, 3)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # in gimbal lock one of two angles is free
+        angles: np.ndarray = Rotation.from_matrix(rotations).as_euler("YXZ", degrees=True)[:, [1, 0, 2]]
+    return angles
 
-    The product is correct in gimbal lock, too, where the angle about X is a right angle.
+
+class Recorder:
+    """An output that keeps frames, and writes files of the wearer's motion at the end.
+
+    Args:
+        paths: the files; their suffixes determine the formats.
+        rest: the network's joints in the rest pose (22, 3), metres, SMPL's body frame.
+        fps: the network's frames per second.
+        report: gets a line about each file that was written, and about breaks.
+
+    Raises:
+        InputError: for other suffixes, a file that exists, or a folder that cannot be written.
     """
-    y = np.arctan2(rotations[:, 0, 2], rotations[:, 2, 2])
-    cosine, sine = np.cos(y)[:, None], np.sin(y)[:, None]
-    first = cosine * rotations[:, 0] - sine * rotations[:, 2]  # rows of Ry^T R = Rx Rz
-    third = sine * rotations[:, 0] + cosine * rotations[:, 2]
-    x = np.arctan2(-rotations[:, 1, 2], third[:, 2])
-    z = np.arctan2(-first[:, 1], first[:, 0])
-    return np.degrees(np.stack([x, y, z], 1))
+
+    def __init__(self, paths: Sequence[Path], rest: np.ndarray, fps: float, report: Callable[[str], None]):
+        for path in paths:
+            format_of(path, "--record")
+            if path.exists():
+                raise InputError(f"--record {path}: already exists; expected a new file")
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise InputError(f"--record {path}: cannot be written ({error.strerror})") from None
+        if len({path.resolve() for path in paths}) < len(paths):
+            raise InputError("--record: the same file twice; expected different files")
+        self.name = "recording " + ", ".join(path.name for path in paths)
+        self.paths, self.rest, self.fps, self.report = paths, rest, fps, report
+        self.rows: list[np.ndarray] = []  # rotation vectors and the root's position (69,) of each frame
+        self.filled, self.breaks, self.scale = 0, 0, 1.0
+        self.last: tuple[float, np.ndarray, np.ndarray] | None = None
+
+    def take(self, frame: BodyFrame) -> None:
+        """Keep a frame, after interpolated frames for those that are missing before it."""
+        root = frame.scale * frame.positions[ROOT]  # in the network's body size
+        if self.last is not None:
+            time, local, last_root = self.last
+            steps = round((frame.time - time) * self.fps)
+            if frame.restarted or not 0 < steps <= LONGEST * self.fps:
+                self.breaks += 1
+                steps = 1
+            for weight in (step / steps for step in range(1, steps)):
+                self._keep(slerp(local, frame.local, weight), last_root + weight * (root - last_root))
+                self.filled += 1
+        self._keep(frame.local, root)
+        self.last, self.scale = (frame.time, frame.local, root), frame.scale
+
+    def _keep(self, local: np.ndarray, root: np.ndarray) -> None:
+        self.rows.append(np.concatenate([Rotation.from_matrix(local).as_rotvec().ravel(), root]).astype("f4"))
+
+    def close(self) -> None:
+        """Write the files.
+
+        Raises:
+            InputError: if a file can't be written; the other files are written all the same.
+        """
+        if not self.rows:
+            self.report("recording: no frame arrived; nothing is written")
+            return
+        errors, rows = [], np.stack(self.rows)
+        for path in self.paths:
+            try:
+                self._write(path, rows)
+            except InputError as error:
+                errors.append(error)
+        if errors:
+            raise errors[0]
+
+    def _write(self, path: Path, rows: np.ndarray) -> None:
+        """Write a file, and report its length, breaks and interpolated frames."""
+        chosen = format_of(path)
+        scale = self.scale if chosen.has_bones else 1.0
+        rest = self.rest / scale
+        poses = rows[:, :-3].reshape(-1, N_JOINTS, 3)
+        clip = Clip(path.stem, poses, rows[:, -3:] / scale - rest[ROOT], self.fps)
+        write_motion(path, clip, rest, chosen)
+        parts = [f"{path}: {len(clip) / self.fps:.1f} s"]
+        if self.breaks:
+            parts.append(f"{self.breaks} break{'s' * (self.breaks > 1)} left out")
+        if self.filled:
+            parts.append(f"{self.filled} of {len(rows)} frames interpolated")
+        self.report(", ".join(parts))

@@ -21,7 +21,6 @@ from processes import PATIENCE, hearing_interrupts, started
 from memmlp.cli.live import LiveOptions, combine_calibration, load_clip
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
-from memmlp.live.session.sources import require_osc
 from memmlp.live.stream import Stream
 from memmlp.live.wearer import Calibration, Offsets, save_calibration
 from memmlp.motion.body import PARENTS, builtin_rest_joints
@@ -40,8 +39,6 @@ REFUSED = {
     "--udp 9001 --token a-token-of-many-letters": "--token: ",
     "--udp 9001 --host 0.0.0.0 --token short": "--token: ",
     "--vmc 127.0.0.1:none": "--vmc",
-    "--save-avatar {avatar}": "already exists",
-    "--save-avatar me.glb": "--save-avatar me.glb",
     "--clip {clip} --avatar none.vrm": "--avatar none.vrm: no such file",
     "--clip {clip} --avatar {clip}": "--avatar",
     "--clip {clip} --record a.fbx": "--record a.fbx",
@@ -52,12 +49,9 @@ REFUSED = {
 
 
 def test_bad_options_are_refused(memmlp: Memmlp, clip: Path, step: Path):
-    avatar = clip.with_suffix(".vrm")
-    avatar.write_bytes(b"precious")
     for words, said in REFUSED.items():
-        line = [word.format(clip=clip, avatar=avatar) for word in words.split()]
+        line = [word.format(clip=clip) for word in words.split()]
         assert one_line(memmlp("live", str(step), "--no-browser", "--port", "0", *line), said), words
-    assert avatar.read_bytes() == b"precious"
 
 
 @pytest.fixture(scope="module")
@@ -79,10 +73,8 @@ def test_python_osc_is_needed_only_by_the_options_that_use_it(
     line = ["live", str(step), "--no-browser"]
     udp = ["--udp", "9001"]
     assert one_line(memmlp(*line, *udp, "--token", "a token of many letters"), "--token: ")  # the last check
-    for needing in (["--osc", "9001"], [*udp, "--vmc", "127.0.0.1"], [*udp, "--vrchat", "127.0.0.1"]):
+    for needing in (["--osc", "9001"], [*udp, "--vmc", "127.0.0.1"]):
         assert one_line(memmlp(*line, *needing), f"{needing[-2]}: needs python-osc")
-    with pytest.raises(InputError, match=r"pip install 'memmlp\[osc\]'"):
-        require_osc()
 
 
 def test_a_clip_of_a_file_is_on_the_network_s_body(step: Path, clip: Path, tmp_path: Path):
@@ -133,12 +125,6 @@ def watch(address: str, frames: int) -> None:
         seen = (line for line in events if line.startswith(b"event: frame"))
         for _ in range(frames):
             next(seen)
-
-
-def test_the_avatar_as_a_file(memmlp: Memmlp, step: Path, tmp_path: Path):
-    assert memmlp("live", str(step), "--save-avatar", "me.vrm").code == 0
-    assert "VRMC_vrm" in Glb(tmp_path / "me.vrm").json["extensions"]
-    assert np.isfinite(Glb(tmp_path / "me.vrm").vertices(None)).all()
 
 
 def test_a_calibration_of_another_height_is_told(

@@ -1,35 +1,37 @@
-"""Outputs: one that fails costs the others nothing; VMC and VRChat by their specifications."""
+"""Outputs: VMC and VRChat by their specifications, recorded files, and failures that stay with one output."""
 
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
+import tiny
+import torch
+import wearer
+from glb import Glb
 from hypothesis import example, given
 from hypothesis import strategies as st
+from plain_kinematics import bvh_positions
 from scipy.spatial.transform import Rotation
-from vmc_receiver import TREE, Marionette, messages
+from vmc_receiver import TREE, Marionette, posed
 from wearer import body_frame
 
 from memmlp.common.errors import InputError
-from memmlp.live.outputs import (
-    LARGEST,
-    VMC,
-    Bundle,
-    Message,
-    Outputs,
-    Receiver,
-    VRChat,
-    euler_degrees,
-    place_trackers,
-)
-from memmlp.live.stream import BodyFrame
-from memmlp.motion.body import JOINTS, builtin_rest_joints
+from memmlp.live.outputs import VMC, Outputs, Receiver, Recorder, VRChat, euler_degrees, place_trackers
+from memmlp.live.spaces import SPACES
+from memmlp.live.stream import BodyFrame, Stream
+from memmlp.motion.body import JOINTS, N_JOINTS, builtin_rest_joints
+from memmlp.motion.formats.npz import read_clip
+from memmlp.motion.formats.vrm import UNITY_BONES
+from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics
 
 REST = builtin_rest_joints()
-FRAME = body_frame(1.5, np.tile(np.eye(3), (22, 1, 1)), REST, REST)
+UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # of a person in AMASS' world who looks along -Y
+AROUND = Rotation.from_euler("y", 180, degrees=True).as_matrix()  # so that the person looks along Unity's +Z
+ETHERNET = 1472  # bytes of a datagram that is not split
 
 
 class Output:
@@ -37,7 +39,7 @@ class Output:
         self.name, self.failing = name, failing
         self.frames = self.closed = 0
 
-    def take(self, frame) -> None:
+    def take(self, frame: BodyFrame) -> None:
         self.frames += 1
         if self.failing:
             raise OSError(101, "Network is unreachable")
@@ -47,27 +49,17 @@ class Output:
         raise InputError(f"{self.name}: not closed")
 
 
-def test_one_that_fails_is_told_once_and_costs_the_others_nothing():
-    told: list[str] = []
+def test_a_failing_output_is_reported_once_and_the_others_continue():
+    lines: list[str] = []
     failing, keeping = Output("failing", True), Output("keeping", False)
-    outputs = Outputs([failing, keeping], told.append)
+    outputs = Outputs([failing, keeping], lines.append)
     for _ in range(3):
-        outputs.take(FRAME)
+        outputs.take(frame(0.0))
     with pytest.raises(InputError, match="not closed"):
         outputs.close()
-    (line,) = told
+    (line,) = lines
     assert line.startswith("failing: Network is unreachable")
     assert (failing.frames, keeping.frames, failing.closed, keeping.closed) == (3, 3, 1, 1)
-
-
-def test_a_bundle_s_floats_are_where_they_belong():
-    """Beside texts of every length, and integers."""
-    names = ["", "a", "ab", "abc", "abcd"]
-    bundle = Bundle([Message(f"/{name}", (name, 7), index) for index, name in enumerate(names)])
-    for values in (np.arange(10.0), -np.arange(10.0)):
-        found = messages(bundle.write(values))
-        assert [m.values[:2] for m in found] == [[name, 7] for name in names]
-        assert [v for m in found for v in m.values[2:]] == values.tolist()
 
 
 class Network:
@@ -80,7 +72,7 @@ class Network:
     def close(self) -> None: ...
 
 
-def test_a_busy_network_drops_a_datagram_and_no_way_is_an_error():
+def test_a_busy_network_drops_a_datagram_and_other_errors_are_raised():
     receiver = Receiver("127.0.0.1", 39539, "--vmc")
     receiver.close()
     for state in (errno.EAGAIN, errno.ENOBUFS):
@@ -91,99 +83,89 @@ def test_a_busy_network_drops_a_datagram_and_no_way_is_an_error():
         receiver.send(b"")
 
 
-# VMC
+# A stream into VMC and files
+
+SECONDS, HEIGHT, FLOOR = 5, 1.86, 0.25
+SIZE = HEIGHT / 1.72  # the wearer's over the built-in body's
+MILLIMETRE = 1e-3
 
 
-UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # of a person in AMASS' world who looks along -Y
+@pytest.mark.slow
+def test_vmc_and_files_have_the_joints_of_a_tall_wearer_s_stream(
+    tmp_path: Path, step_files: Callable[[str], Path]
+):
+    space, count = SPACES["openxr"], 60 * SECONDS
+    person = wearer.person(np.arange(count) / 60)
+    stream, shown = (
+        Stream(step_files("no_memory"), space="openxr", height=HEIGHT, floor=FLOOR) for _ in range(2)
+    )
+    marionette = Marionette()
+    files = {kind: tmp_path / f"played.{kind}" for kind in ("npz", "bvh", "glb")}
+    recorder = Recorder(list(files.values()), stream.network.body.rest, stream.network.fps, print)
+    outputs = Outputs([VMC(Receiver("127.0.0.1", marionette.port, "--vmc")), recorder], pytest.fail)
+    positions = space.positions_out(person.positions * SIZE + [0, 0, FLOOR])
+    rotations = space.rotations_out(person.rotations)
+    poses, received = [], []
+    for index in range(count):
+        trackers = list(zip(positions[index], rotations[index], strict=True))
+        outputs.take(stream.step_body(*trackers, time=5 + index / 60))
+        pose = shown.step(*trackers, time=index / 60)
+        addresses = [message.address for message in marionette.receive() + marionette.receive()]
+        poses.append(pose.positions - [0, FLOOR, 0])
+        received.append([marionette.root, *(marionette.bones[name] for name in UNITY_BONES)])
+    outputs.close(), marionette.close()
+    assert addresses == ["/VMC/Ext/OK", "/VMC/Ext/T", "/VMC/Ext/Root/Pos", *22 * ["/VMC/Ext/Bone/Pos"]]
+    assert marionette.loaded
+    assert marionette.time == pytest.approx(SECONDS - 1 / 60, abs=1e-3)  # it begins at zero
+    poses = np.array(poses)
+    assert np.ptp(poses, 0).max() > 1
+    root, *bones = np.array(received).swapaxes(0, 1)
+    at = posed(root, dict(zip(UNITY_BONES, bones, strict=True)))
+    joints = np.stack([at[name] for name in UNITY_BONES], 1)
+    assert apart(joints, poses * [1, 1, -1]) < MILLIMETRE  # OpenXR's z is Unity's -z
+
+    found = bvh_positions(files["bvh"])
+    assert apart(np.stack([found[name] for name in JOINTS], 1) / 100, poses) < MILLIMETRE
+    glb = Glb(files["glb"])
+    times, _ = glb.channels()["pelvis", "rotation"]
+    np.testing.assert_allclose(times, np.arange(count) / 60, atol=1e-4)
+    for index in range(0, count, 97):
+        world = glb.matrices(index)
+        assert apart(np.stack([world[name][:3, 3] for name in JOINTS]), poses[index]) < MILLIMETRE
+    clip = read_clip(files["npz"], "played")  # on a body of the network's size
+    assert (len(clip), clip.fps) == (count, 60)
+    local = axis_angle_to_matrix(torch.tensor(clip.poses, dtype=torch.float64))
+    root = torch.tensor(clip.trans, dtype=torch.float64) + tiny.REST[0]
+    joints = forward_kinematics(local, root, tiny.REST)[1].numpy().reshape(-1, N_JOINTS, 3)
+    assert apart(joints, space.positions_in(poses) / SIZE) < MILLIMETRE
 
 
-def frame(
-    local: np.ndarray | None = None, root: tuple[float, ...] = (0, 0, 0.98), time: float = 5.0
-) -> BodyFrame:
-    """A frame of a body, whose joints but the root are not needed; upright in T-pose by default."""
-    turns = np.tile(np.eye(3), (22, 1, 1)) if local is None else local.copy()
-    turns[0] = UPRIGHT @ turns[0]
-    return body_frame(time, turns, np.tile(np.array(root), (22, 1)), REST)
+def apart(ours: np.ndarray, theirs: np.ndarray) -> float:
+    assert ours.shape == theirs.shape
+    return np.linalg.norm(ours - theirs, axis=-1).max()
 
 
-@pytest.fixture
-def marionette() -> Iterator[Marionette]:
-    receiver = Marionette()
-    yield receiver
-    receiver.close()
-
-
-@pytest.fixture
-def vmc(marionette: Marionette) -> Iterator[VMC]:
-    sender = VMC(Receiver("127.0.0.1", marionette.port, "--vmc"))
-    yield sender
-    sender.close()
-
-
-def sent(vmc: VMC, marionette: Marionette, each: BodyFrame) -> list:
-    vmc.take(each)
-    return marionette.receive() + marionette.receive()
-
-
-def test_a_t_pose_is_the_identity_and_stands_on_the_floor(vmc: VMC, marionette: Marionette):
+def test_vmc_datagrams_are_small_and_a_t_pose_is_the_identity():
     """Who looks along AMASS' -Y looks along Unity's -Z: the hips are turned by half, all else by nothing."""
-    found = sent(vmc, marionette, frame())
-    assert [m.address for m in found].count("/VMC/Ext/Bone/Pos") == 22
-    assert [m.address for m in found][:3] == ["/VMC/Ext/OK", "/VMC/Ext/T", "/VMC/Ext/Root/Pos"]
-    assert found[0].values == [1, 3, 0]
+    marionette, local = Marionette(), np.tile(np.eye(3), (22, 1, 1))
+    local[0] = UPRIGHT
+    vmc = VMC(Receiver("127.0.0.1", marionette.port, "--vmc"))
+    t_pose = body_frame(5.0, local, np.tile([0, 0, 0.98], (22, 1)), REST)
+    vmc.take(t_pose)
+    assert max(len(marionette.socket.recv(65_536)) for _ in range(2)) <= ETHERNET
+    vmc.take(t_pose)
+    marionette.receive(), marionette.receive()
     assert set(marionette.bones) == set(TREE)
     turns = {name: bone[3:] for name, bone in marionette.bones.items()}
     assert np.abs(turns.pop("Hips")) == pytest.approx([0, 1, 0, 0], abs=1e-6)
     assert np.array(list(turns.values())) == pytest.approx(np.tile([0, 0, 0, 1.0], (21, 1)), abs=1e-6)
-    at = marionette.positions()
-    assert at["Head"] == pytest.approx([0, 0.98 + 0.59, -0.01], abs=1e-6)
-    assert at["LeftHand"][0] == pytest.approx(
-        0.71
-    )  # whose left is Unity's +X, since the person looks along -Z
-    assert at["LeftToes"] == pytest.approx([0.115, 0, -0.095], abs=1e-6)
-
-
-def test_a_person_along_unity_s_z_with_hanging_arms_and_a_bent_knee(vmc: VMC, marionette: Marionette):
-    """Left and right, front and back: each is one-sided."""
-    local = np.tile(np.eye(3), (22, 1, 1))
-    local[0] = AROUND
-    sent(vmc, marionette, frame(local))
-    assert np.abs(marionette.bones["Hips"][3:]) == pytest.approx([0, 0, 0, 1], abs=1e-6)
-    assert marionette.positions()["LeftHand"][0] == pytest.approx(-0.71)
-    assert marionette.positions()["LeftToes"][2] == pytest.approx(0.095)
-    local[JOINTS.index("left_shoulder")] = Rotation.from_euler("z", -90, degrees=True).as_matrix()
-    local[JOINTS.index("right_knee")] = Rotation.from_euler("x", 90, degrees=True).as_matrix()
-    sent(vmc, marionette, frame(local))
-    at = marionette.positions()
-    assert at["LeftHand"] - at["LeftUpperArm"] == pytest.approx([0.005, -0.53, -0.015], abs=1e-5)
-    assert at["RightFoot"] - at["RightLowerLeg"] == pytest.approx([0, 0.03, -0.42], abs=1e-5)
-
-
-def test_time_begins_at_zero_and_packets_are_whole(vmc: VMC, marionette: Marionette):
-    for seconds in (5.0, 5.25):
-        vmc.take(frame(time=seconds))
-        first, second = (marionette.socket.recv(65_536) for _ in range(2))
-        assert max(len(first), len(second)) <= LARGEST
-    for data in (first, second):
-        marionette.socket.sendto(data, ("127.0.0.1", marionette.port))
-        marionette.receive()
-    assert marionette.time == pytest.approx(0.25)
-    assert marionette.loaded
-
-
-def test_nobody_listening_costs_nothing(marionette: Marionette):
-    port = marionette.port
+    assert marionette.positions()["LeftToes"] == pytest.approx([0.115, 0, -0.095], abs=1e-6)
     marionette.close()
-    sender = VMC(Receiver("127.0.0.1", port, "--vmc"))
-    for _ in range(3):
-        sender.take(frame())
-    sender.close()
+    vmc.take(t_pose)  # without a receiver
+    vmc.close()
 
 
 # VRChat
-
-
-AROUND = Rotation.from_euler("y", 180, degrees=True).as_matrix()  # so that the person looks along Unity's +Z
 
 
 def of_axis(axis: int, degrees: float) -> np.ndarray:
@@ -202,27 +184,20 @@ ANGLE = st.sampled_from([0.0, 90.0, -90.0, 180.0]) | st.floats(-180, 180)
 @example(90.0, 30.0, 20.0)
 @example(-90.0, 30.0, 20.0)
 def test_angles_are_applied_about_z_then_x_then_y(x: float, y: float, z: float):
-    wanted = of_axis(1, y) @ of_axis(0, x) @ of_axis(2, z)
-    again = euler_degrees(wanted[None])[0]
-    made = of_axis(1, again[1]) @ of_axis(0, again[0]) @ of_axis(2, again[2])
-    np.testing.assert_allclose(made, wanted, atol=1e-6)
+    expected = of_axis(1, y) @ of_axis(0, x) @ of_axis(2, z)
+    again = euler_degrees(expected[None])[0]
+    found = of_axis(1, again[1]) @ of_axis(0, again[0]) @ of_axis(2, again[2])
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-def standing(**turns: np.ndarray) -> BodyFrame:
-    """A person who looks along Unity's +Z, some joints turned; joints' positions count their index."""
+def test_vrchat_gets_trackers_with_the_limbs_rotations():
+    """A thigh that is lifted turns the knee's tracker; the shank does not. Positions count their joint."""
     local = np.tile(np.eye(3), (22, 1, 1))
-    for name, turn in turns.items():
-        local[JOINTS.index(name)] = turn
-    local[0] = UPRIGHT @ AROUND @ local[0]
-    positions = np.arange(22.0)[:, None] * [1, 10, 100]
-    return body_frame(0.0, local, positions, REST)
-
-
-def test_where_the_trackers_are_and_how_they_turn():
-    """A thigh that is lifted turns the knee's tracker; the shank does not."""
-    lifted, bent = (Rotation.from_euler("x", angle, degrees=True).as_matrix() for angle in (-60, 80))
-    right = Rotation.from_euler("y", -30, degrees=True).as_matrix()  # SMPL's Y is up, its right -X
-    found = place_trackers(standing(left_hip=lifted, left_knee=bent, head=right))
+    for name, axis, angle in (("left_hip", "x", -60), ("left_knee", "x", 80), ("head", "y", -30)):
+        local[JOINTS.index(name)] = Rotation.from_euler(axis, angle, degrees=True).as_matrix()
+    local[0] = UPRIGHT @ AROUND
+    person = body_frame(0.0, local, np.arange(22.0)[:, None] * [1, 10, 100], REST)
+    found = place_trackers(person)
     lower = ("left_ankle", "right_ankle", "left_knee", "right_knee")
     names = ["pelvis", "spine3", *lower, "left_elbow", "right_elbow", "head"]
     index = np.array([JOINTS.index(name) for name in names], float)
@@ -232,18 +207,74 @@ def test_where_the_trackers_are_and_how_they_turn():
     assert angles["left_ankle"] == pytest.approx([20, 0, 0], abs=1e-6)
     assert angles["head"] == pytest.approx([0, 30, 0], abs=1e-6)  # clockwise, seen from above
 
-
-def test_the_datagram():
     receiver = Marionette()
     sender = VRChat(Receiver("127.0.0.1", receiver.port, "--vrchat"))
-    frame = standing()
-    sender.take(frame)
-    found = receiver.receive()
-    sender.close()
-    receiver.close()
-    names = [*map(str, range(1, 9)), "head"]
-    expected = [f"/tracking/trackers/{name}/{part}" for name in names for part in ("position", "rotation")]
-    assert [m.address for m in found] == expected
-    assert {m.types for m in found} == {",fff"}
-    values = np.array([m.values for m in found])
-    np.testing.assert_allclose(values, place_trackers(frame).reshape(-1, 3), atol=1e-4)
+    sender.take(person)
+    messages = receiver.receive()
+    sender.close(), receiver.close()
+    kinds = [f"{name}/{part}" for name in [*range(1, 9), "head"] for part in ("position", "rotation")]
+    assert [m.address for m in messages] == [f"/tracking/trackers/{kind}" for kind in kinds]
+    assert {m.types for m in messages} == {",fff"}
+    np.testing.assert_allclose([m.values for m in messages], found.reshape(-1, 3), atol=1e-4)
+
+
+# Recordings
+
+
+def frame(time: float, restarted: bool = False) -> BodyFrame:
+    """A body that goes along X at 1 m/s, whose neck turns by a radian a second."""
+    local = np.tile(np.eye(3), (22, 1, 1))
+    local[12] = Rotation.from_rotvec([0, time, 0]).as_matrix()
+    return body_frame(time, local, np.tile([time, 0, 1.0], (22, 1)), REST, restarted)
+
+
+def test_missing_frames_are_interpolated_and_breaks_left_out(tmp_path: Path):
+    """Trackers at 20 Hz make three frames at once, and the newest one's pose."""
+    lines: list[str] = []
+    recorder = Recorder([tmp_path / "a.npz"], REST, 60.0, lines.append)
+    for index in range(0, 61, 3):
+        recorder.take(frame(index / 60))
+    recorder.close()
+    clip = read_clip(tmp_path / "a.npz", "a")
+    times = np.arange(61) / 60
+    np.testing.assert_allclose(clip.trans[:, 0], times, atol=1e-6)
+    np.testing.assert_allclose(clip.poses[:, 12, 1], times, atol=1e-6)
+    assert lines == [f"{tmp_path / 'a.npz'}: 1.0 s, 40 of 61 frames interpolated"]
+    for number, later in enumerate((10.0, 0.7, -3.0)):
+        recorder = Recorder([tmp_path / f"{number}.npz"], REST, 60.0, lines.append)
+        for start in (5, 5 + later):
+            for index in range(10):
+                recorder.take(frame(start + index / 60, restarted=start != 5 and index == 0))
+        recorder.close()
+        assert len(read_clip(tmp_path / f"{number}.npz", "a")) == 20
+        assert lines[-1].endswith("0.3 s, 1 break left out")
+
+
+def test_bad_files_are_rejected_at_once_and_nothing_is_written_without_a_frame(tmp_path: Path):
+    (tmp_path / "there.bvh").write_text("precious")
+    for names, words in (
+        (["a.fbx"], "--record .*a.fbx"),
+        (["there.bvh"], "there.bvh: already exists"),
+        (["a.bvh", "a.bvh"], "the same file twice"),
+        (["there.bvh/a.bvh"], "cannot be written"),
+    ):
+        with pytest.raises(InputError, match=words):
+            Recorder([tmp_path / name for name in names], REST, 60.0, pytest.fail)
+    assert (tmp_path / "there.bvh").read_text() == "precious"
+    lines: list[str] = []
+    Recorder([tmp_path / "new" / "a.bvh"], REST, 60.0, lines.append).close()
+    assert list((tmp_path / "new").iterdir()) == []
+    assert len(lines) == 1
+
+
+def test_the_other_files_are_written_if_one_cannot_be(tmp_path: Path):
+    lines: list[str] = []
+    recorder = Recorder([tmp_path / n for n in ("a.npz", "b/a.bvh", "a.glb")], REST, 60.0, lines.append)
+    recorder.take(frame(0.0))
+    recorder.take(frame(1 / 60))
+    (tmp_path / "b").rmdir()
+    (tmp_path / "b").write_text("a file where a folder is needed")
+    with pytest.raises(InputError, match=r"a\.bvh: cannot be written"):
+        recorder.close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.glb", "a.npz", "b"]
+    assert len(lines) == 2

@@ -79,67 +79,64 @@ def run_loop(
     outputs: Outputs | None = None,
     fitting: Fitting | None = None,
     avatar: bool = False,
-    tell: Callable[[str], None] = lambda line: None,
+    report: Callable[[str], None] = lambda line: None,
 ) -> None:
     """Feed samples to the stream, and its frames to the outputs and to open pages, until `stopped` is set.
-
-    A message has the frame's number and time (s); the milliseconds that the exported step took (`ms`), and
-    those that passed from the sample's arrival until all outputs had the pose (`whole`); how many samples
-    were dropped, malformed, or foreign so far; whether the samples' times jump (`OddSamples`); the trackers
-    that are held; and the joints' positions, predicted and true (66 whole millimetres each, in openxr's
-    axes). Rejected packets are reported at once, by a message with these counts alone.
 
     Args:
         stream: the stream of poses; its network is `stream.network`.
         source: gives the samples.
-        publish: gets the messages.
+        publish: gets the messages (`frame_message`); for a malformed sample, the counts alone.
         stopped: ends the loop.
         outputs: get the frames first.
         fitting: fits the stream to its wearer between the samples.
         avatar: whether messages include the avatar's pose (`avatar_message`).
-        tell: gets a line if samples are odd (`OddSamples`), and for the first rejected sample.
+        report: gets a line if samples are odd (`OddSamples`), and for the first malformed sample.
     """
-    stream.odd = OddSamples(tell)
-    number, refused, dropped, reported = 0, 0, 0, (0, 0)
+    stream.odd = OddSamples(report)
+    number, counts = 0, {"dropped": 0, "malformed": 0}
     while not stopped.is_set():
-        sample = source.read()
-        if fitting:
-            fitting.step(sample and sample.trackers)
-        if (source.malformed + refused, source.foreign) != reported:
-            reported = source.malformed + refused, source.foreign
-            publish({"dropped": dropped, "malformed": reported[0], "foreign": reported[1]})
-        if sample is None:
-            continue
-        dropped += sample.dropped
-        arrived = sample.arrived or time.perf_counter()
         try:
+            sample = source.read()
+            if fitting:
+                fitting.step(sample and sample.trackers)
+            if sample is None:
+                continue
+            counts["dropped"] += sample.dropped
             frame = stream.step_body(*sample.trackers, time=sample.time)
         except InputError as error:
-            refused += 1
-            if refused == 1:
-                tell(f"a sample is rejected: {error}")
+            counts["malformed"] += 1
+            if counts["malformed"] == 1:
+                report(f"a sample is rejected: {error}")
+            publish(dict(counts))
             continue
         if not frame.fresh:
             continue
         if outputs:
             outputs.take(frame)
-        whole = 1000 * (time.perf_counter() - arrived)
-        reported = source.malformed + refused, source.foreign
-        message = {
-            "number": number,
-            "time": round(frame.time, 4),
-            "held": frame.held,
-            "jumping": stream.odd.jumping,
-            "ms": round(1000 * stream.step_seconds, 3),
-            "whole": round(whole, 3),
-            "dropped": dropped,
-            "malformed": reported[0],
-            "foreign": reported[1],
-            "positions": to_millimetres(raise_by(frame.positions, stream.wearer.floor)),
-            "truth": to_millimetres(source.truth(frame.time)),
-        }
+        whole = 1000 * (time.perf_counter() - sample.arrived)
+        message = frame_message(stream, frame, source.truth(frame.time))
+        message |= {"number": number, "whole": round(whole, 3), **counts}
         publish(message | (avatar_message(frame) if avatar else {}))
         number += 1
+
+
+def frame_message(stream: Stream, frame: BodyFrame, truth: np.ndarray | None) -> dict[str, Any]:
+    """Return the message about a stream's newest frame, without its number and the loop's counts.
+
+    It has the frame's time (s), the held trackers, whether the samples' times jump (`OddSamples`), the
+    milliseconds that the exported step took (`ms`), and the joints' positions, predicted and true (66 whole
+    millimetres each, in openxr's axes). The loop adds the milliseconds from the sample's arrival until all
+    outputs had the pose (`whole`).
+    """
+    return {
+        "time": round(frame.time, 4),
+        "held": frame.held,
+        "jumping": stream.odd.jumping,
+        "ms": round(1000 * stream.step_seconds, 3),
+        "positions": to_millimetres(raise_by(frame.positions, stream.wearer.floor)),
+        "truth": to_millimetres(truth),
+    }
 
 
 def to_millimetres(joints: np.ndarray | None) -> list[int] | None:

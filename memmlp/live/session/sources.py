@@ -21,7 +21,6 @@ import math
 import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
-from importlib.util import find_spec
 from ipaddress import IPv4Network, ip_address
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -29,7 +28,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from memmlp.common.errors import InputError
+from memmlp.common.page_server import EVERYWHERE, HOST
 from memmlp.common.progress import notify
+from memmlp.live.outputs import encode_osc
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
 from memmlp.live.spaces import Space, SpaceName
 from memmlp.live.tracker_resampling import TRACKERS, TrackerSample, interpolate
@@ -43,17 +44,14 @@ from memmlp.motion.body import (
     SPARSE_ROTATION,
 )
 
-HOST = "127.0.0.1"
-EVERYWHERE = "0.0.0.0"
 PREFIX = "/memmlp/"
 POSE = 7  # numbers of a pose
-FARTHEST = 1e6  # the largest absolute value of a number in a pose
-REPORTED = 3  # strangers that are reported
+REPORTED = 3  # other machines that are reported
 WAIT = 0.25  # seconds that `read` waits at most
 PAUSE = 1.0  # seconds between two rounds of a clip, so long that the stream restarts
 LARGEST = 65_536  # the largest datagram, bytes
 OVERTAKEN = 20  # packets that may overtake another; a number further back is a sender that restarted
-FORGOTTEN = 10_000  # so many missing numbers are another sender, not lost packets
+RESTARTED = 10_000  # so many missing numbers are another sender, not lost packets
 
 QuaternionPose = tuple[np.ndarray, np.ndarray] | None
 """A tracker's position (3,), metres, and quaternion xyzw (4,); None for a lost tracker."""
@@ -76,14 +74,14 @@ class Packet(NamedTuple):
 
 
 def from_json(datagram: bytes) -> Packet:
-    """Read the packet of a JSON datagram. Raises ValueError for anything else."""
+    """Read the packet of a JSON datagram. Raises InputError for anything else."""
     try:
         fields = json.loads(datagram)
-    except RecursionError:
-        raise ValueError("nested too deeply") from None
+    except (ValueError, RecursionError):
+        raise InputError("packet: must be JSON") from None
     if not isinstance(fields, dict):
-        raise ValueError("not a JSON object")
-    return make_packet(fields)
+        raise InputError("packet: must be a JSON object")
+    return read_packet(fields)
 
 
 def to_json(packet: Packet) -> bytes:
@@ -92,7 +90,7 @@ def to_json(packet: Packet) -> bytes:
 
 
 def from_osc(datagram: bytes) -> Packet:
-    """Read the packet of an OSC bundle. Raises ValueError for anything else."""
+    """Read the packet of an OSC bundle. Raises InputError for anything else."""
     from pythonosc.osc_bundle import OscBundle
     from pythonosc.osc_message import OscMessage
 
@@ -101,70 +99,52 @@ def from_osc(datagram: bytes) -> Packet:
         parts = [part for part in OscBundle(datagram) if isinstance(part, OscMessage)]
         arguments = {part.address.removeprefix(PREFIX): list(part.params) for part in parts}
     except Exception as error:  # the library raises many kinds over bytes that are not OSC
-        raise ValueError(f"not an OSC bundle ({error})") from None
+        raise InputError(f"packet: must be an OSC bundle ({error})") from None
     finally:
         logging.disable(logging.NOTSET)
     numbers = {key: arguments[key][0] for key in ("time", "seq") if arguments.get(key)}
-    return make_packet(arguments | numbers)
+    return read_packet(arguments | numbers)
 
 
 def to_osc(packet: Packet) -> bytes:
     """Return the OSC bundle of a packet."""
-    from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
-    from pythonosc.osc_message_builder import OscMessageBuilder
-
-    bundle = OscBundleBuilder(IMMEDIATELY)
-    for name, value in _fields(packet).items():
-        if value is None:
-            continue
-        message = OscMessageBuilder(PREFIX + name)
-        for number in value if isinstance(value, list) else [value]:
-            message.add_arg(number, {"time": "d", "seq": "i"}.get(name, "f"))
-        bundle.add_content(message.build())
-    return bundle.build().dgram
+    kinds = {"time": "d", "seq": "i"}
+    fields = {name: value for name, value in _fields(packet).items() if value is not None}
+    return encode_osc(
+        (PREFIX + name, kinds.get(name, POSE * "f"), [value] if name in kinds else value)
+        for name, value in fields.items()
+    )
 
 
-def make_packet(fields: Mapping[str, Any]) -> Packet:
-    """Return the packet with named values. Raises ValueError if they are malformed."""
+def read_packet(fields: Mapping[str, Any]) -> Packet:
+    """Return the packet with named values. Raises InputError if they are malformed.
+
+    Whether times and rotations are valid is checked by the stream.
+    """
     if not any(name in fields for name in TRACKERS):
-        raise ValueError(f"expected {', '.join(TRACKERS)}")
-    sent, seq = fields.get("time"), fields.get("seq")
-    if sent is not None and not _is_number(sent):
-        raise ValueError("time: not a number")
-    if seq is not None and (not isinstance(seq, int) or isinstance(seq, bool)):
-        raise ValueError("seq: not an integer")
+        raise InputError(f"packet: must have {', '.join(TRACKERS)}")
+    seq = fields.get("seq")
+    if seq is not None and not isinstance(seq, int):
+        raise InputError("seq: must be an integer")
     head, left, right = (_read_pose(name, fields.get(name)) for name in TRACKERS)
-    return Packet((head, left, right), sent, seq)
+    return Packet((head, left, right), fields.get("time"), seq)
 
 
 def _read_pose(name: str, values: Any) -> QuaternionPose:
-    """Return a tracker from its seven numbers. Raises ValueError if they are not a pose."""
     if values is None:
         return None
-    if not isinstance(values, list) or len(values) != POSE or not all(map(_is_number, values)):
-        raise ValueError(f"{name}: not {POSE} numbers")
-    pose = np.array(values, np.float64)
-    norm = float(np.linalg.norm(pose[3:]))
-    if np.abs(pose).max() > FARTHEST or abs(norm - 1) > 1e-2:
-        raise ValueError(f"{name}: not a pose")
-    return pose[:3], pose[3:] / norm
-
-
-def _is_number(value: Any) -> bool:
-    if not isinstance(value, int | float) or isinstance(value, bool):
-        return False
-    return abs(value) < 1e300 and math.isfinite(value)
+    try:
+        pose = np.array(values, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        pose = np.empty(0)
+    if pose.shape != (POSE,):
+        raise InputError(f"{name}: must be {POSE} numbers")
+    return pose[:3], pose[3:]
 
 
 def _fields(packet: Packet) -> dict[str, Any]:
-    poses = [None if t is None else [float(v) for part in t for v in part] for t in packet.trackers]
+    poses = [None if pose is None else [float(v) for part in pose for v in part] for pose in packet.trackers]
     return {"time": packet.time, "seq": packet.seq, **dict(zip(TRACKERS, poses, strict=True))}
-
-
-def require_osc(option: str = "--osc", instead: str = "--udp") -> None:
-    """Raise InputError if python-osc, which an option needs, is not installed."""
-    if find_spec("pythonosc") is None:
-        raise InputError(f"{option}: needs python-osc: pip install 'memmlp[osc]'; or use {instead}")
 
 
 class SourceSample(NamedTuple):
@@ -173,36 +153,34 @@ class SourceSample(NamedTuple):
     Attributes:
         time: seconds of the trackers' clock.
         trackers: head, left and right.
+        arrived: the time of arrival, seconds of `time.perf_counter`.
         dropped: how many samples were lost before this one.
-        arrived: the time of arrival, seconds of `time.perf_counter`; None for the time at which it is
-            returned.
     """
 
     time: float
     trackers: QuaternionPoses
+    arrived: float
     dropped: int = 0
-    arrived: float | None = None
 
 
 class TrackerSource(Protocol):
     """Gives tracker poses, one sample after the other.
 
     Attributes:
-        name: the source in words.
+        name: the source's description.
         space: the frame of reference of its poses.
-        malformed: how many packets could not be read.
-        foreign: how many packets came from machines whose packets are rejected.
         worn: whether the poses come from a wearer's devices, so that the stream can be fitted.
     """
 
     name: str
     space: SpaceName
-    malformed: int
-    foreign: int
     worn: bool
 
     def read(self) -> SourceSample | None:
-        """Return the next sample; None if none came within `WAIT` seconds."""
+        """Return the next sample; None if none came within `WAIT` seconds.
+
+        Raises InputError for a malformed sample.
+        """
 
     def truth(self, time: float) -> np.ndarray | None:
         """Return the true joints (22, 3), metres, AMASS' world, at a time; None if they are unknown."""
@@ -289,7 +267,6 @@ class ClipSource:
     """
 
     space: SpaceName = "amass"
-    malformed = foreign = 0
     worn = False
 
     def __init__(
@@ -323,7 +300,8 @@ class ClipSource:
         self.next = index + 1
         turn, step = divmod(index, self.count)
         within = step / self.hz
-        return SourceSample(turn * self.round_seconds + within, self.clip.trackers(within), dropped)
+        trackers = self.clip.trackers(within)
+        return SourceSample(turn * self.round_seconds + within, trackers, time.perf_counter(), dropped)
 
     @property
     def round_seconds(self) -> float:
@@ -345,11 +323,11 @@ class PacketSource:
     Args:
         name: the kind of packets, in words.
         port: the port; 0 for any free one.
-        parse: reads the packet of a datagram, or raises ValueError.
+        parse: reads the packet of a datagram, or raises InputError.
         space: the frame of reference of the poses.
         senders: the other machines whose packets are accepted; without any, only this machine can reach the
             port.
-        tell: gets a line about each machine whose packets are rejected.
+        report: gets a line about each machine whose packets are rejected.
 
     Raises:
         InputError: if the port is in use.
@@ -364,10 +342,9 @@ class PacketSource:
         parse: Callable[[bytes], Packet],
         space: SpaceName,
         senders: Sequence[IPv4Network] = (),
-        tell: Callable[[str], None] = lambda line: None,
+        report: Callable[[str], None] = lambda line: None,
     ):
-        self.parse, self.space, self.senders, self.tell = parse, space, senders, tell
-        self.malformed = self.foreign = 0
+        self.parse, self.space, self.senders, self.report = parse, space, senders, report
         self.strangers: set[str] = set()
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.settimeout(WAIT)
@@ -383,9 +360,10 @@ class PacketSource:
         self.last: int | None = None
 
     def read(self) -> SourceSample | None:
-        """Return the next packet's sample; None if no packet came in time, or if the packet is rejected.
+        """Return the next packet's sample; None if no packet came in time, or if it is left out.
 
-        A packet that others have overtaken is rejected; it was counted as lost when they came.
+        A packet that others have overtaken is left out; it was counted as lost when they came. Raises
+        InputError for a malformed packet.
         """
         try:
             datagram, (sender, _) = self.socket.recvfrom(LARGEST)
@@ -394,25 +372,20 @@ class PacketSource:
         arrived = time.perf_counter()
         address = ip_address(sender)
         if not address.is_loopback and not any(address in network for network in self.senders):
-            self.foreign += 1
             if sender not in self.strangers and len(self.strangers) < REPORTED:
                 self.strangers.add(sender)
-                self.tell(f"packets from {sender} are ignored; accept them with --sender {sender}")
+                self.report(f"packets from {sender} are ignored; accept them with --sender {sender}")
             return None
-        try:
-            packet = self.parse(datagram)
-        except ValueError:
-            self.malformed += 1
-            return None
+        packet = self.parse(datagram)
         dropped = 0
         if self.last is not None and packet.seq is not None:
             if 0 < self.last - packet.seq <= OVERTAKEN:
                 return None
             missing = packet.seq - self.last - 1
-            dropped = missing if 0 < missing < FORGOTTEN else 0
+            dropped = missing if 0 < missing < RESTARTED else 0
         self.last = packet.seq
         now = time.monotonic() if packet.time is None else packet.time
-        return SourceSample(now, packet.trackers, dropped, arrived)
+        return SourceSample(now, packet.trackers, arrived, dropped)
 
     def truth(self, time: float) -> None:
         """Return None, since the truth is unknown."""

@@ -153,7 +153,7 @@ def test_an_avatar_is_as_tall_as_the_wearer_of_the_frame(browser: Browser, own: 
             person = pose(size)
             told = avatar_message(person) | {"positions": to_millimetres(person.positions), "truth": None}
             times = {"number": number, "time": 0.0, "held": [], "jumping": False, "ms": 1.0, "whole": 1.0}
-            server.hub.publish(told | times | {"dropped": 0, "malformed": 0, "foreign": 0})
+            server.hub.publish(told | times | {"dropped": 0, "malformed": 0})
             browser.wait(f"Math.abs(window.size - {size}) < 1e-3")
     assert browser.errors == []
 

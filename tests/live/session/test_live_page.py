@@ -107,7 +107,7 @@ def test_it_says_what_it_waits_for_and_when_the_command_has_ended(
 
 
 def frame(number: int) -> dict[str, object]:
-    counts = {"held": [], "jumping": False, "dropped": 0, "malformed": 0, "foreign": 0}
+    counts = {"held": [], "jumping": False, "dropped": 0, "malformed": 0}
     positions = {"positions": np.random.default_rng(0).integers(0, 1500, 66).tolist(), "truth": None}
     return {"number": number, "time": 0.0, "ms": 1.0, "whole": 1.0, **positions, **counts}
 

@@ -14,7 +14,6 @@ let greeting = null;
 let greeted = null; // the greeting as it came
 let arrived = -Infinity;
 let malformed = 0;
-let foreign = 0;
 
 const events = new EventSource('events');
 events.addEventListener('greeting', event => {
@@ -25,7 +24,7 @@ events.addEventListener('greeting', event => {
 events.addEventListener('wearer', event => wearer.show(JSON.parse(event.data)));
 events.addEventListener('frame', event => {
   const frame = JSON.parse(event.data);
-  ({ malformed, foreign } = frame);
+  ({ malformed } = frame);
   if (!frame.positions) return; // the message has the counts alone
   if (frame.number <= history.last && history.frames.length) begin(); // the command was started again
   history.add(frame);
@@ -116,8 +115,6 @@ function tell(frame) {
   if (frame.mean !== null) $('mean').textContent = frame.mean.toFixed(1);
   for (const key of ['dropped', 'malformed']) $(key).textContent = frame[key];
   $('frames').textContent = frame.number + 1;
-  $('foreign').textContent = foreign;
-  $('strangers').hidden = !foreign;
   $('jumping').hidden = !frame.jumping;
   for (const item of $('trackers').children) item.classList.toggle('held', frame.held.includes(item.dataset.name));
   for (const row of document.querySelectorAll('#latency [data-key]')) {
