@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.patches import FancyArrowPatch
-from matplotlib.transforms import IdentityTransform
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from memmlp.common.files import atomic_write
@@ -18,16 +18,15 @@ from memmlp.live.rotations import BodyTree
 from memmlp.live.spaces import SPACES, Space
 from memmlp.motion.body import JOINTS, PARENTS, TRACKED, builtin_rest_joints
 from memmlp.motion.limb_shapes import RADII
-from memmlp.report.pictures.canvas import FAINT, INK, Sheet, png
-from memmlp.report.pictures.raster import Camera, draw
-from memmlp.report.pictures.skeleton_picture import LEFT, MIDDLE, RIGHT
+from memmlp.report.pictures.drawing import Camera, draw_skeleton, encode_png, fix_layout, make_panels
+from memmlp.report.pictures.skeleton_picture import LEFT, MIDDLE, RIGHT, colour_of
 
 IMAGES = Path(__file__).parent / "images"
 COLOURS = ("#d1242f", "#1a7f37", "#0969da")  # of X, Y and Z
 TREE = BodyTree(JOINTS, PARENTS, builtin_rest_joints())
 FACING = SPACES["openxr"].rotations_in(np.eye(3))  # the root of a person who stands and looks forward
 RIGHTWARD, FORWARD, UP = np.eye(3)  # of that person
-WIDTH, HEIGHT, TOP = 380, 400, 66  # pixels of a panel, and above it
+WIDTH, HEIGHT = 380, 466  # pixels of a panel
 AZIMUTH = np.pi - 0.62
 
 
@@ -58,31 +57,23 @@ ENGINES = (
 
 
 class View:
-    """A panel of a sheet with a body, onto which arrows and words can be drawn."""
+    """A panel with a body, onto which arrows and words can be drawn."""
 
-    def __init__(self, sheet: Sheet, corner: tuple[int, int], joints: np.ndarray, camera: Camera):
-        self.sheet, self.corner, self.camera = sheet, corner, camera
-        floor = float((joints[:, 2] - np.array(RADII)).min())
-        sheet.panel(*corner, camera.width, camera.height).set_data(draw(camera, joints, None, floor))
+    def __init__(self, panel: Axes, joints: np.ndarray, camera: Camera):
+        self.panel, self.camera = panel, camera
+        draw_skeleton(panel, camera, joints, floor=float((joints[:, 2] - np.array(RADII)).min()))
 
     def place(self, point: np.ndarray) -> np.ndarray:
-        """Return where a point (3,) of the world is on the sheet, pixels from the upper left corner."""
-        right, up, _ = self.camera.project(point) * self.camera.scale
-        middle = np.array(self.corner) + np.array([self.camera.width, self.camera.height]) / 2
-        return middle + np.array([right, -up])
+        """Return where a point (3,) of the world is in the panel, metres."""
+        return self.camera.project(point)[:2]
 
     def arrow(self, start: np.ndarray, end: np.ndarray, colour: str, word: str = "") -> None:
         """Draw an arrow between two points of the world, with a word beyond its head."""
         a, b = self.place(start), self.place(end)
-        flipped = [(float(x), self.sheet.height - float(y)) for x, y in (a, b)]
-        arrow = FancyArrowPatch(
-            *flipped, arrowstyle="-|>", mutation_scale=11, lw=2, shrinkA=0, shrinkB=0, color=colour,
-            transform=IdentityTransform(),
-        )  # fmt: skip
-        self.sheet.figure.add_artist(arrow)
-        if word:
-            beyond = b + 11 * (b - a) / max(float(np.hypot(*(b - a))), 8.0)
-            self.sheet.text(*beyond, word, 16, color=colour, weight="bold")
+        style = {"arrowstyle": "-|>", "lw": 2, "color": colour, "shrinkA": 0, "shrinkB": 0}
+        self.panel.annotate("", b, a, arrowprops=style)
+        beyond = b + 0.07 * (b - a) / max(float(np.hypot(*(b - a))), 0.05)
+        self.panel.text(*beyond, word, color=colour, weight="bold", ha="center", va="center")
 
     def axes(self, origin: np.ndarray, axes: np.ndarray, length: float, words: str = "XYZ") -> None:
         """Draw X, Y and Z, the rows of `axes`, from a point, those farther away first."""
@@ -99,36 +90,37 @@ def standing(local: np.ndarray | None = None) -> np.ndarray:
     return joints - [0, 0, (joints[:, 2] - np.array(RADII)).min()]
 
 
-def camera_on(joints: np.ndarray, azimuth: float = AZIMUTH, scale: float = 155, **size: int) -> Camera:
+def camera_on(joints: np.ndarray, azimuth: float = AZIMUTH, metres: float = 2.6) -> Camera:
     """Return a camera on the middle of a body."""
-    centre = (joints.min(0) + joints.max(0)) / 2
-    size = {"width": WIDTH, "height": HEIGHT} | size
-    return Camera(centre, azimuth, size["width"], size["height"], scale, np.deg2rad(14))
+    return Camera((joints.min(0) + joints.max(0)) / 2, azimuth, metres, np.deg2rad(14))
 
 
-def engines(sheet: Sheet) -> None:
+def engines() -> Figure:
     """Draw a person and the axes of each convention."""
     joints = standing()
-    for index, engine in enumerate(ENGINES):
-        row, column = divmod(index, 3)
-        x, y = column * WIDTH, row * (TOP + HEIGHT)
+    figure, panels = make_panels(3 * WIDTH, 2 * HEIGHT, 2, 3)
+    for panel, engine in zip(panels.flat, ENGINES, strict=True):
         hand = "right-handed" if engine.right_handed else "left-handed"
-        sheet.text(x + WIDTH / 2, y + 24, engine.name, 19, weight="bold")
-        sheet.text(x + WIDTH / 2, y + 50, f"{hand}, {engine.words}", 14, color=FAINT)
-        view = View(sheet, (x, y + TOP), joints, camera_on(joints))
+        panel.set_title(f"{engine.name}\n{hand}, {engine.words}")
+    fix_layout(figure)
+    for panel, engine in zip(panels.flat, ENGINES, strict=True):
+        view = View(panel, joints, camera_on(joints))
         view.axes(joints[0] * [1, 1, 0] + 0.75 * FORWARD, np.array(engine.axes), 0.42)
+    return figure
 
 
-def identities(sheet: Sheet) -> None:
+def identities() -> Figure:
     """Draw the body all of whose rotations are the identity, in each space."""
-    for column, space in enumerate(SPACES.values()):
+    figure, panels = make_panels(3 * WIDTH, HEIGHT, 1, 3)
+    for panel, name in zip(panels.flat, SPACES, strict=True):
+        panel.set_title(f"{name}\n{LIES[name]}")
+    fix_layout(figure)
+    for panel, space in zip(panels.flat, SPACES.values(), strict=True):
         joints = TREE.positions(rooted(space, np.eye(3)))
         joints = joints - [0, 0, (joints[:, 2] - np.array(RADII)).min()]
-        sheet.text((column + 0.5) * WIDTH, 24, space.name, 19, weight="bold")
-        sheet.text((column + 0.5) * WIDTH, 50, LIES[space.name], 14, color=FAINT)
-        view = View(sheet, (column * WIDTH, TOP), joints, camera_on(joints, scale=150))
-        corner = joints[0] * [1, 1, 0] + np.array([0.75, 0.75, 0.0])
-        view.axes(corner, space.world.T, 0.4)
+        view = View(panel, joints, camera_on(joints))
+        view.axes(joints[0] * [1, 1, 0] + np.array([0.75, 0.75, 0.0]), space.world.T, 0.4)
+    return figure
 
 
 LIES = {
@@ -144,7 +136,7 @@ def rooted(space: Space, root: np.ndarray) -> np.ndarray:
     return space.pose_in(np.concatenate([root[None], turns[1:]]))
 
 
-def trackers(sheet: Sheet) -> None:
+def trackers() -> Figure:
     """Draw the axes of head and wrists in T-pose, and in a pose, in the space openxr."""
     turn = {
         "head": Rotation.from_euler("yx", [35, 15], degrees=True),
@@ -155,14 +147,16 @@ def trackers(sheet: Sheet) -> None:
     posed = np.array([turn.get(name, Rotation.identity()).as_matrix() for name in JOINTS])
     still = np.tile(np.eye(3), (len(JOINTS), 1, 1))
     words = ("T-pose: all three rotations are the identity", "a pose: each rotation is the turn since then")
-    for column, (local, title) in enumerate(zip((still, posed), words, strict=True)):
-        joints = standing(local)
-        left = column * 570
-        sheet.text(left + 285, 30, title, 18, weight="bold")
-        view = View(sheet, (left, 50), joints, camera_on(joints, scale=228, width=570, height=530))
-        turns = global_turns(local)
+    figure, panels = make_panels(1140, 580, 1, 2)
+    for panel, title in zip(panels.flat, words, strict=True):
+        panel.set_title(title)
+    fix_layout(figure)
+    for panel, local in zip(panels.flat, (still, posed), strict=True):
+        joints, turns = standing(local), global_turns(local)
+        view = View(panel, joints, camera_on(joints, metres=2.3))
         for joint in TRACKED:
             view.axes(joints[joint], SPACES["openxr"].world.T @ turns[joint].T, 0.26)
+    return figure
 
 
 def global_turns(local: np.ndarray) -> np.ndarray:
@@ -174,47 +168,38 @@ def global_turns(local: np.ndarray) -> np.ndarray:
     return FACING @ turns @ FACING.T
 
 
-def t_pose(sheet: Sheet) -> None:
+def t_pose() -> Figure:
     """Draw the T-pose from the front with the joints' indices, and list their names."""
     joints = standing()
-    view = View(sheet, (190, 20), joints, camera_on(joints, np.pi, 330, width=760, height=640))
+    figure, panels = make_panels(1160, 694, 1, 3)
+    right, front, left = panels.flat
+    front.set_xlabel("from the front: the person's left is on the right; ○ has a tracker")
+    fix_layout(figure)
+    for panel, start, width in ((right, 0, 0.2), (front, 0.16, 0.66), (left, 0.84, 0.16)):
+        panel.set_position((start, 0.06, width, 0.94))
+    view = View(front, joints, camera_on(joints, np.pi, 2.0))
     for joint, point in enumerate(joints):
         x, y = view.place(point)
         if joint in TRACKED:
-            sheet.text(x, y, "○", 34, color=INK, weight="bold")
-        sheet.text(x, y, "●", 12, color=colour(joint))
-        beside = {"ha": "left"} if colour(joint) == MIDDLE else {}
-        shift = np.array([12, 0]) if beside else np.array([0, -19])
-        sheet.text(*(np.array([x, y]) + shift), str(joint), 15, weight="bold", **beside)
-    for left, shown in ((20, RIGHT), (1000, LEFT), (1000, MIDDLE)):
-        listed = [joint for joint in range(len(JOINTS)) if colour(joint) == shown]
-        for row, joint in enumerate(listed):
-            top = 480 if shown == MIDDLE else 60
-            sheet.text(left, top + 26 * row, f"{joint}  {JOINTS[joint]}", 16, ha="left", color=shown)
-    sheet.text(
-        570, 674, "from the front: the person's left is on the right; ○ has a tracker", 15, color=FAINT
-    )
-
-
-def colour(joint: int) -> str:
-    """Return the colour of a joint's side."""
-    return {"left": LEFT, "right": RIGHT}.get(JOINTS[joint].split("_")[0], MIDDLE)
+            front.plot(x, y, "o", ms=16, mfc="none", color="black")
+        front.plot(x, y, "o", ms=5, color=colour_of(JOINTS[joint]))
+        front.annotate(str(joint), (x, y), (6, 6), textcoords="offset points", weight="bold")
+    for panel, top, shown in ((right, 0.9, RIGHT), (left, 0.9, LEFT), (left, 0.4, MIDDLE)):
+        for row, joint in enumerate(one for one in range(len(JOINTS)) if colour_of(JOINTS[one]) == shown):
+            panel.text(0.05, top - 0.04 * row, f"{joint}  {JOINTS[joint]}", color=shown)
+    return figure
 
 
 PICTURES = {
-    "engine_axes": (engines, 3 * WIDTH, 2 * (TOP + HEIGHT)),
-    "engine_identity": (identities, 3 * WIDTH, TOP + HEIGHT),
-    "engine_trackers": (trackers, 1140, 580),
-    "engine_joints": (t_pose, 1160, 694),
-}
+    "engine_axes": engines, "engine_identity": identities, "engine_trackers": trackers,
+    "engine_joints": t_pose,
+}  # fmt: skip
 
 
 def main() -> None:
     """Write all pictures."""
-    for name, (picture, width, height) in PICTURES.items():
-        sheet = Sheet(width, height)
-        picture(sheet)
-        atomic_write(IMAGES / f"{name}.png", png(sheet.pixels()))
+    for name, picture in PICTURES.items():
+        atomic_write(IMAGES / f"{name}.png", encode_png(picture()))
 
 
 if __name__ == "__main__":

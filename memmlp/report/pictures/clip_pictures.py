@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from io import BytesIO
 from itertools import chain, cycle
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,21 +14,25 @@ from memmlp.common.errors import InputError, require
 from memmlp.common.files import atomic_write
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS
-from memmlp.report.pictures.canvas import FAINT, Sheet, png
 from memmlp.report.pictures.clip_piece import ClipPiece
-from memmlp.report.pictures.raster import NEUTRAL, draw, heat_colours
+from memmlp.report.pictures.drawing import (
+    NEUTRAL,
+    Camera,
+    draw_skeleton,
+    encode_png,
+    fix_layout,
+    get_pixels,
+    heat_colours,
+    make_panels,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.text import Text
 
 SUFFIXES = (".png", ".gif", ".mp4")
 POSES = 6
-
-# Sizes of a figure's panels and margins, pixels.
-POSE_WIDTH, POSE_HEIGHT = 230, 330
-HEAD, LEFT, COLOUR_BAR, CAPTION = 84, 40, 110, 26
-
-# Sizes of a film's panels and margins, pixels.
-WIDTH, HEIGHT = 340, 480
-TOP, RIGHT, BOTTOM = 88, 112, 44
-
 RATE = 30  # pictures a second
 TICKS = (30, 30, 40)  # milliseconds of a GIF's pictures in turn, multiples of 10: 30 a second on average
 
@@ -58,66 +63,71 @@ def write_picture(path: Path, piece: ClipPiece, poses: int = POSES, key: str = "
     suffix = path.suffix.lower()
     try:
         if suffix == ".png":
-            atomic_write(path, png(draw_poses(piece, poses)))
+            atomic_write(path, encode_png(draw_poses(piece, poses)))
         else:
             atomic_write(path, {".gif": encode_gif, ".mp4": encode_mp4}[suffix](draw_film(piece)))
     except OSError as error:
         raise InputError(f"{key} {path}: {error.strerror or error}") from None
 
 
-def draw_poses(piece: ClipPiece, poses: int = POSES) -> np.ndarray:
-    """Draw a heat-map figure like the paper's Figs. 6 and 9 to 13, as a picture (height, width, 3), uint8.
+def draw_poses(piece: ClipPiece, poses: int = POSES) -> Figure:
+    """Draw a heat-map figure like the paper's Figs. 6 and 9 to 13.
 
     The first row has the truth's poses, and each further row a prediction, coloured by error. Each pose is
     seen from the person's front, by the same camera in all rows. The mean error of the 22 joints is written
     under a prediction.
     """
-    rows, step = 1 + len(piece.predictions), POSE_HEIGHT + CAPTION
-    sheet = Sheet(LEFT + poses * POSE_WIDTH + COLOUR_BAR, HEAD + rows * step + 8)
-    sheet.text(LEFT, 28, piece.title, 22, ha="left", weight="bold")
-    for row, label in enumerate(["truth", *piece.predictions]):
-        sheet.text(20, HEAD + row * step + POSE_HEIGHT / 2, label, 17, rotation=90, weight="bold")
-    frames = np.linspace(0, len(piece.truth) - 1, poses + 2).round().astype(int)[1:-1]
-    for column, frame in enumerate(progress_bar(frames.tolist(), "poses")):
-        x = LEFT + column * POSE_WIDTH
-        sheet.text(x + POSE_WIDTH / 2, HEAD - 16, f"{piece.seconds(frame):.2f} s", 17)
-        camera = piece.camera(piece.azimuth(frame), piece.truth[frame, 0, :2], POSE_WIDTH, POSE_HEIGHT)
-        for row, (joints, errors) in enumerate(piece.rows(frame)):
-            panel = sheet.panel(x, HEAD + row * step, POSE_WIDTH, POSE_HEIGHT)
-            panel.set_data(draw(camera, joints, errors, piece.floor))
-        for row, errors in enumerate(piece.errors.values(), 2):
-            mean = f"{errors[frame].mean():.1f} cm"
-            sheet.text(x + POSE_WIDTH / 2, HEAD + row * step - CAPTION + 10, mean, 16, color=FAINT)
-    tall = min(360, rows * step - 40)
-    sheet.colour_bar(LEFT + poses * POSE_WIDTH + 18, HEAD + (rows * step - tall) // 2, 16, tall, piece.top)
-    return sheet.pixels()
+    labels = ["truth", *piece.predictions]
+    figure, panels = make_panels(150 + 230 * poses, 60 + 360 * len(labels), len(labels), poses)
+    frames = np.linspace(0, len(piece.truth) - 1, poses + 2).round().astype(int)[1:-1].tolist()
+    for column, frame in zip(panels.T, frames, strict=True):
+        column[0].set_title(f"{piece.seconds(frame):.2f} s")
+        _write_errors(column[1:], piece, frame)
+    for panel, label in zip(panels[:, 0], labels, strict=True):
+        panel.set_ylabel(label, weight="bold")
+    _add_scale(figure, piece)
+    for column, frame in zip(panels.T, progress_bar(frames, "poses"), strict=True):
+        camera = piece.camera(piece.azimuth(frame), piece.truth[frame, 0, :2])
+        _draw_skeletons(column, piece, frame, camera)
+    return figure
 
 
 def draw_film(piece: ClipPiece) -> Iterator[np.ndarray]:
-    """Yield a film's pictures (H, W, 3), uint8, 30 a second, with a progress bar."""
+    """Yield a film's pictures (H, W, 3), uint8, 30 a second, with a progress bar. H and W are even."""
     labels = ["truth", *piece.predictions]
-    width = len(labels) * WIDTH + RIGHT
-    sheet = Sheet(width + width % 2, TOP + HEIGHT + BOTTOM)
-    sheet.text(20, 26, piece.title, 22, ha="left", weight="bold")
-    time = sheet.text(width - 20, 26, "", 20, ha="right")
-    middles = [(column + 0.5) * WIDTH for column in range(len(labels))]
-    for x, label in zip(middles, labels, strict=True):
-        sheet.text(x, 64, label, 19, weight="bold")
-    panels = [sheet.panel(column * WIDTH, TOP, WIDTH, HEIGHT) for column in range(len(labels))]
-    means = {
-        label: sheet.text(x, TOP + HEIGHT + 18, "", 18, color=FAINT)
-        for x, label in zip(middles[1:], labels[1:], strict=True)
-    }
-    sheet.colour_bar(len(labels) * WIDTH + 16, TOP + 60, 16, HEIGHT - 120, piece.top)
+    figure, panels = make_panels(120 + 340 * len(labels), 600, 1, len(labels))
+    for panel, label in zip(panels[0], labels, strict=True):
+        panel.set_title(label, weight="bold")
+    _write_errors(panels[0, 1:], piece, 0)
+    title = _add_scale(figure, piece)
     path, azimuth = piece.path(), piece.azimuth(len(piece.truth) // 2)
     for frame in progress_bar(range(0, len(piece.truth), FPS // RATE), "pictures"):
-        camera = piece.camera(azimuth, path[frame], WIDTH, HEIGHT)
-        for panel, (joints, errors) in zip(panels, piece.rows(frame), strict=True):
-            panel.set_data(draw(camera, joints, errors, piece.floor))
-        for label, text in means.items():
-            text.set_text(f"{piece.errors[label][frame].mean():.1f} cm")
-        time.set_text(f"{piece.seconds(frame):.2f} s")
-        yield sheet.pixels()
+        _draw_skeletons(panels[0], piece, frame, piece.camera(azimuth, path[frame]))
+        _write_errors(panels[0, 1:], piece, frame)
+        title.set_text(f"{piece.title}   {piece.seconds(frame):.2f} s")
+        yield get_pixels(figure)
+
+
+def _draw_skeletons(panels: Iterable[Axes], piece: ClipPiece, frame: int, camera: Camera) -> None:
+    for panel, (joints, errors) in zip(panels, piece.rows(frame), strict=True):
+        draw_skeleton(panel, camera, joints, errors, piece.floor)
+
+
+def _write_errors(panels: Iterable[Axes], piece: ClipPiece, frame: int) -> None:
+    for panel, errors in zip(panels, piece.errors.values(), strict=True):
+        panel.set_xlabel(f"{errors[frame].mean():.1f} cm")
+
+
+def _add_scale(figure: Figure, piece: ClipPiece) -> Text:
+    """Add the colour scale and the title, fix the layout, and return the title."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    colours = ScalarMappable(Normalize(0, piece.top), heat_colours())
+    figure.colorbar(colours, ax=figure.axes, shrink=0.6, aspect=24, label="error of a joint [cm]")
+    title = figure.suptitle(piece.title, x=0.01, ha="left", weight="bold", size=16)
+    fix_layout(figure)
+    return title
 
 
 def encode_gif(pictures: Iterable[np.ndarray]) -> bytes:
@@ -128,8 +138,9 @@ def encode_gif(pictures: Iterable[np.ndarray]) -> bytes:
     """
     from PIL import Image
 
-    hues = ((heat_colours(np.linspace(0, 1, 28)), 7), (np.array([NEUTRAL]), 36), (np.ones((1, 3)), 24))
-    shades = [(np.linspace(0.3, 1, count)[:, None, None] * colours).reshape(-1, 3) for colours, count in hues]
+    heat, white = heat_colours()(np.linspace(0, 1, 28))[:, :3], np.ones((1, 3))
+    hues = ((heat, 7, 1.1), (np.array([NEUTRAL]), 36, 1.1), (white, 24, 1.0))
+    shades = [(np.linspace(0.3, top, n)[:, None, None] * hue).reshape(-1, 3) for hue, n, top in hues]
     palette = Image.new("P", (1, 1))
     palette.putpalette((255 * np.clip(np.concatenate(shades), 0, 1) + 0.5).astype(np.uint8).tobytes())
     first, *others = (

@@ -11,12 +11,13 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.motion.body import FPS, ROOT
 from memmlp.motion.limb_shapes import LIMBS, RADII
-from memmlp.report.pictures.raster import ELEVATION, Camera, colour_scale_top
+from memmlp.report.pictures.drawing import ELEVATION, Camera
 
 BOTTOM = -0.195  # height of a picture's lower edge above the floor, metres
 SIDE = np.deg2rad(25)  # the camera's angle from the person's front, radians
 LOWEST, HIGHEST = 2.15, 2.9  # smallest and largest height that a picture covers, metres
 TIP = max(limb.tip + max(limb.radii) for limb in LIMBS)  # largest reach of a limb beyond its joint, metres
+SCALES = (10, 15, 20, 30, 40, 50, 75, 100)  # the possible tops of a colour scale, cm
 SMOOTHING = 0.4  # seconds over which the camera's path is smoothed
 
 
@@ -39,6 +40,12 @@ def frame_range(
         given = f"{keys[0]} {begin:g}" + ("" if end is None else f" {keys[1]} {end:g}")
         raise InputError(f"{given}: there is no frame between; {title} has {length / FPS:.1f} s")
     return round(begin * FPS), round(stop * FPS)
+
+
+def colour_scale_top(errors: np.ndarray) -> float:
+    """Return the top of a scale for errors in cm: the least of `SCALES` below which 98 % of them are."""
+    high = float(np.percentile(errors, 98))
+    return float(next((top for top in SCALES if high <= top), SCALES[-1]))
 
 
 @dataclass(frozen=True)
@@ -89,10 +96,9 @@ class ClipPiece:
         predicted = [(p[frame], self.errors[k][frame] / self.top) for k, p in self.predictions.items()]
         return [(self.truth[frame], None), *predicted]
 
-    def camera(self, azimuth: float, place: np.ndarray, width: int, height: int) -> Camera:
+    def camera(self, azimuth: float, place: np.ndarray) -> Camera:
         """Return a camera that looks at a person standing at a point (2,) on the floor, metres."""
-        point = np.array([*place, self.floor + BOTTOM + self.metres / 2])
-        return Camera(point, azimuth, width, height, height / self.metres)
+        return Camera(np.array([*place, self.floor + BOTTOM + self.metres / 2]), azimuth, self.metres)
 
     def azimuth(self, frame: int) -> float:
         """Return the azimuth, radians, that shows the true person from the front, slightly from the side."""

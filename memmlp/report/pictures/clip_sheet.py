@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,12 +14,14 @@ from memmlp.motion.clip import Skipped
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.geometry import clip_kinematics
 from memmlp.motion.preparing.find_clips import clip_name, find_clips
-from memmlp.report.pictures.canvas import Sheet, shorten
-from memmlp.report.pictures.raster import Camera, draw
+from memmlp.report.pictures.drawing import Camera, draw_skeleton, fix_layout, make_panels
 
-WIDTH, HEIGHT, LABEL, COLUMNS = 150, 220, 26, 12  # pixels; panels a row
-SCALE = 100.0  # pixels a metre
-LENS = 1.0  # height that the camera looks at, metres
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+ACROSS, MOMENTS = 4, 3  # clips beside each other, moments of each
+NAME = 48  # the most characters of a name
+METRES, LENS = 2.2, 1.0  # height that a panel covers, and that the camera looks at, metres
 SIDE = np.deg2rad(35)  # the camera's angle from the person's front, radians
 
 
@@ -52,30 +55,25 @@ def read_sample(
     return clips, skipped, len(files)
 
 
-def draw_sheet(clips: Sequence[tuple[str, np.ndarray]], moments: int = 3) -> np.ndarray:
-    """Draw clips side by side, each at evenly spread moments.
+def draw_sheet(clips: Sequence[tuple[str, np.ndarray]]) -> Figure:
+    """Draw clips side by side, each at three evenly spread moments.
 
     Args:
         clips: name and global joint positions (N, 22, 3), metres, world (Z up, the floor at 0), of each.
-        moments: pictures of each clip.
-
-    Returns:
-        The picture (height, width, 3), uint8.
     """
-    across = max(1, COLUMNS // moments)
-    rows = -(-len(clips) // across)
-    sheet = Sheet(across * moments * WIDTH, rows * (HEIGHT + LABEL))
-    for index, (name, joints) in enumerate(clips):
-        left, top = index % across * moments * WIDTH, index // across * (HEIGHT + LABEL)
-        sheet.text(left + moments * WIDTH / 2, top + LABEL / 2, shorten(name, 48), 13)
-        for moment in range(moments):
-            frame = (2 * moment + 1) * len(joints) // (2 * moments)
-            panel = sheet.panel(left + moment * WIDTH, top + LABEL, WIDTH, HEIGHT)
-            panel.set_data(draw(_camera(joints[frame]), joints[frame], None, 0.0))
-    return sheet.pixels()
+    rows = -(-len(clips) // ACROSS)
+    figure, panels = make_panels(150 * ACROSS * MOMENTS, 246 * rows, rows, ACROSS * MOMENTS)
+    shown = list(zip(panels.reshape(-1, MOMENTS), clips, strict=False))
+    for row, (name, _) in shown:
+        row[1].set_title(name if len(name) <= NAME else f"…{name[1 - NAME :]}", size=9)
+    fix_layout(figure)
+    for row, (_, joints) in shown:
+        for moment, panel in enumerate(row):
+            frame = (2 * moment + 1) * len(joints) // (2 * MOMENTS)
+            draw_skeleton(panel, _camera(joints[frame]), joints[frame])
+    return figure
 
 
 def _camera(joints: np.ndarray) -> Camera:
     left = joints[1] - joints[2]  # from right to left hip
-    centre = np.array([*joints[0, :2], LENS])
-    return Camera(centre, np.arctan2(left[1], left[0]) + SIDE, WIDTH, HEIGHT, SCALE)
+    return Camera(np.array([*joints[0, :2], LENS]), np.arctan2(left[1], left[0]) + SIDE, METRES)

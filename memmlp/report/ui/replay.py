@@ -16,7 +16,7 @@ from memmlp.common.files import read_json
 from memmlp.live.spaces import SPACES
 from memmlp.motion.body import FPS, JOINTS
 from memmlp.motion.limb_shapes import HEAT, LIMBS
-from memmlp.report.pictures.raster import colour_scale_top
+from memmlp.report.pictures.clip_piece import colour_scale_top
 from memmlp.runs.identity import evaluation_id
 from memmlp.runs.run import Run
 

@@ -9,7 +9,8 @@ import pytest
 from memmlp.common.errors import InputError
 from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.synthetic import synthesize_clip
-from memmlp.report.pictures.clip_sheet import COLUMNS, HEIGHT, LABEL, WIDTH, draw_sheet, read_sample
+from memmlp.report.pictures.clip_sheet import ACROSS, draw_sheet, read_sample
+from memmlp.report.pictures.drawing import get_pixels
 
 
 @pytest.fixture
@@ -48,11 +49,8 @@ def test_nothing_to_show_is_rejected(folder: Path, tmp_path: Path):
 
 @pytest.mark.slow
 def test_a_sheet_has_a_row_for_every_few_clips(folder: Path):
-    clips = read_sample(folder, 5)[0]
-    sheet = draw_sheet(clips)
-    assert sheet.shape == (2 * (HEIGHT + LABEL), COLUMNS * WIDTH, 3)
-    blank = [
-        (sheet[HEIGHT + 2 * LABEL :, left : left + WIDTH] == 255).all()
-        for left in range(0, sheet.shape[1], WIDTH)
-    ]
+    sheet = get_pixels(draw_sheet(read_sample(folder, 5)[0]))
+    height, width = sheet.shape[:2]
+    panels = sheet[height // 2 + 30 :].reshape(-1, 3 * ACROSS, width // (3 * ACROSS), 3)
+    blank = [(panels[:, number] == 255).all() for number in range(3 * ACROSS)]
     assert blank == [False] * 3 + [True] * 9  # the fifth clip has three panels in the second row
