@@ -17,7 +17,7 @@ from memmlp.training.losses import HandPosition, MotionLoss, TermsLoss, Uncertai
 from memmlp.training.optim import Optim
 from memmlp.training.rollout import OwnPredictions, PersistentStreams, TeacherForcing
 from memmlp.training.train_network import MotionTask, NetworkTraining
-from memmlp.training.train_sage import PARTS, PartTask, Windows, make_objective
+from memmlp.training.train_sage import PARTS, PartTask, make_objective
 from memmlp.training.train_vqvae import VQVAETask
 
 OPTIM = Optim(steps=12, batch=4, lr=1e-3, final_lr=1e-4, schedule="cosine", checkpoint_every=5, log_every=4)
@@ -62,9 +62,9 @@ def part_task(kind: str, optim: Optim = OPTIM, seed: int = 0) -> PartTask:
     ).eval()
     part = {"upper_diffusion": net.upper, "lower_diffusion": net.lower}.get(kind, halves[kind.split("_")[0]])
     network = NetworkTraining(seed, lambda branches: TermsLoss(angle=1), TeacherForcing(), optim, "frames")
-    windows = Windows(network, tiny.frames(), tiny.frames((30,), seed=9), net.frames)
     halves.requires_grad_(False)
-    return PartTask(part.requires_grad_(True), make_objective(kind, halves), windows)
+    objective, validation = make_objective(kind, halves), tiny.frames((30,), seed=9)
+    return PartTask(part.requires_grad_(True), objective, network, tiny.frames(), validation, net.frames)
 
 
 def weights(run: Run) -> dict[str, torch.Tensor]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -14,12 +14,13 @@ import torch
 import torch.nn.functional as F
 from onnx import TensorProto, helper
 from torch import Tensor
+from torch.backends import mha
+from torch.utils.flop_counter import FlopCounterMode, flop_registry, shape_wrapper
 
 from memmlp.common.processes import CoreClock
 from memmlp.deploy.onnx_stream import OnnxStream, start_session
 from memmlp.motion.body import MOTION_DIM, N_JOINTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Change, Normalizer
-from memmlp.networks.flop_counter import counting_flops
 from memmlp.networks.motion_model import MotionModel, StreamingGraph
 from memmlp.networks.vqvae import EMACodebook
 
@@ -145,9 +146,33 @@ def size(model: MotionModel, step: MotionModel | StreamingGraph, path: Path) -> 
 @torch.no_grad()
 def macs(model: MotionModel | StreamingGraph) -> int:
     """Count the multiply-adds of the matrix products of one streaming step."""
-    with counting_flops() as counter:
-        model.advance(torch.zeros(1, 1, SPARSE_DIM), model.initial_state(1), 1)
+    counter = FlopCounterMode(display=False)
+    counter.flop_registry = {**flop_registry, **CPU_FORMULAS}
+    fast = mha.get_fastpath_enabled()
+    mha.set_fastpath_enabled(False)  # whole layers as one kernel, without its products
+    try:
+        with counter:
+            model.advance(torch.zeros(1, 1, SPARSE_DIM), model.initial_state(1), 1)
+    finally:
+        mha.set_fastpath_enabled(fast)
     return counter.get_total_flops() // 2
+
+
+def _lstm_flops(x: Sequence[int], to_gates: Sequence[int], again: Sequence[int], *shapes, **rest) -> int:
+    """Count an LSTM's FLOPs from its arguments' shapes.
+
+    These are inputs (n, B, inputs), their weights (4 k, inputs), and the hidden state's weights (4 k, k).
+    """
+    return 2 * x[0] * x[1] * (to_gates[0] * to_gates[1] + again[0] * again[1])
+
+
+CPU_FORMULAS = {
+    torch.ops.aten.mkldnn_rnn_layer: shape_wrapper(_lstm_flops),
+    torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: flop_registry[
+        torch.ops.aten._scaled_dot_product_flash_attention
+    ],
+}
+"""Formulas of CPU kernels that torch's own counter counts as 0."""
 
 
 def yardstick() -> onnx.ModelProto:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from memmlp.common.errors import InputError
 from memmlp.evaluation import modes
 from memmlp.evaluation.ik import IK
 from memmlp.evaluation.metrics import UserMetrics
@@ -18,7 +16,6 @@ from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset
 from memmlp.networks.motion_model import MotionModel
 
-SAME = 0.1  # cm: largest difference of the MPJPE of two branches with the same joints
 PICTURE_FRAMES = 600  # the first 10 s
 
 
@@ -46,36 +43,13 @@ class Evaluation:
         Returns:
             "mean", the metrics by branch, and "clips", a row for each clip with its metrics by branch; and
             "offline" for a network that can't run as a stream.
-
-        Raises:
-            InputError: if the network does not learn positions, and its positions do not follow from its
-                rotations.
         """
         torch.manual_seed(self.seed)  # a mode's result does not depend on which modes came before it
         found = modes.evaluate(model, test, [mode], self.batch, self.ik, self.metrics)
         facts = ("name", "group", "source", "frames")
         rows = [{key: row[key] for key in facts if key in row} | row[mode] for row in found["clips"]]
-        if "position" not in model.branches:
-            check_positions(type(model).__name__, rows)
         label = {} if model.is_stream else {"offline": True}
         return {"mean": found["mean"][mode], "clips": rows, **label}
-
-
-def check_positions(network: str, rows: Sequence[dict[str, Any]]) -> None:
-    """Check that the positions of a network that does not learn them follow by forward kinematics.
-
-    Raises:
-        InputError: if they don't; then the network, or the way it was loaded, is broken.
-    """
-    for row in rows:
-        learned, followed = row["position"]["MPJPE"], row["rotation"]["MPJPE"]
-        diverged = math.isnan(learned) and math.isnan(followed)  # the results show it
-        if not diverged and not math.isclose(learned, followed, rel_tol=0, abs_tol=SAME):
-            raise InputError(
-                f"{network}: its positions have an MPJPE of {learned:.2f} cm in clip {row['name']}, those of "
-                f"its rotations {followed:.2f} cm; without a position branch, positions must follow from the "
-                "rotations by forward kinematics"
-            )
 
 
 def predict_first_clip(model: MotionModel, test: MotionDataset) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,6 @@ and gaps (memmlp.live.tracker_resampling) are left to the caller: NaN in is NaN 
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,7 +26,7 @@ from memmlp.common.errors import InputError
 from memmlp.deploy.export import metadata, save
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.opsets import NATIVE
-from memmlp.deploy.parity import in_float64, in_torch, is_rounding
+from memmlp.deploy.parity import in_torch
 from memmlp.live.rotations import BodyTree, quaternion_to_matrix
 from memmlp.live.spaces import Space, space_of
 from memmlp.motion.body import (
@@ -206,18 +205,6 @@ def full_differences(model: MotionModel, path: Path, clip: Tensor, space: str = 
     ]
     found = [np.concatenate(parts) for parts in zip(*steps, strict=True)]
     return _compare(found, _in_torch(model, trackers, reference))
-
-
-def full_matches(model: MotionModel, path: Path, clip: Tensor, apart: Tensor, space: str = "amass") -> bool:
-    """Return whether `full_differences` (N,) over a clip (N, 252) are due to rounding; see `is_rounding`."""
-
-    def exact() -> float:
-        positions, rotations = trackers_of(clip[:, :SPARSE_DIM].cpu().double())
-        reference, wide = space_of(space), copy.deepcopy(model).double()
-        found = in_float64(path, _inputs((positions, rotations), reference))
-        return float(_compare(list(found.values()), _in_torch(wide, (positions, rotations), reference)).max())
-
-    return is_rounding(apart, exact)
 
 
 def _inputs(trackers: tuple[Tensor, Tensor], space: Space) -> dict[str, np.ndarray]:

@@ -14,7 +14,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from memmlp.common import distributed
 from memmlp.common.components import component
 from memmlp.common.settings import at_least, setting
 from memmlp.motion.body import ROTATION, SPARSE_DIM
@@ -219,18 +218,12 @@ class AGRoLDiffusion(WindowModel):
         return self.diffusion.sample(lambda noisy, time: self.denoise(noisy, time, encoded), noise)
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
-        """Make a training call: add noise to the truth (B, T, 252), and denoise it in one call.
+        """Make a training call: add noise to the truth, and denoise it in one call; see MotionModel.
 
         A diffusion time is drawn for each window.
-
-        Args:
-            sparse: world inputs (B, n, 54) of the newest frames.
-            state: what the last call returned, or `initial_state`.
-            true_frames: world frames [X | Theta] (B, T, 252) of the window.
         """
         _, kept = self.append_inputs(sparse, state)
         window, frames = true_frames[..., :SPARSE_DIM], self.normalizer.encode(true_frames)
         encoded, clean = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:][..., ROTATION]
-        time = distributed.draw_rows(self.diffusion.draw_times, true_frames)
-        noisy = self.diffusion.add_noise(clean, time, distributed.draw_rows(torch.randn_like, clean))
+        noisy, time, _ = self.diffusion.draw_noisy(clean)
         return TrainingOutputs(self.normalizer.posed(self.denoise(noisy, time, encoded), window), kept, {})

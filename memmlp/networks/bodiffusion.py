@@ -13,7 +13,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from memmlp.common import distributed
 from memmlp.common.components import component
 from memmlp.common.settings import at_least, positive, setting
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM, TRACKED
@@ -222,23 +221,16 @@ class BoDiffusion(WindowModel):
         return self.normalizer.posed(rotation, sparse)
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
-        """Make a training call: add noise to the truth (B, T, 252), and denoise it in one call.
+        """Make a training call: add noise to the truth, and denoise it in one call; see MotionModel.
 
         A diffusion time is drawn for each window. The returned motion is made from the rotations that remain
         once the predicted noise is removed, clamped to their limits as in sampling; the losses are those of
         the noise and of the variances.
-
-        Args:
-            sparse: world inputs (B, n, 54) of the newest frames.
-            state: what the last call returned, or `initial_state`.
-            true_frames: world frames [X | Theta] (B, T, 252) of the window.
         """
         _, kept = self.append_inputs(sparse, state)
         window, frames = true_frames[..., :SPARSE_DIM], self.normalizer.encode(true_frames)
         encoded, clean = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:][..., ROTATION]
-        time = distributed.draw_rows(self.diffusion.draw_times, true_frames)
-        noise = distributed.draw_rows(torch.randn_like, clean)
-        noisy = self.diffusion.add_noise(clean, time, noise)
+        noisy, time, noise = self.diffusion.draw_noisy(clean)
         made = self.denoise(noisy, time, encoded)
         error, bound = self.diffusion.compute_losses(clean, noise, time, made, self.compute_limits())
         found = self.diffusion.remove_noise(noisy, made.noise, time).clamp(*self.compute_limits())

@@ -9,6 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from memmlp.common import distributed
+
 Denoise = Callable[[Tensor, Tensor], Tensor]
 
 
@@ -59,6 +61,12 @@ class Noising(nn.Module):
         """Mix clean signals (B, ...) with standard normal noise (B, ...) as the times (B,) demand."""
         signal = look_up(self.signal, time, clean)
         return signal.sqrt() * clean + (1 - signal).sqrt() * noise
+
+    def draw_noisy(self, clean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Draw times (B,) and noise (B, ...) for a training batch (B, ...); return noisy signals, both."""
+        time = distributed.draw_rows(self.draw_times, clean)
+        noise = distributed.draw_rows(torch.randn_like, clean)
+        return self.add_noise(clean, time, noise), time, noise
 
 
 def look_up(table: Tensor, time: Tensor, like: Tensor) -> Tensor:

@@ -1,7 +1,4 @@
-"""The MLP block of the backbone and the predictor, and its two forms that take in a memory feature.
-
-This file also finds layers that several processes cannot train together.
-"""
+"""The MLP block of Mem-MLP and AGRoL, and layers that several networks share."""
 
 from __future__ import annotations
 
@@ -73,14 +70,8 @@ class MLPBlock(nn.Module):
 class ResidualFusion(MLPBlock):
     """An MLP block whose linear layer also sees the memory feature: h + f([h; z]) (reading 3).
 
-    Args:
-        hidden: d.
-        frames: T.
-        extra: k, the width of the memory feature.
+    Its argument `extra` is k, the width of the memory feature.
     """
-
-    def __init__(self, hidden: int, frames: int, extra: int):
-        super().__init__(hidden, frames, extra)
 
     def fuse(self, h: Tensor, z: Tensor) -> Tensor:
         """Map the hidden state (B, T, d) and the memory feature (B, T, k) to (B, T, d)."""
@@ -118,17 +109,18 @@ class Dropout(nn.Dropout):
 
 def find_batch_dependent(module: nn.Module) -> list[str]:
     """Name the layers whose result for a row depends on the other rows of the batch."""
-    found = [layer for layer in module.modules() if _counts(layer) or (_draws(layer) and layer.p)]
-    found += [layer for layer in module.modules() if isinstance(layer, nn.RNNBase) and layer.dropout]
+
+    def draws(layer: nn.Module) -> bool:
+        if isinstance(layer, nn.RNNBase):
+            return layer.dropout > 0
+        return isinstance(layer, _DropoutNd) and layer.p > 0 and not isinstance(layer, Dropout)
+
+    found = (
+        layer
+        for layer in module.modules()
+        if isinstance(layer, _BatchNorm) or getattr(layer, "of_whole_batch", False) or draws(layer)
+    )
     return sorted({type(layer).__name__ for layer in found})
-
-
-def _draws(layer: nn.Module) -> bool:
-    return isinstance(layer, _DropoutNd) and not isinstance(layer, Dropout)
-
-
-def _counts(layer: nn.Module) -> bool:
-    return isinstance(layer, _BatchNorm) or getattr(layer, "of_whole_batch", False)
 
 
 def compute_products(weights: Sequence[Tensor], x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:

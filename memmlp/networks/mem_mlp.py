@@ -14,7 +14,7 @@ from memmlp.common.components import chosen, component
 from memmlp.common.settings import Settings, at_least, setting
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.layers import MLPBlock, PlainFusion, ResidualFusion
+from memmlp.networks.layers import MLPBlock, PlainFusion
 from memmlp.networks.memory import Memory, MemoryBlock
 from memmlp.networks.motion_model import (
     MotionModel,
@@ -25,113 +25,59 @@ from memmlp.networks.motion_model import (
     slide_window,
 )
 from memmlp.networks.predictor import Branch, Predictor
-from memmlp.networks.streaming import OneFrameNormalizer
+from memmlp.networks.streaming import OneFrameNormalizer, linear
 from memmlp.networks.vqvae import VQVAE
-
-Selection = Callable[[Tensor], Tensor]
-
-
-def newest(window: Tensor) -> Tensor:
-    """Return the newest frame (1, size) of a window (T, size)."""
-    return window[-1:]
-
-
-def whole(window: Tensor) -> Tensor:
-    """Return a window as it is."""
-    return window
 
 
 class StreamingBlock(nn.Module):
     """An MLP block of a streaming graph.
 
-    Args:
-        block: the network's block.
-    """
-
-    def __init__(self, block: MLPBlock):
-        super().__init__()
-        self.time_norm, self.time_mix = block.time_norm, block.time_mix
-        self.norm, self.linear = block.norm, block.linear
-
-    def forward(self, h: Tensor, contributions: Sequence[Tensor], take: Selection = whole) -> Tensor:
-        """Map (T, d) to what `take` selects of the block's output, without computing the rest.
-
-        Args:
-            h: the hidden state (T, d).
-            contributions: what each memory block's feature adds to the output of its linear layer, a window
-                (T, d) each.
-            take: `whole` or `newest`.
-        """
-        mix = self.time_mix
-        h = take(h) + F.silu(torch.addmm(take(mix.bias), take(mix.weight), self.time_norm(h)))
-        return self.channels(h, contributions, take)
-
-    def channels(self, h: Tensor, contributions: Sequence[Tensor], take: Selection) -> Tensor:
-        """Apply the block's second half, which works frame by frame."""
-        return h + F.silu(self.linear(self.norm(h)))
-
-
-class SharedBlock(StreamingBlock):
-    """A memory block whose memory feature is multiplied by its part of the linear layer in advance.
-
-    In [h; z] W = h W_h + z W_z, the feature's contribution z W_z is known when a frame enters.
+    A memory feature enters it as a contribution that is computed in advance: in [h; z] W = h W_h + z W_z,
+    the part z W_z is known when a frame enters.
 
     Args:
-        block: the network's block.
-        index: the block's index among the memory blocks.
+        block: the network's block; in a memory block, its fusion.
+        index: the index of the block's contribution; None for a block without memory.
 
     Attributes:
         feature_part: computes the contribution (1, d) of a feature (1, k), bias included.
     """
 
     feature_part: nn.Linear
+    merge: nn.Linear
 
-    def __init__(self, block: MLPBlock, index: int):
-        super().__init__(block)
-        self.index = index
-        self.hidden = block.norm.normalized_shape[0]
+    def __init__(self, block: MLPBlock, index: int | None = None):
+        super().__init__()
+        self.time_norm, self.time_mix = block.time_norm, block.time_mix
+        self.norm, self.linear = block.norm, block.linear
+        self.index, self.plain = index, isinstance(block, PlainFusion)
+        if index is not None:
+            name = "merge" if self.plain else "linear"
+            layer, hidden = getattr(block, name), block.norm.normalized_shape[0]
+            setattr(self, name, linear(layer.weight[:, :hidden]))
+            self.feature_part = linear(layer.weight[:, hidden:], layer.bias)
 
-    def split(self, layer: nn.Linear) -> nn.Linear:
-        """Split a layer on [h; z] into its parts for h and for z.
+    def forward(self, h: Tensor, contributions: Sequence[Tensor], newest: bool = False) -> Tensor:
+        """Map the hidden state (T, d) to the block's output (T, d).
 
-        Returns:
-            The part for h, without bias. The part for z, with the bias, is kept as `feature_part`.
+        Args:
+            h: the hidden state (T, d).
+            contributions: what each memory block's feature adds to its linear layer, a window (T, d) each.
+            newest: whether only the newest frame's output (1, d) is computed.
         """
-        self.feature_part = part(layer, slice(self.hidden, None), layer.bias)
-        return part(layer, slice(0, self.hidden), None)
 
+        def take(window: Tensor) -> Tensor:
+            return window[-1:] if newest else window
 
-class ResidualBlock(SharedBlock):
-    """The streaming form of ResidualFusion: h + f([h; z])."""
-
-    def __init__(self, block: ResidualFusion, index: int):
-        super().__init__(block, index)
-        self.linear = self.split(block.linear)
-
-    def channels(self, h: Tensor, contributions: Sequence[Tensor], take: Selection) -> Tensor:
-        return h + F.silu(self.linear(self.norm(h)) + take(contributions[self.index]))
-
-
-class PlainBlock(SharedBlock):
-    """The streaming form of PlainFusion: an MLP block, then Linear([h; z])."""
-
-    def __init__(self, block: PlainFusion, index: int):
-        super().__init__(block, index)
-        self.merge = self.split(block.merge)
-
-    def channels(self, h: Tensor, contributions: Sequence[Tensor], take: Selection) -> Tensor:
-        """Apply the block's second half and the merging layer, which work frame by frame."""
-        return self.merge(super().channels(h, contributions, take)) + take(contributions[self.index])
-
-
-def part(layer: nn.Linear, inputs: slice, bias: Tensor | None) -> nn.Linear:
-    """Make a linear layer that sees some of another layer's inputs, and has the given bias."""
-    weight = layer.weight[:, inputs]
-    made = nn.Linear(weight.shape[1], weight.shape[0], bias=bias is not None)
-    made.weight = nn.Parameter(weight)
-    if bias is not None:
-        made.bias = nn.Parameter(bias)
-    return made
+        mix = self.time_mix
+        h = take(h) + F.silu(torch.addmm(take(mix.bias), take(mix.weight), self.time_norm(h)))
+        made = self.linear(self.norm(h))
+        if self.index is None:
+            return h + F.silu(made)
+        contribution = take(contributions[self.index])
+        if self.plain:
+            return self.merge(h + F.silu(made)) + contribution
+        return h + F.silu(made + contribution)
 
 
 class StreamedBranch(nn.Module):
@@ -143,39 +89,9 @@ class StreamedBranch(nn.Module):
 
     def forward(self, h: Tensor, contributions: Sequence[Tensor], count: int) -> Tensor:
         """Map the window (T, d) to the newest frame's outputs (1, size); `count` is always 1."""
-        if not len(self.blocks):
-            return self.linear(newest(h))
-        *earlier, last = self.blocks
-        for block in earlier:
-            h = block(h, contributions)
-        return self.linear(last(h, contributions, newest))
-
-
-class Converter:
-    """Turns a network's blocks into streaming ones, one after the other, and collects what they share.
-
-    Attributes:
-        features: the feature modules of all memory blocks so far.
-        shared: the streaming memory blocks so far.
-    """
-
-    def __init__(self) -> None:
-        self.features: list[nn.Module] = []
-        self.shared: list[SharedBlock] = []
-
-    def convert(self, source: nn.Module) -> StreamingBlock:
-        """Make the streaming block of an MLPBlock or a MemoryBlock."""
-        if not isinstance(source, MemoryBlock):
-            assert isinstance(source, MLPBlock)
-            return StreamingBlock(source)
-        kinds: dict[type[MLPBlock], type[SharedBlock]] = {
-            ResidualFusion: ResidualBlock,
-            PlainFusion: PlainBlock,
-        }
-        self.features.append(source.feature)
-        block = kinds[type(source.fusion)](source.fusion, len(self.shared))
-        self.shared.append(block)
-        return block
+        for index, block in enumerate(self.blocks, 1):
+            h = block(h, contributions, index == len(self.blocks))
+        return self.linear(h[-1:])
 
 
 class MemMLPGraph(StreamingGraph):
@@ -197,16 +113,23 @@ class MemMLPGraph(StreamingGraph):
     def build(self, model: Any) -> None:
         self.conversions = OneFrameNormalizer(model.normalizer)
         self.stem = model.stem
-        converter = Converter()
-        self.blocks = nn.ModuleList(converter.convert(block) for block in model.blocks)
+        features: list[nn.Module] = []
+        parts: list[nn.Module] = []
+
+        def convert(block: Any) -> StreamingBlock:
+            if not isinstance(block, MemoryBlock):
+                return StreamingBlock(block)
+            made = StreamingBlock(block.fusion, len(parts))
+            features.append(block.feature)
+            parts.append(made.feature_part)
+            return made
+
+        self.blocks = nn.ModuleList(map(convert, model.blocks))
         self.predictor = model.predictor
         for name, branch in list(model.predictor.named_children()):
-            assert isinstance(branch, Branch)
-            blocks = [converter.convert(block) for block in branch.blocks]
-            setattr(self.predictor, name, StreamedBranch(blocks, branch.linear))
-        parts = [block.feature_part for block in converter.shared]
-        self.recall = model.memory.streaming_recall(model.memory, converter.features, parts)
-        self.contributions = [f"memory.{index}" for index in range(len(converter.shared))]
+            setattr(self.predictor, name, StreamedBranch(list(map(convert, branch.blocks)), branch.linear))
+        self.recall = model.memory.streaming_recall(model.memory, features, parts)
+        self.contributions = [f"memory.{index}" for index in range(len(parts))]
 
     def windows(self) -> State:
         """Return zeros: windows (T, d) of stem outputs and of contributions, and the memory's state."""

@@ -67,11 +67,8 @@ class MemoryBlock(nn.Module):
         return self.fusion.fuse(h, self.feature(past))
 
 
-Pieces = Sequence[Tensor]
-
-
 class Recall(nn.Module):
-    """Computes, for each memory block, what the recalled feature adds to it at this step.
+    """Computes, for each memory block, what the recalled feature adds to it at a step of a stream.
 
     Args:
         memory: the network's memory.
@@ -91,14 +88,13 @@ class Recall(nn.Module):
     def join(self, features: Sequence[Any]) -> None:
         """Join the blocks' feature modules into one that computes a frame's features for all of them."""
 
-    def forward(self, past: Past | RecurrentPast | None) -> tuple[Pieces, Pieces]:
+    def forward(self, past: Past | RecurrentPast | None) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
         """Return each block's contribution (1, d): of the entering frame, and of frames before the first."""
         if not self.parts:
             return (), ()
         z = self.compute_features(past)
-        contributions = self._contributions(z)
-        before = self.compute_earlier(z)
-        return contributions, contributions if before is z else self._contributions(before)
+        before, made = self.compute_earlier(z), self._multiply(z)
+        return made, made if before is z else self._multiply(before)
 
     def compute_features(self, past: Any) -> Tensor:
         """Return the features (1, blocks, k) of the frame that enters."""
@@ -108,7 +104,7 @@ class Recall(nn.Module):
         """Return the features of frames before the first one, given the first one's (1, blocks, k)."""
         return first
 
-    def _contributions(self, z: Tensor) -> Pieces:
+    def _multiply(self, z: Tensor) -> Sequence[Tensor]:
         return [part(of) for part, of in zip(self.parts, z.flatten(0, 1).split(1), strict=True)]
 
 
@@ -117,6 +113,12 @@ FUSIONS: dict[str, type[ResidualFusion | PlainFusion]] = {"residual": ResidualFu
 
 class Memory(nn.Module):
     """The memory slot's interface; in this base class nothing is kept and nothing is recalled.
+
+    Args:
+        hidden: the backbone's d.
+        frames: the backbone's T.
+        depth: the backbone's L; not used here.
+        codes: the frozen VQ-VAE; not used here.
 
     Attributes:
         shift: how many frames before the newest one the recalled past ends, which is also how many frames a
@@ -130,18 +132,20 @@ class Memory(nn.Module):
 
     streaming_recall: ClassVar[type[Recall]] = Recall
 
-    shift: int
-    past_frames: int
-    frames: int
     settled: bool = False
 
+    def __init__(self, *, hidden: int, frames: int, depth: int, codes: VQVAE | None = None):
+        super().__init__()
+        self.hidden, self.frames = hidden, frames
+        self.shift, self.past_frames = 0, frames - 1
+
     def make_block(self, layer: int) -> nn.Module:
-        """Make the backbone's block of a layer (1-based)."""
-        raise NotImplementedError
+        """Make the backbone's block of a layer (1-based); by default one without memory."""
+        return MLPBlock(self.hidden, self.frames)
 
     def make_memory_block(self) -> nn.Module:
         """Make one more block that takes in a memory feature, for the predictor's branches (Table 8)."""
-        raise NotImplementedError
+        raise InputError("memory: must have memory blocks for this predictor, which uses them")
 
     def initial_state(self, batch: int) -> State:
         """Return the memory's state at a fresh start: zeros."""
@@ -183,29 +187,9 @@ class Memory(nn.Module):
 
 @component("memory", "none")
 class NoMemory(Memory):
-    """The empty memory: plain blocks, no past, no state.
-
-    Args:
-        hidden: the backbone's d.
-        frames: the backbone's T.
-        depth: the backbone's L; not used here.
-        codes: the frozen VQ-VAE; not used here.
-    """
+    """The empty memory: plain blocks, no past, no state."""
 
     settled = True
-
-    def __init__(self, *, hidden: int, frames: int, depth: int, codes: VQVAE | None = None):
-        super().__init__()
-        self.hidden, self.frames = hidden, frames
-        self.shift = 0
-        self.past_frames = frames - 1
-
-    def make_block(self, layer: int) -> nn.Module:
-        return MLPBlock(self.hidden, self.frames)
-
-    def make_memory_block(self) -> nn.Module:
-        """Raise InputError, since this memory has no memory blocks."""
-        raise InputError("memory=none: must be a memory with blocks for this predictor, which uses them")
 
 
 @dataclass
@@ -225,27 +209,23 @@ class FeatureMemory(Memory):
 
     Args:
         settings: the memory's keys, of which `layers`, `width` and `fusion` are used here.
-        hidden: the backbone's d.
-        frames: the backbone's T.
         depth: the backbone's L.
-        codes: the frozen VQ-VAE; not used here.
+        sizes: the other arguments of Memory.
 
     Raises:
         InputError: if a layer is not one of the backbone's.
     """
 
-    def __init__(self, settings: Any, *, hidden: int, frames: int, depth: int, codes: VQVAE | None = None):
-        super().__init__()
+    def __init__(self, settings: Any, *, depth: int, **sizes: Any):
+        super().__init__(depth=depth, **sizes)
         self.layers, self.width, self.fusion = settings.layers, settings.width, FUSIONS[settings.fusion]
         if not set(self.layers) <= set(range(1, depth + 1)):
             raise InputError(f"memory.layers={self.layers}: must be layers of the backbone, 1 to {depth}")
-        self.hidden, self.frames = hidden, frames
 
     def make_block(self, layer: int) -> nn.Module:
-        return self.make_memory_block() if layer in self.layers else MLPBlock(self.hidden, self.frames)
+        return self.make_memory_block() if layer in self.layers else super().make_block(layer)
 
     def make_memory_block(self) -> nn.Module:
-        """Make a block that takes in a memory feature."""
         return MemoryBlock(self.make_feature(), self.fusion(self.hidden, self.frames, self.width))
 
     def make_feature(self) -> nn.Module:

@@ -140,36 +140,29 @@ class CodeIndices(nn.Module):
 
 
 class OwnPastRecall(Recall):
-    """Recall for memories that project the inputs and the network's own motion."""
+    """Recall for memories of the network's own past, whose blocks' projections are computed together."""
 
     def join(self, features: Sequence[PastFeature]) -> None:
-        """Make one feature module whose projections are those of all blocks."""
+        """Make one feature module whose projections are those of all blocks; code-vectors get a table."""
         self.whole = copy.deepcopy(features[0])
         for name, child in list(self.whole.named_children()):
             if isinstance(child, Projection):
-                setattr(self.whole, name, self.projections(name, [getattr(f, name) for f in features]))
+                parts = [getattr(feature, name) for feature in features]
+                table = (
+                    CodeTable(parts, self._replace_codes()) if name == "codes" else JointProjections(parts)
+                )
+                setattr(self.whole, name, table)
 
-    def projections(self, name: str, parts: Sequence[Projection]) -> nn.Module:
-        """Join all blocks' projections of the input with the given name: "sparse", "motion" or "codes"."""
-        return JointProjections(parts)
+    def _replace_codes(self) -> Tensor:
+        """Let the memory return indices instead of code-vectors; return the vectors (K, width)."""
+        assert isinstance(self.memory, VQMemory)
+        codes = self.memory.codes
+        # In a new dict, since the shallow copy of the memory shares its own with the network's.
+        self.memory._modules = {**self.memory._modules, "codes": CodeIndices(codes)}
+        return codes.codebook.vectors
 
     def compute_features(self, past: Past) -> Tensor:
         return self.whole(Past(*(part[0] for part in past)))
-
-
-class CodeRecall(OwnPastRecall):
-    """Recall for memories that have code-vectors as well, whose projections are looked up."""
-
-    def join(self, features: Sequence[PastFeature]) -> None:
-        assert isinstance(self.memory, VQMemory)
-        self.vectors = self.memory.codes.codebook.vectors
-        super().join(features)
-        # In a new dict, since the shallow copy of the memory shares its own with the network's.
-        self.memory._modules = {**self.memory._modules, "codes": CodeIndices(self.memory.codes)}
-
-    def projections(self, name: str, parts: Sequence[Projection]) -> nn.Module:
-        """Join all blocks' projections of the input with the given name; code-vectors get a table."""
-        return CodeTable(parts, self.vectors) if name == "codes" else super().projections(name, parts)
 
 
 @dataclass
@@ -248,14 +241,9 @@ class OwnPastMemory(FeatureMemory):
         return self.frames if self.history == "latest" else new
 
     def recall(self, sparse: Tensor, state: State, new: int) -> Past:
-        """Recall the T frames that end one shift before the newest frame.
+        """Recall the T frames that end one shift before the newest frame; see Memory.
 
         If that window would reach into the new frames, it ends just before the first of them instead.
-
-        Args:
-            sparse: inputs (B, past + new, 54).
-            state: the motion before the new frames (B, past, 198).
-            new: how many of the inputs are new.
         """
         # The buffers begin T + shift - 1 frames before the first new one, so the window begins at new - 1,
         # but not after shift - 1: the motion of the new frames is not known yet.
@@ -269,14 +257,6 @@ class OwnPastMemory(FeatureMemory):
         raise NotImplementedError
 
     def remember(self, motion: Tensor, past: Past | RecurrentPast | None, state: State, new: int) -> State:
-        """Return the state after an output.
-
-        Args:
-            motion: output (B, n, 198), n at least `count_needed(new)`.
-            past: not used here.
-            state: the state before the new frames.
-            new: how many of the output's last frames are new.
-        """
         buffer = torch.cat([state["motion"], motion[:, -new:]], 1)[:, -self.past_frames :]
         if self.history == "latest":
             buffer = torch.cat([buffer[:, : self.past_frames - self.frames], motion], 1)
@@ -300,7 +280,6 @@ class VQMemory(OwnPastMemory):
     Each frame of the past window has one code-vector, shared by all memory blocks (reading 4).
     """
 
-    streaming_recall = CodeRecall
     codes: VQVAE
 
     def make_feature(self) -> nn.Module:

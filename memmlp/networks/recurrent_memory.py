@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import torch
 import torch.nn.functional as F
@@ -22,61 +22,31 @@ class Recurrence(nn.Module):
     """LayerNorm of the sparse features, a recurrent layer, SiLU (App. A, reading 19).
 
     Args:
+        kind: the class of the recurrent layer, nn.LSTM or nn.GRU.
         width: k, the layer's hidden size.
-
-    Attributes:
-        kind: the class of the recurrent layer.
-        carried: names of the recurrent layer's states, the hidden one first.
     """
 
-    kind: ClassVar[Callable[..., nn.RNNBase]]
-    carried: ClassVar[tuple[str, ...]]
-
-    def __init__(self, width: int):
+    def __init__(self, kind: type[nn.LSTM] | type[nn.GRU], width: int):
         super().__init__()
         self.norm = nn.LayerNorm(SPARSE_DIM)
         self.first = nn.Linear(SPARSE_DIM, width)
-        self.layer = self.kind(SPARSE_DIM, width, batch_first=True)
+        self.layer: nn.Module = kind(SPARSE_DIM, width, batch_first=True)
 
     def begin(self, sparse: Tensor) -> Tensor:
         """Map the input (B, 54) just before a training window to the hidden state (B, k) to start from."""
         return self.first(self.norm(sparse))
 
     def forward(self, sparse: Tensor, carried: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
-        """Run over the inputs (B, n, 54) from the carried states, each (B, k).
+        """Run over the inputs (B, n, 54) from the carried states, each (B, k), the hidden one first.
 
         Returns:
             Features (B, n, k), and the states after the last input.
         """
+        states = tuple(state.contiguous()[None] for state in carried)
+        single = len(states) == 1  # a GRU, which takes and returns its one state as a tensor
         with in_float32(sparse.device):  # not every CPU has an LSTM in bfloat16
-            output, states = self.run(self.norm(sparse), [state.contiguous()[None] for state in carried])
-        return F.silu(output), [state[0] for state in states]
-
-    def run(self, x: Tensor, states: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
-        """Run the recurrent layer over inputs (B, n, 54) from a sequence of states, each (1, B, k)."""
-        raise NotImplementedError
-
-
-class LSTM(Recurrence):
-    """A recurrence with a hidden and a cell state."""
-
-    kind = nn.LSTM
-    carried = ("hidden", "cell")
-
-    def run(self, x: Tensor, states: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
-        return self.layer(x, tuple(states))
-
-
-class GRU(Recurrence):
-    """A recurrence with a hidden state alone."""
-
-    kind = nn.GRU
-    carried = ("hidden",)
-
-    def run(self, x: Tensor, states: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
-        """Run the recurrent layer over inputs (B, n, 54) from a sequence of one state (1, B, k)."""
-        output, hidden = self.layer(x, states[0])
-        return output, [hidden]
+            output, after = self.layer(self.norm(sparse), states[0] if single else states)
+        return F.silu(output), [state[0] for state in ([after] if single else after)]
 
 
 class RecurrentFeature(nn.Module):
@@ -126,53 +96,46 @@ class RecurrentMemory(FeatureMemory):
     """
 
     streaming_recall = RecurrentRecall
-    recurrence: ClassVar[type[Recurrence]]
     settled = True
+    layer: ClassVar[type[nn.LSTM] | type[nn.GRU]]
+    carried: ClassVar[tuple[str, ...]]  # the names of the layer's states, the hidden one first
 
     def __init__(self, settings: LSTMMemorySettings, **sizes: Any):
         super().__init__(settings, **sizes)
         self.recurrences = nn.ModuleList()
         self.shift = self.frames
-        self.past_frames = self.frames - 1
 
     def make_feature(self) -> nn.Module:
         """Add one more recurrent layer and make the module that looks up its output."""
-        self.recurrences.append(self.recurrence(self.width))
+        self.recurrences.append(Recurrence(self.layer, self.width))
         return RecurrentFeature(len(self.recurrences) - 1)
 
     def initial_state(self, batch: int) -> State:
         """Return zeros: states (B, blocks, k), and the earlier frames' features (B, blocks, T - 1, k)."""
         blocks = len(self.recurrences)
-        states = {name: torch.zeros(batch, blocks, self.width) for name in self.recurrence.carried}
+        states = {name: torch.zeros(batch, blocks, self.width) for name in self.carried}
         return states | {"features": torch.zeros(batch, blocks, self.frames - 1, self.width)}
 
     def true_state(self, sparse: Tensor, motion: Tensor) -> State:
         """Return hidden states projected from the last of the inputs (B, past, 54), for teacher forcing."""
-        hidden = torch.stack([layer.begin(sparse[:, -1]) for layer in self._layers()], 1)
-        return {"hidden": hidden.float()}
+        hidden = [cast(Recurrence, one).begin(sparse[:, -1]) for one in self.recurrences]
+        return {"hidden": torch.stack(hidden, 1).float()}
 
     def recall(self, sparse: Tensor, state: State, new: int) -> RecurrentPast:
         """Run the layers over the `new` last inputs of (B, past + new, 54), and recall the window."""
         features, states = [], []
-        for index, layer in enumerate(self._layers()):
-            carried = [state[name][:, index] for name in layer.carried]
-            made, after = layer(sparse[:, -new:], carried)
+        for index, recurrence in enumerate(self.recurrences):
+            made, after = recurrence(sparse[:, -new:], [state[name][:, index] for name in self.carried])
             features.append(made)
             states.append(after)
         window = torch.cat([state["features"], torch.stack(features, 1)], 2)[:, :, -self.frames :]
-        names = self.recurrence.carried
-        carried_on = {
-            name: torch.stack(of, 1) for name, of in zip(names, zip(*states, strict=True), strict=True)
-        }
-        return RecurrentPast(window, carried_on)
+        after = (torch.stack(of, 1) for of in zip(*states, strict=True))
+        return RecurrentPast(window, dict(zip(self.carried, after, strict=True)))
 
     def remember(self, motion: Tensor, past: Past | RecurrentPast | None, state: State, new: int) -> State:
         """Return the states after the newest frame, and the features of the last T - 1 frames."""
         assert isinstance(past, RecurrentPast)
         return past.carried | {"features": past.features[:, :, 1:]}
-
-    def _layers(self) -> list[Recurrence]:
-        return [layer for layer in self.recurrences if isinstance(layer, Recurrence)]
 
 
 @component("memory", "lstm", builds="LSTMMemory")
@@ -193,10 +156,10 @@ class GRUMemorySettings(LSTMMemorySettings):
 class LSTMMemory(RecurrentMemory):
     """A memory of LSTM layers (Table 15's LSTM-MB)."""
 
-    recurrence = LSTM
+    layer, carried = nn.LSTM, ("hidden", "cell")
 
 
 class GRUMemory(RecurrentMemory):
     """A memory of GRU layers (Table 15's GRU-MB)."""
 
-    recurrence = GRU
+    layer, carried = nn.GRU, ("hidden",)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
@@ -41,10 +41,9 @@ class RecurrentCell(nn.Module):
 
     def __init__(self, width: int):
         super().__init__()
-        self.size = self.carried * width
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Run over inputs (B, n, d) from a state (B, size).
+        """Run over inputs (B, n, d) from a state (B, carried x d).
 
         Returns:
             Outputs (B, n, d), and the state after the last input.
@@ -52,11 +51,7 @@ class RecurrentCell(nn.Module):
         raise NotImplementedError
 
     def step(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Take in one input (B, d) at a state (B, size).
-
-        Returns:
-            The output (B, d), and the state after it.
-        """
+        """Take in one input (B, d) at a state; return the output (B, d) and the state after it."""
         raise NotImplementedError
 
 
@@ -72,7 +67,6 @@ class GRUCell(RecurrentCell):
         return made, after[0]
 
     def step(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Take in one input (B, d) at a state (B, d); see RecurrentCell."""
         state = step_gru(self.layer.all_weights[0], x, state)
         return state, state
 
@@ -87,13 +81,11 @@ class LSTMCell(RecurrentCell):
         self.layer = nn.LSTM(width, width, batch_first=True)
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Run over inputs (B, n, d) from a state (B, 2 d); see RecurrentCell."""
         hidden, cell = (part[None].contiguous() for part in state.chunk(2, -1))
         made, after = self.layer(x, (hidden, cell))
         return made, torch.cat(after, -1)[0]
 
     def step(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Take in one input (B, d) at a state (B, 2 d); see RecurrentCell."""
         hidden, cell = state.chunk(2, -1)
         entering, again = compute_products(self.layer.all_weights[0], x, hidden)
         enter, keep, new, show = (entering + again).chunk(4, -1)
@@ -136,7 +128,6 @@ class LinearCell(RecurrentCell):
         return h, h[:, -1]
 
     def step(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Take in one input (B, d) at a state (B, d); see RecurrentCell."""
         keep, new = self.gates(x)
         state = keep * state + new
         return state, state
@@ -193,88 +184,46 @@ class RecurrentBlock(nn.Module):
         )
 
     def forward(self, h: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Map a sequence (B, n, d) and the cell's state to (B, n, d) and the state after it."""
+        """Map a sequence (B, n, d), or one frame (B, d), and the cell's state to the same and a new state."""
         x = self.cell_norm(h)
-        with in_float32(h.device):  # a state adds up what bfloat16 rounds
-            made, state = self.cell(x.float() if x.dtype == torch.bfloat16 else x, state)
-        return self.mix_channels(h + made), state
-
-    def step(self, h: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Map one frame (B, d) and the cell's state to (B, d) and the state after it."""
-        made, state = self.cell.step(self.cell_norm(h), state)
-        return self.mix_channels(h + made), state
-
-    def mix_channels(self, h: Tensor) -> Tensor:
-        """Mix the channels of (..., d)."""
-        return h + self.mlp(self.norm(h))
+        if h.dim() == 2:
+            made, state = self.cell.step(x, state)
+        else:
+            with in_float32(h.device):  # a state adds up what bfloat16 rounds
+                made, state = self.cell(x.float() if x.dtype == torch.bfloat16 else x, state)
+        h = h + made
+        return h + self.mlp(self.norm(h)), state
 
 
-class RotationOutput(nn.Module):
-    """What a member's outputs (..., 132) mean as rotations; the interface of the option `model.output`."""
+class Member(nn.Module):
+    """From encoded inputs to rotations: a linear stem, residual blocks, and a linear head.
 
-    def init_head(self, head: nn.Linear, normalizer: Normalizer) -> None:
-        """Change the initial weights of a member's head; by default they stay as they are."""
-
-    def pose(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        """Map a member's outputs (..., 132) to world motion (..., 198), given inputs (..., 54)."""
-        raise NotImplementedError
-
-    def pose_for_losses(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        """Map a member's outputs to the motion that the losses compare; by default the same as `pose`."""
-        return self.pose(made, sparse, normalizer)
-
-
-class LocalRotations(RotationOutput):
-    """Each joint's rotation in its parent's frame."""
-
-    def pose(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        return normalizer.posed(made, sparse)
-
-
-class GlobalRotations(RotationOutput):
-    """Each joint's rotation in the frame of the network's space.
-
-    No joint inherits its ancestors' errors, and the positions are sums of turned bones.
+    Args:
+        settings: width, depth, cell and expansion of the blocks.
     """
 
-    def init_head(self, head: nn.Linear, normalizer: Normalizer) -> None:
-        """Begin near the mean pose: trainings that begin at random rotations leave legs turned wrongly."""
-        with torch.no_grad():
-            head.weight *= 0.3
-            head.bias.copy_(compute_mean_pose(normalizer))
+    def __init__(self, settings: RecurrentPoserSettings):
+        super().__init__()
+        width, cell = settings.width, CELLS[settings.cell]
+        self.stem = nn.Linear(SPARSE_DIM, width)
+        self.blocks = nn.ModuleDict(
+            {
+                f"block{i}": RecurrentBlock(cell(width), width, settings.expansion)
+                for i in range(1, settings.depth + 1)
+            }
+        )
+        self.norm = nn.LayerNorm(width)
+        self.head = nn.Linear(width, ROTATION.stop)
 
-    def pose(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        with in_float32(made.device):
-            return normalizer.posed_in_world(self.turn_to_world(made, sparse, normalizer), sparse)
+    def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        """Map encoded inputs (B, n, 54) or (B, 54) to rotations (..., 132) and the state after them.
 
-    def turn_to_world(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        """Map a member's outputs (..., 132) to global rotations in the world, given inputs (..., 54)."""
-        return normalizer.rotations_out(made.to(sparse.dtype), normalizer.origin(sparse))
-
-
-class ReachingArms(GlobalRotations):
-    """Global rotations, and arms that reach to the hands' trackers (`reach_hands`).
-
-    The losses compare the arms before they reach: with losses after it, rotations and positions had larger
-    errors.
-    """
-
-    def pose(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        with in_float32(made.device):
-            rotations = use_tracker_rotations(self.turn_to_world(made, sparse, normalizer), sparse)
-            return normalizer.posed_in_world(rotations, sparse, reach_hands)
-
-    def pose_for_losses(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        """Map a member's outputs (..., 132) to world motion whose arms have not been made to reach."""
-        return super().pose(made, sparse, normalizer)
-
-
-OUTPUTS: dict[str, type[RotationOutput]] = {
-    "local": LocalRotations,
-    "global": GlobalRotations,
-    "reaching": ReachingArms,
-}
-"""What the rotations may stand for, by the names that the config knows."""
+        The state (B, carried x d) of each block's cell is named by the block.
+        """
+        h, kept = self.stem(x), {}
+        for name, block in self.blocks.items():
+            h, kept[name] = block(h, state[name])
+        return self.head(self.norm(h)), kept
 
 
 def compute_mean_pose(normalizer: Normalizer) -> Tensor:
@@ -285,59 +234,6 @@ def compute_mean_pose(normalizer: Normalizer) -> Tensor:
     local = sixd_to_matrix(normalizer.mean[SPARSE_DIM:][ROTATION].unflatten(-1, (N_JOINTS, 6)))
     rotations, _ = forward_kinematics(local, torch.zeros_like(normalizer.rest[0]), normalizer.rest)
     return matrix_to_sixd(rotations).flatten()
-
-
-class Member(nn.Module):
-    """From encoded inputs to rotations: a linear stem, residual blocks, and a linear head.
-
-    Args:
-        cells: makes a recurrent cell of d inputs and outputs.
-        width: d, the width of the hidden state.
-        depth: number of blocks.
-        expansion: the hidden width of the blocks' MLPs, as a multiple of d.
-    """
-
-    def __init__(self, cells: Callable[[int], RecurrentCell], width: int, depth: int, expansion: int):
-        super().__init__()
-        self.stem = nn.Linear(SPARSE_DIM, width)
-        self.blocks = nn.ModuleDict(
-            {f"block{i}": RecurrentBlock(cells(width), width, expansion) for i in range(1, depth + 1)}
-        )
-        self.norm = nn.LayerNorm(width)
-        self.head = nn.Linear(width, ROTATION.stop)
-
-    def named_blocks(self) -> Iterator[tuple[str, RecurrentBlock]]:
-        """Yield the blocks by their names, in order."""
-        return cast(Iterator[tuple[str, RecurrentBlock]], self.blocks.items())
-
-    def initial_state(self, like: Tensor, batch: int) -> State:
-        """Return the state of a fresh start: zeros (B, size) of each block's cell, by the block's name."""
-        return {name: like.new_zeros(batch, block.cell.size) for name, block in self.named_blocks()}
-
-    def forward(self, x: Tensor, state: State, newest: int) -> tuple[Tensor, State]:
-        """Map encoded inputs (B, n, 54) to the newest rotations (B, newest, 132) and the new state."""
-        h, kept = self.stem(x), {}
-        for name, block in self.named_blocks():
-            h, kept[name] = block(h, state[name])
-        return self.head(self.norm(h[:, h.shape[1] - newest :])), kept
-
-    def step(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        """Map one frame's encoded inputs (B, 54) to rotations (B, 132) and the state after it."""
-        h, kept = self.stem(x), {}
-        for name, block in self.named_blocks():
-            h, kept[name] = block.step(h, state[name])
-        return self.head(self.norm(h)), kept
-
-
-def _join(states: Mapping[str, State]) -> State:
-    """Merge the states of several members into one."""
-    return {f"{name}_{block}": value for name, state in states.items() for block, value in state.items()}
-
-
-def _select(state: State, member: str) -> State:
-    """Return the state of one member, taken from the merged state of all."""
-    own = f"{member}_"
-    return {name.removeprefix(own): value for name, value in state.items() if name.startswith(own)}
 
 
 class RecurrentPoserGraph(FrameGraph):
@@ -352,14 +248,15 @@ class RecurrentPoserGraph(FrameGraph):
     def build(self, model: Any) -> None:
         self.model = model
         self.model.normalizer = OneFrameNormalizer(model.normalizer)
-        outer = ["model.normalizer"]
-        for name, member in model.named_members():
-            inner = ["stem", *(f"blocks.{block}.mlp" for block in member.blocks), "head"]
-            outer += [f"model.members.{name}.{part}" for part in inner]
-        self.float32_modules = tuple(outer)
+        float32 = ["model.normalizer"]
+        for name, member in model.members.items():
+            parts = ["stem", *(f"blocks.{block}.mlp" for block in member.blocks), "head"]
+            float32 += [f"model.members.{name}.{part}" for part in parts]
+        self.float32_modules = tuple(float32)
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        return self.model.step(sparse, state)
+        made, kept = self.model.predict_members(sparse, state)
+        return self.model.pose(made.mean(0), sparse), kept
 
 
 @component("model", "recurrent_poser", version=3, builds="RecurrentPoser")
@@ -421,61 +318,64 @@ class RecurrentPoser(WindowlessModel):
 
     def __init__(self, normalizer: Normalizer, settings: RecurrentPoserSettings):
         super().__init__(normalizer, settings.frames)
-        self.output = OUTPUTS[settings.output]()
-        self.members = nn.ModuleDict(
-            {
-                f"member{i}": Member(CELLS[settings.cell], settings.width, settings.depth, settings.expansion)
-                for i in range(1, settings.members + 1)
-            }
-        )
-        for _, member in self.named_members():
-            self.output.init_head(member.head, normalizer)
-
-    def named_members(self) -> Iterator[tuple[str, Member]]:
-        """Yield the members by their names, in order."""
-        return cast(Iterator[tuple[str, Member]], self.members.items())
+        self.output = settings.output
+        members = range(1, settings.members + 1)
+        self.members = nn.ModuleDict({f"member{i}": Member(settings) for i in members})
+        size = CELLS[settings.cell].carried * settings.width
+        self.sizes = {f"member{i}_block{j}": size for i in members for j in range(1, settings.depth + 1)}
+        if self.output != "local":
+            # Trainings that begin at random rotations, far from the mean pose, leave legs turned wrongly.
+            for member in cast(Iterable[Member], self.members.values()):
+                member.head.weight.data *= 0.3
+                member.head.bias.data.copy_(compute_mean_pose(normalizer))
 
     def initial_state(self, batch: int = 1) -> State:
         """Return the state of a fresh start: zeros (B, size) for each cell, named by its member and block."""
-        return _join(
-            {name: one.initial_state(self.normalizer.mean, batch) for name, one in self.named_members()}
-        )
+        return {name: self.normalizer.mean.new_zeros(batch, size) for name, size in self.sizes.items()}
 
-    def encode(self, sparse: Tensor) -> Tensor:
-        """Map world inputs (..., 54) to network space, as the members see them."""
-        return self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
+    def pose(self, made: Tensor, sparse: Tensor, reach: bool = True) -> Tensor:
+        """Map a member's outputs (..., 132) to world motion (..., 198), given inputs (..., 54).
 
-    def pose(self, made: Tensor, sparse: Tensor) -> Tensor:
-        """Map a member's rotations (..., 132) to world motion (..., 198), given inputs (..., 54)."""
-        return self.output.pose(made, sparse, self.normalizer)
+        With `model.output=reaching` the arms reach to the hands' trackers (`reach_hands`), if `reach`.
+        Global rotations inherit no errors from a joint's ancestors; positions are sums of turned bones.
+        """
+        if self.output == "local":
+            return self.normalizer.posed(made, sparse)
+        with in_float32(made.device):
+            rotations = self.normalizer.rotations_out(made.to(sparse.dtype), self.normalizer.origin(sparse))
+            if not (reach and self.output == "reaching"):
+                return self.normalizer.posed_in_world(rotations, sparse)
+            rotations = use_tracker_rotations(rotations, sparse)
+            return self.normalizer.posed_in_world(rotations, sparse, reach_hands)
 
-    def predict_members(self, sparse: Tensor, state: State, newest: int) -> tuple[Tensor, State]:
-        """Return the newest rotations of each member (members, B, newest, 132), and the state after them."""
-        x, made, kept = self.encode(sparse), [], {}
-        for name, member in self.named_members():
-            rotations, kept[name] = member(x, _select(state, name), newest)
+    def predict_members(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
+        """Return the rotations of each member (members, ..., 132), and the state after them.
+
+        Args:
+            sparse: world inputs (B, n, 54), or (B, 54) of one frame, which has plain layers then.
+            state: the state before these frames.
+        """
+        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
+        made: list[Tensor] = []
+        kept: State = {}
+        for name, member in self.members.items():
+            own = {key.removeprefix(f"{name}_"): value for key, value in state.items()}
+            rotations, after = member(encoded, own)
             made.append(rotations)
-        return torch.stack(made), _join(kept)
+            kept |= {f"{name}_{block}": value for block, value in after.items()}
+        return torch.stack(made), kept
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        wanted = sparse.shape[1] if newest is None else newest
-        made, kept = self.predict_members(sparse, state, wanted)
-        return self.pose(made.mean(0), sparse[:, sparse.shape[1] - wanted :]), kept
+        made, kept = self.predict_members(sparse, state)
+        start = sparse.shape[1] - (sparse.shape[1] if newest is None else newest)
+        return self.pose(made[:, :, start:].mean(0), sparse[:, start:]), kept
 
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
-        """Make a training call; it returns the motion of each member (members B, T, 198), one by one."""
-        made, kept = self.predict_members(sparse, state, sparse.shape[1])
-        motion = self.output.pose_for_losses(made, sparse.expand(len(made), -1, -1, -1), self.normalizer)
-        return TrainingOutputs(motion.flatten(0, 1), kept, {})
+        """Make a training call; it returns the motion of each member (members B, T, 198), one by one.
 
-    def step(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
-        """Take in one frame of world inputs (B, 54), as `advance` does, in plain layers.
-
-        Returns:
-            World motion (B, 198), and the state after the frame.
+        The losses compare the arms before they reach: with losses after it, rotations and positions had
+        larger errors.
         """
-        x, made, kept = self.encode(sparse), [], {}
-        for name, member in self.named_members():
-            rotations, kept[name] = member.step(x, _select(state, name))
-            made.append(rotations)
-        return self.pose(torch.stack(made).mean(0), sparse), _join(kept)
+        made, kept = self.predict_members(sparse, state)
+        motion = self.pose(made, sparse.expand(len(made), -1, -1, -1), reach=False)
+        return TrainingOutputs(motion.flatten(0, 1), kept, {})

@@ -85,11 +85,8 @@ class RPM(WindowlessModel):
 
     def __init__(self, normalizer: Normalizer, settings: RPMSettings):
         super().__init__(normalizer, settings.frames)
-        self.context, self.horizon, self.own_dropout = (
-            settings.context,
-            settings.horizon,
-            settings.own_dropout,
-        )
+        self.context, self.horizon = settings.context, settings.horizon
+        self.own_dropout = settings.own_dropout
         self.motion = nn.Linear(ROTATION.stop, settings.width)
         self.sparse = nn.Linear(SPARSE_DIM, settings.width)
         self.attention = Attention(settings.width, settings.heads)
@@ -128,9 +125,9 @@ class RPM(WindowlessModel):
         future = motion.new_zeros(len(motion), self.horizon, ROTATION.stop)
         queries = self.motion(torch.cat([motion, future], 1)) + self.places
         seen = self.sparse(encoded) + self.places[: encoded.shape[1]]
-        attention = self.attention
-        attended = attention.attend(attention.query(queries), attention.key(seen), attention.value(seen))
-        h = self.norm(queries + attended).squeeze(0)  # without a batch axis, a live step has plain layers
+        h = self.norm(queries + self.attention(queries, seen)).squeeze(
+            0
+        )  # without a batch axis, a live step has plain layers
         for layer in self.layers:
             h = layer(h)
         return self.head(h[..., -self.horizon :, :]).view(future.shape)
@@ -175,12 +172,7 @@ class RPM(WindowlessModel):
         """Make a training call: a few frames of free running without gradients, then one step with gradients.
 
         The number of free-running frames is drawn for each call. The step predicts the window's last W
-        frames.
-
-        Args:
-            sparse: world inputs (B, T, 54).
-            state: a fresh start.
-            true_frames: world frames [X | Theta] (B, T, 252).
+        frames; see MotionModel.
         """
         now = self.frames - self.horizon
         begin = now - int(torch.randint(now - self.context + 1, ()))

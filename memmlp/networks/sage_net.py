@@ -183,20 +183,10 @@ class SAGENet(NewestFrameModel):
 
     def __init__(self, normalizer: Normalizer, settings: SAGESettings):
         super().__init__(normalizer, settings.frames)
-        self._codes = {
-            "width": settings.code_width,
-            "depth": settings.code_depth,
-            "heads": settings.code_heads,
-        }
-        self._dropout = settings.dropout
+        self.settings = settings
         self.diffusion = Diffusion(settings.diffusion_steps, settings.sampling_steps)
-        self.upper = UpperDenoiser(
-            settings.frames, width=settings.width, depth=settings.depth, heads=settings.heads
-        )
-        self.lower = LowerDenoiser(
-            settings.frames, width=settings.width, depth=settings.depth, heads=settings.heads
-        )
-        self.decoder = Decoder(settings.frames, **self._codes, dropout=settings.dropout)
+        self.upper, self.lower = UpperDenoiser(settings), LowerDenoiser(settings)
+        self.decoder = Decoder(settings)
         draw = torch.Generator().manual_seed(settings.noise_seed)
         self.register_buffer(
             "noises", settings.noise * torch.randn(2, settings.frames // 2, LATENT, generator=draw)
@@ -204,7 +194,7 @@ class SAGENet(NewestFrameModel):
 
     def make_codes(self, joints: tuple[int, ...]) -> HalfVQVAE:
         """Make a VQ-VAE with fresh weights for the half of the body that has the given joints."""
-        return HalfVQVAE(joints, **self._codes, dropout=self._dropout)
+        return HalfVQVAE(joints, self.settings)
 
     def sample_upper(self, encoded: Tensor) -> Tensor:
         """Sample the upper half's latents (B, T // 2, 384) for inputs (B, T, 54)."""

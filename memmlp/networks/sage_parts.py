@@ -8,7 +8,7 @@ both. The refiner that follows is memmlp.networks.refiner. All latents are (B, T
 from __future__ import annotations
 
 import math
-from typing import cast
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
@@ -70,10 +70,8 @@ class AttentionBlock(nn.Module):
 
     def newest(self, h: Tensor, count: int) -> Tensor:
         """Map features (..., T, d) to those of the newest frames (..., count, d), without the rest."""
-        seen, attention = self.attention_norm(h), self.attention
-        query = attention.query(seen[..., -count:, :])
-        attended = attention.attend(query, attention.key(seen), attention.value(seen))
-        h = h[..., -count:, :] + self.dropout(attended)
+        seen = self.attention_norm(h)
+        h = h[..., -count:, :] + self.dropout(self.attention(seen[..., -count:, :], seen))
         return h + self.dropout(self.mlp(self.norm(h)))
 
 
@@ -93,11 +91,11 @@ class Stack(nn.Module):
         self.norm, self.head = nn.LayerNorm(width), nn.Linear(width, width, bias=False)
 
     def prepare(self, h: Tensor) -> Tensor:
-        """Return the features that the blocks get, made from features (B, T, d); by default unchanged."""
+        """Map features (B, T, d) to those that the blocks get; by default unchanged."""
         return h
 
     def finish(self, h: Tensor) -> Tensor:
-        """Return the features made from the blocks' output (B, T, d); by default unchanged."""
+        """Map the blocks' output (B, T, d) to features (B, T', d); by default unchanged."""
         return h
 
     def forward(self, h: Tensor) -> Tensor:
@@ -125,7 +123,6 @@ class Shortened(Stack):
         self.convolution = nn.Conv1d(width, width, 3, padding=1)
 
     def prepare(self, h: Tensor) -> Tensor:
-        """Return features (B, T // 2, d) of features (B, T, d)."""
         return F.max_pool1d(self.convolution(h.transpose(1, 2)), 2).transpose(1, 2)
 
 
@@ -137,7 +134,6 @@ class Lengthened(Stack):
         self.convolution = nn.ConvTranspose1d(width, width, 3, stride=2)
 
     def finish(self, h: Tensor) -> Tensor:
-        """Return features (B, 2 T, d): a transposed convolution doubles the frames of features (B, T, d)."""
         return self.convolution(h.transpose(1, 2))[..., 1:].transpose(1, 2)
 
     def predict_last(self, h: Tensor, at: Tensor) -> Tensor:
@@ -218,29 +214,20 @@ class HalfVQVAE(nn.Module):
 
     Args:
         joints: the joints of the half.
-        width: d, the width of the features.
-        depth: number of blocks of the encoder, and of the decoder.
-        heads: number of attention heads; it divides d.
-        dropout: dropout rate in the blocks, while training.
+        settings: the network's settings, of which `code_*` and `dropout` are used here.
     """
 
-    def __init__(
-        self,
-        joints: tuple[int, ...],
-        *,
-        width: int = 256,
-        depth: int = 4,
-        heads: int = 4,
-        dropout: float = 0.1,
-    ):
+    def __init__(self, joints: tuple[int, ...], settings: Any):
         super().__init__()
+        width = settings.code_width
+        blocks = width, settings.code_depth, settings.code_heads, settings.dropout
         self.joints, count = joints, len(joints)
         self.mixture = Mixture(count)
         self.stem = nn.Linear(count * (6 + JOINT_DIM), width)
-        self.encoder = Shortened(width, depth, heads, dropout)
+        self.encoder = Shortened(*blocks)
         self.into, self.out_of = nn.Linear(width, LATENT), nn.Linear(LATENT, width)
         self.quantiser = ProductQuantiser()
-        self.decoder = Lengthened(width, depth, heads, dropout)
+        self.decoder = Lengthened(*blocks)
         self.head = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, count * 6))
 
     def encode(self, rotation: Tensor, encoded: Tensor) -> tuple[Tensor, Tensor]:
@@ -294,19 +281,17 @@ class UpperDenoiser(nn.Module):
     """Predicts the upper half's clean latents from noisy ones and the inputs; 57,969,432 parameters.
 
     Args:
-        frames: T, the window's length.
-        width: d, the width of the features.
-        depth: number of blocks.
-        heads: number of attention heads; it divides d.
+        settings: the network's settings: frames, width, depth and heads.
     """
 
-    def __init__(self, frames: int = 20, *, width: int = 512, depth: int = 12, heads: int = 8):
+    def __init__(self, settings: Any):
         super().__init__()
+        frames, width = settings.frames, settings.width
         self.condition = Halved(frames, width)
         self.time = TimeEmbedding(width, SINES)
         self.align = nn.Linear(frames // 2, frames // 2)
         self.stem = nn.Linear(width + LATENT, width)
-        self.blocks = nn.ModuleList(DiTBlock(width, heads, 4) for _ in range(depth))
+        self.blocks = nn.ModuleList(DiTBlock(width, settings.heads, 4) for _ in range(settings.depth))
         self.head = nn.Linear(width, LATENT)
 
     def align_frames(self, latent: Tensor) -> Tensor:
@@ -332,8 +317,8 @@ class UpperDenoiser(nn.Module):
 class LowerDenoiser(UpperDenoiser):
     """Predicts the lower half's clean latents, given the upper half's as well; 58,264,728 parameters."""
 
-    def __init__(self, frames: int = 20, *, width: int = 512, depth: int = 12, heads: int = 8):
-        super().__init__(frames, width=width, depth=depth, heads=heads)
+    def __init__(self, settings: Any):
+        super().__init__(settings)
         self.beside = nn.Linear(2 * LATENT, LATENT)
 
     def join(self, noisy: Tensor, upper: Tensor) -> Tensor:
@@ -345,20 +330,15 @@ class Decoder(nn.Module):
     """Makes rotations from both halves' latents and the inputs; 4,035,374 parameters.
 
     Args:
-        frames: T, the window's length.
-        width: d, the width of the features.
-        depth: number of blocks.
-        heads: number of attention heads; it divides d.
-        dropout: dropout rate in the blocks, while training.
+        settings: the network's settings, of which `frames`, `code_*` and `dropout` are used here.
     """
 
-    def __init__(
-        self, frames: int = 20, *, width: int = 256, depth: int = 4, heads: int = 4, dropout: float = 0.1
-    ):
+    def __init__(self, settings: Any):
         super().__init__()
-        self.condition = Halved(frames, LATENT)
+        width = settings.code_width
+        self.condition = Halved(settings.frames, LATENT)
         self.stem = nn.Linear(3 * LATENT, width)
-        self.stack = Lengthened(width, depth, heads, dropout)
+        self.stack = Lengthened(width, settings.code_depth, settings.code_heads, settings.dropout)
         sizes = 6, ROTATION.stop - 6
         self.heads = nn.ModuleList(
             nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, size)) for size in sizes

@@ -29,9 +29,10 @@ class Attention(nn.Module):
         self.query, self.key, self.value = (nn.Linear(width, width) for _ in range(3))
         self.out = nn.Linear(width, width)
 
-    def forward(self, h: Tensor) -> Tensor:
-        """Map features (B, T, d) to (B, T, d)."""
-        return self.attend(self.query(h), self.key(h), self.value(h))
+    def forward(self, h: Tensor, seen: Tensor | None = None) -> Tensor:
+        """Map features (B, n, d) to (B, n, d); they attend to `seen` (B, T, d), by default to themselves."""
+        seen = h if seen is None else seen
+        return self.attend(self.query(h), self.key(seen), self.value(seen))
 
     def attend(self, *parts: Tensor) -> Tensor:
         """Attend with queries (B, n, d) to keys (B, T, d) and values (B, T, d), given in this order.
@@ -108,10 +109,7 @@ def encode_newest_frame(layers: list[EncoderLayer], h: Tensor) -> Tensor:
     *earlier, last = layers
     for layer in earlier:
         h = layer(h)
-    attention, newest = last.attention, h[-1:]
-    return last.finish(
-        newest, attention.attend(attention.query(newest), attention.key(h), attention.value(h))
-    )
+    return last.finish(h[-1:], last.attention(h[-1:], h))
 
 
 class DiTBlock(nn.Module):
@@ -145,8 +143,6 @@ class DiTBlock(nn.Module):
             count: how many of the newest frames are wanted.
         """
         shift, scale, gate, mlp_shift, mlp_scale, mlp_gate = modulation
-        seen, attention = self.attention_norm(h) * (1 + scale) + shift, self.attention
-        query = attention.query(seen[..., -count:, :])
-        attended = attention.attend(query, attention.key(seen), attention.value(seen))
-        h = h[..., -count:, :] + gate * attended
+        seen = self.attention_norm(h) * (1 + scale) + shift
+        h = h[..., -count:, :] + gate * self.attention(seen[..., -count:, :], seen)
         return h + mlp_gate * self.mlp(self.norm(h) * (1 + mlp_scale) + mlp_shift)

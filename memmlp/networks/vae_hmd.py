@@ -136,15 +136,10 @@ class VAEHMD(WindowlessModel):
     def __init__(self, normalizer: Normalizer, settings: VAEHMDSettings):
         super().__init__(normalizer, settings.frames)
         self.divergence_weight = settings.divergence_weight
-        self.encoder = Perceptron(
-            TRACKERS, 2 * settings.latent, settings.width, settings.depth, settings.dropout
-        )
-        self.decoder = Perceptron(
-            settings.latent, ROTATION.stop, settings.width, settings.depth, settings.dropout
-        )
-        self.pose_encoder = Perceptron(
-            MOTION_DIM, 2 * settings.latent, settings.width, settings.depth, settings.dropout
-        )
+        sizes = settings.width, settings.depth, settings.dropout
+        self.encoder = Perceptron(TRACKERS, 2 * settings.latent, *sizes)
+        self.decoder = Perceptron(settings.latent, ROTATION.stop, *sizes)
+        self.pose_encoder = Perceptron(MOTION_DIM, 2 * settings.latent, *sizes)
 
     def count_parameters(self) -> int:
         """Count the trainable parameters of the network in use, without the encoder of whole poses."""
@@ -162,12 +157,7 @@ class VAEHMD(WindowlessModel):
     def training_call(self, sparse: Tensor, state: State, true_frames: Tensor) -> TrainingOutputs:
         """Make a training call: each window is decoded either from its true poses or from its trackers.
 
-        The one further loss is the latents' KL divergence.
-
-        Args:
-            sparse: world inputs (B, T, 54).
-            state: see `advance`.
-            true_frames: world frames [X | Theta] (B, T, 252).
+        The one further loss is the latents' KL divergence; see MotionModel.
         """
         posed = (distributed.draw_rows(torch.rand_like, sparse[:, :1, :1]) < 0.5).to(sparse.dtype)
         of_pose = self.pose_encoder(self.normalizer.encode(true_frames)[..., SPARSE_DIM:])

@@ -43,9 +43,6 @@ HIDDEN_SHARE = 0.5  # of a half's joints, which its VQ-VAE has to guess
 HIDDEN_COUNT = 2  # joints of the diffusion models' condition, drawn with replacement
 CODE_WEIGHTS = {"orientation": 0.2, "rotation": 1.0, "position": 5.0, "hand": 5.0, "codebook": 0.25}
 
-WHOLE = ("warmup", "ema", "clip_norm", "weight_decay", "compile")
-"""The keys of optim, besides the optimiser, that only act for the whole network: parts have defaults."""
-
 
 @dataclass(frozen=True)
 class DroppingOptim(Optim):
@@ -148,15 +145,7 @@ class SAGEUpstreamSettings(Settings):
             betas = (0.9, 0.99) if kind in ("upper_codes", "lower_codes") else (0.9, 0.999)
             optim = DroppingOptim(**own, **often, betas=betas, validate_every=own["steps"])
             make = DecoderTraining if kind == "decoder" else PartTraining
-            unused = list_unused(config["optim"]["name"], network.optim, optim)
-            yield make(kind, replace(network, optim=optim), unused)
-
-
-def list_unused(name: str, whole: Optim, part: Optim) -> tuple[str, ...]:
-    """Return the settings of optim that a part does not use, such as "optim.warmup=100"."""
-    other = () if name == "adamw" else (f"optim={name}",)
-    own = {key: getattr(whole, key, None) for key in WHOLE}
-    return (*other, *(f"optim.{key}={own[key]}" for key in WHOLE if own[key] != getattr(part, key)))
+            yield make(kind, replace(network, optim=optim))
 
 
 @dataclass(frozen=True)
@@ -166,19 +155,15 @@ class PartTraining:
     Attributes:
         kind: which of PARTS.
         network: seed, optimisation, and how windows are drawn.
-        unused: settings of optim that act only in the training of the whole network.
     """
 
     kind: str
     network: NetworkTraining
-    unused: tuple[str, ...] = ()
 
     @property
     def description(self) -> str:
-        """What the training does, in words, and which settings it does not use."""
-        steps = f"{self.kind.replace('_', ' ')}: train it for {self.network.optim.steps} steps"
-        unused = f" by AdamW; without {', '.join(self.unused)}, for the whole network" if self.unused else ""
-        return steps + unused
+        """What the training does, in words."""
+        return f"{self.kind.replace('_', ' ')}: train it for {self.network.optim.steps} steps"
 
     def train(
         self,
@@ -188,14 +173,9 @@ class PartTraining:
         run: Run,
         device: torch.device,
     ) -> dict[str, float]:
-        """Train the part, from the run's checkpoint if there is one, and write it with the parts before it.
+        """Train the part and write it with the parts before it, whose file is `upstream`.
 
-        Args:
-            architecture: builds the whole network.
-            data: the prepared motion.
-            upstream: file of the parts that were trained before; None for the first part.
-            run: the run whose folder takes checkpoints, log and weights.
-            device: the device to train on.
+        For the other arguments see `NetworkTraining.train`.
 
         Returns:
             The part's errors on windows of the validation part.
@@ -214,8 +194,8 @@ class PartTraining:
             checkpoint.load_module(finished, module, before)
         halves = nn.ModuleDict({"net": net, "upper": parts["codes.upper"], "lower": parts["codes.lower"]})
         halves.eval().requires_grad_(False).to(device)
-        windows = Windows(self.network, dataset, data.open("val").to(device), net.frames)
-        task = PartTask(part.requires_grad_(True), make_objective(self.kind, halves), windows)
+        objective, validation = make_objective(self.kind, halves), data.open("val").to(device)
+        task = PartTask(part.requires_grad_(True), objective, self.network, dataset, validation, net.frames)
         train(task, self.network.optim, run, self.network.seed, self.kind.replace("_", " "))
         if distributed.is_first():
             checkpoint.write(run.model, before | checkpoint.module_tensors(name, part), {})
@@ -246,41 +226,35 @@ def last_errors(run: Run) -> dict[str, float]:
     return dict(found[-1]) if found else {}
 
 
-class Windows:
-    """Draws the windows with which a part is trained, and those on which it is validated."""
+class PartTask(TrainingTask):
+    """The training task of a part: the sum of an objective's losses, on windows of T frames."""
 
     def __init__(
-        self, network: NetworkTraining, dataset: MotionDataset, validation: MotionDataset, frames: int
+        self,
+        part: nn.Module,
+        objective: Objective,
+        network: NetworkTraining,
+        dataset: MotionDataset,
+        validation: MotionDataset,
+        frames: int,
     ):
+        self.module, self.objective, self.frames = part, objective, frames
         self.dataset = MirroredDataset(dataset) if network.mirror else dataset
         draws = network.optim.batch, frames, network.seed, network.drawn_by, network.shares
-        self.frames, self.sampler = frames, WindowSampler(self.dataset, *draws)
+        self.sampler = WindowSampler(self.dataset, *draws)
         drawn = WindowSampler(validation, VALIDATION_WINDOWS, frames, seed=0).draw(0)
         self.validation = validation.stretches(*drawn, frames)
 
-    def draw(self, step: int) -> tuple[Tensor, Tensor]:
-        """Return the world frames (B, T, 252) of a step's windows, and the indices (B,) of their clips."""
-        clips, end = map(distributed.local_rows, self.sampler.draw(step))
-        return self.dataset.stretches(clips, end, self.frames), clips
-
-
-class PartTask(TrainingTask):
-    """The training task of a part: the sum of an objective's losses."""
-
-    def __init__(self, part: nn.Module, objective: Objective, windows: Windows):
-        self.module, self.objective, self.windows = part, objective, windows
-        self.dataset = windows.dataset
-
     def step(self, step: int) -> StepResult:
         """Compute the losses on a batch of windows."""
-        frames, clips = self.windows.draw(step)
-        terms = self.objective(frames, True)
+        clips, end = map(distributed.local_rows, self.sampler.draw(step))
+        terms = self.objective(self.dataset.stretches(clips, end, self.frames), True)
         return StepResult(torch.stack(list(terms.values())).sum(), terms, clips)
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
         """Compute the losses on the validation windows, with no joints hidden and with sampled latents."""
-        return {name: float(term) for name, term in self.objective(self.windows.validation, False).items()}
+        return {name: float(term) for name, term in self.objective(self.validation, False).items()}
 
 
 Objective = Callable[[Tensor, bool], dict[str, Tensor]]
@@ -298,7 +272,9 @@ def make_objective(kind: str, halves: nn.ModuleDict) -> Objective:
     net, codes = halves["net"], halves[half]
     assert isinstance(net, SAGENet)
     assert isinstance(codes, HalfVQVAE)
-    return partial(compute_code_losses if of == "codes" else LATENT_LOSSES[half], net, codes)
+    if of == "codes":
+        return partial(compute_code_losses, net, codes)
+    return partial(compute_latent_losses, net, codes, lower=half == "lower")
 
 
 def compute_code_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool) -> dict[str, Tensor]:
@@ -357,30 +333,24 @@ def measure_half(
     return errors
 
 
-def compute_upper_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool) -> dict[str, Tensor]:
-    """Return the error of the upper half's latents (smooth L1); arguments as in `compute_code_losses`."""
-    rotation, encoded = encode_windows(net, frames)
-    clean = encode_latents(codes, rotation, encoded)
-    if not training:
-        return {"latent": F.smooth_l1_loss(net.sample_upper(encoded), clean)}
-    noisy, time, hidden = add_noise(net, clean)
-    return {"latent": F.smooth_l1_loss(net.upper(noisy, time, encoded, hidden), clean)}
+def compute_latent_losses(
+    net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool, lower: bool
+) -> dict[str, Tensor]:
+    """Return the error of a half's latents (smooth L1); for other arguments see `compute_code_losses`.
 
-
-def compute_lower_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool) -> dict[str, Tensor]:
-    """Return the error of the lower half's latents (smooth L1), given sampled latents of the upper half."""
+    Args:
+        lower: whether the half is the lower one, which is given sampled latents of the upper half.
+    """
     rotation, encoded = encode_windows(net, frames)
     clean = encode_latents(codes, rotation, encoded)
     with torch.no_grad():
-        upper = net.sample_upper(encoded)
+        upper = net.sample_upper(encoded) if lower or not training else clean
     if not training:
-        return {"latent": F.smooth_l1_loss(net.sample_lower(upper, encoded), clean)}
+        sampled = net.sample_lower(upper, encoded) if lower else upper
+        return {"latent": F.smooth_l1_loss(sampled, clean)}
     noisy, time, hidden = add_noise(net, clean)
-    found = net.lower(net.lower.join(noisy, upper), time, encoded, hidden)
-    return {"latent": F.smooth_l1_loss(found, clean)}
-
-
-LATENT_LOSSES = {"upper": compute_upper_losses, "lower": compute_lower_losses}
+    denoiser, noisy = (net.lower, net.lower.join(noisy, upper)) if lower else (net.upper, noisy)
+    return {"latent": F.smooth_l1_loss(denoiser(noisy, time, encoded, hidden), clean)}
 
 
 def encode_windows(net: SAGENet, frames: Tensor) -> tuple[Tensor, Tensor]:
@@ -402,7 +372,6 @@ def encode_latents(codes: HalfVQVAE, rotation: Tensor, encoded: Tensor) -> Tenso
 
 def add_noise(net: SAGENet, clean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return noisy latents (B, T // 2, 384), their random times (B,), and random hidden joints (B, 22)."""
-    time = distributed.draw_rows(net.diffusion.draw_times, clean)
-    noisy = net.diffusion.add_noise(clean, time, distributed.draw_rows(torch.randn_like, clean))
+    noisy, time, _ = net.diffusion.draw_noisy(clean)
     drawn = distributed.draw_rows(lambda like: torch.rand_like(like[:, 0, :HIDDEN_COUNT]), clean) * N_JOINTS
     return noisy, time, F.one_hot(drawn.long(), N_JOINTS).sum(1) > 0

@@ -7,20 +7,19 @@ import pytest
 import tiny
 import torch
 from exported import NETWORKS
-from torch import nn
 
-from memmlp.common.errors import InputError
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import NoIK
 from memmlp.evaluation.modes import quick_stream
 from memmlp.motion.network_coordinates import Heading
-from memmlp.networks.recurrent_poser import OUTPUTS
 
 STREAM = Evaluation(("stream",), batch=4, ik=NoIK(), seed=0)
 TEST = tiny.frames((14, 11))
 
 
-RECURRENT = {name: partial(tiny.recurrent_poser, Heading(), output=name) for name in OUTPUTS}
+RECURRENT = {
+    name: partial(tiny.recurrent_poser, Heading(), output=name) for name in ["local", "global", "reaching"]
+}
 
 
 @pytest.mark.parametrize("network", [*NETWORKS.values(), *RECURRENT.values()], ids=[*NETWORKS, *RECURRENT])
@@ -29,26 +28,6 @@ def test_positions_that_are_not_learned_follow_from_the_rotations(network):
     row = STREAM.report(model, TEST, "stream")["clips"][0]
     same = row["position"]["MPJPE"] == pytest.approx(row["rotation"]["MPJPE"], abs=1e-3)
     assert same == ("position" not in model.branches)
-
-
-class Displaced(nn.Module):
-    """An output that leaves all bones away, as one did that was built before the rest pose was known."""
-
-    def __init__(self, output: nn.Module):
-        super().__init__()
-        self.output = output
-
-    def pose(self, made, sparse, normalizer):
-        motion = self.output.pose(made, sparse, normalizer).clone()
-        motion[..., -66:] = sparse[..., 36:39].repeat_interleave(22, -1)
-        return motion
-
-
-def test_positions_that_are_not_those_of_the_rotations_are_refused():
-    model = tiny.recurrent_poser(Heading(), output="global")
-    model.output = Displaced(model.output)
-    with pytest.raises(InputError, match=r"RecurrentPoser: its positions have an MPJPE of .* clip clip0"):
-        STREAM.report(model, TEST, "stream")
 
 
 def test_a_network_that_diverged_is_evaluated_like_any_other():

@@ -238,7 +238,7 @@ def test_the_branches_look_at_the_memory(kind, predictor):
 
 
 def test_no_memory_has_no_blocks_for_the_branches():
-    with pytest.raises(InputError, match="memory=none"):
+    with pytest.raises(InputError, match="memory: must have memory blocks"):
         tiny.model(NoMemory, TwoBranchMemorySettings)
 
 

@@ -15,7 +15,7 @@ from memmlp.evaluation import modes as evaluation
 from memmlp.motion.body import HANDS, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.network_coordinates import Heading
 from memmlp.networks import checkpoint
-from memmlp.networks.recurrent_poser import CELLS, OUTPUTS, RecurrentCell, scan
+from memmlp.networks.recurrent_poser import CELLS, RecurrentCell, scan
 from memmlp.networks.streaming import streaming
 
 CLIP = tiny.clip(24)
@@ -91,16 +91,7 @@ def test_the_past_counts_without_end_and_the_future_does_not():
     assert (found[:, 5:] - other[:, 5:]).abs().amax(-1).min() > 1e-9
 
 
-@pytest.mark.parametrize("output", OUTPUTS)
-@torch.no_grad()
-def test_positions_are_forward_kinematics_of_the_rotations(output):
-    model = tiny.recurrent_poser(Heading(), output=output)
-    motion = evaluation.stream(model, [CLIP])[0]
-    expected = model.normalizer.pose(motion, CLIP[:, :SPARSE_DIM]).flatten(1)
-    torch.testing.assert_close(motion[:, ROTATION.stop :], expected, atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize("output", OUTPUTS)
+@pytest.mark.parametrize("output", ["local", "global", "reaching"])
 @torch.no_grad()
 def test_a_network_that_is_loaded_makes_the_same_motion(output, tmp_path):
     """It is built before its body is known, which comes with the weights."""
@@ -124,13 +115,6 @@ def test_a_global_head_begins_at_the_mean_pose():
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
 
 
-@torch.no_grad()
-def test_side_by_side_is_one_by_one():
-    model, clips = tiny.recurrent_poser(), [tiny.clip(n, seed=n) for n in (4, 25, 14)]
-    for together, clip in zip(evaluation.predict(model, clips, "stream", 8), clips, strict=True):
-        torch.testing.assert_close(together, evaluation.stream(model, [clip])[0], atol=1e-5, rtol=0)
-
-
 @pytest.mark.parametrize("cell", CELLS)
 @torch.no_grad()
 def test_cells_stay_exact_where_layers_are_rounded(cell):
@@ -145,17 +129,6 @@ def test_cells_stay_exact_where_layers_are_rounded(cell):
     for found, expected in zip(made, block.cell(*given), strict=True):
         assert found.dtype == torch.float32
         torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
-
-
-@torch.no_grad()
-def test_every_knob_changes_the_motion():
-    changes = [
-        {"width": 12}, {"depth": 1}, {"expansion": 1}, {"cell": "lstm"}, {"cell": "mingru"}, {"cell": "lru"},
-        {"output": "global"}, {"members": 2},
-    ]  # fmt: skip
-    base, *others = (evaluation.stream(tiny.recurrent_poser(**c), [CLIP])[0] for c in ({}, *changes))
-    for change, other in zip(changes, others, strict=True):
-        assert not torch.allclose(base, other, atol=1e-4), change
 
 
 @pytest.mark.parametrize(
@@ -198,7 +171,7 @@ def cell(name: str) -> tuple[RecurrentCell, torch.Tensor]:
     """A cell of width 4 with random weights, and a random state."""
     torch.manual_seed(2)
     made = CELLS[name](4).double()
-    return made, torch.randn(2, made.size).double()
+    return made, torch.randn(2, 4 * made.carried).double()
 
 
 def sigmoid(x: np.ndarray) -> np.ndarray:

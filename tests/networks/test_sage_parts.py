@@ -6,43 +6,37 @@ import torch
 
 from memmlp.networks import sage_parts
 from memmlp.networks.layers import find_batch_dependent
+from memmlp.networks.sage_net import SAGESettings
 
-SIZES = {
-    "upper codes": (lambda: sage_parts.HalfVQVAE(sage_parts.UPPER), 7_239_436),
-    "lower codes": (lambda: sage_parts.HalfVQVAE(sage_parts.LOWER), 7_200_986),
-    "upper diffusion": (sage_parts.UpperDenoiser, 57_969_432),
-    "lower diffusion": (sage_parts.LowerDenoiser, 58_264_728),
-    "decoder": (sage_parts.Decoder, 4_035_374),
-}
+PAPER = SAGESettings(20, 512, 12, 8, 256, 4, 4)
+SMALL = SAGESettings(20, 16, 1, 2, 16, 1, 2)
 
 
-@pytest.mark.parametrize("name", SIZES)
-def test_published_sizes(name):
-    make, count = SIZES[name]
+def test_published_sizes():
+    """Table 16 counts both diffusion models and the decoder."""
     with torch.device("meta"):
-        assert sum(p.numel() for p in make().parameters()) == count
-
-
-def test_table_16_counts_diffusion_and_decoder():
-    assert sum(SIZES[name][1] for name in ("upper diffusion", "lower diffusion", "decoder")) == 120_269_534
+        made = [
+            *(sage_parts.HalfVQVAE(half, PAPER) for half in (sage_parts.UPPER, sage_parts.LOWER)),
+            *(
+                kind(PAPER)
+                for kind in (sage_parts.UpperDenoiser, sage_parts.LowerDenoiser, sage_parts.Decoder)
+            ),
+        ]
+    sizes = [sum(p.numel() for p in part.parameters()) for part in made]
+    assert sizes == [7_239_436, 7_200_986, 57_969_432, 58_264_728, 4_035_374]
 
 
 @torch.no_grad()
-def test_the_way_of_a_window():
-    x, rotation = torch.randn(2, 20, 54), torch.randn(2, 20, 132)
-    small = {"width": 16, "depth": 1, "heads": 2}
-    codes = [sage_parts.HalfVQVAE(joints, **small).eval() for joints in (sage_parts.UPPER, sage_parts.LOWER)]
-    (upper, _), (lower, _) = (one.encode(rotation, x) for one in codes)
-    assert [tuple(one.decode(z).shape) for one, z in zip(codes, (upper, lower), strict=True)] == [
-        (2, 20, 84),
-        (2, 20, 54),
-    ]
-    time = torch.tensor([3, 5])
-    assert sage_parts.UpperDenoiser(**small)(upper, time, x).shape == (2, 10, 384)
-    denoiser = sage_parts.LowerDenoiser(**small)
-    assert denoiser(denoiser.join(lower, upper), time, x).shape == (2, 10, 384)
-    assert sage_parts.Decoder(**small)(upper, lower, x).shape == (2, 20, 132)
-    assert sorted({*sage_parts.UPPER, *sage_parts.LOWER}) == list(range(22))
+def test_the_shapes_of_a_window_on_its_way_through_the_parts():
+    x, rotation, time = torch.randn(2, 20, 54), torch.randn(2, 20, 132), torch.tensor([3, 5])
+    codes = [sage_parts.HalfVQVAE(half, SMALL).eval() for half in (sage_parts.UPPER, sage_parts.LOWER)]
+    latents = [one.encode(rotation, x)[0] for one in codes]
+    decoded = [one.decode(z) for one, z in zip(codes, latents, strict=True)]
+    assert [tuple(one.shape) for one in decoded] == [(2, 20, 84), (2, 20, 54)]
+    assert sage_parts.UpperDenoiser(SMALL)(latents[0], time, x).shape == (2, 10, 384)
+    denoiser = sage_parts.LowerDenoiser(SMALL)
+    assert denoiser(denoiser.join(latents[1], latents[0]), time, x).shape == (2, 10, 384)
+    assert sage_parts.Decoder(SMALL)(*latents, x).shape == (2, 20, 132)
 
 
 @torch.no_grad()
@@ -72,6 +66,5 @@ def test_codes_that_nothing_uses_come_alive_and_gradients_pass_straight_through(
 
 
 def test_several_processes_would_count_codes_each_by_itself():
-    small = {"width": 16, "depth": 1, "heads": 2}
-    assert find_batch_dependent(sage_parts.HalfVQVAE(sage_parts.LOWER, **small)) == ["ProductQuantiser"]
-    assert find_batch_dependent(sage_parts.LowerDenoiser(**small)) == []
+    assert find_batch_dependent(sage_parts.HalfVQVAE(sage_parts.LOWER, SMALL)) == ["ProductQuantiser"]
+    assert find_batch_dependent(sage_parts.LowerDenoiser(SMALL)) == []

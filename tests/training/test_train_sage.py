@@ -12,8 +12,6 @@ import torch
 from tiny_tasks import part_task
 from torch import nn
 
-from memmlp.config.build import build_experiment
-from memmlp.config.compose import composed
 from memmlp.motion.body import HEAD, N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.network_coordinates import World
 from memmlp.motion.normalizer import Normalizer
@@ -115,8 +113,12 @@ def test_the_upper_half_is_validated_on_what_it_samples():
     rotation, encoded = train_sage.encode_windows(net, FRAMES)
     error = net.sample_upper(encoded) - train_sage.encode_latents(codes, rotation, encoded)
     expected = nn.functional.smooth_l1_loss(error, torch.zeros_like(error))
-    assert torch.equal(train_sage.compute_upper_losses(net, codes, FRAMES, False)["latent"], expected)
-    assert not torch.equal(train_sage.compute_upper_losses(net, codes, FRAMES, True)["latent"], expected)
+    assert torch.equal(
+        train_sage.compute_latent_losses(net, codes, FRAMES, False, lower=False)["latent"], expected
+    )
+    assert not torch.equal(
+        train_sage.compute_latent_losses(net, codes, FRAMES, True, lower=False)["latent"], expected
+    )
 
 
 def test_the_lower_half_is_given_what_the_upper_one_samples():
@@ -126,7 +128,7 @@ def test_the_lower_half_is_given_what_the_upper_one_samples():
     net.lower.join = Watched(net.lower.join)
     with torch.no_grad():
         for training in (True, False):
-            train_sage.compute_lower_losses(net, codes, FRAMES, training)
+            train_sage.compute_latent_losses(net, codes, FRAMES, training, lower=True)
         net.predict_rotations(encoded)
         expected = net.sample_upper(encoded)
     assert len(net.lower.join.calls) == 1 + 2 * len(net.diffusion.times)
@@ -162,16 +164,6 @@ def test_it_begins_with_the_weights_of_its_parts(tmp_path: Path):
 
 def test_the_learning_rate_falls_where_it_is_told():
     assert [OPTIM.compute_factor(step) for step in range(4)] == pytest.approx([1, 1, 0.2, 0.04])
-
-
-def test_parts_are_trained_by_adamw_and_name_what_they_do_not_use():
-    words = ["model=sage", "profile=tiny"]
-    assert not any(training.unused for training in build_experiment(composed(words)).prerequisites)
-    words += ["optim=muon", "optim.warmup=5", "optim.precision=bf16"]
-    for training in build_experiment(composed(words)).prerequisites:
-        assert training.unused == ("optim=muon", "optim.warmup=5")
-        assert "optim=muon, optim.warmup=5" in training.description
-        assert training.network.optim.precision == "bf16"
 
 
 @pytest.mark.parametrize("half", JOINTS)
