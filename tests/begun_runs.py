@@ -5,21 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 
 from memmlp.runs.evaluation_file import write_report
-from memmlp.runs.identity import (
-    run_id,
-)
+from memmlp.runs.identity import Identity
 from memmlp.runs.run import Run
 
 CONFIG = {"seed": 0, "model": {"width": 16, "layers": [2, 4]}, "optim": {"lr": 1e-3, "log_every": 5}}
 
 
-def identity(config: dict = CONFIG, kind: str = "memmlp", data: str = "d", upstream: str | None = "u") -> str:
-    return run_id(kind, config, data=data, upstream=upstream)
+def identity(
+    config: dict = CONFIG, kind: str = "memmlp", data: str = "d", prerequisite: Identity | None = None
+) -> str:
+    return Identity(kind, config, data, prerequisite).id
 
 
 def begun(outputs: Path, config: dict = CONFIG, kind: str = "memmlp") -> Run:
     run = Run.of(outputs, identity(config, kind))
-    run.begin(kind, config, data="d", upstream=None)
+    run.begin(kind, config, data="d", prerequisite=None)
     return run
 
 

@@ -93,7 +93,7 @@ class FakeShown:
 def a_run(outputs: Path, name: str = "0" * 16, steps: int = 3, **config: object) -> Run:
     """A begun run with some steps."""
     run = Run.of(outputs, name)
-    run.begin("memmlp", {"seed": 0, **config}, data="d" * 64, upstream=None, stages=[])
+    run.begin("memmlp", {"seed": 0, **config}, data="d" * 64, prerequisite=None, stages=[])
     for step in range(1, steps + 1):
         run.log(step, {"loss": 1 / step})
     return run
@@ -108,6 +108,9 @@ def an_outdated_evaluation(run: Run) -> Path:
     """Write an evaluation by an earlier recipe, and return its file."""
     settings = {"mode": "stream", "ik": "off"}
     path = run.evaluation(evaluation_id_of(settings))
-    recipes = {"mode.stream": 0}
-    write_report(path, {"mode": "stream", "settings": settings, "mean": {}, "clips": [], "recipes": recipes})
+    versions = {"mode.stream": 0}
+    write_report(
+        path,
+        {"mode": "stream", "settings": settings, "mean": {}, "clips": [], "component_versions": versions},
+    )
     return path

@@ -31,7 +31,7 @@ CLIPS = (*(f"salsa/{number:02}" for number in range(1, 11)), "kicks/01", "kicks/
 ORIGIN = {
     "version": "0.3.0", "git": {"commit": "0123456789abcdef", "dirty": False}, "data": "d" * 64,
     "cpu": "A processor", "cores": 2, "host": "h" * 12, "packages": {"torch": "2.0.0"}, "device": "cpu",
-    "threads": 1, "precision": "fp32", "recipes": {"memory": 1}, "body": "builtin",
+    "threads": 1, "precision": "fp32", "component_versions": {"memory": 1}, "body": "builtin",
 }  # fmt: skip
 
 

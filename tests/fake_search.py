@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from memmlp.runs.identity import run_id
+from memmlp.runs.identity import Identity
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan, RunTask
 from memmlp.sweep.search.director import Director
@@ -36,9 +36,7 @@ def open_study(folder: Path, **changes: Any) -> Study:
 
 def compose(values: Mapping[str, Value], seeds: int = 1) -> list[list[RunTask]]:
     configs = [{"optim": {"steps": STEPS}, "values": dict(values), "seed": seed} for seed in range(seeds)]
-    return [
-        [RunTask(run_id("memmlp", config, data="d", upstream=None), "memmlp", config)] for config in configs
-    ]
+    return [[RunTask(Identity("memmlp", config, "d").id, "memmlp", config)] for config in configs]
 
 
 def director(study: Study, folder: Path, composed: Callable = compose) -> Director:
@@ -59,7 +57,7 @@ def finish(plan: Plan) -> None:
     """Bring the runs of a plan to their end."""
     for task in plan.left():
         run = plan.run_of(task)
-        run.begin("memmlp", task.config, data="d", upstream=None)
+        run.begin("memmlp", task.config, data="d", prerequisite=None)
         log(run, STEPS, error(task.config))
         run.finish([])
 
@@ -74,7 +72,7 @@ def begun(plan: Plan) -> Run:
     """Begin the run of a plan's only task, and return it."""
     (task,) = plan.tasks
     run = plan.run_of(task)
-    run.begin("memmlp", task.config, data="d", upstream=None)
+    run.begin("memmlp", task.config, data="d", prerequisite=None)
     return run
 
 

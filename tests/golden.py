@@ -1,7 +1,7 @@
 """The numbers that every component makes of fixed inputs, for tests/test_golden.py.
 
 `make golden` writes that file. It refuses where a component's numbers changed and its version
-did not: raise that first, in its declaration or in memmlp/runs/recipe_versions.py, in the same commit.
+did not: raise that first, in its declaration or in memmlp/runs/component_versions.py, in the same commit.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.motion.synthetic import ACTIVITIES, synthesize, synthesize_clip
+from memmlp.networks.constant_pose import ConstantPose, ConstantPoseSettings
 from memmlp.networks.memory import NoMemory
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, NoCodesMemory
@@ -42,8 +43,7 @@ from memmlp.networks.predictor import (
 )
 from memmlp.networks.recurrent_memory import GRUMemory, LSTMMemory
 from memmlp.networks.recurrent_poser import CELLS
-from memmlp.networks.still_pose import StillPose, StillPoseSettings
-from memmlp.runs.recipe_versions import version_of
+from memmlp.runs.component_versions import version_of
 from memmlp.training.loop import seed_step
 from memmlp.training.losses import (
     AGRoLLoss,
@@ -242,7 +242,9 @@ CASES: dict[str, Callable[[], Numbers]] = {
         f"model.{name}": partial(lambda name: network(tiny.baseline(name)), name)
         for name in tiny.BASELINES
     },
-    "model.still_pose": lambda: network(StillPose(tiny.normalizer(Heading()), StillPoseSettings(frames=7))),
+    "model.constant_pose": lambda: network(
+        ConstantPose(tiny.normalizer(Heading()), ConstantPoseSettings(frames=7))
+    ),
     "model.recurrent_poser": lambda: {
         f"{cell}{' ' + output if output != 'local' else ''} {name}": value
         for cell, output in [*((cell, "local") for cell in CELLS), ("gru", "global"), ("gru", "reaching")]
@@ -263,7 +265,7 @@ CASES: dict[str, Callable[[], Numbers]] = {
         }.items()
     },
     "refiner.sage": refiner,
-    "upstream.sage": parts,
+    "prerequisite.sage": parts,
     "vqvae": vqvae,
     **{f"codebook.{name}": partial(vqvae, name) for name in ("ema", "gradient")},
     "sampler": sampler,
@@ -291,7 +293,7 @@ CASES: dict[str, Callable[[], Numbers]] = {
         for name, value in loss(partial(AvatarPoserLoss, AvatarPoserLossSettings(anchor=anchor))).items()
     },
     "loss.rpm": lambda: loss(RPMLoss),
-    "loss.own": lambda: {
+    "loss.of_network": lambda: {
         "total": float(LossOfNetwork()(*(torch.ones(1, 1, n) for n in (198, 198, 54)), tiny.normalizer())[0])
     },
     "loss.terms": lambda: {
@@ -329,7 +331,7 @@ def numbers(case: str) -> Numbers:
 
 
 def stored() -> dict[str, dict[str, Any]]:
-    """What golden.json holds: a recipe version and numbers by component."""
+    """What golden.json holds: a component version and numbers by component."""
     return json.loads(PATH.read_text()) if PATH.exists() else {}
 
 

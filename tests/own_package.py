@@ -12,14 +12,14 @@ from command_line import SMALL
 from memmlp.common import components
 from memmlp.config import plugins
 from memmlp.evaluation.metric_facts import HIGHER, SMALLEST, UNITS
-from memmlp.runs.recipe_versions import RECIPES
+from memmlp.runs.component_versions import VERSIONS
 
 EXAMPLE = Path(__file__).parent.parent / "docs/examples/feet"
 PACKAGE = "memmlp_feet"
 TINY = ["profile=tiny", *SMALL, "loggers=none", "threads=1", "optim.validate_every=20"]
 KILLED = [*TINY, "optim.steps=40", "optim.checkpoint_every=5"]
 """Words of a run that takes long enough to be killed at a checkpoint."""
-REGISTERS = (SMALLEST, UNITS, RECIPES, HIGHER, plugins._active, components._roots)
+REGISTERS = (SMALLEST, UNITS, VERSIONS, HIGHER, plugins._active, components._roots)
 
 
 @contextmanager

@@ -7,7 +7,7 @@ import pytest
 from golden_numbers import changed, tolerance
 
 from memmlp.common.components import declared
-from memmlp.runs.recipe_versions import RECIPES, version_of
+from memmlp.runs.component_versions import VERSIONS, version_of
 
 
 @pytest.mark.slow
@@ -23,8 +23,8 @@ def test_a_component_computes_what_its_recipe_number_stands_for(case: str):
 
 def test_every_component_has_numbers():
     named = {f"{slot}.{name}" for slot, name in declared() if slot != "loggers"}
-    named -= {"loss.of_network", "optim.adamw"}  # loss.own, training
-    assert set(golden.CASES) | set(golden.UNSEEN) == set(RECIPES) | named
+    named -= {"optim.adamw"}  # its numbers are those of training
+    assert set(golden.CASES) | set(golden.UNSEEN) == set(VERSIONS) | named
 
 
 def test_numbers_are_recorded_only_under_another_recipe(monkeypatch, tmp_path):
@@ -42,6 +42,6 @@ def test_numbers_are_recorded_only_under_another_recipe(monkeypatch, tmp_path):
     golden.record()
     assert golden.stored()["hand.off"]["numbers"] == {"a": 1.0, "b": 2.0}  # what is new is no change
     monkeypatch.setattr(golden, "CASES", {"hand.off": lambda: {"a": 1.001}})
-    monkeypatch.setitem(RECIPES, "hand.off", 99)
+    monkeypatch.setitem(VERSIONS, "hand.off", 99)
     golden.record()
     assert golden.stored()["hand.off"] == {"recipe": 99, "numbers": {"a": 1.001}}

@@ -194,7 +194,7 @@ def _make_table(kept: Kept, source: str | None = None, patterns: Sequence[str] =
     from memmlp.config.compose_plan import find_sweep
     from memmlp.report.tables.build_table import make_table, on_source, together
     from memmlp.report.tables.seed_rounds import Rounds
-    from memmlp.runs.recipe_versions import outdated
+    from memmlp.runs.component_versions import outdated
 
     # With the command line's overrides, the table warns of other data than its own.
     sweep = replace(find_sweep(kept.sweep), command_line=kept.overrides)
@@ -217,8 +217,11 @@ def _make_table(kept: Kept, source: str | None = None, patterns: Sequence[str] =
         runs, tied = together(runs, patterns)
         flags += [*tied, *([other] if other else [])]
         table = make_table(sweep, runs, command=kept.command)
-    changed = sorted({change for run in kept.every for change in outdated(run.origin.every_recipe)})
-    flags += [*kept.flags, *([f"made by an earlier recipe: {', '.join(changed)}"] if changed else [])]
+    changed = sorted({change for run in kept.every for change in outdated(run.origin.every_version)})
+    flags += [
+        *kept.flags,
+        *([f"made with earlier component versions: {', '.join(changed)}"] if changed else []),
+    ]
     return replace(table, flags=(*table.flags, *flags))
 
 

@@ -139,10 +139,10 @@ def said(outcome: Outcome) -> str:
 
 
 def older_code(run: Run, changed: Sequence[str]) -> str:
-    """Return a warning that code has changed since the run was made, though no recipe version was raised."""
+    """Return a warning that code has changed since the run was made, under the same component versions."""
     names = ", ".join(changed[:5]) + (f" and {len(changed) - 5} more" if len(changed) > 5 else "")
     return (
-        f"run {run.id} was made before the code of {names} changed, under the same recipe versions: "
+        f"run {run.id} was made before the code of {names} changed, under the same component versions: "
         "force=true makes it again"
     )
 

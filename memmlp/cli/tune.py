@@ -128,8 +128,8 @@ def _check_space(setup: Setup) -> str:
 
     Returns:
         A text that names the first trial's run, its interval of validations, how its network is used, and
-        with what, by which recipes, the ends of the space are trained. It is part of the digest in the name
-        of the search's folder, so that another config or other data makes another search.
+        the component versions that the ends of the space use. It is part of the digest in the name of the
+        search's folder, so that another config or other data makes another search.
 
     Raises:
         InputError: if a searched key is set on the command line or does not change the training, or if the

@@ -30,7 +30,18 @@ DECORATOR = re.compile(r'^@component\(\s*"(\w+)",\s*"(\w+)"([^)]*)\)', re.MULTIL
 PLAIN = re.compile(r"dataclasses|typing|collections\.abc|math|memmlp\.common\.components|(.+\.)?settings")
 """The modules that declarations may import as they are."""
 
-SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term", "refiner", "upstream", "optim")
+SLOTS = (
+    "model",
+    "memory",
+    "predictor",
+    "rollout",
+    "loss",
+    "hand",
+    "term",
+    "refiner",
+    "prerequisite",
+    "optim",
+)
 """The groups of the config whose options are components of the network and of its training."""
 
 _Kind = TypeVar("_Kind", bound=Callable[..., Any])

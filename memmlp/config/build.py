@@ -95,10 +95,10 @@ def build_prerequisites(cfg: DictConfig, config: dict[str, Any]) -> tuple[Prereq
     """
     if cfg.refiner is not None:
         return ()
-    if cfg.upstream is not None:
+    if cfg.prerequisite is not None:
         training = build_training(cfg, {})
         assert isinstance(training, NetworkTraining)
-        return tuple(build(cfg, "upstream").trainings(config, training))
+        return tuple(build(cfg, "prerequisite").trainings(config, training))
     if getattr(chosen(cfg, "memory"), "codes", "") != "frozen":
         return ()
     optim = partial(build_vqvae_optim, cfg)
@@ -172,7 +172,7 @@ def build_architecture(cfg: DictConfig) -> Architecture:
         vqvae=vqvae,
         network=build_network,
         uses_codes=codes == "frozen",
-        trained_parts=None if cfg.upstream is None else (),
+        trained_parts=None if cfg.prerequisite is None else (),
         refiner=refiner,
     )
 

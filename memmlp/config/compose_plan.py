@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -215,11 +215,11 @@ def tasks_of(request: RunRequest, data: str) -> list[RunTask]:
 
     bare = without_refiner(request.config) if request.config["refiner"] is not None else request.config
     *before, own = request.identities(data)
-    tasks = [RunTask(one.id, one.kind, bare, one.upstream.id if one.upstream else None) for one in before]
-    if bare is not request.config:  # the training of the network that is refined is enough
-        tasks[-1] = replace(tasks[-1], what=before[-1].what)
-    last = before[-1].id if before else None
-    return [*tasks, RunTask(own.id, own.kind, request.config, last, request.stage_ids, own.what)]
+    tasks: list[RunTask] = []
+    for one in before:
+        tasks.append(RunTask(one.id, one.kind, bare, tasks[-1].id if tasks else None))
+    last = tasks[-1].id if tasks else None
+    return [*tasks, RunTask(own.id, own.kind, request.config, last, request.stage_ids)]
 
 
 def _data_digest(request: RunRequest, prepare: bool, data: dict[str, dict[str, Any]]) -> str | None:

@@ -174,7 +174,7 @@ class Config:
     hand: Settings | None = None
     term: Settings | None = None
     refiner: Settings | None = None
-    upstream: Settings | None = None
+    prerequisite: Settings | None = None
     optim: Settings = group(Settings)
     evaluation: EvaluationConfig = group(EvaluationConfig)
     export: ExportConfig = group(ExportConfig)

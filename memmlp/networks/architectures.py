@@ -52,19 +52,19 @@ class Architecture:
         model = self.network(normalizer, codes)
         return self.refiner.build(model) if self.refiner else model
 
-    def build_for_training(self, normalizer: Normalizer, upstream: Path | None) -> MotionModel:
+    def build_for_training(self, normalizer: Normalizer, prerequisite: Path | None) -> MotionModel:
         """Build the network as its training begins, without its refiner.
 
         Args:
             normalizer: converts between the world and network space.
-            upstream: file of the weights of the prerequisite run; None for a network without one.
+            prerequisite: file of the weights of the prerequisite run; None for a network without one.
 
         Raises:
             InputError: if the file of weights is damaged.
         """
-        tensors = checkpoint.read(upstream)[0] if upstream else {}
+        tensors = checkpoint.read(prerequisite)[0] if prerequisite else {}
         if self.trained_parts is None:
-            if upstream is None:
+            if prerequisite is None:
                 return self.network(normalizer, None)
             codes = self.vqvae()
             checkpoint.load_module("model", codes, tensors)

@@ -179,8 +179,8 @@ class MemMLPSettings(Settings):
             if config[slot] is None:
                 yield f"{slot}: must be one of its options{words}, since model=mem_mlp has this slot"
                 return
-        if config["upstream"] is not None:
-            yield f"upstream={config['upstream']['name']}: must be null with model=mem_mlp"
+        if config["prerequisite"] is not None:
+            yield f"prerequisite={config['prerequisite']['name']}: must be null with model=mem_mlp"
         memory, model, rollout = config["memory"], config["model"], config["rollout"]
         layers = list(memory.get("layers", []))
         if layers and max(layers) > model["depth"]:

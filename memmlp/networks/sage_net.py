@@ -135,8 +135,8 @@ class SAGENetGraph(StreamingGraph):
 class SAGESettings(NetworkSettings):
     """SAGE-Net (Feng et al. 2024): two diffusion models of the body halves' latents, and a decoder.
 
-    Its parts are trained before it, in runs of their own (upstream); then optim trains both diffusion models
-    and the decoder together, through the sampler. Its refiner is refiner=sage, which can stand behind any
+    Its parts are trained before it, in prerequisite runs; then optim trains both diffusion models and the
+    decoder together, through the sampler. Its refiner is refiner=sage, which can stand behind any
     network. Losses, learning rates and features are those of its released code.
     """
 
@@ -156,7 +156,7 @@ class SAGESettings(NetworkSettings):
     noise_seed: int = setting(at_least(0), 0)  # its seed, the same noise for every window
 
     learns_newest_frame: ClassVar[bool] = True
-    defaults: ClassVar = {"loss": "sage", "upstream": "sage"}
+    defaults: ClassVar = {"loss": "sage", "prerequisite": "sage"}
     recipe: ClassVar = {"optim.steps": sized(20, 1000, 56000), "optim.lr": sized(5.0e-4, 5.0e-4, 8.0e-5)}
 
     @classmethod

@@ -56,16 +56,16 @@ class NetworkSettings(Settings):
         calls, steps = model.get("sampling_steps", 1), model.get("diffusion_steps", 1)
         if calls > steps:
             yield f"model.sampling_steps={calls}: must be at most model.diffusion_steps={steps}"
-        needed = cls.upstream_option()
-        if needed is None and config["upstream"] is not None:
-            yield f"upstream={config['upstream']['name']}: must be null with model={name}"
-        if needed and (config["upstream"] is None or config["upstream"]["name"] != needed):
-            yield f"upstream: must be {needed} with model={name}"
+        needed = cls.prerequisite_option()
+        if needed is None and config["prerequisite"] is not None:
+            yield f"prerequisite={config['prerequisite']['name']}: must be null with model={name}"
+        if needed and (config["prerequisite"] is None or config["prerequisite"]["name"] != needed):
+            yield f"prerequisite: must be {needed} with model={name}"
 
     @classmethod
-    def upstream_option(cls) -> str | None:
-        """Return the option of `upstream` that trains the network's parts before it; None for no parts."""
-        return cls.defaults.get("upstream")
+    def prerequisite_option(cls) -> str | None:
+        """Return the option of `prerequisite` that trains the network's parts first; None for no parts."""
+        return cls.defaults.get("prerequisite")
 
 
 def _offline_problems(config: Any) -> Iterator[str]:

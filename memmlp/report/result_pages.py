@@ -92,9 +92,11 @@ def describe_origin(kept: Kept) -> str:
         if last:
             parts.append(f"{what} {escaped(' and '.join(filter(None, [', '.join(others), last])))}")
     parts += sorted({escaped(run.origin.partial) for run in kept.every if run.origin.partial})
-    recipes = sorted({recipe for run in kept.every for recipe in run.origin.every_recipe.items()})
-    if recipes:
-        parts.append(f"recipes {', '.join(f'{escaped(name)} {number}' for name, number in recipes)}")
+    versions = sorted({item for run in kept.every for item in run.origin.every_version.items()})
+    if versions:
+        parts.append(
+            f"component versions {', '.join(f'{escaped(name)} {number}' for name, number in versions)}"
+        )
     command = kept.command
     if not counts["run"]:
         command = f"{command} --untrained".replace("sweep", "table", 1)

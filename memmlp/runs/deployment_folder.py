@@ -9,7 +9,7 @@ from typing import Any
 
 from memmlp.common.files import file_digest, now, read_json, write_json
 from memmlp.runs.environment import environment
-from memmlp.runs.identity import belongs, deployment_id_of, deployment_recipes
+from memmlp.runs.identity import belongs, deployment_id_of, deployment_versions
 
 ONNX_FILES = {
     "fp32": "step.onnx",
@@ -62,9 +62,9 @@ class DeploymentFolder:
         return self.folder.name == deployment_id_of(self.settings)
 
     @property
-    def recipes(self) -> dict[str, int]:
+    def component_versions(self) -> dict[str, int]:
         """The component versions with which it was made; empty if these are not the current ones."""
-        return deployment_recipes(self.settings) if self.current else {}
+        return deployment_versions(self.settings) if self.current else {}
 
     def finish(self, record: Mapping[str, Any]) -> None:
         """Write the measurements, with the files' digests; this marks the deployment as complete."""

@@ -10,9 +10,9 @@ from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import now, plain, read_json, write_json
+from memmlp.runs.component_versions import outdated, version_of
 from memmlp.runs.environment import environment
 from memmlp.runs.identity import belongs, evaluation_id_of, solver_of
-from memmlp.runs.recipe_versions import outdated, version_of
 
 COMBINED = "combined"
 """The branch of the rotations after inverse kinematics, by the solver in the settings of the evaluation."""
@@ -57,7 +57,9 @@ def outdated_by(path: Path, report: Mapping[str, Any]) -> str | None:
 
     Custom metrics whose package is not in use are not compared.
     """
-    known = {name: number for name, number in report.get("recipes", {}).items() if version_of(name)}
+    known = {
+        name: number for name, number in report.get("component_versions", {}).items() if version_of(name)
+    }
     return ", ".join(outdated(known)) or None
 
 

@@ -57,7 +57,7 @@ class EvaluationsAsConfigured:
 
     @property
     def outdated(self) -> dict[str, str]:
-        """The modes whose `results` were measured by earlier recipes, each with what has changed since."""
+        """The changed component versions of each mode whose `results` were measured with earlier ones."""
         last = {report.get("mode"): outdated_by(path, report) for path, report in self._found.items()}
         return {str(mode): changed for mode, changed in last.items() if changed}
 

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 from memmlp.common.files import read_json
 from memmlp.common.lease import is_alive
+from memmlp.runs.component_versions import outdated
 from memmlp.runs.identity import NETWORK
 from memmlp.runs.lookup import kind_words, list_runs
 from memmlp.runs.notes import read_notes
-from memmlp.runs.origin import upstream_recipes
-from memmlp.runs.recipe_versions import outdated
+from memmlp.runs.origin import prerequisite_versions
 from memmlp.runs.run import Run
 
 REASONS = ("failed", "old", "orphaned")
@@ -51,7 +51,7 @@ def garbage(outputs: Path, kinds: Iterable[str] = REASONS) -> list[Garbage]:
         kind, reason = _reason(run, orphans)
         if kind in wanted and not _marked(run) and run.state(False) != "running":
             found[run.id] = Garbage(run, kind, reason, _size(run.folder))
-    while found.keys() & (used := {run.manifest.get("upstream") for run in runs if run.id not in found}):
+    while found.keys() & (used := {run.manifest.get("prerequisite") for run in runs if run.id not in found}):
         found = {run_id: one for run_id, one in found.items() if run_id not in used}
     return list(found.values())
 
@@ -69,7 +69,9 @@ def delete(one: Garbage) -> bool:
 def _reason(run: Run, orphans: Mapping[str, str]) -> tuple[str, str]:
     if run.failure and not run.done:  # a trained run may have failed in an export alone
         return "failed", run.failure
-    if changed := outdated({**upstream_recipes(run.manifest), **(run.manifest.get("recipes") or {})}):
+    if changed := outdated(
+        {**prerequisite_versions(run.manifest), **(run.manifest.get("component_versions") or {})}
+    ):
         return "old", f"older version: {', '.join(changed)}"
     return ("orphaned", orphans[run.id]) if run.id in orphans else ("", "")
 
@@ -86,7 +88,7 @@ def _orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
         for folder in outputs.glob("sweeps/*/")
         for run_id in _left(folder)
     }
-    used = {run.manifest.get("upstream") for run in runs} | planned
+    used = {run.manifest.get("prerequisite") for run in runs} | planned
     kinds = {run.id: str(run.manifest.get("kind") or NETWORK) for run in runs}
     alone = [run_id for run_id, kind in kinds.items() if kind != NETWORK and run_id not in used]
     empty = [run for run in runs if not run.manifest]

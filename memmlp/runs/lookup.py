@@ -82,7 +82,7 @@ def frames_seen(run: Run) -> float:
     seen = float((optim.get("steps") or 0) * (optim.get("batch") or 0) * length)
     if not refiner:
         return seen
-    before = frames_seen(Run(run.folder.parent / str(run.manifest.get("upstream"))))
+    before = frames_seen(Run(run.folder.parent / str(run.manifest.get("prerequisite"))))
     return seen + before if seen and before else 0.0
 
 

@@ -14,14 +14,14 @@ from memmlp.runs.environment import MIXED, changed
 MACHINE = ("device", "gpu", "gpu_index", "threads", "processes", "precision", "cpu")
 """What can change a result's last digits, and which of a machine's GPUs it was."""
 
-UPSTREAM = "upstream_runs"
+PREREQUISITES = "prerequisite_runs"
 """The key of the manifest with the origins of a run's prerequisite runs."""
 
-FACTS = ("recipes", "git", "version", "sources", "plugins", "packages", *MACHINE)
+FACTS = ("component_versions", "git", "version", "sources", "plugins", "packages", *MACHINE)
 """What the manifest of a prerequisite run has on its code and its machine."""
 
 
-def upstream_origins(manifest: Mapping[str, Any], weights: str | None) -> list[dict[str, Any]]:
+def prerequisite_origins(manifest: Mapping[str, Any], weights: str | None) -> list[dict[str, Any]]:
     """Return the origins of the prerequisite runs of a run that begins, the nearest first.
 
     Each has the run's `id` and `kind`, the SHA-256 of its `weights`, and FACTS as far as known.
@@ -32,18 +32,18 @@ def upstream_origins(manifest: Mapping[str, Any], weights: str | None) -> list[d
     """
     own = {"id": manifest.get("id"), "kind": manifest.get("kind"), "weights": weights}
     facts = {name: manifest[name] for name in FACTS if name in manifest}
-    return [own | facts, *recorded_upstream(manifest)]
+    return [own | facts, *recorded_prerequisites(manifest)]
 
 
-def recorded_upstream(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
+def recorded_prerequisites(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the origins of the prerequisite runs in a run's manifest."""
-    return manifest.get(UPSTREAM) or []
+    return manifest.get(PREREQUISITES) or []
 
 
-def upstream_recipes(manifest: Mapping[str, Any]) -> dict[str, int]:
+def prerequisite_versions(manifest: Mapping[str, Any]) -> dict[str, int]:
     """Return the component versions with which a run's prerequisite runs were trained, from its manifest."""
-    every = [one.get("recipes") or {} for one in recorded_upstream(manifest)]
-    return {name: number for recipes in every for name, number in recipes.items()}
+    every = [one.get("component_versions") or {} for one in recorded_prerequisites(manifest)]
+    return {name: number for versions in every for name, number in versions.items()}
 
 
 def join_origins(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
@@ -66,9 +66,9 @@ def join_origins(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[st
         found["git"] = {**new, "dirty": old["dirty"] or new["dirty"]} | ({"before": other} if other else {})
     known = before.get("sources", after["sources"])
     found["sources"] = after["sources"] | dict.fromkeys(changed(known, after["sources"]), MIXED)
-    upstream = after.get(UPSTREAM, [])
-    if earlier := [one for one in before.get(UPSTREAM, []) if one not in upstream]:
-        found[UPSTREAM] = [*upstream, *earlier]
+    prerequisite = after.get(PREREQUISITES, [])
+    if earlier := [one for one in before.get(PREREQUISITES, []) if one not in prerequisite]:
+        found[PREREQUISITES] = [*prerequisite, *earlier]
     for name, package in (before.get("plugins") or {}).items():
         now = (after.get("plugins") or {}).get(name, package)
         if now["digest"] != package["digest"]:

@@ -37,8 +37,8 @@ DEEPEST = 50  # parentheses and "not"s in one another
 def record(run: Run) -> dict[str, Any]:
     """Return the values that conditions can use for a run, by key.
 
-    They are its id, kind, status, name, started, upstream, user, tag and note; its data by name (`data`) and
-    by digest (`data_digest`); the keys of its config, with slots also under their name alone (`memory` for
+    They are its id, kind, status, name, started, prerequisite, user, tag and note; its data by name (`data`)
+    and by digest (`data_digest`); the keys of its config, with slots also by their names (`memory` for
     `memory.name`); and its results, with those of the rotation branch also without the branch (`stream.MPJPE`
     for `stream.rotation.MPJPE`), and after inverse kinematics with its name (`stream.combined-arms.MPJPE`).
     Times and size are those of the file that the config asks for; those of another, if only that was
@@ -50,7 +50,7 @@ def record(run: Run) -> dict[str, Any]:
     flat = flatten(config)
     short = {key.replace(".rotation.", "."): value for key, value in results.items()}
     slots = {slot: option_in_slot(config, slot) for slot in SLOTS if slot in config}
-    facts = {name: manifest.get(name) for name in ("kind", "started", "upstream", "user")}
+    facts = {name: manifest.get(name) for name in ("kind", "started", "prerequisite", "user")}
     digest = str(manifest.get("data") or "")
     facts |= {"data": flat.get("data.name") or digest[:SHORT], "data_digest": digest}
     facts |= {"id": run.id, "name": run_name(manifest, flat), "status": run.status}

@@ -136,8 +136,8 @@ class Run:
     def preferred_deployment(self) -> DeploymentFolder:
         """The deployment to use live, among those that use the network as the run's config does.
 
-        One with the present recipe versions is preferred, then one whose int8 file is accurate enough, then
-        one of the file that the config asks for, then the one that was made last.
+        One with the current component versions is preferred, then one whose int8 file is accurate enough,
+        then one of the file that the config asks for, then the one that was made last.
         """
         config = self.config
         return self._best_deployment(
@@ -156,7 +156,7 @@ class Run:
         """Return the deployment whose measurements are shown, given the run's config.
 
         It is of the file that the config asks for, whatever else was exported since; if there are several,
-        one with the present recipe versions, then one with just the config's settings, then the last. Only
+        one with the present component versions, then one with just the config's settings, then the last. Only
         if it is missing, another is shown and named (`latency_name`).
         """
         asked = deployment_settings(config)
@@ -272,7 +272,7 @@ class Run:
             self.write_manifest({"forgiven": attempts})
 
     def begin(
-        self, kind: str, config: Mapping[str, Any], *, data: str, upstream: str | None, **facts: Any
+        self, kind: str, config: Mapping[str, Any], *, data: str, prerequisite: str | None, **facts: Any
     ) -> None:
         """Write config.yaml and the manifest of a run that starts or resumes.
 
@@ -282,15 +282,15 @@ class Run:
             kind: what is trained (see `Identity`).
             config: the resolved config.
             data: digest of the prepared data.
-            upstream: id of the run whose weights this one uses.
-            facts: further entries of the manifest, such as recipes, device and threads, the origins of its
-                upstream runs (`upstream_runs`), and the user's packages that it uses (`plugins`).
+            prerequisite: id of the run whose weights this one uses.
+            facts: further entries of the manifest, such as component versions, device and threads, the
+                origins of its prerequisite runs (`prerequisite_runs`), and the user's packages (`plugins`).
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         atomic_write(self.config_path, yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
         if patch := changes():
             atomic_write(self.folder / "code.patch", patch)
-        identity = {"id": self.id, "kind": kind, "data": data, "upstream": upstream}
+        identity = {"id": self.id, "kind": kind, "data": data, "prerequisite": prerequisite}
         before = self.manifest if self.checkpoint.exists() else {}
         sources = describe_sources(facts.get("plugins", ()))
         made = join_origins(before, {**facts, **environment(), **sources})

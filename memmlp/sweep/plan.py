@@ -28,17 +28,15 @@ class RunTask:
         id: the run's id.
         kind: the kind of run (see `Identity`).
         config: the resolved config of an experiment that needs the run.
-        upstream: the id of the run that must be done first; None for none.
+        prerequisite: the id of the run that must be done first; None for none.
         stages: identities of the evaluations and the deployment that the run must have.
-        what: what the run has in common with runs of other recipe versions (`Identity.what`).
     """
 
     id: str
     kind: str
     config: Mapping[str, Any]
-    upstream: str | None = None
+    prerequisite: str | None = None
     stages: tuple[str, ...] = ()
-    what: str = ""
 
     @property
     def key(self) -> str:
@@ -89,8 +87,8 @@ class Plan:
         entries = tuple(entry for entry in self.entries if entry.label in chosen)
         wanted = {entry.key for entry in entries}
         for task in reversed(self.tasks):  # each before those that it needs, whose keys are their ids
-            if task.key in wanted and task.upstream:
-                wanted.add(task.upstream)
+            if task.key in wanted and task.prerequisite:
+                wanted.add(task.prerequisite)
         return replace(self, entries=entries, tasks=tuple(task for task in self.tasks if task.key in wanted))
 
     def run(self, label: str, seed: int) -> Run | None:
@@ -128,7 +126,7 @@ class Plan:
         """Return the states with "blocked" for tasks that have a failed prerequisite."""
         found = dict(states)
         for task in self.tasks:  # prerequisites come first
-            if found[task.key] != "done" and found.get(task.upstream or "") in ("failed", "blocked"):
+            if found[task.key] != "done" and found.get(task.prerequisite or "") in ("failed", "blocked"):
                 found[task.key] = "blocked"
         return found
 
@@ -174,7 +172,7 @@ class Plan:
 def unique(tasks: Iterable[RunTask]) -> tuple[RunTask, ...]:
     """Return each task once, in the given order, and prerequisites right before the first that needs them."""
     known = {task.key: task for task in tasks}
-    order = (key for task in known.values() for key in (task.upstream, task.key) if key in known)
+    order = (key for task in known.values() for key in (task.prerequisite, task.key) if key in known)
     return tuple(known[key] for key in dict.fromkeys(order))
 
 

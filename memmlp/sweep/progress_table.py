@@ -118,7 +118,7 @@ def task_name(plan: Plan, task: RunTask) -> str:
             return f"{entry.label} seed {entry.seed}"
     users = {task.id}
     for other in plan.tasks:  # each after those that it needs
-        users |= {other.id} if other.upstream in users else set()
+        users |= {other.id} if other.prerequisite in users else set()
     seeds = sorted({entry.seed for entry in plan.entries if entry.id in users})
     of_seeds = f" of seed {', '.join(map(str, seeds))}" if seeds else ""
     return f"{kind_words(task.kind)} {task.id}{of_seeds}"

@@ -35,11 +35,11 @@ class PrerequisiteTraining(Protocol):
         self,
         architecture: Architecture,
         data: Prepared,
-        upstream: Path | None,
+        prerequisite: Path | None,
         run: Run,
         device: torch.device,
     ) -> dict[str, float]:
-        """Train upon the weights in `upstream`, from the run's checkpoint if there is one; return errors."""
+        """Train from the weights in `prerequisite`, or resume the run's checkpoint; return errors."""
 
 
 def kind_alone(kind: str, config: Mapping[str, Any]) -> str:

@@ -79,9 +79,9 @@ class RunRequest:
         if config["refiner"] is not None:
             bare = without_refiner(config)
             return [*RunRequest(bare, self.motion)._chain, (NETWORK, own)]
-        upstream: Any = chosen(config, "upstream")
-        if upstream is not None:
-            return [*upstream.prerequisites(config), (NETWORK, own)]
+        prerequisite: Any = chosen(config, "prerequisite")
+        if prerequisite is not None:
+            return [*prerequisite.prerequisites(config), (NETWORK, own)]
         if codes == "frozen":
             vqvae = {"normalizer": config["normalizer"], "vqvae": config["vqvae"]}
             vqvae |= {"data": {"mirror": True}} if config["data"].get("mirror") else {}

@@ -31,11 +31,11 @@ from memmlp.runs.identity import (
     NETWORK,
     Identity,
     deployment_settings,
-    evaluation_recipes,
     evaluation_settings,
+    evaluation_versions,
 )
 from memmlp.runs.loggers.logger import Loggers
-from memmlp.runs.origin import UPSTREAM, upstream_origins
+from memmlp.runs.origin import PREREQUISITES, prerequisite_origins
 from memmlp.runs.run import Run
 from memmlp.training.data_remarks import data_warnings, partial_words
 from memmlp.training.devices import described, overlooked_gpu
@@ -255,7 +255,11 @@ def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequen
             settings = evaluation_settings(experiment.config, mode, experiment.motion.groups_digest)
             name = experiment.evaluations[mode]
             report = {"mode": mode, "run": run.manifest["id"], "name": name, "settings": settings}
-            report |= {"recipes": evaluation_recipes(settings), **machine(experiment), **own_code(experiment)}
+            report |= {
+                "component_versions": evaluation_versions(settings),
+                **machine(experiment),
+                **own_code(experiment),
+            }
             write_report(run.evaluation(name), report | experiment.evaluation.report(model, test, mode))
         if not run.picture.exists() and find_spec("matplotlib"):
             draw_first_clip(model, test, run.picture)
@@ -297,19 +301,18 @@ def begin(
 
     The manifest also has the origin of the weights that the training builds upon (`before`).
     """
-    above = identity.upstream
+    above = identity.prerequisite
     counting: Mapping[str, Any] = {**(above.config if above else {}), **identity.config}
     facts = {
-        **({UPSTREAM: upstream_origins(before.manifest, before.weights_digest)} if before else {}),
-        "recipes": identity.recipes,
-        "what": identity.what,
+        **({PREREQUISITES: prerequisite_origins(before.manifest, before.weights_digest)} if before else {}),
+        "component_versions": identity.component_versions,
         **machine(experiment),
         "processes": distributed.world_size(),
         **own_code(experiment),
         "name": experiment.make_name(identity.kind, counting),
         "user": user(),
     }
-    run.begin(identity.kind, config, data=identity.data, upstream=above.id if above else None, **facts)
+    run.begin(identity.kind, config, data=identity.data, prerequisite=above.id if above else None, **facts)
 
 
 def user() -> str | None:

@@ -55,7 +55,7 @@ class NetworkTraining:
         self,
         architecture: Architecture,
         data: Prepared,
-        upstream: Path | None,
+        prerequisite: Path | None,
         run: Run,
         device: torch.device,
         on_validation: ValidationCallback | None = None,
@@ -65,7 +65,7 @@ class NetworkTraining:
         Args:
             architecture: builds the network.
             data: the prepared motion.
-            upstream: file of the weights that the network builds upon, such as a frozen VQ-VAE's, or None.
+            prerequisite: file of the prerequisite run's weights, such as a frozen VQ-VAE's, or None.
             run: the run whose folder takes checkpoints, log and weights.
             device: the device to train on.
             on_validation: called after each validation; see `memmlp.training.loop.train`.
@@ -73,14 +73,14 @@ class NetworkTraining:
         Returns:
             The trained network in evaluation mode.
         """
-        task = self.task(architecture, data, upstream, device)
+        task = self.task(architecture, data, prerequisite, device)
         train(task, self.optim, run, self.seed, "network", on_validation)
         if distributed.is_first():
             checkpoint.write(run.model, checkpoint.module_tensors("model", task.model), {})
         return task.model.eval()
 
     def task(
-        self, architecture: Architecture, data: Prepared, upstream: Path | None, device: torch.device
+        self, architecture: Architecture, data: Prepared, prerequisite: Path | None, device: torch.device
     ) -> MotionTask:
         """Make the task of training an untrained network; for the arguments see `train`.
 
@@ -89,7 +89,7 @@ class NetworkTraining:
         dataset = data.open("train").to(device)
         torch.manual_seed(self.seed)
         normalizer = architecture.make_normalizer(data.manifest, dataset.frames)
-        model = architecture.build_for_training(normalizer, upstream).to(device)
+        model = architecture.build_for_training(normalizer, prerequisite).to(device)
         self.rollout.begin(model)
         pieces = modes.chunks(data.open("val").to(device), VALIDATION_PIECE, least=60)
         return MotionTask(

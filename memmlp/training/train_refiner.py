@@ -104,7 +104,7 @@ class RefinerTraining:
         self,
         architecture: Architecture,
         data: Prepared,
-        upstream: Path | None,
+        prerequisite: Path | None,
         run: Run,
         device: torch.device,
         on_validation: ValidationCallback | None = None,
@@ -114,7 +114,7 @@ class RefinerTraining:
         Args:
             architecture: builds the network with its refiner.
             data: the prepared motion.
-            upstream: file of the weights of the finished network.
+            prerequisite: file of the weights of the finished network.
             run: the run whose folder takes checkpoints, log and weights.
             device: the device to train on.
             on_validation: called after each validation; see `memmlp.training.loop.train`.
@@ -122,10 +122,10 @@ class RefinerTraining:
         Returns:
             The refined network in evaluation mode.
         """
-        assert upstream is not None
+        assert prerequisite is not None
         plain = data.open("train").to(device)
         dataset = MirroredDataset(plain) if self.mirror else plain
-        finished = replace(architecture, refiner=None).load(upstream).to(device).requires_grad_(False)
+        finished = replace(architecture, refiner=None).load(prerequisite).to(device).requires_grad_(False)
         torch.manual_seed(self.seed)
         model = self.refiner.build(finished).to(device)
         validation = modes.chunks(data.open("val").to(device), VALIDATION_PIECE, least=60)

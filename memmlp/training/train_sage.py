@@ -71,9 +71,9 @@ class PartSettings:
     lr_drop: float = setting(positive(), 0.25)  # by which the learning rate is multiplied at each of these
 
 
-@component("upstream", "sage", version=3)
+@component("prerequisite", "sage", version=3)
 @dataclass
-class SAGEUpstreamSettings(Settings):
+class SAGEPrerequisiteSettings(Settings):
     """The training of SAGE-Net's parts before the whole network (Feng et al. 2024), each in a run of its own.
 
     Learning rates and their falls are its authors'; at profile=paper steps draw as many windows as epochs.
@@ -126,7 +126,7 @@ class SAGEUpstreamSettings(Settings):
                     **{key: config[key] for key in ("profile", "data", "normalizer", "seed")},
                     **loss,
                     "model": {key: config["model"][key] for key in cls.model_keys[kind]},
-                    "upstream": {key: config["upstream"][key] for key in ("name", kind)},
+                    "prerequisite": {key: config["prerequisite"][key] for key in ("name", kind)},
                     "optim": {"precision": config["optim"]["precision"]},
                 },
             )
@@ -169,18 +169,21 @@ class PartTraining:
         self,
         architecture: Architecture,
         data: Prepared,
-        upstream: Path | None,
+        prerequisite: Path | None,
         run: Run,
         device: torch.device,
     ) -> dict[str, float]:
-        """Train the part and write it with the parts before it, whose file is `upstream`.
+        """Train the part and write it with the parts before it, whose file is `prerequisite`.
 
         For the other arguments see `NetworkTraining.train`.
 
         Returns:
             The part's errors on windows of the validation part.
         """
-        before, dataset = checkpoint.read(upstream)[0] if upstream else {}, data.open("train").to(device)
+        before, dataset = (
+            checkpoint.read(prerequisite)[0] if prerequisite else {},
+            data.open("train").to(device),
+        )
         torch.manual_seed(self.network.seed)
         net = architecture.build(architecture.make_normalizer(data.manifest, dataset.frames), None)
         assert isinstance(net, SAGENet)
@@ -210,13 +213,13 @@ class DecoderTraining(PartTraining):
         self,
         architecture: Architecture,
         data: Prepared,
-        upstream: Path | None,
+        prerequisite: Path | None,
         run: Run,
         device: torch.device,
     ) -> dict[str, float]:
         """Train the decoder and write it together with the diffusion models; see PartTraining."""
         fixed = replace(architecture, trained_parts=("upper", "lower"))
-        self.network.train(fixed, data, upstream, run, device)
+        self.network.train(fixed, data, prerequisite, run, device)
         return last_errors(run)
 
 

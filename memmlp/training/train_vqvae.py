@@ -45,13 +45,13 @@ class VQVAETraining:
         self,
         architecture: Architecture,
         data: Prepared,
-        upstream: Path | None,
+        prerequisite: Path | None,
         run: Run,
         device: torch.device,
     ) -> dict[str, float]:
         """Train the architecture's VQ-VAE, from the run's checkpoint if there is one, and write its weights.
 
-        A VQ-VAE builds upon no other run, so `upstream` is None. For the other arguments see
+        A VQ-VAE builds upon no other run, so `prerequisite` is None. For the other arguments see
         `NetworkTraining.train`.
 
         Returns:

@@ -11,9 +11,9 @@ import pytest
 from conftest import Memmlp, Ran, one_line
 
 from memmlp.common.files import write_json
+from memmlp.runs.component_versions import VERSIONS
 from memmlp.runs.evaluation_file import write_report
-from memmlp.runs.identity import evaluation_id_of, evaluation_recipes, evaluation_settings
-from memmlp.runs.recipe_versions import RECIPES
+from memmlp.runs.identity import evaluation_id_of, evaluation_settings, evaluation_versions
 from memmlp.runs.run import Run
 
 A, B, C = ("a" * 16, "b" * 16, "c" * 16)
@@ -31,7 +31,7 @@ def outputs(tmp_path: Path) -> Path:
     for name, seed in ((A, 0), (B, 1), (C, 2)):
         run = Run.of(folder, name)
         run.begin(
-            "memmlp", {"seed": seed, "memory": {"layers": [2, 4, 6, 8] * 9}}, data="d" * 64, upstream=None
+            "memmlp", {"seed": seed, "memory": {"layers": [2, 4, 6, 8] * 9}}, data="d" * 64, prerequisite=None
         )
         if name != C:
             write_json(run.results_path, RESULTS | {"stream": {"rotation": {"MPJPE": 6.512 + seed}}})
@@ -59,7 +59,7 @@ def test_list_lines_up(memmlp: Memmlp, outputs: Path, monkeypatch: pytest.Monkey
 
 def test_list_names_the_older_ones(memmlp: Memmlp, outputs: Path):
     for i in range(25):
-        Run.of(outputs, f"{i:016x}").begin("vqvae", {}, data="d", upstream=None)
+        Run.of(outputs, f"{i:016x}").begin("vqvae", {}, data="d", prerequisite=None)
     assert memmlp("runs", "list").out.count("VQ-VAE") < 25
     assert "8 older ones" in memmlp("runs", "list").out
     assert memmlp("runs", "list", "--all").out.count("VQ-VAE") == 25
@@ -67,7 +67,7 @@ def test_list_names_the_older_ones(memmlp: Memmlp, outputs: Path):
 
 def test_finished_vqvaes_are_counted_and_listed_where_asked_for(memmlp: Memmlp, outputs: Path):
     run = Run.of(outputs, "d" * 16)
-    run.begin("vqvae", {}, data="d" * 64, upstream=None)
+    run.begin("vqvae", {}, data="d" * 64, prerequisite=None)
     assert "VQ-VAE" in memmlp("runs", "list").out
     run.finish([])
     said = memmlp("runs", "list").out
@@ -87,7 +87,7 @@ def test_runs_of_two_data_sets_fit_a_terminal(
         digest = "e" * 64 if name == "mocap" else "f" * 64
         run = Run.of(tmp_path / "outputs", letter * 16)
         words = " · ".join(["profile=tiny", f"memory={memory}", "seed 0"])
-        run.begin("memmlp", config, data=digest, upstream=None, name=words)
+        run.begin("memmlp", config, data=digest, prerequisite=None, name=words)
     monkeypatch.setenv("COLUMNS", "80")
     ran = memmlp("runs", "list")
     assert lines_up(ran, 80)
@@ -102,7 +102,7 @@ def test_runs_of_two_data_sets_fit_a_terminal(
 def test_a_long_value_that_nobody_asked_for_is_cut(
     memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    Run.of(outputs, A).begin("memmlp", {"seed": "x," * 40}, data="d" * 64, upstream=None)
+    Run.of(outputs, A).begin("memmlp", {"seed": "x," * 40}, data="d" * 64, prerequisite=None)
     monkeypatch.setenv("COLUMNS", "120")
     assert "…" in memmlp("runs", "list").out
     assert "…" not in memmlp("runs", "list", "--columns", "seed").out
@@ -150,7 +150,7 @@ def test_list_names_the_networks_that_hardly_saw_motion(memmlp: Memmlp, outputs:
     little = {"model": {"frames": 41}, "optim": {"steps": 20, "batch": 8}}
     for digit in "de":
         run = Run.of(outputs, digit * 16)
-        run.begin("memmlp", little, data="d" * 64, upstream=None)
+        run.begin("memmlp", little, data="d" * 64, prerequisite=None)
         if digit == "d":
             write_json(run.results_path, RESULTS)
             run.finish(["results.json"])
@@ -175,7 +175,7 @@ def test_diff_cuts_no_number(memmlp: Memmlp, outputs: Path, monkeypatch: pytest.
 def test_diff_leaves_out_what_changes_no_result(memmlp: Memmlp, outputs: Path):
     for name, memory, made in ((A, "vq", "today"), (B, "none", "tomorrow")):
         config = {"memory": {"name": memory}, "threads": len(memory)}
-        Run.of(outputs, name).begin("memmlp", config, data="d" * 64, upstream=None)
+        Run.of(outputs, name).begin("memmlp", config, data="d" * 64, prerequisite=None)
         latency = {"median_ms": 1.0, "made": made, "settings": {"steps": len(made)}}
         write_json(Run.of(outputs, name).results_path, {"latency": latency})
     said = memmlp("runs", "diff", A, B).out
@@ -184,28 +184,34 @@ def test_diff_leaves_out_what_changes_no_result(memmlp: Memmlp, outputs: Path):
 
 
 def test_diff_tells_of_another_recipe_and_device(memmlp: Memmlp, outputs: Path):
-    Run.of(outputs, A).write_manifest({"recipes": {"features": 1, "memory.vq": 1}, "device": "cpu"})
-    Run.of(outputs, B).write_manifest({"recipes": {"features": 2}, "device": "cuda"})
+    Run.of(outputs, A).write_manifest(
+        {"component_versions": {"features": 1, "memory.vq": 1}, "device": "cpu"}
+    )
+    Run.of(outputs, B).write_manifest({"component_versions": {"features": 2}, "device": "cuda"})
     for name, cpu in ((A, "fast"), (B, "slow")):
         path = Run.of(outputs, name).deployment("fp32-0").latency
         path.parent.mkdir(parents=True)
         path.write_text(json.dumps({"median_ms": 1.0, "made_by": {"cpu": cpu}}))
     rows = [line.split() for line in memmlp("runs", "diff", A, B).out.splitlines()]
-    assert ["recipes.features", "1", "2"] in rows
+    assert ["component_versions.features", "1", "2"] in rows
     assert ["device", "cpu", "cuda"] in rows
     assert ["latency", "fast", "slow"] in rows
-    assert not [row for row in rows if row[:1] == ["recipes.memory.vq"]]
+    assert not [row for row in rows if row[:1] == ["component_versions.memory.vq"]]
 
 
 def test_results_by_an_earlier_recipe_are_told(
     memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """They stood beside those of today's; of a run that was measured again today's count."""
-    for number, measured in ((1, (A, B)), (RECIPES["mode.window"], (B,))):
-        monkeypatch.setitem(RECIPES, "mode.window", number)
+    for number, measured in ((1, (A, B)), (VERSIONS["mode.window"], (B,))):
+        monkeypatch.setitem(VERSIONS, "mode.window", number)
         for name in measured:
             settings = evaluation_settings({}, "window")
-            report = {"mode": "window", "settings": settings, "recipes": evaluation_recipes(settings)}
+            report = {
+                "mode": "window",
+                "settings": settings,
+                "component_versions": evaluation_versions(settings),
+            }
             report |= {"mean": {"rotation": {"MPJPE": 5.0 + number}}, "clips": []}
             write_report(Run.of(outputs, name).evaluation(evaluation_id_of(settings)), report)
     said = f"by an earlier version: mode.window 1 -> {number}"
@@ -229,7 +235,7 @@ def test_list_shows_what_differs_as_far_as_there_is_room(
     memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch
 ):
     config = {"seed": 1, "memory": {"layers": [2]}}
-    Run.of(outputs, "d" * 16).begin("memmlp", config, data="d" * 64, upstream=None)
+    Run.of(outputs, "d" * 16).begin("memmlp", config, data="d" * 64, prerequisite=None)
     seen = {}
     for width in ("40", "85", "140"):
         monkeypatch.setenv("COLUMNS", width)
@@ -246,7 +252,9 @@ def test_of_many_keys_a_few_have_columns_and_results_have_theirs(
 ):
     for digit in ("d", "e"):
         config = {f"key{letter}": digit for letter in "abcdefghij"}
-        Run.of(outputs, digit * 16).begin("memmlp", config, data="d" * 64, upstream=None, name=f"of {digit}")
+        Run.of(outputs, digit * 16).begin(
+            "memmlp", config, data="d" * 64, prerequisite=None, name=f"of {digit}"
+        )
     for width, there in (("80", {"name", "stream"}), ("140", {"name", "stream", "window", "Jitter", "keya"})):
         monkeypatch.setenv("COLUMNS", width)
         ran = memmlp("runs", "list")
@@ -262,7 +270,7 @@ def test_names_have_the_room_that_there_is(memmlp: Memmlp, outputs: Path, monkey
     long = "model=avatar_poser · optim.lr=0.004 · optim.warmup=100"
     for digit in ("d", "e"):
         config = {"seed": int(digit, 16), "memory": {"layers": [2]}}
-        Run.of(outputs, digit * 16).begin("memmlp", config, data="d" * 64, upstream=None, name=long)
+        Run.of(outputs, digit * 16).begin("memmlp", config, data="d" * 64, prerequisite=None, name=long)
     monkeypatch.setenv("COLUMNS", "200")
     assert memmlp("runs", "list").out.count(long) == 2
     monkeypatch.setenv("COLUMNS", "90")
@@ -282,7 +290,7 @@ def test_data_stay_in_a_narrow_list_since_errors_on_others_do_not_compare(
             "optim": {"lr": int(digit, 16)},
             "data": {"name": data},
         }
-        Run.of(outputs, digit * 16).begin("memmlp", config, data=digit * 64, upstream=None)
+        Run.of(outputs, digit * 16).begin("memmlp", config, data=digit * 64, prerequisite=None)
     monkeypatch.setenv("COLUMNS", "40")
     assert "data" in heads(memmlp("runs", "list").out)
 

@@ -23,8 +23,8 @@ from memmlp.cli.workers import split_executor
 from memmlp.common.errors import InputError
 from memmlp.config.compose_plan import find_sweep, kept_or_new_plan, orphans, plan_anew
 from memmlp.config.worker_process import perform
+from memmlp.runs.component_versions import VERSIONS, version_of
 from memmlp.runs.lookup import list_runs
-from memmlp.runs.recipe_versions import RECIPES, version_of
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan
 from memmlp.sweep.progress_table import task_name
@@ -83,7 +83,9 @@ def test_status_and_dry_run_show_and_do_nothing(home: Path):
     )
     sources = older.manifest["sources"]
     older.write_manifest({"sources": sources | {"training/loop.py": "0" * 12}})
-    line = "code of training/loop.py has changed since these runs, under the same recipes: 'none'\n"
+    line = (
+        "code of training/loop.py has changed since these runs, under the same component versions: 'none'\n"
+    )
     assert line in command(home, "--status")
     older.write_manifest({"sources": sources})
     forecast = command(home, "seed=0,1", "--dry-run", "--workers", "2")
@@ -142,7 +144,7 @@ def test_seeds_come_one_after_another_each_with_all_variants(home: Path, monkeyp
     own = [task.id for task in plan.tasks if task.kind == "memmlp"]
     assert own == [entry.id for entry in plan.entries]
     for task in plan.tasks:
-        assert task.upstream is None or task.upstream in [
+        assert task.prerequisite is None or task.prerequisite in [
             other.id for other in plan.tasks[: plan.tasks.index(task)]
         ]
     (codes,) = (task for task in plan.tasks if task.kind == "vqvae" and task.id == plan.tasks[0].id)
@@ -349,21 +351,7 @@ def test_a_worker_of_other_code_or_data_leaves_the_run_alone(home: Path, monkeyp
     assert not plan.run_of(other).folder.exists()
 
 
-def test_runs_of_an_older_recipe_are_said_and_made_again(home: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(RECIPES, "memory.none", version_of("memory.none") + 1)
-    words = (
-        "table",
-        "trial.yaml",
-        *TINY,
-        "optim.log_every=3",
-    )  # the override changes no result, but makes another plan
-    said = " ".join(run(home, *words).split())
-    assert "missing: 'none' seed 0, 'wild' seed 0" in said
-    known = next(
-        one for one in list_runs(home / "outputs") if "memory.none" in one.manifest.get("recipes", {})
-    )
-    before = version_of("memory.none") - 1
-    assert (
-        f"made again by the sweep: 'none' seed 0 (run {known.id}: memory.none {before} -> {before + 1})"
-        in said
-    )
+def test_runs_with_another_component_version_are_missing(home: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(VERSIONS, "memory.none", version_of("memory.none") + 1)
+    said = run(home, "table", "trial.yaml", *TINY, "optim.log_every=3")  # a new plan with the same results
+    assert "missing: 'none' seed 0, 'wild' seed 0" in " ".join(said.split())

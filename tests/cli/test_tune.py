@@ -22,7 +22,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.lease import current_process
 from memmlp.config.build_request import build_request
 from memmlp.config.compose import composed
-from memmlp.runs.recipe_versions import RECIPES
+from memmlp.runs.component_versions import VERSIONS
 from memmlp.runs.run import Run
 from memmlp.sweep.search import director as director_module
 from memmlp.sweep.search import results
@@ -207,7 +207,7 @@ def test_another_recipe_of_what_later_trials_use_makes_another_search(
     before = prepare_search([*TINY, *space], None, tmp_path).folder.name
     for component, same in {"memory.gru": True, "memory.vq": False, "codebook.ema": False}.items():
         with monkeypatch.context() as patched:
-            patched.setitem(RECIPES, component, 99)
+            patched.setitem(VERSIONS, component, 99)
             assert (prepare_search([*TINY, *space], None, tmp_path).folder.name == before) == same
 
 

@@ -371,7 +371,7 @@ WAYS: dict[str, Callable[[Run], object]] = {
     "checkpoint": lambda run: atomic_write(run.checkpoint, b"late"),
     "DONE": lambda run: run.finish(["model.safetensors"]),
     "manifest": lambda run: run.write_manifest({"late": True}),
-    "begin": lambda run: run.begin("memmlp", {}, data="d", upstream=None),
+    "begin": lambda run: run.begin("memmlp", {}, data="d", prerequisite=None),
     "FAILED": lambda run: run.fail("late"),
     "retry": Run.retry,
     "evaluation": lambda run: write_report(run.evaluation("late-0"), {"mean": {}}),

@@ -29,7 +29,7 @@ def test_every_option_composes_and_passes(tmp_path: Path):
         "data=amass_s3": [root],
         "loss=avatar_poser": ["model=avatar_poser"],
         "loss=of_network": ["model=bodiffusion"],
-        "upstream=sage": ["model=sage"],
+        "prerequisite=sage": ["model=sage"],
         **{f"loss={name}": ["model=agrol_mlp"] for name in (*OF_TERMS, "agrol", "rpm", "terms")},
         **{f"predictor={name}": ["hand=fk"] for name in ("rotation_only", "rotation_only_memory")},
     }

@@ -43,7 +43,7 @@ def test_a_storm_over_processes_that_end_at_once_ends_too(tmp_path: Path):
 
 def finished(outputs: Path, name: str, weights: bytes = b"w") -> Run:
     run = Run.of(outputs, name * 16)
-    run.begin("memmlp", {}, data="d", upstream=None)
+    run.begin("memmlp", {}, data="d", prerequisite=None)
     run.want([])  # no evaluation and no export
     run.model.write_bytes(weights)
     run.finish(["model.safetensors"])

@@ -35,7 +35,7 @@ def whole(plan: Plan, task: RunTask) -> None:
     """A run of a few steps, done as the pipeline does one: from its checkpoint, and only what is missing."""
     run = plan.run_of(task)
     if not run.done:
-        run.begin(task.kind, {"optim": {"steps": STEPS}}, data="d", upstream=None)
+        run.begin(task.kind, {"optim": {"steps": STEPS}}, data="d", prerequisite=None)
         run.clear_stages()
         first = int(run.checkpoint.read_bytes()) if run.checkpoint.exists() else 0
         for step in range(first + 1, STEPS + 1):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from begun_runs import begun
 
-import memmlp.runs.recipe_versions
+import memmlp.runs.component_versions
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.report.tables.measured_run import load
@@ -32,7 +32,7 @@ def solved(run: Run, ik: str, value: float, iterations: int | None = None, made:
 def test_combined_is_of_one_inverse_kinematics_which_is_named(tmp_path: Path):
     """That of the run's config, or else the last one; nothing is joined of two."""
     run = begun(tmp_path)
-    run.begin("memmlp", {"evaluation": {"ik": "off"}}, data="d", upstream=None)
+    run.begin("memmlp", {"evaluation": {"ik": "off"}}, data="d", prerequisite=None)
     solved(run, "lbfgs", 1.0, 15, made="1")
     solved(run, "arms", 2.0, made="2")
 
@@ -50,7 +50,7 @@ def test_combined_is_of_one_inverse_kinematics_which_is_named(tmp_path: Path):
     named = {f"stream.combined-arms.{key}": value for key, value in both.items()}
     assert found() == (both, both, {"stream": "arms"}, named)
     assert load(run.folder).clips["a"]["stream"]["combined"] == both
-    run.begin("memmlp", {"evaluation": {"ik": "lbfgs", "ik_iterations": 15}}, data="d", upstream=None)
+    run.begin("memmlp", {"evaluation": {"ik": "lbfgs", "ik_iterations": 15}}, data="d", prerequisite=None)
     own = {"MPJPE": 1.0, "of lbfgs": 1.0}
     named = {f"stream.combined-lbfgs-15.{key}": value for key, value in own.items()}
     assert found() == (own, own, {"stream": "lbfgs-15"}, named)
@@ -61,11 +61,17 @@ def test_combined_is_of_one_inverse_kinematics_which_is_named(tmp_path: Path):
 
 def test_a_mode_that_was_measured_by_an_earlier_recipe_says_so(tmp_path: Path, monkeypatch):
     settings = {"mode": "stream", "ik": "off"}
-    report = {"mode": "stream", "settings": settings, "mean": {}, "clips": [], "recipes": {"mode.stream": 1}}
+    report = {
+        "mode": "stream",
+        "settings": settings,
+        "mean": {},
+        "clips": [],
+        "component_versions": {"mode.stream": 1},
+    }
     write_report(tmp_path / f"{evaluation_id_of(settings)}.json", report)
-    monkeypatch.setitem(memmlp.runs.recipe_versions.RECIPES, "mode.stream", 1)
+    monkeypatch.setitem(memmlp.runs.component_versions.VERSIONS, "mode.stream", 1)
     assert EvaluationsAsConfigured(tmp_path, {}).outdated == {}
-    monkeypatch.setitem(memmlp.runs.recipe_versions.RECIPES, "mode.stream", 2)
+    monkeypatch.setitem(memmlp.runs.component_versions.VERSIONS, "mode.stream", 2)
     assert EvaluationsAsConfigured(tmp_path, {}).outdated == {"stream": "mode.stream 1 -> 2"}
 
 

@@ -8,17 +8,19 @@ import pytest
 
 from memmlp.common.files import write_json
 from memmlp.common.lease import current_process
+from memmlp.runs.component_versions import VERSIONS
 from memmlp.runs.garbage_runs import delete, garbage
 from memmlp.runs.notes import add_tags, remove_tags
-from memmlp.runs.recipe_versions import RECIPES
 from memmlp.runs.run import Run
 
 FAILED, OLD, GONE, CODES, USED, GOOD, EMPTY = (f"{letter}" * 16 for letter in "0123456")
 
 
-def made(outputs: Path, name: str, kind: str = "memmlp", upstream: str | None = None, recipe: int = 1) -> Run:
+def made(
+    outputs: Path, name: str, kind: str = "memmlp", prerequisite: str | None = None, version: int = 1
+) -> Run:
     run = Run.of(outputs, name)
-    run.begin(kind, {}, data="d", upstream=upstream, recipes={"metrics": recipe})
+    run.begin(kind, {}, data="d", prerequisite=prerequisite, component_versions={"metrics": version})
     run.model.write_bytes(b"weights")
     run.finish([run.model.name])
     return run
@@ -27,13 +29,13 @@ def made(outputs: Path, name: str, kind: str = "memmlp", upstream: str | None = 
 @pytest.fixture
 def outputs(tmp_path: Path) -> Path:
     """One run of each sort."""
-    Run.of(tmp_path, FAILED).begin("memmlp", {}, data="d", upstream=None)
+    Run.of(tmp_path, FAILED).begin("memmlp", {}, data="d", prerequisite=None)
     Run.of(tmp_path, FAILED).fail("loss is nan")
-    made(tmp_path, OLD, recipe=0)
+    made(tmp_path, OLD, version=0)
     made(tmp_path, GONE)
     made(tmp_path, CODES, "vqvae")
-    made(tmp_path, USED, "vqvae", recipe=0)
-    made(tmp_path, GOOD, upstream=USED)
+    made(tmp_path, USED, "vqvae", version=0)
+    made(tmp_path, GOOD, prerequisite=USED)
     Run.of(tmp_path, EMPTY).folder.mkdir()
     sweep = tmp_path / "sweeps" / "mine"
     sweep.mkdir(parents=True)
@@ -96,15 +98,15 @@ def test_runs_of_an_arm_that_is_gone_may_go(outputs: Path):
 def test_a_trained_run_whose_export_failed_stays(outputs: Path):
     made(outputs, "7" * 16).fail("step.int8.onnx: ONNX Runtime differs")
     assert "7" * 16 not in found(outputs)
-    Run.of(outputs, "8" * 16).begin("memmlp", {}, data="d", upstream=None)
+    Run.of(outputs, "8" * 16).begin("memmlp", {}, data="d", prerequisite=None)
     Run.of(outputs, "8" * 16).fail("loss is nan")
     assert found(outputs)["8" * 16] == "failed"
 
 
-def test_what_is_upstream_of_what_stays_stays_however_far_up(outputs: Path):
-    made(outputs, "7" * 16, "vqvae", recipe=0)
-    made(outputs, "8" * 16, upstream="7" * 16, recipe=0)
-    made(outputs, "9" * 16, upstream="8" * 16)
+def test_prerequisites_of_kept_runs_are_kept(outputs: Path):
+    made(outputs, "7" * 16, "vqvae", version=0)
+    made(outputs, "8" * 16, prerequisite="7" * 16, version=0)
+    made(outputs, "9" * 16, prerequisite="8" * 16)
     assert {"7" * 16, "8" * 16} & set(found(outputs)) == set()
 
 
@@ -120,8 +122,15 @@ def test_a_finished_vqvae_of_a_search_under_way_stays(outputs: Path):
 def test_a_network_upon_an_older_vqvae_may_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Its own component versions do not include those of its prerequisite runs."""
     run = Run.of(tmp_path, OLD)
-    above = [{"id": CODES, "recipes": {"codebook.ema": RECIPES["codebook.ema"]}}]
-    run.begin("memmlp", {}, data="d", upstream=None, recipes={"memory.vq": 1}, upstream_runs=above)
+    above = [{"id": CODES, "component_versions": {"codebook.ema": VERSIONS["codebook.ema"]}}]
+    run.begin(
+        "memmlp",
+        {},
+        data="d",
+        prerequisite=None,
+        component_versions={"memory.vq": 1},
+        prerequisite_runs=above,
+    )
     assert found(tmp_path, "old") == {}
-    monkeypatch.setitem(RECIPES, "codebook.ema", RECIPES["codebook.ema"] + 1)
+    monkeypatch.setitem(VERSIONS, "codebook.ema", VERSIONS["codebook.ema"] + 1)
     assert found(tmp_path, "old") == {OLD: "old"}

@@ -38,7 +38,7 @@ def test_no_such_run_is_one_line(tmp_path: Path):
 def test_a_bare_folder_name_is_found_and_an_ambiguous_beginning_lists_the_runs(tmp_path: Path, monkeypatch):
     runs = [Run.of(tmp_path, "ab" + digit * 14) for digit in "01"]
     for run in runs:
-        run.begin("memmlp", {}, data="d", upstream=None)
+        run.begin("memmlp", {}, data="d", prerequisite=None)
     with pytest.raises(InputError, match=r"2 ids .*: ab0+, ab1+"):
         find_run(tmp_path, "ab")
     monkeypatch.chdir(runs[0].folder.parent)
@@ -50,7 +50,7 @@ SEEN = {"optim": {"steps": 100, "batch": 8}, "model": {"frames": 11}}
 
 def test_a_refiner_saw_its_network_s_frames_and_its_own_pieces(tmp_path: Path):
     network = fake_run(tmp_path, "network", config=SEEN)
-    above = {"upstream": network.id}
+    above = {"prerequisite": network.id}
     config = SEEN | {"refiner": {"frames": 20}}
     assert frames_seen(fake_run(tmp_path, "refiner", config=config, origin=above)) == 100 * 8 * (11 + 20)
 

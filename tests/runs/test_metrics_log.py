@@ -68,7 +68,7 @@ def test_a_log_may_go_on_after_a_reset(tmp_path: Path):
     run = begun(tmp_path)
     run.log(1, {"loss": 1.0})
     run.reset()
-    run.begin("memmlp", CONFIG, data="d", upstream=None)
+    run.begin("memmlp", CONFIG, data="d", prerequisite=None)
     run.log(2, {"loss": 1.0})
     assert [entry.step for entry in run.metrics()] == [2]
 

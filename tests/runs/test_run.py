@@ -11,7 +11,7 @@ import pytest
 from begun_runs import CONFIG, begun, complete
 from processes import finished
 
-import memmlp.runs.recipe_versions
+import memmlp.runs.component_versions
 from memmlp.cli.runs.listing import shown_number
 from memmlp.cli.runs.show import measured_numbers
 from memmlp.common.errors import InputError
@@ -146,13 +146,13 @@ def test_todays_recipes_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         place.finish({"settings": deployment_settings(config), "int8": {"growth": 0.0, "jitter_growth": 0.0}})
 
     with monkeypatch.context() as today:
-        today.setitem(memmlp.runs.recipe_versions.RECIPES, "metrics", 2)
-        today.setitem(memmlp.runs.recipe_versions.RECIPES, "graph.naive", 2)
+        today.setitem(memmlp.runs.component_versions.VERSIONS, "metrics", 2)
+        today.setitem(memmlp.runs.component_versions.VERSIONS, "graph.naive", 2)
         make(fp32, 2.0, b"new")
     make(config, 1.0, b"old")
     assert run.results["stream"]["rotation"]["MPJPE"] == 1.0
-    monkeypatch.setitem(memmlp.runs.recipe_versions.RECIPES, "metrics", 2)
-    monkeypatch.setitem(memmlp.runs.recipe_versions.RECIPES, "graph.naive", 2)
+    monkeypatch.setitem(memmlp.runs.component_versions.VERSIONS, "metrics", 2)
+    monkeypatch.setitem(memmlp.runs.component_versions.VERSIONS, "graph.naive", 2)
     assert run.results["stream"]["rotation"]["MPJPE"] == 2.0
     assert load(run.folder).means["stream"]["rotation"]["MPJPE"] == 2.0
     assert run.preferred_onnx.read_bytes() == b"new"

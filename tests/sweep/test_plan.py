@@ -32,7 +32,7 @@ def needed(*labels: str) -> list[str]:
     return [task.key for task in part.tasks]
 
 
-def test_variants_need_their_runs_and_those_upstream():
+def test_variants_need_their_runs_and_their_prerequisites():
     assert needed("plain") == ["plain stream"]
     assert needed("network") == ["vqvae", "net stream"]
     assert needed("refined") == ["vqvae", "net", "refined stream"]
@@ -45,7 +45,7 @@ CODES, QUICK, SLOW = ("c" * 16,), ("a" * 16, "b" * 16), ("d" * 16, "e" * 16)
 
 @pytest.fixture
 def plan(tmp_path: Path) -> Plan:
-    """Two variants of two seeds each, and what is upstream of them."""
+    """Two variants of two seeds each, and what is prerequisite of them."""
     variants = {"quick": QUICK, "slow": SLOW}
     entries = [
         Entry(variant, seed, name) for variant, names in variants.items() for seed, name in enumerate(names)
@@ -59,7 +59,7 @@ def finish(plan: Plan, name: str, seconds: object) -> None:
     """End a run that took so long."""
     task = next(task for task in plan.tasks if task.id == name)
     run = plan.run_of(task)
-    run.begin(task.kind, {}, data="d", upstream=task.upstream)
+    run.begin(task.kind, {}, data="d", prerequisite=task.prerequisite)
     run.write_manifest({"seconds": seconds})
     run.results_path.write_text("{}")
     run.finish(["results.json"])

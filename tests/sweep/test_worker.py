@@ -47,16 +47,16 @@ def saved(outputs: Path, *tasks: RunTask, **changes) -> Path:
 
 def finish(plan: Plan, task: RunTask) -> None:
     run = plan.run_of(task)
-    run.begin(task.kind, {}, data="d", upstream=task.upstream)
+    run.begin(task.kind, {}, data="d", prerequisite=task.prerequisite)
     run.results_path.write_text("{}")
     run.finish(["results.json"])
 
 
-def test_upstream_runs_come_first_and_each_task_once(tmp_path: Path):
+def test_prerequisite_runs_come_first_and_each_task_once(tmp_path: Path):
     seen: list[str] = []
 
     def perform(plan: Plan, task: RunTask) -> None:
-        assert task.upstream is None or Run.of(plan.outputs, task.upstream).done
+        assert task.prerequisite is None or Run.of(plan.outputs, task.prerequisite).done
         seen.append(task.id)
         finish(plan, task)
 
@@ -85,7 +85,7 @@ def test_what_a_worker_saw_done_it_looks_at_no_more(tmp_path: Path, monkeypatch:
     assert looks.count(TWO.id) > 1
 
 
-def test_an_upstream_run_stands_right_before_the_first_that_needs_it():
+def test_a_prerequisite_run_stands_right_before_the_first_that_needs_it():
     other = RunTask("d" * 16, "vqvae", {})
     four = RunTask("4" * 16, "memmlp", {}, other.id)
     assert unique([CODES, ONE, ALONE, other, four, CODES, TWO]) == (CODES, ONE, ALONE, other, four, TWO)
@@ -154,7 +154,7 @@ def test_what_needs_a_failed_run_is_blocked(tmp_path: Path):
 
 def test_a_cancelled_run_is_left_as_it_is(tmp_path: Path):
     def perform(plan: Plan, task: RunTask) -> None:
-        plan.run_of(task).begin("memmlp", {}, data="d", upstream=None)
+        plan.run_of(task).begin("memmlp", {}, data="d", prerequisite=None)
         saved(tmp_path, ALONE, cancelled=(ALONE.id,))
         raise Cancelled
 
@@ -195,7 +195,7 @@ def test_a_run_whose_process_died_is_lost_then_taken_over(tmp_path: Path):
     code = (
         "import sys, time; from pathlib import Path; from memmlp.sweep.worker import work_off\n"
         "def perform(plan, task):\n"
-        "    plan.run_of(task).begin('memmlp', {}, data='d', upstream=None)\n"
+        "    plan.run_of(task).begin('memmlp', {}, data='d', prerequisite=None)\n"
         "    print('at it', flush=True); time.sleep(600)\n"
         "work_off(Path(sys.argv[1]), perform)"
     )
@@ -217,12 +217,12 @@ def test_a_run_that_kills_its_workers_fails_at_last(tmp_path: Path):
     path = saved(tmp_path, ALONE)
     run = Plan.load(path).run_of(ALONE)
     for _ in range(worker.DEATHS - 1):
-        run.begin("memmlp", {}, data="d", upstream=None)
+        run.begin("memmlp", {}, data="d", prerequisite=None)
     assert worker.deaths(run) == worker.DEATHS - 1
     run.log(5, {"loss": 1.0})
     assert worker.deaths(run) == 0
     for _ in range(worker.DEATHS):
-        run.begin("memmlp", {}, data="d", upstream=None)
+        run.begin("memmlp", {}, data="d", prerequisite=None)
     work_off(path, finish)
     assert run.status == "failed"
     assert "processes died at step 5" in str(run.failure)
@@ -242,7 +242,7 @@ def _log_tasks(path: Path, log: Path, locks: bool) -> None:
         with open(log, "ab", buffering=0) as file:
             file.write(f"{task.id}\n".encode())
         run = plan.run_of(task)
-        run.begin(task.kind, {}, data="d", upstream=None)
+        run.begin(task.kind, {}, data="d", prerequisite=None)
         time.sleep(0.02)
         run.results_path.write_text("{}")
         run.finish(["results.json"])
@@ -275,7 +275,7 @@ lease.BEAT, stop = 0.01, sys.argv[2]
 
 def perform(plan, task):
     run = plan.run_of(task)
-    run.begin(task.kind, {}, data="d", upstream=None)
+    run.begin(task.kind, {}, data="d", prerequisite=None)
     print(f"at {task.id[0]}", flush=True)
     if task.id[0] == stop:
         sys.stdin.readline()

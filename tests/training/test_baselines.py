@@ -31,5 +31,5 @@ def test_one_command_trains_evaluates_and_finds_it_again(name, memmlp):
     assert run.results["stream"]["rotation"]["MPJPE"] > 0
     if name == "recurrent_poser":  # which sees all frames before, in either mode
         assert run.results["stream"]["rotation"] == run.results["window"]["rotation"]
-    assert run.manifest["upstream"] is None
+    assert run.manifest["prerequisite"] is None
     assert "finished already" in memmlp("train", f"model={name}", *SHORT, "export.graph=off").out

@@ -73,7 +73,7 @@ UNTRIED = {
     "plugins": "changes no run by itself: tests/config/test_plugins.py",
     "term": "one of a package of one's own: tests/config/test_plugins.py",
     "evaluation.metrics": "of a package of one's own: tests/config/test_plugins.py",
-    "upstream": "parts of SAGE-Net, each a run of its own: tests/training/test_sage.py",
+    "prerequisite": "parts of SAGE-Net, each a run of its own: tests/training/test_sage.py",
     "refiner": "a run of its own, behind the network's: tests/training/test_refiner.py",
     "vqvae.epochs": "steps by another name: the two exclude each other (tests/config/test_compose.py)",
 }

@@ -26,9 +26,9 @@ def experiment(mirror: bool, *overrides: str) -> Experiment:
     return build_experiment(composed([*SHORT, f"data.mirror={mirror}", *overrides]))
 
 
-def trained(training, architecture, upstream: Path | None, folder: Path) -> dict[str, torch.Tensor]:
+def trained(training, architecture, prerequisite: Path | None, folder: Path) -> dict[str, torch.Tensor]:
     folder.mkdir()
-    training.train(architecture, DATA, upstream, run := Run(folder), torch.device("cpu"))
+    training.train(architecture, DATA, prerequisite, run := Run(folder), torch.device("cpu"))
     return checkpoint.read(run.model)[0]
 
 

@@ -30,10 +30,12 @@ def test_one_command_trains_the_network_and_then_its_refiner(memmlp):
     ran = memmlp("train", *SHORT, "refiner=sage")
     assert ran.code == 0, ran.err
     (refined,) = (run for run in list_runs(Path("outputs")) if run.id != bare.id)
-    assert refined.manifest["upstream"] == bare.id
-    assert [one["id"] for one in refined.manifest["upstream_runs"]] == [bare.id]
+    assert refined.manifest["prerequisite"] == bare.id
+    assert [one["id"] for one in refined.manifest["prerequisite_runs"]] == [bare.id]
     assert bare.model.read_bytes() == weights
-    assert refined.manifest["recipes"].keys() - bare.manifest["recipes"].keys() == {"refiner.sage"}
+    assert refined.manifest["component_versions"].keys() - bare.manifest["component_versions"].keys() == {
+        "refiner.sage"
+    }
     assert set(refined.results) == {"window", "stream"}
     assert refined.results["window"] == refined.results["stream"]
     assert refined.results["stream"]["rotation"]["MPJPE"] != bare.results["stream"]["rotation"]["MPJPE"]
@@ -48,21 +50,21 @@ def experiment(*overrides: str):
 @pytest.mark.slow
 def test_its_identity_is_of_all_that_its_pieces_follow_from():
     bare, refined = experiment().identity("d"), experiment("refiner=sage").identity("d")
-    assert refined.upstream == bare
+    assert refined.prerequisite == bare
     assert refined.id not in (bare.id, experiment("refiner=sage", "refiner.pieces=9").identity("d").id)
     words = ["model=agrol_diffusion", "refiner=sage"]
     sampled = [experiment(*words, f"model.sampling_steps={steps}").identity("d") for steps in (2, 3)]
-    assert sampled[0].upstream.id == sampled[1].upstream.id
+    assert sampled[0].prerequisite.id == sampled[1].prerequisite.id
     assert sampled[0].id != sampled[1].id
 
 
 @pytest.mark.slow
-def test_a_sweep_trains_what_is_upstream_first():
+def test_a_sweep_trains_prerequisites_first():
     """VQ-VAE, network, refiner; each task's config is one that makes its run."""
     refined = build_experiment(composed(["profile=tiny", "refiner=sage"]))
     tasks = tasks_of(refined, "d")
     assert [task.kind for task in tasks] == ["vqvae", "memmlp", "memmlp"]
-    assert [task.upstream for task in tasks] == [None, tasks[0].id, tasks[1].id]
+    assert [task.prerequisite for task in tasks] == [None, tasks[0].id, tasks[1].id]
     assert [bool(task.stages) for task in tasks] == [False, False, True]
     assert tasks[1].id == build_experiment(composed(["profile=tiny"])).identity("d").id
     assert [task.config["refiner"] is None for task in tasks] == [True, True, False]

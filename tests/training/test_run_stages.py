@@ -27,10 +27,10 @@ from memmlp.live.stream import Stream
 from memmlp.motion.dataset import MotionDataset
 from memmlp.report.tables.measured_run import load
 from memmlp.runs import environment
+from memmlp.runs.component_versions import VERSIONS
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.lookup import list_runs
-from memmlp.runs.recipe_versions import RECIPES
 from memmlp.runs.run import Run
 from memmlp.sweep.worker import Cancelled, deaths
 from memmlp.training import run_stages
@@ -56,20 +56,26 @@ def test_a_run_leaves_everything(home):
     assert run.results["stream"]["rotation"]["MPJPE"] > 0
     assert run.results["latency"]["steps"] >= 200
     assert run.results["latency"]["onnx_parity"] < 1e-4
-    upstream = Run.of(home / "outputs", run.manifest["upstream"])
-    assert upstream.done
-    assert upstream.manifest["kind"] == "vqvae"
-    (known,) = run.manifest["upstream_runs"]
-    assert (known["id"], known["weights"]) == (upstream.id, file_digest(upstream.model))
-    assert known["recipes"] == upstream.manifest["recipes"]
-    assert load(run.folder).origin.upstream_recipes["vqvae"] == RECIPES["vqvae"]
+    prerequisite = Run.of(home / "outputs", run.manifest["prerequisite"])
+    assert prerequisite.done
+    assert prerequisite.manifest["kind"] == "vqvae"
+    (known,) = run.manifest["prerequisite_runs"]
+    assert (known["id"], known["weights"]) == (prerequisite.id, file_digest(prerequisite.model))
+    assert known["component_versions"] == prerequisite.manifest["component_versions"]
+    assert load(run.folder).origin.prerequisite_versions["vqvae"] == VERSIONS["vqvae"]
     with Image.open(run.folder / "poses.png") as picture:
         assert picture.size[0] > 600
         assert len(picture.convert("RGB").getcolors(10**6)) > 50
     report = json.loads(next(run.evaluations.glob("stream-*.json")).read_text())
     assert report["run"] == run.id
-    assert report["recipes"] == {"metrics": RECIPES["metrics"], "mode.stream": RECIPES["mode.stream"]}
-    assert load(run.folder).origin.recipes.items() >= {**run.manifest["recipes"], **report["recipes"]}.items()
+    assert report["component_versions"] == {
+        "metrics": VERSIONS["metrics"],
+        "mode.stream": VERSIONS["mode.stream"],
+    }
+    assert (
+        load(run.folder).origin.component_versions.items()
+        >= {**run.manifest["component_versions"], **report["component_versions"]}.items()
+    )
     graph = onnx.load(run.onnx)
     assert {p.key: p.value for p in graph.metadata_props}["run_id"] == run.id
     out = (home / "out.txt").read_text()
@@ -212,7 +218,7 @@ def test_export_again_and_bad_names(home, memmlp, monkeypatch):
     assert one_line(memmlp(*full), "--scope full")
     assert one_line(memmlp("eval", "zzz"), "run 'zzz'")
     assert one_line(memmlp("export", run.id, "--out", "no/where.onnx"), "--out")
-    assert one_line(memmlp("eval", run.manifest["upstream"]), "a finished run of a motion network")
+    assert one_line(memmlp("eval", run.manifest["prerequisite"]), "a finished run of a motion network")
 
 
 def test_a_nan_on_a_later_clip_is_not_exported(home, memmlp, monkeypatch):
@@ -262,7 +268,7 @@ def test_every_experiment_trains_and_streams(home, name, monkeypatch: pytest.Mon
 def begun(tmp_path: Path) -> tuple[Any, Run]:
     """What an experiment's outcome is recorded with, and a run that has begun."""
     run = Run.of(tmp_path, "0" * 16)
-    run.begin("memmlp", {}, data="d", upstream=None)
+    run.begin("memmlp", {}, data="d", prerequisite=None)
     return SimpleNamespace(loggers=Loggers((), tmp_path), stage_ids=(), outputs=tmp_path), run
 
 

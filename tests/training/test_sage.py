@@ -19,7 +19,7 @@ from memmlp.training.train_sage import PARTS
 
 SHORT = [
     "model=sage", "profile=tiny", "data.synth.minutes=0.05", "loggers=none", "threads=1", "export.graph=off",
-    "optim.steps=2", *(f"upstream.{part}.steps=2" for part in PARTS), "model.sampling_steps=1",
+    "optim.steps=2", *(f"prerequisite.{part}.steps=2" for part in PARTS), "model.sampling_steps=1",
 ]  # fmt: skip
 
 
@@ -39,10 +39,10 @@ def test_one_command_trains_each_part_and_then_the_whole(memmlp):
     assert ran.code == 0, ran.err
     runs = {run.manifest["kind"]: run for run in list_runs(Path("outputs"))}
     chain = [runs[kind] for kind in (*PARTS, "memmlp")]
-    assert [run.manifest["upstream"] for run in chain] == [None, *(run.id for run in chain[:-1])]
+    assert [run.manifest["prerequisite"] for run in chain] == [None, *(run.id for run in chain[:-1])]
     assert all(run.done for run in chain)
     above = [one.id for one in reversed(chain[:-1])]
-    assert [one["id"] for one in chain[-1].manifest["upstream_runs"]] == above
+    assert [one["id"] for one in chain[-1].manifest["prerequisite_runs"]] == above
     assert [run.manifest["name"].partition(" ·")[0] for run in chain[:2]] == ["upper codes", "lower codes"]
     whole = chain[-1]
     assert isinstance(build_experiment(config_of(whole)).architecture.load(whole.model), SAGENet)
@@ -73,13 +73,13 @@ FIRST = {
     "seed": (1, 0), "normalizer.z_scores": (True, 0), "model.frames": (10, 0), "model.code_width": (8, 0),
     "model.code_depth": (2, 0), "model.code_heads": (1, 0), "model.dropout": (0.2, 0),
     "data.drawn_by": ("clips", 0), "data.mirror": (True, 0), "optim.precision": ("bf16", 0),
-    "upstream.upper_codes.steps": (3, 0), "upstream.upper_codes.lr_drop": (0.5, 0),
-    "upstream.lower_codes.lr": (0.1, 1),
+    "prerequisite.upper_codes.steps": (3, 0), "prerequisite.upper_codes.lr_drop": (0.5, 0),
+    "prerequisite.lower_codes.lr": (0.1, 1),
     "model.width": (8, 2), "model.depth": (2, 2), "model.heads": (1, 2), "model.diffusion_steps": (99, 2),
-    "upstream.upper_diffusion.batch": (9, 2), "upstream.upper_diffusion.lr_drops_at": ([0.1], 2),
+    "prerequisite.upper_diffusion.batch": (9, 2), "prerequisite.upper_diffusion.lr_drops_at": ([0.1], 2),
     "model.sampling_steps": (2, 3), "model.noise": (0.1, 3), "model.noise_seed": (1, 3),
-    "upstream.lower_diffusion.steps": (3, 3),
-    "loss.orientation": (1.0, 4), "upstream.decoder.lr": (0.1, 4),
+    "prerequisite.lower_diffusion.steps": (3, 3),
+    "loss.orientation": (1.0, 4), "prerequisite.decoder.lr": (0.1, 4),
     "optim.steps": (3, 5), "optim.lr": (0.1, 5), "optim.clip_norm": (1.0, 5),
     "optim.log_every": (3, 6), "evaluation.batch": (3, 6), "vqvae.codes": (3, 6),
 }  # fmt: skip

@@ -148,7 +148,7 @@ def measure_seed(
                 f"--json: seed {seed} has other configs, component versions or data; use a new file"
             )
         return known
-    if len({(run.data, run.upstream.id if run.upstream else None) for run in runs.values()}) > 1:
+    if len({(run.data, run.prerequisite.id if run.prerequisite else None) for run in runs.values()}) > 1:
         raise InputError("--recipe: must not change the data or the VQ-VAE, which are not timed")
     learners = {}
     for name, experiment in experiments.items():

@@ -25,11 +25,12 @@ SHORT = 8  # characters of a shortened id
 MAX_LENGTH = 36  # characters of a shortened value
 SUMMARY = ("kind", "started", "finished")
 HIDDEN = (
-    "id", "name", "what", "data", "upstream", "upstream_runs", "sources", "source_bytes", "attempts",
-    "forgiven", "stages", *SUMMARY,
+    "id", "name", "data", "prerequisite", "prerequisite_runs", "sources",
+    "source_bytes", "attempts", "forgiven", "stages", *SUMMARY,
 )  # fmt: skip
 ORIGIN = (
-    "device", "gpu", "threads", "processes", "precision", "version", "git", "python", "packages", "recipes",
+    "device", "gpu", "threads", "processes", "precision", "version", "git", "python", "packages",
+    "component_versions",
 )  # fmt: skip
 
 
@@ -56,7 +57,7 @@ def show(run: str, config: bool, outputs: Path) -> None:
     if found.results:
         console().print(_pairs(measured_numbers(found), title="results"))
     origin = {key: value for key, value in found.manifest.items() if key not in HIDDEN}
-    components = {"recipes": origin.pop("recipes", {})}
+    components = {"component_versions": origin.pop("component_versions", {})}
     console().print(_pairs(flatten(origin | components), title="made by"))
     if config and found.config:
         console().print(_pairs(flatten(found.config), title="config"))
@@ -71,8 +72,8 @@ def _summary(run: Run) -> dict[str, Any]:
     facts |= {key: manifest[key] for key in SUMMARY if key in manifest}
     digest = str(values.get("data_digest", ""))[:SHORT]
     facts["data"] = " ".join(dict.fromkeys([str(values.get("data", "-")), digest]))
-    if upstream := manifest.get("upstream"):
-        facts["needs run"] = upstream
+    if prerequisite := manifest.get("prerequisite"):
+        facts["needs run"] = prerequisite
     attempts = [
         f"{one['stage']} from step {one['step']}, {one['started']}"
         for one in manifest.get("attempts", [])
@@ -168,7 +169,7 @@ def _origin_differences(first: Run, second: Run) -> list[tuple[str, ...]]:
     return [
         (key, _text(a.get(key)), _text(b.get(key)))
         for key in a | b
-        if a.get(key) != b.get(key) and (not key.startswith("recipes.") or (key in a and key in b))
+        if a.get(key) != b.get(key) and (not key.startswith("component_versions.") or (key in a and key in b))
     ]
 
 

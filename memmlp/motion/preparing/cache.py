@@ -30,7 +30,7 @@ from memmlp.motion.preparing.find_clips import Folders, Root, clip_name, find_cl
 from memmlp.motion.preparing.imported_body import body_name, check_imported_body
 from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manifest
 from memmlp.motion.preparing.splits import PARTS, Split
-from memmlp.runs.recipe_versions import RECIPES
+from memmlp.runs.component_versions import VERSIONS
 
 FRAMES_VERSION = 1  # number of a frame's content; a new one changes every digest, and so repeats every run
 CHUNK = 4096  # frames turned into features at a time
@@ -216,7 +216,7 @@ def frame_blocks(clip: Clip, rest: np.ndarray) -> Iterator[np.ndarray]:
 def _request_digest(source: ClipFolder, rest: np.ndarray) -> str:
     """Return a digest of the settings and of each source's path, size and times, without opening any file."""
     files = [(file, *_stamp(source.root / file)) for file in find_clips(source.root).files]
-    code = [FORMAT, FRAMES_VERSION, RECIPES["features"]]
+    code = [FORMAT, FRAMES_VERSION, VERSIONS["features"]]
     settings = [source.min_frames, source.interpolation, rest.tolist(), source.split.describe()]
     return _hash([*code, *settings, files])
 

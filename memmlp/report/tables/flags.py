@@ -85,7 +85,7 @@ def find_flags(
     yield from _unequal_training(sweep, runs)
     yield from _data_warnings(every, "partial", ", and no more")
     yield from _data_warnings(every, "divided")
-    yield from _unequal_recipes(every)
+    yield from _unequal_versions(every)
     if uncommitted := [label for label, run in every if run.origin.changed]:
         yield f"made by code with uncommitted changes: {quoted(uncommitted)}"
     if has_errors:
@@ -112,7 +112,7 @@ def missing_seeds(sweep: Sweep, variant: Variant, runs: Mapping[str, RunsBySeed]
 
 
 def older_code(runs: Iterable[tuple[str, Mapping[str, str], Iterable[str]]]) -> Iterator[str]:
-    """Flag runs that were made before code changed, though no recipe version was raised.
+    """Flag runs that were made before code changed, though no component version was raised.
 
     Args:
         runs: for each run its variant's label, the digests of its code (`code_digests`; empty where these are
@@ -123,7 +123,7 @@ def older_code(runs: Iterable[tuple[str, Mapping[str, str], Iterable[str]]]) -> 
     names = sorted({name for _, files in found for name in files})
     if names:
         labels = quoted(label for label, files in found if files)
-        since = "has changed since these runs, under the same recipes"
+        since = "has changed since these runs, under the same component versions"
         yield f"code of {listed(names, FILES)} {since}: {labels}"
 
 
@@ -349,17 +349,17 @@ def _data_warnings(every: Labelled, field: str, ending: str = "") -> Iterator[st
         yield f"{warning}{ending}: {labels}"
 
 
-def _unequal_recipes(every: Labelled) -> Iterator[str]:
-    versions = [(run.origin.every_recipe, label) for label, run in every]
+def _unequal_versions(every: Labelled) -> Iterator[str]:
+    versions = [(run.origin.every_version, label) for label, run in every]
     for name in sorted({name for known, _ in versions for name in known}):
         having = [(str(known[name]), label) for known, label in versions if name in known]
         yield from differences(f"recipe of {name}", having)
     weights: dict[str, list[tuple[str, str]]] = defaultdict(list)
     for label, run in every:
-        for upstream, digests in run.origin.upstream_weights.items():
-            weights[upstream] += [(digest, label) for digest in digests.split(", ")]
-    for upstream, having in weights.items():  # trained again, or on another machine
-        yield from differences(f"digest of the weights of upstream run {upstream}", having)
+        for prerequisite, digests in run.origin.prerequisite_weights.items():
+            weights[prerequisite] += [(digest, label) for digest in digests.split(", ")]
+    for prerequisite, having in weights.items():  # trained again, or on another machine
+        yield from differences(f"digest of the weights of prerequisite run {prerequisite}", having)
     for name in sorted({name for _, run in every for name in run.origin.plugins}):
         having = [(run.origin.plugins[name], label) for label, run in every if name in run.origin.plugins]
         yield from differences(f"code of {name}", having)
@@ -405,11 +405,11 @@ def _replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
         yield f"{each} (data.split.groups): right if no two share a person"
     if one_group and not one_seed:
         yield "one group of test clips: the intervals are about other seeds, not about other takes or people"
-    upstream = {label: {run.origin.upstream for run in found} for label, found in measured.items()}
+    prerequisite = {label: {run.origin.prerequisite for run in found} for label, found in measured.items()}
     one_vqvae = [
         label
         for label, found in measured.items()
-        if len(found) > 1 and len(upstream[label]) == 1 and None not in upstream[label]
+        if len(found) > 1 and len(prerequisite[label]) == 1 and None not in prerequisite[label]
     ]
     if one_vqvae:
         yield f"all seeds share one VQ-VAE, so they do not replicate it: {quoted(one_vqvae)}"

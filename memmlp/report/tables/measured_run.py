@@ -19,7 +19,7 @@ from memmlp.motion.preparing.groups import Grouping
 from memmlp.runs.deployment_folder import as_deployed, deployed_precision, timed_on
 from memmlp.runs.evaluation_file import intact, of_one_solver
 from memmlp.runs.lookup import frames_seen
-from memmlp.runs.origin import recorded_upstream, upstream_recipes
+from memmlp.runs.origin import prerequisite_versions, recorded_prerequisites
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import TIMES
 
@@ -40,7 +40,7 @@ SAME = 1e-4  # relative difference up to which two errors count as those of the 
 class Origin:
     """What a run was made from, and on which machine. All runs of a table should have the same origin.
 
-    Code, uncommitted changes, packages and machines include those of its upstream runs and its evaluations.
+    Code, uncommitted changes, packages and machines include those of its prerequisites and its evaluations.
 
     Attributes:
         code: the commit; the package's version outside a checkout.
@@ -54,11 +54,10 @@ class Origin:
         torch: torch's version.
         precision: the precision of training.
         body: whose rest joints the motion is on: "builtin" or the file of a body model.
-        recipes: the recipe version of each component.
-        upstream: the id of the upstream run: a VQ-VAE's, a part's, or that of the network before a refiner;
-            None if it is missing.
-        upstream_recipes: the recipe version of each component of the upstream runs, as far as known.
-        upstream_weights: a digest of the weights of each upstream run, by its id, as far as known; two where
+        component_versions: the version of each component.
+        prerequisite: the id of the prerequisite run, such as a VQ-VAE's; None if it is missing.
+        prerequisite_versions: the version of each component of the prerequisite runs, as far as known.
+        prerequisite_weights: a digest of the weights of each prerequisite run, by its id, if known; two if
             the run was resumed upon others.
         partial: which part of its protocol's list the data is, in words; None if it is complete.
         plugins: version and code digest of each user's package that it uses.
@@ -81,8 +80,8 @@ class Origin:
     torch: str = UNKNOWN
     precision: str = UNKNOWN
     body: str = UNKNOWN
-    recipes: Mapping[str, int] = field(default_factory=dict)
-    upstream: str | None = None
+    component_versions: Mapping[str, int] = field(default_factory=dict)
+    prerequisite: str | None = None
     partial: str | None = None
     plugins: Mapping[str, str] = field(default_factory=dict)
     offline: bool = False
@@ -91,13 +90,13 @@ class Origin:
     divided: str | None = None
     resampled: str | None = None
     unusual: str | None = None
-    upstream_recipes: Mapping[str, int] = field(default_factory=dict)
-    upstream_weights: Mapping[str, str] = field(default_factory=dict)
+    prerequisite_versions: Mapping[str, int] = field(default_factory=dict)
+    prerequisite_weights: Mapping[str, str] = field(default_factory=dict)
 
     @property
-    def every_recipe(self) -> Mapping[str, int]:
-        """The recipe version of each component, of the upstream runs too."""
-        return {**self.upstream_recipes, **self.recipes}
+    def every_version(self) -> Mapping[str, int]:
+        """The component version of each component, of the prerequisite runs too."""
+        return {**self.prerequisite_versions, **self.component_versions}
 
 
 @dataclass(frozen=True)
@@ -120,7 +119,7 @@ class Measured:
         training: what its training took, as far as known: `seconds`; `frames`, the frames seen, each counted
             as often as it was drawn in a window; and `flops` for kept results.
         code: a digest of the code of each file with which it was trained (`code_digests`), or several where
-            its upstream runs were trained with other code; empty for kept results.
+            its prerequisite runs were trained with other code; empty for kept results.
     """
 
     id: str
@@ -247,9 +246,13 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     deployments = [run.deployment(name) for name in stages or () if run.deployment(name).done]
     deployed = (deployments or [run.deployment_as_configured])[-1]
     latency = deployed.record
-    origin = _evaluated(_with_upstream(_origin(manifest), run), reports)
+    origin = _evaluated(_with_prerequisites(_origin(manifest), run), reports)
     origin = replace(origin, deployed=deployed_precision(latency))
-    origin = replace(origin, recipes={**origin.recipes, **deployed.recipes}, timed_on=timed_on(latency))
+    origin = replace(
+        origin,
+        component_versions={**origin.component_versions, **deployed.component_versions},
+        timed_on=timed_on(latency),
+    )
     seconds, frames = (manifest.get("seconds") or {}).get("train"), frames_seen(run)
     training = {"seconds": float(seconds)} if seconds is not None else {}
     training |= {"frames": frames} if frames else {}
@@ -319,7 +322,7 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
     # A training that other code resumed names the commit that it began with, too.
     before = [git["before"][:7]] if git.get("before") else []
     copied: dict[str, Any] = {name: of(name) for name in ("device", "gpu", "threads", "precision", "body")}
-    for name in ("upstream", "partial", "divided", "resampled", "unusual"):
+    for name in ("prerequisite", "partial", "divided", "resampled", "unusual"):
         copied[name] = manifest.get(name)
     return Origin(
         code=", ".join([*before, git["commit"][:7]]) if git else f"version {of('version')}",
@@ -328,7 +331,7 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
         hardware=of("cpu"),
         processes=str(manifest.get("processes") or 1),
         torch=str((manifest.get("packages") or {}).get("torch") or UNKNOWN),
-        recipes=manifest.get("recipes") or {},
+        component_versions=manifest.get("component_versions") or {},
         **copied,
         plugins={
             name: f"{one['version'] or 'no version'} ({one['digest']})"
@@ -338,25 +341,27 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
 
 
 def _code(manifest: Mapping[str, Any]) -> dict[str, str]:
-    own, *others = [one.get("sources") or {} for one in (manifest, *recorded_upstream(manifest))]
+    own, *others = [one.get("sources") or {} for one in (manifest, *recorded_prerequisites(manifest))]
     return {name: _words([own[name], *(one[name] for one in others if name in one)]) for name in own}
 
 
-def _with_upstream(origin: Origin, run: Run) -> Origin:
-    upstream = recorded_upstream(run.manifest)
+def _with_prerequisites(origin: Origin, run: Run) -> Origin:
+    prerequisite = recorded_prerequisites(run.manifest)
     digests: dict[str, list[str]] = defaultdict(list)
-    for one in upstream:
+    for one in prerequisite:
         digests[one["id"]] += [one["weights"][:8]] if one.get("weights") else []
     weights = {name: _words(found) for name, found in digests.items() if found}
-    joined = _joined(origin, list(map(_origin, upstream)))
-    return replace(joined, upstream_recipes=upstream_recipes(run.manifest), upstream_weights=weights)
+    joined = _joined(origin, list(map(_origin, prerequisite)))
+    return replace(
+        joined, prerequisite_versions=prerequisite_versions(run.manifest), prerequisite_weights=weights
+    )
 
 
 def _evaluated(origin: Origin, reports: Sequence[Mapping[str, Any]]) -> Origin:
     others = [_origin({**report.get("made_by", {}), **report}) for report in reports]
-    recipes = {name: number for one in (origin, *others) for name, number in one.recipes.items()}
+    versions = {name: number for one in (origin, *others) for name, number in one.component_versions.items()}
     offline = any(report.get("offline") for report in reports)
-    return replace(_joined(origin, others), recipes=recipes, offline=offline)
+    return replace(_joined(origin, others), component_versions=versions, offline=offline)
 
 
 def _joined(origin: Origin, others: Sequence[Origin]) -> Origin:

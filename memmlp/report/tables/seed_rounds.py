@@ -353,14 +353,14 @@ def check_same_runs(rounds: Rounds, sweep: Sweep, plan: Plan, path: Path) -> Non
     """Check that past analyses compared the same runs that the sweep's variants have now.
 
     Raises:
-        InputError: if an analysis compared other runs, because data, configs or recipes have changed since.
+        InputError: if an analysis compared other runs, after a change of data, configs or versions.
     """
     for one in rounds.analyses:
         for label, known in one.runs.items():
             if known != digest_of_runs(rounds, sweep, plan, label, one.seeds):
                 raise InputError(
-                    f"{path}: its interim analyses were of other runs of '{label}': data, configs or recipes "
-                    "changed since; remove it to restart them"
+                    f"{path}: its interim analyses were of other runs of '{label}': data, configs or "
+                    "versions changed since; remove it to restart them"
                 )
 
 

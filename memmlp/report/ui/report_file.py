@@ -21,7 +21,7 @@ MAX_REPLAYS = 4  # in the file
 REPLAY_SECONDS = 4
 ERROR = "stream.rotation.MPJPE"  # by which the best run of a sweep is found
 CURVES = ("train loss", "val rotation ", "val position MPJPE", "val loss")  # beginnings of names
-LONG_FACTS = ("source", "attempts", "upstream_runs")  # of a manifest, left out
+LONG_FACTS = ("source", "attempts", "prerequisite_runs")  # of a manifest, left out
 
 
 class ReportedSweep(NamedTuple):

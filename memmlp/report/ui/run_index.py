@@ -131,7 +131,7 @@ def read_facts(folder: Path) -> dict[str, Any]:
         "data": _text(manifest.get("data"))[:8],
         "data_name": _text(listed.get("data.name")),
         "device": _text(manifest.get("gpu")) or _text(manifest.get("device")),
-        "upstream": _text(manifest.get("upstream")),
+        "prerequisite": _text(manifest.get("prerequisite")),
         "steps": _total_steps(manifest.get("kind"), config),
         "recent": read_recent(run.metrics_path),
         "config": listed,

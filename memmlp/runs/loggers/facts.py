@@ -18,7 +18,7 @@ from memmlp.runs.metrics_log import parsed
 from memmlp.runs.notes import read_notes
 from memmlp.runs.run import Run
 
-ORIGIN = ("kind", "data", "upstream", "started", "version", "user", "host", "device", "gpu", "threads")
+ORIGIN = ("kind", "data", "prerequisite", "started", "version", "user", "host", "device", "gpu", "threads")
 
 
 class CurvePoint(NamedTuple):

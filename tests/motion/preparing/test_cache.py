@@ -25,7 +25,7 @@ from memmlp.motion.preparing.cache import ClipFolder, prepare
 from memmlp.motion.preparing.imported_body import RECORD, body_record
 from memmlp.motion.preparing.manifest import Manifest
 from memmlp.motion.preparing.splits import SeededSplit
-from memmlp.runs.recipe_versions import RECIPES
+from memmlp.runs.component_versions import VERSIONS
 
 
 def motion(length: int, seed: int, fps: float = 60.0) -> Clip:
@@ -199,7 +199,7 @@ def test_frames_of_an_older_component_version_are_made_again(root, tmp_path, mon
     made = (tmp_path / "cache" / "train.npy").stat().st_mtime_ns
     prepare(source(root), tmp_path / "cache")
     assert (tmp_path / "cache" / "train.npy").stat().st_mtime_ns == made
-    monkeypatch.setitem(RECIPES, "features", RECIPES["features"] + 1)
+    monkeypatch.setitem(VERSIONS, "features", VERSIONS["features"] + 1)
     again = prepare(source(root), tmp_path / "cache")
     assert (tmp_path / "cache" / "train.npy").stat().st_mtime_ns > made
     assert again.digest == first.digest

@@ -242,7 +242,7 @@ ORIGINS = [
     ({"threads": 2}, ("threads differs", "2 of 'by position'")),
     ({"packages": {"torch": "3.0"}}, ("torch differs", "3.0 of 'by position'")),
     ({"precision": "bf16"}, ("precision differs", "bf16 of 'by position'")),
-    ({"recipes": {"memory": 2}}, ("memory differs", "2 of 'by position'")),
+    ({"component_versions": {"memory": 2}}, ("memory differs", "2 of 'by position'")),
 ]
 
 
@@ -255,18 +255,26 @@ def test_runs_of_different_origin(flags: Callable[..., list[str]]):
 
         (flag,) = flags(words[0], settings)
         assert all(word in flag for word in words)
-    extra = {"by position": {"recipes": {"memory": 1, "gru": 7}}}  # a component of one variant alone
+    extra = {
+        "by position": {"component_versions": {"memory": 1, "gru": 7}}
+    }  # a component of one variant alone
     assert flags("gru", lambda label, _: {"origin": extra.get(label)}) == []
 
 
-UPSTREAM = {**ORIGIN, "id": "a" * 16, "weights": "1" * 64, "recipes": {"vqvae": 1}, "sources": {"ik.py": "1"}}
-UPSTREAMS = [
+PREREQUISITES = {
+    **ORIGIN,
+    "id": "a" * 16,
+    "weights": "1" * 64,
+    "component_versions": {"vqvae": 1},
+    "sources": {"ik.py": "1"},
+}
+CHANGED_PREREQUISITES = [
     ({"git": ORIGIN["git"] | {"commit": "fedcba98"}}, "code differs: 0123456 of 'no | memory', "),
     ({"git": ORIGIN["git"] | {"commit": "fedcba98"}}, "; 0123456, fedcba9 of 'by position'"),
     ({"git": ORIGIN["git"] | {"dirty": True}}, "made by code with uncommitted changes: 'by position'"),
     ({"cpu": "Another one"}, "; A processor, Another one of 'by position'"),
     ({"gpu": "A card"}, "; none, A card of 'by position'"),
-    ({"recipes": {"vqvae": 2}}, "of vqvae differs: 1 of 'no | memory', 'full_model'; 2 of 'by po"),
+    ({"component_versions": {"vqvae": 2}}, "of vqvae differs: 1 of 'no | memory', 'full_model'; 2 of 'by po"),
     ({"sources": {"ik.py": "3"}}, "code of ik.py has changed since these runs"),
     ({"weights": "2" * 64}, "aaaaaaaaaaaaaaaa differs: 11111111 of "),
 ]
@@ -280,13 +288,15 @@ def test_prerequisite_runs_of_different_origin(
 
     def flags_upon(change: dict[str, Any]) -> list[str]:
         def settings(label: str, _: int) -> dict[str, Any]:
-            run = UPSTREAM | (change if label == "by position" else {})
-            return {"origin": {"upstream": run["id"], "upstream_runs": [run], "sources": {"ik.py": "1"}}}
+            run = PREREQUISITES | (change if label == "by position" else {})
+            return {
+                "origin": {"prerequisite": run["id"], "prerequisite_runs": [run], "sources": {"ik.py": "1"}}
+            }
 
         return flags("", settings)
 
     before = flags_upon({})
-    for change, words in UPSTREAMS:
+    for change, words in CHANGED_PREREQUISITES:
         assert any(words in flag for flag in flags_upon(change)), words
         assert not any(words in flag for flag in before)
 
@@ -296,8 +306,8 @@ def test_seeds_upon_other_weights_of_one_prerequisite(sweep: Sweep, tmp_path: Pa
     weights: dict[int, list[str]] = {0: ["1"], 1: ["1", "2"], 2: []}
 
     def run(variant, seed: int) -> Run:
-        runs = [UPSTREAM | {"weights": 64 * one} for one in weights[seed]]
-        made = {"upstream": UPSTREAM["id"], **({"upstream_runs": runs} if runs else {})}
+        runs = [PREREQUISITES | {"weights": 64 * one} for one in weights[seed]]
+        made = {"prerequisite": PREREQUISITES["id"], **({"prerequisite_runs": runs} if runs else {})}
         return fake_run(tmp_path, variant.label, seed, origin=made)
 
     def found(runs) -> list[str]:
@@ -421,9 +431,9 @@ def test_variants_that_share_a_single_seed(sweep: Sweep, tmp_path: Path):
 
 
 def test_seeds_that_share_a_vqvae(flags: Callable[..., list[str]]):
-    (flag,) = flags("share one VQ-VAE", lambda *_: {"origin": {"upstream": "v"}}, (0, 1))
+    (flag,) = flags("share one VQ-VAE", lambda *_: {"origin": {"prerequisite": "v"}}, (0, 1))
     assert flag.endswith(EVERY)
-    assert flags("share one VQ-VAE", lambda _, seed: {"origin": {"upstream": f"v{seed}"}}, (0, 1)) == []
+    assert flags("share one VQ-VAE", lambda _, seed: {"origin": {"prerequisite": f"v{seed}"}}, (0, 1)) == []
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,9 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
 from memmlp.report.kept_results import Kept, dumps, load_kept
 from memmlp.report.tables.measured_run import Measured, load
+from memmlp.runs.component_versions import VERSIONS, outdated
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.identity import deployment_id_of
-from memmlp.runs.recipe_versions import RECIPES, outdated
 from memmlp.sweep.definition import Sweep
 
 
@@ -48,17 +48,17 @@ def test_size_and_times_are_of_the_precision_that_was_asked_for(sweep: Sweep, tm
 
 def test_costs_of_an_earlier_recipe_are_known_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     run, settings = fake_run(tmp_path, "run"), {"graph": "naive", "precision": "int8"}
-    before = load(run.folder).origin.recipes
+    before = load(run.folder).origin.component_versions
     path = run.deployment("fp32-0").latency
     path.write_text(json.dumps(json.loads(path.read_text()) | {"settings": settings}))
     path.parent.rename(path.parent.with_name(deployment_id_of(settings)))
-    after = load(run.folder).origin.recipes
+    after = load(run.folder).origin.component_versions
     made_by = {name: number for name, number in after.items() if name not in before}
     assert made_by.keys() == {"export", "latency", "graph.naive", "int8"}
     number = made_by["latency"]
-    monkeypatch.setitem(RECIPES, "latency", number + 1)
+    monkeypatch.setitem(VERSIONS, "latency", number + 1)
     assert outdated(made_by) == [f"latency {number} -> {number + 1}"]
-    assert load(run.folder).origin.recipes == before  # by which numbers it was made, is not known
+    assert load(run.folder).origin.component_versions == before  # by which numbers it was made, is not known
 
 
 def test_what_an_evaluation_ran_on_counts_too(sweep: Sweep, tmp_path: Path):
@@ -80,10 +80,10 @@ def test_a_refined_network_saw_its_own_frames_and_the_refiners(tmp_path: Path):
     optim = {"steps": 10, "batch": 2}
     network = fake_run(tmp_path, "network", config={"optim": optim, "model": {"frames": 7}, "refiner": None})
     config = {"optim": {"steps": 5, "batch": 4}, "model": {"frames": 7}, "refiner": {"frames": 30}}
-    refined = fake_run(tmp_path, "refined", config=config, origin={"upstream": network.id})
+    refined = fake_run(tmp_path, "refined", config=config, origin={"prerequisite": network.id})
     seen = [load(run.folder).training.get("frames") for run in (network, refined)]
     assert seen == [140, 140 + 600]
-    orphan = fake_run(tmp_path, "orphan", config=config, origin={"upstream": "0" * 16})
+    orphan = fake_run(tmp_path, "orphan", config=config, origin={"prerequisite": "0" * 16})
     assert "frames" not in load(orphan.folder).training  # what came before is not known
 
 

@@ -12,7 +12,7 @@ from report.ui.conftest import run_of
 
 from memmlp.common.errors import InputError
 from memmlp.report.ui.replay import Replays, cut_piece, find_worst_seconds
-from memmlp.runs.recipe_versions import RECIPES
+from memmlp.runs.component_versions import VERSIONS
 from memmlp.runs.run import Run
 
 FRAMES = 900
@@ -101,7 +101,7 @@ def test_a_prediction_of_an_older_recipe_is_computed_again(outputs: Path, monkey
     run, found = run_of(outputs), []
     for at in (300, 100):
         found.append(ready(Replays(outputs, lambda *_, at=at: motion(at)), run.id, "a clip", "stream"))
-        monkeypatch.setitem(RECIPES, "mode.stream", RECIPES["mode.stream"] + 1)
+        monkeypatch.setitem(VERSIONS, "mode.stream", VERSIONS["mode.stream"] + 1)
     assert [one["worst"][0]["first"] for one in found] == [300, 100]
 
 

@@ -11,9 +11,9 @@ from report.ui.conftest import started_run
 
 from memmlp.evaluation.metric_facts import HIGHER, UNITS
 from memmlp.report.ui.runs import Curves, describe_units, differing_keys, outdated_modes, thin_out
+from memmlp.runs.component_versions import VERSIONS
 from memmlp.runs.evaluation_file import write_report
-from memmlp.runs.identity import evaluation_id_of, evaluation_recipes, evaluation_settings
-from memmlp.runs.recipe_versions import RECIPES
+from memmlp.runs.identity import evaluation_id_of, evaluation_settings, evaluation_versions
 from memmlp.runs.run import Run
 
 
@@ -46,11 +46,11 @@ def test_units_and_what_is_better_of_known_metrics():
 
 def test_modes_of_an_earlier_component_version_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     run, settings = Run(tmp_path / ("a" * 16)), evaluation_settings({}, "window")
-    report = {"mode": "window", "settings": settings, "recipes": evaluation_recipes(settings)}
+    report = {"mode": "window", "settings": settings, "component_versions": evaluation_versions(settings)}
     write_report(run.evaluation(evaluation_id_of(settings)), {**report, "mean": {}, "clips": []})
     assert outdated_modes(run) == []
-    now = RECIPES["mode.window"]
-    monkeypatch.setitem(RECIPES, "mode.window", now + 1)
+    now = VERSIONS["mode.window"]
+    monkeypatch.setitem(VERSIONS, "mode.window", now + 1)
     assert outdated_modes(run) == [f"window (mode.window {now} -> {now + 1})"]
     run.config_path.write_text("[")
     assert outdated_modes(run) == []

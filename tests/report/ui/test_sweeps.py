@@ -74,12 +74,12 @@ def test_progress_and_time_left(outputs: Path, monkeypatch: pytest.MonkeyPatch):
 def test_a_run_that_lacks_an_evaluation_is_trained_and_a_vqvae_is_a_prerequisite(outputs: Path):
     path = outputs / "sweeps" / "mine" / "plan.json"
     plan = Plan.load(path)
-    upstream = fake_run(outputs, "vqvae")
+    prerequisite = fake_run(outputs, "vqvae")
     first = plan.entries[0]
     tasks = tuple(
         replace(task, stages=("stream-absent",)) if task.id == first.id else task for task in plan.tasks
     )
-    vqvae = RunTask(upstream.id, "vqvae", {"vqvae": {"steps": 20}})
+    vqvae = RunTask(prerequisite.id, "vqvae", {"vqvae": {"steps": 20}})
     entries = (replace(first, stages=("stream-absent",)), *plan.entries[1:])
     replace(plan, entries=entries, tasks=(vqvae, *tasks)).save(path)
     sweeps = sweeps_of(outputs)

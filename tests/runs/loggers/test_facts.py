@@ -8,9 +8,9 @@ import pytest
 from fake_logger import a_run, an_outdated_evaluation
 
 from memmlp.common.files import write_json
+from memmlp.runs.component_versions import VERSIONS
 from memmlp.runs.loggers.facts import SweepFacts, Tail, read_run
 from memmlp.runs.notes import add_tags, set_note
-from memmlp.runs.recipe_versions import RECIPES
 
 
 def test_status_is_that_of_the_folder(tmp_path: Path):
@@ -55,10 +55,10 @@ def test_name_origin_data_labels_and_note(tmp_path: Path):
 def test_results_by_an_earlier_recipe_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     run = a_run(tmp_path, evaluation={"ik": "off"})
     an_outdated_evaluation(run)
-    monkeypatch.setitem(RECIPES, "mode.stream", 0)
+    monkeypatch.setitem(VERSIONS, "mode.stream", 0)
     now = read_run(run).fingerprint
     assert read_run(run).outdated == ""
-    monkeypatch.setitem(RECIPES, "mode.stream", 1)
+    monkeypatch.setitem(VERSIONS, "mode.stream", 1)
     assert read_run(run).outdated == "stream (mode.stream 0 -> 1)"
     assert read_run(run).fingerprint != now
 

@@ -32,7 +32,7 @@ CONFIG = {
 
 def a_run(outputs: Path, name: str = "0" * 16) -> Run:
     run = Run.of(outputs, name)
-    run.begin("memmlp", CONFIG, data="d", upstream="u")
+    run.begin("memmlp", CONFIG, data="d", prerequisite="u")
     for step in range(1, 6):
         run.log(step, {"loss": 1 / step, "bad": math.nan})
     write_json(run.results_path, {"stream": {"rotation": {"MPJPE": 6.5}}, "note": "text"})
@@ -79,7 +79,7 @@ def test_a_run_from_its_start_to_its_end(tmp_path: Path, capfd: pytest.CaptureFi
     session.end()
     found = shown(tmp_path)[run.id]
     assert (found.info.status, found.info.run_name) == ("FINISHED", "memory=gru · seed 1")
-    assert (found.data.tags["memmlp.upstream"], found.data.tags["mlflow.user"]) == ("u", "somebody")
+    assert (found.data.tags["memmlp.prerequisite"], found.data.tags["mlflow.user"]) == ("u", "somebody")
     assert found.data.tags["mlflow.source.git.commit"] == "c" * 40
     (given,) = found.inputs.dataset_inputs
     assert (given.dataset.name, given.dataset.digest) == ("mine", "d")
@@ -134,7 +134,7 @@ def test_many_values_go_in_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(MlflowClient, "log_batch", spy)
     run = Run.of(tmp_path, "2" * 16)
-    run.begin("memmlp", {f"key{i}": i for i in range(250)}, data="d", upstream=None)
+    run.begin("memmlp", {f"key{i}": i for i in range(250)}, data="d", prerequisite=None)
     for step in range(600):
         run.log(step, {"a": 1.0, "b": 2.0})
     sync(MLflow(None, tmp_path), [run], print)

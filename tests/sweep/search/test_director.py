@@ -191,7 +191,7 @@ def test_a_pruned_trials_run_is_wanted_again_by_one_with_its_values(tmp_path: Pa
         seen.add(task.id)
         run = plan.run_of(task)
         if not run.done:
-            run.begin("memmlp", task.config, data="d", upstream=None)
+            run.begin("memmlp", task.config, data="d", prerequisite=None)
             log(run, 10, 5.0 if not seen - {task.id} else 9.0)
             one.update(1)
             if study.trials[-1].state != TrialState.PRUNED and not run.done:

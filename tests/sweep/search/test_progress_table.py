@@ -34,7 +34,7 @@ def test_the_devices_of_runs_under_way_are_counted(tmp_path: Path):
     assert "running on" not in drawn(study, tmp_path)
     runs = [plan.run_of(task) for task in plan.tasks]
     for run, task, facts in zip(runs, plan.tasks, (CARD, {"device": "cpu"}, CARD), strict=True):
-        run.begin("memmlp", task.config, data="d", upstream=None)
+        run.begin("memmlp", task.config, data="d", prerequisite=None)
         run.write_manifest(facts)
     with runs[0].lock(), runs[1].lock(), runs[2].lock():
         assert "running on GPU 1 (A card): 2, cpu: 1" in drawn(study, tmp_path)

@@ -57,7 +57,7 @@ function facts(run) {
   return pairs([
     ['id', code(run.id)], ['started', h('span', { title: ago(run.started) }, date(run.started))], ['took', duration(run.seconds)],
     ['data', code(dataName(run.data) || '–')], ['device', run.device || '–'], ['code', code(run.code || '–')],
-    run.upstream && ['prerequisite', link(address('run', run.upstream), run.upstream.slice(0, 8))],
+    run.prerequisite && ['prerequisite', link(address('run', run.prerequisite), run.prerequisite.slice(0, 8))],
     run.control && ['control', [link(address('run', run.control.id), nameOf(run.control)), ' · ', link(address('compare', '', { runs: `${run.id},${run.control.id}` }), 'compare')]],
   ].filter(Boolean), 'facts');
 }
@@ -178,7 +178,7 @@ function latency({ latency: found }) {
 function files(run) {
   const name = file => (file.viewable && !inFile ? h('a', { href: `files/${run.id}/${encodeURIComponent(file.name)}`, target: '_blank', rel: 'noopener' }, file.name) : file.name);
   const sum = run.files.reduce((total, file) => total + file.bytes, 0);
-  const manifest = Object.entries(run.manifest).filter(([key]) => !/^(attempts|sources|seconds|upstream_runs)/.test(key)).map(([key, value]) => [key, word(value)]);
+  const manifest = Object.entries(run.manifest).filter(([key]) => !/^(attempts|sources|seconds|prerequisite_runs)/.test(key)).map(([key, value]) => [key, word(value)]);
   return section('Files and origin',
     h('details', {}, h('summary', {}, `${run.files.length} files, ${bytes(sum)}`), table(null, run.files.map(file => [name(file), bytes(file.bytes), run.changed.includes(file.name) ? 'changed' : '']))),
     manifest.length ? h('details', {}, h('summary', {}, 'Manifest'), pairs(manifest)) : null);

@@ -1,4 +1,4 @@
-"""A still pose is one pose, which the head carries along, and at first the average of its training frames."""
+"""A constant pose moves with the head, and is at first the average of its training frames."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from memmlp.motion.body import HEAD, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSI
 from memmlp.motion.geometry import sixd_to_matrix
 from memmlp.motion.network_coordinates import Heading
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.still_pose import StillPose, StillPoseSettings
+from memmlp.networks.constant_pose import ConstantPose, ConstantPoseSettings
 from memmlp.networks.streaming import streaming
 
 CLIP = tiny.clip(40)
 
 
 @pytest.fixture
-def model() -> StillPose:
+def model() -> ConstantPose:
     """One that was fitted to a clip and then moved off its average."""
-    model = StillPose(Normalizer.fit(Heading(), tiny.REST, CLIP), StillPoseSettings(frames=7))
+    model = ConstantPose(Normalizer.fit(Heading(), tiny.REST, CLIP), ConstantPoseSettings(frames=7))
     torch.nn.init.normal_(model.pose, generator=torch.Generator().manual_seed(0))
     return model.eval()
 
@@ -36,7 +36,7 @@ def rotations(motion: torch.Tensor) -> torch.Tensor:
 
 
 @torch.no_grad()
-def test_the_pose_is_the_same_and_the_head_where_its_tracker_is(model: StillPose):
+def test_the_pose_is_the_same_and_the_head_where_its_tracker_is(model: ConstantPose):
     (motion,) = modes.stream(model, [CLIP])
     local = rotations(motion)
     torch.testing.assert_close(local[:, 1:], local[:1, 1:].expand(len(CLIP), -1, -1, -1))
@@ -49,14 +49,14 @@ def test_the_pose_is_the_same_and_the_head_where_its_tracker_is(model: StillPose
 def test_its_first_gradient_is_that_of_rotations(normalize: bool):
     """Zeros are no rotation, and the gradient of one made of them is 1e12 times that of another."""
     made = Normalizer.fit(Heading(), tiny.REST, CLIP) if normalize else Normalizer.raw(Heading(), tiny.REST)
-    model = StillPose(made, StillPoseSettings(frames=7))
+    model = ConstantPose(made, ConstantPoseSettings(frames=7))
     motion = model.training_call(CLIP[None, :7, :SPARSE_DIM], {}, CLIP[None, :7]).motion
     (rotations(motion) * torch.rand(22, 3, 3)).sum().backward()
     assert 1e-3 < float(model.pose.grad.norm()) < 1e3
 
 
 @torch.no_grad()
-def test_it_turns_with_the_head_and_with_nothing_else(model: StillPose):
+def test_it_turns_with_the_head_and_with_nothing_else(model: ConstantPose):
     """The root's turns are about the vertical, and those of the head's heading."""
     (motion,) = modes.stream(model, [CLIP])
     root = rotations(motion)[:, 0]
@@ -72,7 +72,7 @@ def test_it_turns_with_the_head_and_with_nothing_else(model: StillPose):
 @torch.no_grad()
 def test_at_first_it_is_the_average():
     normalizer = Normalizer.fit(Heading(), tiny.REST, CLIP)
-    (motion,) = modes.stream(StillPose(normalizer, StillPoseSettings(frames=7)).eval(), [CLIP])
+    (motion,) = modes.stream(ConstantPose(normalizer, ConstantPoseSettings(frames=7)).eval(), [CLIP])
     mean = CLIP[:, SPARSE_DIM:][:, 6 : ROTATION.stop].mean(0)
     torch.testing.assert_close(motion[:, 6 : ROTATION.stop], mean.expand(len(CLIP), -1), atol=1e-5, rtol=0)
 
@@ -80,7 +80,7 @@ def test_at_first_it_is_the_average():
 @pytest.mark.slow
 @pytest.mark.parametrize("precision", ["int8", "int8_blocks", "fp16"])
 def test_its_file_is_the_network_and_has_nothing_in_a_lower_precision(
-    model: StillPose, tmp_path: Path, precision: str
+    model: ConstantPose, tmp_path: Path, precision: str
 ):
     path, stream = tmp_path / "step.onnx", streaming(model)
     export(stream, path, "0123456789abcdef")

@@ -8,11 +8,11 @@ every component and fails until that is done. Moving or renaming code changes no
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from memmlp.common.components import declared
 
-RECIPES: dict[str, int] = {
+VERSIONS: dict[str, int] = {
     # what networks see (memmlp.motion)
     "features": 1,
     # parts of networks that are no option of a slot
@@ -29,7 +29,6 @@ RECIPES: dict[str, int] = {
     "ema": 1,
     "warmup": 1,
     "precision.bf16": 2,
-    "loss.own": 1,  # the former name of loss.of_network
     "weighting.learned": 2,
     # how they are evaluated (memmlp.evaluation)
     "metrics": 1,
@@ -50,18 +49,18 @@ RECIPES: dict[str, int] = {
 
 
 def version_of(component: str) -> int:
-    """Return the version of a component, named SLOT.NAME or as in RECIPES; 0 if it is not in use."""
+    """Return the version of a component, named SLOT.NAME or as in VERSIONS; 0 if it is not in use."""
     slot, _, name = component.partition(".")
     found = declared().get((slot, name))
-    return RECIPES.get(component, found.version if found else 0)
+    return VERSIONS.get(component, found.version if found else 0)
 
 
-def outdated(known: Mapping[str, int]) -> list[str]:
-    """Describe which of the known recipe versions, by component, are different now: "name old -> new"."""
-    now = recipes(list(known))
-    return [f"{name} {number} -> {now[name]}" for name, number in known.items() if now[name] != number]
-
-
-def recipes(components: list[str]) -> dict[str, int]:
-    """Return the recipe versions of components by name; 0 for a component that is not in use."""
+def find_versions(components: Iterable[str]) -> dict[str, int]:
+    """Return the versions of components by name; 0 for a component that is not in use."""
     return {name: version_of(name) for name in sorted(components)}
+
+
+def outdated(recorded: Mapping[str, int]) -> list[str]:
+    """Describe the recorded component versions that differ from the current ones: "name old -> new"."""
+    now = find_versions(recorded)
+    return [f"{name} {number} -> {now[name]}" for name, number in recorded.items() if now[name] != number]

@@ -25,16 +25,16 @@ from memmlp.networks.motion_model import (
 from memmlp.networks.settings import NetworkSettings
 
 
-class StillPoseGraph(FrameGraph):
+class ConstantPoseGraph(FrameGraph):
     """The streaming graph of one pose, in which nothing can be quantised."""
 
     float32_modules = ()
-    model: StillPose
+    model: ConstantPose
 
 
-@component("model", "still_pose", builds="StillPose")
+@component("model", "constant_pose", builds="ConstantPose")
 @dataclass
-class StillPoseSettings(NetworkSettings):
+class ConstantPoseSettings(NetworkSettings):
     """One pose that turns and moves with the head: a floor for tables, which knows only the average pose."""
 
     frames: int = setting(at_least(2), tiny=10, small=40, paper=40)  # T, the frames of a training window
@@ -43,16 +43,16 @@ class StillPoseSettings(NetworkSettings):
     recipe: ClassVar = {"normalizer.coordinates": "heading", "normalizer.z_scores": True}
 
 
-class StillPose(WindowlessModel):
+class ConstantPose(WindowlessModel):
     """A learned pose, which the coordinates alone turn and carry along: by default with the head.
 
     It has 132 parameters: the joints' local rotations, at first those of the normalizer's mean, or none where
     it has no mean (`normalizer.z_scores=false`).
     """
 
-    graph = StillPoseGraph
+    graph = ConstantPoseGraph
 
-    def __init__(self, normalizer: Normalizer, settings: StillPoseSettings):
+    def __init__(self, normalizer: Normalizer, settings: ConstantPoseSettings):
         super().__init__(normalizer, settings.frames)
         self.pose = nn.Parameter(torch.zeros(ROTATION.stop))
         if not normalizer.mean.any():  # zeros would be no rotations then, and their gradient has no bound
