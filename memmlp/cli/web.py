@@ -12,12 +12,10 @@ from memmlp.cli.run_remarks import remark_on
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
-    from memmlp.live.web.networks import SiteNetwork
-    from memmlp.live.web.site import SiteClip
+    from memmlp.live.web.site import SiteClip, SiteNetwork
 
 BASE = ("profile=paper", "model=avatar_poser")
 """The network with which the bench compares: AvatarPoser in the paper's size, with random weights."""
-CALIBRATION = 2  # clips: int8's ranges do not matter for the time
 
 
 @click.command("web")
@@ -33,7 +31,6 @@ CALIBRATION = 2  # clips: int8's ranges do not matter for the time
     type=Finite(1, 600),
     help="Longest part of a clip, from its middle, seconds.",
 )
-@click.option("--no-webgpu", is_flag=True, help="Leave out WebGPU's files, 6.7 MB.")
 @click.option("--no-bench", is_flag=True, help="Leave out the bench, and the graphs that it times.")
 @plugins_option
 @outputs_option
@@ -42,22 +39,19 @@ def web(
     out: Path,
     clips: int,
     seconds: float,
-    no_webgpu: bool,
     no_bench: bool,
     outputs: Path,
 ) -> None:
     """Make a site of finished RUNS (ids, their beginnings, or folders) that any static server can serve.
 
     In the browser, such as a headset's, it times each network, plays test clips, and shows the wearer's body
-    in a mirror (docs/guides/web.md). The command downloads onnxruntime-web and three.js from the npm
-    registry, once.
+    in a mirror (docs/guides/web.md). The command downloads onnxruntime-web from the npm registry, once.
     """
     check_runs(outputs, *runs)
     from memmlp.common.errors import InputError
     from memmlp.config.build import untrained
     from memmlp.config.open_run import open_run
-    from memmlp.live.web.networks import SiteNetwork
-    from memmlp.live.web.site import Site, check_place
+    from memmlp.live.web.site import RANDOM, Site, SiteNetwork, check_place
 
     check_place(out)
     opened = [open_run(outputs, run) for run in dict.fromkeys(runs)]
@@ -65,13 +59,11 @@ def web(
         raise InputError(f"{' '.join(runs)}: expected each run only once")
     found = {one.run.id: pack_clips(one, clips, seconds) for one in opened}
     networks = [describe_network(one, found[one.run.id]) for one in opened]
-    base = None if no_bench else SiteNetwork("avatar-poser", "AvatarPoser", "random", untrained(BASE))
+    base = None if no_bench else SiteNetwork("avatar-poser", "AvatarPoser", RANDOM, untrained(BASE))
     site = Site(
         networks=networks,
         base=base,
         clips=list({clip.key: clip for some in found.values() for clip in some}.values()),
-        calibration=[] if no_bench else opened[0].data.open("train").clips()[:CALIBRATION],
-        webgpu=not no_webgpu,
     )
     size = site.make(out)
     click.echo(f"{out}: {size / 1e6:.1f} MB; serve it with: python -m http.server --directory {out}")
@@ -91,7 +83,7 @@ def pack_clips(opened: OpenedRun, count: int, seconds: float) -> list[SiteClip]:
 
 def describe_network(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:
     """Return a run's network in the form that a site needs."""
-    from memmlp.live.web.networks import SiteNetwork
+    from memmlp.live.web.site import SiteNetwork
     from memmlp.networks.streaming import check_streams
     from memmlp.runs.identity import flatten
     from memmlp.runs.lookup import frames_seen, hardly_trained, run_name

@@ -12,7 +12,7 @@ import tiny
 
 from memmlp.cli.web import describe_network
 from memmlp.common.errors import InputError
-from memmlp.common.npm import ONNXRUNTIME_WEB, THREE, tarball
+from memmlp.common.npm import ONNXRUNTIME_WEB, tarball
 from memmlp.runs.lookup import is_trained, list_runs
 
 pytestmark = pytest.mark.slow
@@ -20,11 +20,11 @@ pytestmark = pytest.mark.slow
 
 def test_a_site_to_play_and_wear(home: Path):
     try:
-        tarball(ONNXRUNTIME_WEB), tarball(THREE)
+        tarball(ONNXRUNTIME_WEB)
     except InputError as error:
         pytest.skip(str(error))
     (run,) = [run.id for run in list_runs(home / "outputs") if is_trained(run)]
-    words = ("web", run[:6], "--out", "site", "--no-bench", "--no-webgpu", "--clips", "2", "--seconds", "1")
+    words = ("web", run[:6], "--out", "site", "--no-bench", "--clips", "2", "--seconds", "1")
     said = command_line.run(home, *words)
     assert "python -m http.server --directory site" in said
     about = json.loads((home / "site" / "site.json").read_text())
@@ -34,7 +34,6 @@ def test_a_site_to_play_and_wear(home: Path):
     assert network["remark"].startswith("hardly trained (its steps saw")
     assert f"run {run}: {network['remark']}" in said
     assert "base" not in about
-    assert about["backends"] == ["wasm"]
     assert [clip["frames"] for clip in about["clips"]] == [60] * len(about["clips"])
     assert network["clips"] == [clip["key"] for clip in about["clips"]]
     size = sum(path.stat().st_size for path in (home / "site").rglob("*") if path.is_file())

@@ -1,64 +1,91 @@
-"""A site as a folder of static files: the page, packages, networks, clips, and a service worker."""
+"""A site as a folder of static files: the page, ONNX Runtime, networks, clips, and a service worker."""
 
 from __future__ import annotations
 
-import base64
 import gzip
 import hashlib
 import json
-import re
 import shutil
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from torch import Tensor
+import onnx
+import torch
+from onnx import numpy_helper
 
 from memmlp import __version__
 from memmlp.common.errors import InputError
 from memmlp.common.files import file_digest, now, read_json
 from memmlp.common.lease import publish, temporary
-from memmlp.common.npm import ONNXRUNTIME_WEB, THREE, read
+from memmlp.common.npm import ONNXRUNTIME_WEB, read
+from memmlp.common.page_server import read_page_file, security_policy
+from memmlp.common.progress import announce
+from memmlp.deploy.export import export
 from memmlp.deploy.latency import yardstick
-from memmlp.live.rotations import matrix_to_quaternion
+from memmlp.deploy.lower_precision import lower
+from memmlp.live.rotations import BodyTree, matrix_to_quaternion
 from memmlp.live.session.loop import TOP
 from memmlp.live.session.sources import TrackedClip
 from memmlp.live.spaces import SPACES
-from memmlp.live.web.networks import SiteNetwork, write_network, write_weightless
-from memmlp.motion.body import FPS, JOINTS
+from memmlp.live.trackers_to_body_graph import export_full
+from memmlp.live.wearer import stature
+from memmlp.motion.body import FPS, FRAME_DIM, JOINTS, PARENTS, TRACKED
 from memmlp.motion.limb_shapes import HEAT, LIMBS
+from memmlp.networks.motion_model import MotionModel, StreamingGraph
+from memmlp.networks.streaming import has_stream, streaming
 
 ABOUT = "site.json"
-PAGES: dict[str, tuple[str, ...] | None] = {
-    "memmlp.live.web": None,
-    "memmlp.live.session": ("stage.js", "history.js"),
+SPACE = SPACES["openxr"]  # of everything on the site
+OTHER_PAGES = {
+    "memmlp.live.session": (
+        "stage.js", "history.js", "three/three.module.min.js", "three/three.core.min.js",
+        "three/OrbitControls.js", "three/LICENSE",
+    ),
     "memmlp.common": ("theme.js", "dom.js", "style.css"),
-}
-"""The packages whose files of pages a site uses, and which; None for all."""
-DRAWING = {
-    "LICENSE": "three/LICENSE",
-    "build/three.core.js": "three/three.core.js",
-    "build/three.module.js": "three/three.module.js",
-    "examples/jsm/controls/OrbitControls.js": "three/OrbitControls.js",
-}
-WASM = {
+}  # fmt: skip
+"""Files of other pages that a site uses, by the package that contains them."""
+RUNTIME = {
     "dist/ort.wasm.bundle.min.mjs": "ort/wasm.js",
     "dist/ort-wasm-simd-threaded.wasm": "ort/wasm.wasm.gz",
 }
-WEBGPU = {
-    "dist/ort.webgpu.bundle.min.mjs": "ort/webgpu.js",
-    "dist/ort-wasm-simd-threaded.asyncify.wasm": "ort/webgpu.wasm.gz",
-}
-"""Where files of npm packages lie on the site: modules end in .js, which every server knows; .gz are
-compressed."""
-DOCUMENTED = re.compile(rb"^[ \t]*/\*\*(?!\s*\* @license)(?:(?!\*/).)*\*/[ \t]*\n", re.MULTILINE | re.DOTALL)
-"""Comments for a library's developers on lines of their own, a third of three.js; licences are kept."""
-
+"""Where ONNX Runtime's files lie on the site; every server knows modules that end in .js."""
+EYES = 0.936
+"""The height of the eyes over that of the person (Drillis and Contini 1966, in Winter, Biomechanics and Motor
+Control of Human Movement, fig. 4.1), from which a headset estimates its wearer's height."""
 NUMBERS = 9 + 12 + 66
 """Numbers per frame: positions and quaternions (xyzw) of head and wrists, joints; metres, openxr axes."""
+LEAST = 32_768  # bytes; smaller tensors, such as those of normalisation, and constants, keep their values
+PERIOD = 4099  # random numbers that are repeated in a timed graph; its file is compressed to almost nothing
+RANDOM = "random"  # the run of a network with random weights, which is only timed
+PRECISIONS = {"naive": ("fp32",), "streaming": ("fp32", "int8", "fp16")}
+
+Entry = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class SiteNetwork:
+    """A network of a site.
+
+    Attributes:
+        key: the network's name in files and in the page's code.
+        name: the network's readable name.
+        run: the id of the network's run; "random" for random weights.
+        model: the network as it was trained.
+        clips: the names of those of its test clips that are on the site.
+        remark: a warning that the page shows, such as that it is hardly trained; empty for no warning.
+    """
+
+    key: str
+    name: str
+    run: str
+    model: MotionModel
+    clips: tuple[str, ...] = ()
+    remark: str = ""
 
 
 class SiteClip(NamedTuple):
@@ -90,9 +117,9 @@ def pack_clip(name: str, frames: np.ndarray, seconds: float) -> SiteClip:
     """
     count = min(len(frames), round(seconds * FPS))
     first = (len(frames) - count) // 2
-    clip, space = TrackedClip(name, frames[first : first + count]), SPACES["openxr"]
-    rotations = matrix_to_quaternion(space.rotations_out(clip.rotations).reshape(-1, 3, 3))
-    parts = [space.positions_out(clip.positions), rotations, space.positions_out(clip.joints)]
+    clip = TrackedClip(name, frames[first : first + count])
+    rotations = matrix_to_quaternion(SPACE.rotations_out(clip.rotations).reshape(-1, 3, 3))
+    parts = [SPACE.positions_out(clip.positions), rotations, SPACE.positions_out(clip.joints)]
     content = np.concatenate([part.reshape(count, -1) for part in parts], 1).astype("<f4").tobytes()
     return SiteClip(hashlib.sha256(content).hexdigest()[:12], name, content)
 
@@ -105,15 +132,11 @@ class Site:
         networks: the networks; those that are trained play clips and run on headsets.
         base: the network that the others' times are compared with; None for a site without a bench.
         clips: the clips that can be played.
-        calibration: clips (N, 252) from which the ranges of int8 are found, for the bench.
-        webgpu: whether the site has the files that WebGPU needs.
     """
 
     networks: Sequence[SiteNetwork]
     base: SiteNetwork | None
     clips: Sequence[SiteClip]
-    calibration: Sequence[Tensor]
-    webgpu: bool = True
 
     def make(self, out: Path) -> int:
         """Write the site, completely or not at all, and return its size in bytes.
@@ -121,7 +144,7 @@ class Site:
         An earlier site in that folder is replaced.
 
         Raises:
-            InputError: if the folder holds something else, or a package can't be downloaded.
+            InputError: if the folder holds something else, or ONNX Runtime can't be downloaded.
         """
         check_place(out)
         unfinished = temporary(out)
@@ -139,23 +162,19 @@ class Site:
         return total
 
     def _fill(self, folder: Path) -> None:
+        for name, content in read(ONNXRUNTIME_WEB, RUNTIME).items():
+            _write(folder, RUNTIME[name], content)
+        clips = [
+            {"key": clip.key, "name": clip.name, "frames": clip.frames}
+            | {"file": _write(folder, f"clips/{clip.key}.gz", clip.content)}
+            for clip in self.clips
+        ]
         bench = self.base is not None
-        places = {THREE: DRAWING, ONNXRUNTIME_WEB: {**WASM, **WEBGPU} if self.webgpu else WASM}
-        for package, files in places.items():
-            for name, content in read(package, files).items():
-                small = gzip.compress(content, 9, mtime=0) if files[name].endswith(".gz") else None
-                _write(folder / files[name], small or DOCUMENTED.sub(b"", content))
-        clips = []
-        for clip in self.clips:
-            file = f"clips/{clip.key}.gz"
-            _write(folder / file, gzip.compress(clip.content, 9, mtime=0))
-            clips.append({"key": clip.key, "name": clip.name, "file": file, "frames": clip.frames})
-        about: dict[str, Any] = {
+        about: Entry = {
             "memmlp": __version__,
             "made": now(),
-            "packages": {package.name: package.version for package in places},
-            "backends": ["wasm", "webgpu"] if self.webgpu else ["wasm"],
-            "networks": [write_network(folder, one, self.calibration, bench) for one in self.networks],
+            "packages": {ONNXRUNTIME_WEB.name: ONNXRUNTIME_WEB.version},
+            "networks": [write_network(folder, one, bench) for one in self.networks],
             "clips": clips,
             "limbs": [{"start": a, "end": b, "radii": radii, "tip": tip} for a, b, radii, tip in LIMBS],
             "joints": JOINTS,
@@ -163,9 +182,9 @@ class Site:
             "top": TOP,
         }
         if self.base is not None:
-            about["base"] = write_network(folder, self.base, self.calibration, bench)
-            about["yardstick"] = write_weightless(folder, "yardstick", yardstick())
-        _write(folder / ABOUT, (json.dumps(about, separators=(",", ":")) + "\n").encode())
+            about["base"] = write_network(folder, self.base, bench)
+            about["yardstick"] = write_timed(folder, "yardstick", yardstick())
+        _write(folder, ABOUT, (json.dumps(about, separators=(",", ":")) + "\n").encode())
         _write_page(folder)
 
 
@@ -180,38 +199,122 @@ def check_place(out: Path) -> None:
         raise InputError(f"--out {out}: there is no folder {out.parent}")
 
 
+def write_network(folder: Path, network: SiteNetwork, bench: bool) -> Entry:
+    """Write a network's graphs into a site's folder, and return its entry in the site's description.
+
+    Args:
+        folder: the site's folder.
+        network: the network; one with random weights is only timed.
+        bench: whether to write the graphs that are timed; if not, only the one that plays clips.
+    """
+    announce(f"web: export {network.name}")
+    model, played = network.model.cpu().eval(), None
+    if network.run != RANDOM:
+        with tempfile.TemporaryDirectory() as temporary:
+            path = Path(temporary) / "whole.onnx"
+            export_full(streaming(model) if has_stream(model) else model, path, network.run, SPACE.name)
+            played = _write(folder, f"networks/{network.key}.onnx.gz", path.read_bytes())
+    rest = model.normalizer.rest.double().numpy()
+    return {
+        "key": network.key,
+        "name": network.name,
+        "run": network.run,
+        "frames": model.frames,
+        "fps": FPS,
+        "parameters": model.count_parameters(),
+        "body": {  # head and wrists in the T-pose, the lowest joint's height, and the body height, metres
+            "rest": (rest[list(TRACKED)] * SPACE.body).tolist(),
+            "floor": float(rest[:, 1].min()),
+            "height": stature(BodyTree(JOINTS, PARENTS, rest)),
+            "eyes": EYES,
+        },
+        "play": played,
+        "graphs": list(write_graphs(folder, network)) if bench else [],
+        "clips": list(network.clips),
+        "remark": network.remark,
+    }
+
+
+def write_graphs(folder: Path, network: SiteNetwork) -> Iterator[Entry]:
+    """Write the graphs of a network that are timed, with random weights, and yield an entry about each.
+
+    They are the network as published, its stream, and the stream in lower precision, each as the step alone
+    and as the full graph from trackers to joints. There is no full graph in int8.
+    """
+    model, frames = network.model, [0.1 * torch.randn(60, FRAME_DIM)]  # int8's ranges do not matter for time
+    graphs: dict[str, MotionModel | StreamingGraph] = {"naive": model}
+    if has_stream(model):
+        graphs["streaming"] = streaming(model)
+    with tempfile.TemporaryDirectory() as temporary:
+        step, whole, lowered = (Path(temporary) / f"{name}.onnx" for name in ("step", "whole", "lower"))
+        for name, graph in graphs.items():
+            export(graph, step, network.run)
+            export_full(graph, whole, network.run, SPACE.name)
+            for precision in PRECISIONS[name]:
+                entry: Entry = {"graph": name, "precision": precision, "whole": None}
+                for part, source in {"step": step, "whole": whole}.items():
+                    if isinstance(graph, StreamingGraph) and precision != "fp32":
+                        if part == "whole" and precision == "int8":
+                            continue
+                        lower(precision, source, lowered, graph, frames)
+                        source = lowered
+                    file = f"{network.key}-{name}-{precision}-{part}"
+                    entry[part] = write_timed(folder, file, onnx.load(source))
+                yield entry
+
+
+def write_timed(folder: Path, name: str, model: onnx.ModelProto) -> str:
+    """Write a graph that is only timed, with random weights; return its address."""
+    randomize_weights(model)
+    return _write(folder, f"networks/{name}.onnx.gz", model.SerializeToString())
+
+
+def randomize_weights(model: onnx.ModelProto) -> None:
+    """Replace the large weights of a graph by repeated random numbers of the same standard deviation.
+
+    The weights' values do not matter for a step's time, and repeated numbers keep a compressed site small.
+    Numbers of about the same size keep the operations' speed: none becomes infinite, or so small that a
+    processor takes longer over it.
+    """
+    random = np.random.default_rng(0)
+    for tensor in model.graph.initializer:
+        values = numpy_helper.to_array(tensor)
+        if len(tensor.raw_data) < LEAST or values.dtype not in (np.float32, np.float16, np.int8):
+            continue
+        scale = np.sqrt(np.square(values.astype(np.float64)).mean())
+        if np.isfinite(scale):  # a mask is not
+            drawn = random.normal(0, scale, PERIOD)
+            if values.dtype == np.int8:
+                drawn = drawn.round().clip(-127, 127)
+            tensor.raw_data = np.resize(drawn.astype(values.dtype), values.size).tobytes()
+
+
 def _files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.rglob("*") if path.is_file())
 
 
-def _write(path: Path, content: bytes) -> None:
+def _write(folder: Path, address: str, content: bytes) -> str:
+    """Write a file, compressed if its address ends in .gz, and return its address on the site."""
+    path = folder / address
     path.parent.mkdir(exist_ok=True)
-    path.write_bytes(content)
+    path.write_bytes(gzip.compress(content, 6, mtime=0) if path.suffix == ".gz" else content)
+    return address
 
 
 def _write_page(folder: Path) -> None:
     """Write the page's files, with its policy, and a service worker that lists all files of the site.
 
-    The Content-Security-Policy allows no other hosts; scripts are files, or the import map. The worker's
-    version changes with any file.
+    The worker's version changes with any file.
     """
-    for package, names in PAGES.items():
-        page = resources.files(package).joinpath("page")
-        for name in names or tuple(path.name for path in page.iterdir()):
-            _write(folder / name, page.joinpath(name).read_bytes())
+    own = resources.files("memmlp.live.web").joinpath("page")
+    for package, names in {"memmlp.live.web": [path.name for path in own.iterdir()], **OTHER_PAGES}.items():
+        for name in names:
+            _write(folder, name, read_page_file(package, name))
     index = (folder / "index.html").read_text("utf-8")
-    inline = re.search(r'<script type="importmap">(.*?)</script>', index, re.DOTALL)
-    assert inline is not None
-    digest = base64.b64encode(hashlib.sha256(inline[1].encode()).digest()).decode()
-    policy = (
-        f"default-src 'none'; script-src 'self' 'wasm-unsafe-eval' 'sha256-{digest}'; worker-src 'self'; "
-        "style-src 'self' 'unsafe-inline'; img-src 'self' data:; connect-src 'self'; base-uri 'none'; "
-        "form-action 'none'"
-    )
-    _write(folder / "index.html", index.replace("POLICY", policy).encode())
-    worker = folder / "sw.js"
+    policy = security_policy(index, "'wasm-unsafe-eval'")
+    _write(folder, "index.html", index.replace("POLICY", policy).encode())
     digests = {str(file.relative_to(folder).as_posix()): file_digest(file) for file in _files(folder)}
     version = hashlib.sha256(json.dumps(digests).encode()).hexdigest()[:16]
-    others = [name for name in digests if name != worker.name]
+    others = [name for name in digests if name != "sw.js"]
     head = f"const VERSION = {json.dumps(version)};\nconst FILES = {json.dumps(others)};\n"
-    _write(worker, head.encode() + worker.read_bytes())
+    _write(folder, "sw.js", head.encode() + (folder / "sw.js").read_bytes())

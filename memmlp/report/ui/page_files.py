@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import hashlib
 import json
 import re
 from collections.abc import Mapping
@@ -33,18 +32,6 @@ FILES = {"index.html": OWN, "style.css": SHARED, **SCRIPTS, **MODULES}
 def read(name: str) -> bytes:
     """Return a file of the page. Raises KeyError for an unknown name."""
     return read_page_file(FILES[name], name)
-
-
-def security_policy() -> str:
-    """Return the Content-Security-Policy: only scripts of this page, and its import map."""
-    inline = re.search(r'<script type="importmap">(.*?)</script>', read("index.html").decode(), re.DOTALL)
-    assert inline is not None
-    digest = base64.b64encode(hashlib.sha256(inline[1].encode()).digest()).decode()
-    return (
-        f"default-src 'none'; script-src 'self' 'sha256-{digest}'; style-src 'self' 'unsafe-inline'; "
-        "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
-        "frame-ancestors 'none'"
-    )
 
 
 def one_file(answers: Mapping[str, Any]) -> str:

@@ -11,7 +11,7 @@ from typing import Any, Self
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import plain
-from memmlp.common.page_server import HOST, TEXT, PageHandler, PageServer, content_type
+from memmlp.common.page_server import HOST, TEXT, PageHandler, PageServer, content_type, security_policy
 from memmlp.report.ui import page_files, runs
 from memmlp.report.ui.replay import Predict, Replays, describe_body
 from memmlp.report.ui.run_index import RunIndex
@@ -215,7 +215,8 @@ class RunsServer(PageServer):
         self, answers: Answers, port: int, host: str = HOST, token: str | None = None, every: float = 1.0
     ):
         self.answers = answers
-        self.headers = {"Content-Security-Policy": page_files.security_policy()}
+        policy = security_policy(page_files.read("index.html").decode())
+        self.headers = {"Content-Security-Policy": f"{policy}; frame-ancestors 'none'"}
         self.watch = Watch(answers.refresh, every)
         super().__init__(RunsHandler, port, host, token)
 

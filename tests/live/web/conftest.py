@@ -19,8 +19,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.npm import ONNXRUNTIME_WEB, Package, read
 from memmlp.deploy.export import export
 from memmlp.live.trackers_to_body_graph import export_full
-from memmlp.live.web.networks import SiteNetwork
-from memmlp.live.web.site import Site, pack_clip
+from memmlp.live.web.site import Site, SiteNetwork, pack_clip
 from memmlp.networks.memory import NoMemory
 from memmlp.networks.motion_model import MotionModel
 
@@ -69,19 +68,17 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Made:
     home = shared(tmp_path_factory, "web")
     made = Made(home / "site", home / "step.onnx")
     with FileLock(home / "lock"), pytest.MonkeyPatch.context() as patched:
-        patched.setattr("memmlp.live.web.networks.export", once(export))
-        patched.setattr("memmlp.live.web.networks.export_full", once(export_full))
-        patched.setattr("memmlp.live.web.networks.LEAST", 1_000_000)  # only the yardstick's are drawn
+        patched.setattr("memmlp.live.web.site.export", once(export))
+        patched.setattr("memmlp.live.web.site.export_full", once(export_full))
+        patched.setattr("memmlp.live.web.site.randomize_weights", lambda model: None)
         if not made.step.exists():
             clip = pack_clip("walk", PERSON.frames.numpy(), 4.0)
             Site(
                 networks=[SiteNetwork(RUN, "tiny", RUN, network(), (clip.key,), REMARK)],
                 base=SiteNetwork("base", "AvatarPoser", "random", network()),
                 clips=[clip],
-                calibration=[PERSON.frames],
-                webgpu=False,
             ).make(made.folder)
-            bare = made.folder / "networks" / f"{RUN}-streaming.onnx.gz"
+            bare = made.folder / "networks" / f"{RUN}-streaming-fp32-step.onnx.gz"
             made.step.write_bytes(gzip.decompress(bare.read_bytes()))
     return made
 

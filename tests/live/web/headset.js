@@ -21,7 +21,7 @@
 
   const device = new IWER.XRDevice(IWER.metaQuest3, { stereoEnabled: false });
   device.installRuntime({ forceInstall: true });
-  const kept = { device, saved: null };
+  const kept = { device };
   const request = navigator.xr.requestSession.bind(navigator.xr);
   navigator.xr.requestSession = async (...words) => {
     kept.session = patient(await request(...words));
@@ -30,12 +30,6 @@
     kept.session.addEventListener('end', () => { window.seldom = before; });
     return kept.session;
   };
-  const address = URL.createObjectURL;
-  URL.createObjectURL = blob => {
-    blob.text().then(text => { kept.saved = text; });
-    return address(blob);
-  };
-
   // Where the grips are on the target rays, which are what IWER's controllers are placed by.
   kept.learn = () => new Promise(resolve => kept.session.requestAnimationFrame((_, frame) => {
     kept.grips = ['left', 'right'].map(side => {

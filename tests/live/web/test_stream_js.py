@@ -125,7 +125,7 @@ def answers(site: Made, node: str, tmp_path_factory: pytest.TempPathFactory) -> 
     folder = tmp_path_factory.mktemp("node")
     entry = json.loads((site.folder / "site.json").read_text())["networks"][0]
     assert entry["run"] == RUN
-    for name, packed in (("model.onnx", entry["play"]["file"]), ("ort.wasm", "ort/wasm.wasm.gz")):
+    for name, packed in (("model.onnx", entry["play"]), ("ort.wasm", "ort/wasm.wasm.gz")):
         (folder / name).write_bytes(gzip.decompress((site.folder / packed).read_bytes()))
     page = folder / "page"
     page.mkdir()

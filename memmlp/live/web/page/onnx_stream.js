@@ -6,18 +6,14 @@ const STATE = 'state.';
 const NEXT = '.next';
 
 export class OnnxStream {
-  // model: the ONNX file's bytes; weights: the bytes of the file that holds weights outside of it, if any;
-  // backend: wasm or webgpu.
-  static async open(ort, model, { weights = null, backend = 'wasm' } = {}) {
-    const options = { executionProviders: [backend], graphOptimizationLevel: 'all', logSeverityLevel: 3 };
-    if (weights) options.externalData = [{ path: 'weights', data: weights }];
+  // model: the ONNX file's bytes.
+  static async open(ort, model) {
+    const options = { executionProviders: ['wasm'], graphOptimizationLevel: 'all', logSeverityLevel: 3 };
     return new OnnxStream(ort, await ort.InferenceSession.create(model, options));
   }
 
   constructor(ort, session) {
-    this.session = session;
-    this.inputs = {};
-    this.zeros = {};
+    Object.assign(this, { session, inputs: {}, zeros: {} });
     for (const { name, type, shape } of session.inputMetadata) {
       const tensor = new ort.Tensor(type, new Float32Array(shape.reduce((a, b) => a * b, 1)), shape);
       (name.startsWith(STATE) ? this.zeros : this.inputs)[name] = tensor;
@@ -45,6 +41,4 @@ export class OnnxStream {
     if (fresh) this.reset();
     return this.step({ tracker_positions: positions, tracker_rotations: rotations });
   }
-
-  close() { return this.session.release(); }
 }

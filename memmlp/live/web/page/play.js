@@ -1,13 +1,12 @@
 // Plays test clips through a network in this browser: the truth in grey, the prediction coloured by its error.
 
 import { h, replace, select } from './dom.js';
-import { fetched } from './fetched.js';
 import { History } from './history.js';
-import { WorkerProxy } from './worker_proxy.js';
+import { fetched, WorkerProxy } from './worker_proxy.js';
 import { Stage } from './stage.js';
 import { Stream } from './stream.js';
 
-const NUMBERS = 87; // of a frame: see memmlp.live.web.clips
+const NUMBERS = 87; // of a frame: see memmlp.live.web.site
 const PAUSE = 1000; // milliseconds between two rounds of a clip
 
 export function play(page, site) {
@@ -85,7 +84,7 @@ class Play {
     if (!this.clip) return this.tell('This site has no test clip of this network.');
     this.tell('Loading the network.');
     try {
-      const [content] = await Promise.all([fetched(this.clip.file), this.proxy.open('play', this.network.play)]);
+      const [content] = await Promise.all([fetched(this.clip.file), this.proxy.call('open', ['play', this.network.play])]);
       const clip = new Clip(content.buffer);
       this.tell('');
       this.stage ??= this.drawn();

@@ -1,26 +1,26 @@
 // Times of steps, in turn, round by round, so that a machine that grows warm slows all equally.
 
 export const ROUNDS = 5;
-export const WARM_UP = 30; // untimed steps of each at the start
+const WARM_UP = 30; // untimed steps of each at the start
 const SETTLING = 3; // untimed steps of each at the start of a round, in which caches fill
 
-// steps: { key: async () => anything }, each timed `rounds` times `each` times from its call until its outputs were read.
+// steps: { key: async () => anything }, each timed ROUNDS times `each` times from its call until its outputs were read.
 // Resolves to { key: [[milliseconds of a round's steps]] }; progress(share) reports the share that is done.
-export async function interleaved(steps, { rounds = ROUNDS, each, progress = () => {} }) {
+export async function timeInTurn(steps, each, progress) {
   const keys = Object.keys(steps);
   const times = Object.fromEntries(keys.map(key => [key, []]));
-  for (const key of keys) await repeated(steps[key], WARM_UP);
-  for (let round = 0; round < rounds; round++) {
+  for (const key of keys) await repeat(steps[key], WARM_UP);
+  for (let round = 0; round < ROUNDS; round++) {
     for (const [index, key] of keys.entries()) {
-      await repeated(steps[key], SETTLING);
-      times[key].push(await repeated(steps[key], each));
-      progress((round + (index + 1) / keys.length) / rounds);
+      await repeat(steps[key], SETTLING);
+      times[key].push(await repeat(steps[key], each));
+      progress((round + (index + 1) / keys.length) / ROUNDS);
     }
   }
   return times;
 }
 
-async function repeated(step, count) {
+async function repeat(step, count) {
   const times = new Array(count);
   for (let i = 0; i < count; i++) {
     const start = performance.now();

@@ -13,7 +13,6 @@ const COUNTDOWN = 3; // seconds from the trigger to the calibration
 const AWAITED = 2; // samples that may wait for the network; later ones are skipped
 const TIMED = 600; // the newest poses whose times are shown
 const USUAL = 91; // the newest frames of the display, whose median gives its rate
-const SURE = 10; // so many of them at least
 const [SHORTEST, TALLEST] = [0.9, 2.4]; // metres; outside of them a floor or a height is wrong
 const INVITE = ['Pull a trigger or pinch, then stand upright in T-pose:', 'arms to the sides, palms down, eyes forward'];
 
@@ -28,8 +27,6 @@ class Wear {
     this.canvas = h('canvas', { 'aria-label': 'The view in the mirror' });
     this.trouble = h('p', { class: 'trouble' }, 'Loading the network.');
     this.height = h('input', { type: 'number', id: 'height', min: 100, max: 230, step: 'any', placeholder: 'by headset' });
-    this.record = h('input', { type: 'checkbox', id: 'record' });
-    this.save = h('button', { type: 'button', id: 'save', hidden: true, onclick: () => this.saved() }, 'Save recording');
     this.buttons = Object.entries(MODES).map(([mode, name]) =>
       h('button', { type: 'button', class: 'primary', id: mode, disabled: true, onclick: () => this.enter(mode) }, name));
     this.layout();
@@ -43,7 +40,7 @@ class Wear {
   }
 
   layout() {
-    const facts = [['display', 'rate', 'Hz'], ['frames', 'frames', ''], ['dropped', 'dropped', ''], ['skipped samples', 'skipped', ''], ['pose, median', 'middle', 'ms'], ['pose, p95', 'p95', 'ms'], ['height', 'tall', 'm']];
+    const facts = [['display', 'rate', 'Hz'], ['frames', 'frames', ''], ['skipped samples', 'skipped', ''], ['pose, median', 'middle', 'ms'], ['pose, p95', 'p95', 'ms'], ['height', 'tall', 'm']];
     const named = id => (this[`${id}Text`] = h('b', { id }, '–'));
     replace(this.page,
       h('h1', {}, 'Your body, from head and hands'),
@@ -54,8 +51,7 @@ class Wear {
           this.showRemark();
           this.ready();
         }),
-        h('label', { class: 'field' }, h('span', {}, 'Your height [cm]'), this.height),
-        h('label', { class: 'tick' }, this.record, 'record'), this.save),
+        h('label', { class: 'field' }, h('span', {}, 'Your height [cm]'), this.height)),
       this.remark = h('p', { class: 'warning', id: 'remark' }),
       h('p', { class: 'faint', id: 'support' }, ''),
       this.seen = h('div', { class: 'replay' }, h('div', { class: 'view' }, h('div', { class: 'view-stage' }, this.canvas, this.trouble)),
@@ -77,7 +73,7 @@ class Wear {
   async ready() {
     const proxy = (this.proxy = (this.proxy?.close(), new WorkerProxy()));
     try {
-      await proxy.open('wear', this.network.play);
+      await proxy.call('open', ['wear', this.network.play]);
     } catch (error) {
       if (proxy === this.proxy) this.trouble.textContent = `The network did not load: ${error.message}`;
       return;
@@ -110,8 +106,7 @@ class Wear {
     const { body, fps } = this.network;
     const tall = this.tall(null);
     this.worn = {
-      session, network: this.network, tall, kinds: [null, null], placed: false, calibrated: false, due: null, waiting: 0, frames: 0, dropped: 0, skipped: 0, last: null, passed: [], times: [],
-      tape: this.record.checked ? [] : null,
+      session, network: this.network, tall, kinds: [null, null], placed: false, calibrated: false, due: null, waiting: 0, frames: 0, skipped: 0, last: null, passed: [], times: [],
       stream: new Stream({ fps, body, offsets: usualOffsets([null, null]), scale: body.height / tall, run: frame => this.proxy.call('pose', ['wear', frame]) }),
     };
     this.seen.hidden = false;
@@ -136,15 +131,10 @@ class Wear {
     this.mirror.draw();
   }
 
-  // Count the display's frames that were dropped: those that came later than one and a half of the usual time.
   count(time) {
     const { worn } = this;
-    if (worn.last !== null) {
-      worn.passed.push(time - worn.last);
-      if (worn.passed.length > USUAL) worn.passed.shift();
-      const usual = median(worn.passed);
-      if (worn.passed.length >= SURE && time - worn.last > 1.5 * usual) worn.dropped += Math.round((time - worn.last) / usual) - 1;
-    }
+    if (worn.last !== null) worn.passed.push(time - worn.last);
+    if (worn.passed.length > USUAL) worn.passed.shift();
     worn.last = time;
     worn.frames++;
     if (worn.frames % 20 === 0) this.tell();
@@ -182,7 +172,6 @@ class Wear {
       document.documentElement.dataset.calibrated = 'yes';
       this.stand(trackers[0]);
       mirror.tell(`Calibrated, ${worn.tall.toFixed(2)} m tall.`, 'Pull a trigger or pinch to do it again.');
-      worn.tape?.push({ calibrated: worn.stream.offsets, height: worn.tall, at: trackers });
     } catch (error) {
       mirror.tell('Not calibrated:', ...error.message.split('; '), INVITE[0]);
     }
@@ -202,15 +191,11 @@ class Wear {
     if (worn.waiting >= AWAITED) return worn.skipped++;
     worn.waiting++;
     const start = performance.now();
-    const noted = { time, trackers, pose: null, held: null };
-    worn.tape?.push(noted);
     worn.stream.step(...trackers, time).then(pose => {
       worn.waiting--;
       if (pose.fresh) worn.times.push(performance.now() - start);
       if (worn.times.length > TIMED) worn.times.shift();
       if (pose.positions) this.mirror.show(pose.positions);
-      noted.held = pose.held;
-      if (pose.fresh && worn.tape) noted.pose = { time: pose.time, positions: [...pose.positions] };
     }, error => {
       worn.waiting--;
       this.mirror.tell('The network stopped:', error.message);
@@ -221,7 +206,6 @@ class Wear {
     const { worn } = this;
     this.framesText.textContent = worn.frames;
     this.rateText.textContent = rateOf(worn);
-    this.droppedText.textContent = worn.dropped;
     this.skippedText.textContent = worn.skipped;
     this.tallText.textContent = worn.tall.toFixed(2);
     if (!worn.times.length) return;
@@ -231,24 +215,11 @@ class Wear {
 
   ended() {
     this.tell();
-    this.tape = this.worn.tape;
-    this.recorded = this.worn.network.run;
-    this.save.hidden = !this.tape?.length;
     this.worn = null;
     this.mirror.visible(false);
     this.mirror.through(false);
     this.mirror.renderer.setAnimationLoop(null);
     this.seen.hidden = true;
-  }
-
-  // The recording: the headset's samples, in OpenXR's axes, and their poses, without the last ones, which still waited
-  // for the network.
-  saved() {
-    const samples = this.tape.filter(({ held, calibrated }) => held || calibrated);
-    const content = JSON.stringify({ format: 'memmlp web recording 1', run: this.recorded, joints: this.site.joints, samples });
-    const address = URL.createObjectURL(new Blob([content], { type: 'application/json' }));
-    h('a', { href: address, download: 'recording.json' }).click();
-    setTimeout(() => URL.revokeObjectURL(address), 10000);
   }
 
   leave() {

@@ -1,43 +1,41 @@
 // Runs networks beside the page, which goes on drawing: opens graphs, computes poses, times steps.
 
-import { fetched } from './fetched.js';
 import { OnnxStream } from './onnx_stream.js';
 import { Stream } from './stream.js';
-import { clockStep, interleaved } from './timing.js';
-import { drawn } from './weights.js';
+import { clockStep, timeInTurn } from './timing.js';
+import { fetched } from './worker_proxy.js';
 
 const onnxStreams = new Map();
 let runtime = null;
 
-// ONNX Runtime for a backend, "wasm" or "webgpu", on one thread; its SIMD is part of the build.
-function load(backend) {
+// ONNX Runtime on one thread; its SIMD is part of the build.
+function load() {
   runtime ??= (async () => {
-    const [ort, wasm] = await Promise.all([import(`./ort/${backend}.js`), fetched(`ort/${backend}.wasm.gz`)]);
-    ort.env.wasm.numThreads = 1;
-    ort.env.wasm.wasmBinary = wasm;
-    return { ort, backend };
+    const [ort, wasm] = await Promise.all([import('./ort/wasm.js'), fetched('ort/wasm.wasm.gz')]);
+    Object.assign(ort.env.wasm, { numThreads: 1, wasmBinary: wasm });
+    return ort;
   })();
   return runtime;
 }
 
 const calls = {
-  async open(key, { file, weights }, backend) {
-    const [{ ort }, model] = await Promise.all([load(backend), fetched(file)]);
-    onnxStreams.set(key, await OnnxStream.open(ort, model, { weights: drawn(weights), backend }));
+  async open(key, file) {
+    const [ort, model] = await Promise.all([load(), fetched(file)]);
+    onnxStreams.set(key, await OnnxStream.open(ort, model));
   },
 
   pose: (key, frame) => onnxStreams.get(key).pose(frame),
 
   // plan: [{ key, kind, body, fps }] of open graphs; kind: step, whole (from trackers to joints) or plain (no state).
   async time(plan, each, id) {
-    const steps = Object.fromEntries(plan.map(part => [part.key, stepper[part.kind](onnxStreams.get(part.key), part)]));
-    const times = await interleaved(steps, { each, progress: share => postMessage({ id, share }) });
+    const steps = Object.fromEntries(plan.map(part => [part.key, steppers[part.kind](onnxStreams.get(part.key), part)]));
+    const times = await timeInTurn(steps, each, share => postMessage({ id, share }));
     for (const part of plan) await check(steps[part.key], part.key);
     return { times, clock: clockStep() };
   },
 };
 
-const stepper = {
+const steppers = {
   step(onnxStream) {
     const sparse = Float32Array.from({ length: 54 }, (_, i) => Math.sin(12.9898 * (i + 1)));
     return () => onnxStream.step({ sparse });
@@ -62,8 +60,7 @@ const stepper = {
 
 // NaN or infinity could make a step quicker or slower than the network's.
 async function check(step, key) {
-  const outputs = await step();
-  const arrays = Object.values(outputs).filter(value => value instanceof Float32Array);
+  const arrays = Object.values(await step()).filter(value => value instanceof Float32Array);
   if (!arrays.length || !arrays.every(array => array.every(Number.isFinite))) throw new Error(`${key}: its outputs are not finite`);
 }
 

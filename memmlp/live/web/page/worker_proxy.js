@@ -1,12 +1,22 @@
-// The worker as an object: a call by name resolves to the worker's answer.
+// The worker as an object, whose calls resolve to the worker's answers; and the files that both load.
+
+// The bytes of a file of the site, decompressed unless the server did that already.
+export async function fetched(address) {
+  const answer = await fetch(address);
+  if (!answer.ok) throw new Error(`${address}: the server answers ${answer.status}`);
+  const content = new Uint8Array(await answer.arrayBuffer());
+  if (content[0] !== 0x1f || content[1] !== 0x8b) return content;
+  const stream = new Blob([content]).stream().pipeThrough(new DecompressionStream('gzip'));
+  return new Uint8Array(await new Response(stream).arrayBuffer());
+}
 
 export class WorkerProxy {
   constructor() {
     this.worker = new Worker('worker.js', { type: 'module' });
     this.waiting = new Map();
     this.count = 0;
-    this.worker.addEventListener('message', ({ data }) => this.answered(data));
-    this.worker.addEventListener('error', event => this.failed(event.message || 'the worker could not be loaded'));
+    this.worker.addEventListener('message', ({ data }) => this.receive(data));
+    this.worker.addEventListener('error', event => this.fail(event.message || 'the worker could not be loaded'));
   }
 
   // progress(share) reports a long call's progress.
@@ -17,9 +27,7 @@ export class WorkerProxy {
     });
   }
 
-  open(key, entry, backend = 'wasm') { return this.call('open', [key, entry, backend]); }
-
-  answered({ id, value, error, share }) {
+  receive({ id, value, error, share }) {
     const waits = this.waiting.get(id);
     if (!waits) return;
     if (share !== undefined) return waits.progress(share);
@@ -28,13 +36,13 @@ export class WorkerProxy {
     else waits.reject(new Error(error));
   }
 
-  failed(reason) {
+  fail(reason) {
     for (const { reject } of this.waiting.values()) reject(new Error(reason));
     this.waiting.clear();
   }
 
   close() {
     this.worker.terminate();
-    this.failed('stopped');
+    this.fail('stopped');
   }
 }
