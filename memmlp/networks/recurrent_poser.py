@@ -266,7 +266,7 @@ class RecurrentPoserSettings(NetworkSettings):
 
     It is a recurrent stream without a window. It predicts rotations; positions follow by forward kinematics,
     with the head on its tracker. The learning rate is the best of four at profile=small. Weight decays from
-    0.05 to 0.5 are alike in MPJRE, and Jitter falls with them (docs/guides/recurrent-poser-search.md).
+    0.05 to 0.5 are alike in MPJRE, and Jitter falls with them (docs/guides/recurrent-poser.md).
     """
 
     # T, the frames of a training window, from a zero state; live there is no window
