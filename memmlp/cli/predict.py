@@ -66,8 +66,8 @@ def predict(
     from memmlp.cli.data.printing import show_exported
     from memmlp.config.open_run import OpenedRun, data_of, experiment_of, trained_network
     from memmlp.evaluation.predictions import ClipPredictor
+    from memmlp.motion.body import check_imported_body
     from memmlp.motion.exporting import plan_export
-    from memmlp.motion.preparing.imported_body import check_imported_body
     from memmlp.runs.lookup import find_run
 
     found = find_run(outputs, run)

@@ -13,8 +13,7 @@ from torch import Tensor
 from memmlp.common.errors import InputError
 from memmlp.motion.body import FRAME_DIM, SWAPPED, TRACKED
 from memmlp.motion.preparing.find_clips import source_of
-from memmlp.motion.preparing.manifest import Manifest
-from memmlp.motion.preparing.splits import PARTS
+from memmlp.motion.preparing.manifest import PARTS, Manifest
 
 DRAWN_BY = ("frames", "clips")
 SHARE_STEPS = 2**52  # resolution of the sources' shares

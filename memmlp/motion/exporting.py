@@ -12,14 +12,13 @@ import numpy as np
 
 from memmlp.common.errors import InputError, one_line
 from memmlp.common.progress import progress_bar
-from memmlp.motion.body import load_rest_joints
+from memmlp.motion.body import check_imported_body, load_rest_joints
 from memmlp.motion.clip import Clip, Skipped, resample
 from memmlp.motion.formats.bvh import write_bvh
 from memmlp.motion.formats.gltf import write_gltf
 from memmlp.motion.formats.npz import NoMotion, read_clip, write_clip
 from memmlp.motion.plausibility import check_plausible
 from memmlp.motion.preparing.find_clips import clip_name, find_clips
-from memmlp.motion.preparing.imported_body import check_imported_body
 
 T = TypeVar("T")
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from memmlp.common.errors import InputError
 from memmlp.common.lease import Lock, publish, temporary
 from memmlp.motion.preparing.cache import ClipFolder, finished_cache, prepare
-from memmlp.motion.preparing.find_clips import FoundFiles, clip_name, find_clips
+from memmlp.motion.preparing.find_clips import clip_name, find_clips
 from memmlp.motion.preparing.manifest import Coverage, Manifest
 
 if TYPE_CHECKING:
@@ -91,19 +91,14 @@ class MotionSource:
         """
         if self.generate is not None:
             _make_once(Path(str(self.clips.root)), self.generate)
-        if not self.partial:
-            self._listed().check(self.clips.root)
+        split, root = self.clips.split, self.clips.root
+        if not self.partial and split.listed:
+            names = [clip_name(file) for file in find_clips(root).files]
+            Coverage.of(split.listed, split.missing(names)).check(root)
         found = Prepared(self.cache, prepare(self.clips, self.cache))
         if not self.partial:
-            found.manifest.coverage.check(self.clips.root)
+            found.manifest.coverage.check(root)
         return found
-
-    def _listed(self) -> Coverage:
-        """Return how many entries of the split have a file, whatever the file contains."""
-        split = self.clips.split
-        found = find_clips(self.clips.root) if split.listed else FoundFiles()
-        names = [clip_name(file) for file in (*found.files, *found.links)]
-        return Coverage.of(split.listed, split.missing(names))
 
     def digest(self) -> str | None:
         """Return the digest of the prepared data; None if the cache is missing or out of date."""

@@ -9,8 +9,8 @@ from memmlp.motion.body import FPS
 from memmlp.motion.clip import LINES, Skipped
 from memmlp.motion.motion_source import Prepared
 from memmlp.motion.preparing.amass_names import absent_subsets
+from memmlp.motion.preparing.groups import divided_remark, unmatched_patterns_remark
 from memmlp.motion.preparing.manifest import ClipRecord, Manifest
-from memmlp.motion.preparing.split_remarks import divided_remark, unmatched_patterns_remark
 
 SLOW = 0.99  # of the network's rate; 59.94 Hz counts as 60
 

@@ -23,9 +23,8 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.live.stream import Stream
 from memmlp.live.wearer import Calibration, Offsets, save_calibration
-from memmlp.motion.body import PARENTS, builtin_rest_joints
+from memmlp.motion.body import PARENTS, RECORD, body_record, builtin_rest_joints
 from memmlp.motion.formats.npz import read_clip, write_clip
-from memmlp.motion.preparing.imported_body import RECORD, body_record
 from memmlp.motion.synthetic import synthesize_clip
 
 REFUSED = {

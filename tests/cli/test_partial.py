@@ -69,7 +69,8 @@ def test_a_plan_that_was_made_for_a_look_is_no_way_round(home):
 
 
 def test_data_prepare_shows_the_gap(home):
-    said = run(home, "data", "prepare", "amass", "--split", "lists:lists", "--val", "0.2", "--out", "cache")
+    words = ("data=amass_s1", "data.split.folder=lists", "data.split.val=0.2")
+    said = run(home, "data", "prepare", "amass", *words, "--out", "cache")
     assert "87 % of the list (7 of 8 entries): 1 of 8 entries" in " ".join(said.split())
     assert "87 % of the list" in run(home, "data", "inspect", "cache")
 

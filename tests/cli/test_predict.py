@@ -13,9 +13,9 @@ import pytest
 from memmlp.common.files import write_json
 from memmlp.config.open_run import open_run
 from memmlp.evaluation.predictions import predict_clip
+from memmlp.motion.body import body_record
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.npz import read_clip
-from memmlp.motion.preparing.imported_body import body_record
 from memmlp.runs.lookup import is_trained, list_runs
 
 

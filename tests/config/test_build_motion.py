@@ -63,7 +63,7 @@ def test_named_sources_have_fractions_of_their_own():
     assert isinstance(split, MixedSplit)
     held_out = {name: (own.test, own.val) for name, own in split.splits.items()}
     assert held_out == {"cmu": (0.35, 0.05), "bandai": (0.1, 0.05)}
-    with pytest.raises(InputError, match=r"data\.sources\.cmu: .*data\.val"):
+    with pytest.raises(InputError, match=r"data\.sources\.cmu: .*data\.split\.val"):
         build_motion(mix(with_source(val=0.95)))
 
 

@@ -10,12 +10,11 @@ import pytest
 from conftest import Memmlp, one_line
 
 from memmlp.common.errors import InputError
-from memmlp.motion.body import builtin_rest_joints
+from memmlp.motion.body import RECORD, body_record, builtin_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.exporting import FORMATS, export, format_of, plan_export, write_motion
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.npz import write_clip
-from memmlp.motion.preparing.imported_body import RECORD, body_record
 
 REST = builtin_rest_joints()
 

@@ -69,7 +69,7 @@ def test_a_damaged_clip_is_missing_and_one_that_is_too_short_is_not(root):
     with pytest.raises(InputError, match=r"1 of 8 .*\(CMU 1 of 4\)"):
         listed(root).prepare()
     manifest = listed(root, partial=True).prepare().manifest
-    assert (manifest.missing, manifest.damaged) == ((), ("CMU/02/take_poses",))
+    assert manifest.missing == ("CMU/02/take_poses",)
 
 
 def test_a_missing_subset_is_said_and_a_seeded_split_has_no_list(root):
@@ -88,7 +88,7 @@ def test_a_column_file_has_a_cache_of_its_own_and_names_the_groups(root):
     def prepared(last: str):
         rows = [f"{name}_stageii,{name.split('/')[0]}" for name in NAMES]
         file.write_text("\n".join(["clip,group", *rows[:-1], f"{NAMES[-1]}_stageii,{last}"]))
-        split = SeededSplit(0.3, 0.3, groups_file=file)
+        split = SeededSplit(test=0.3, val=0.3, groups_file=file)
         return MotionSource(ClipFolder(root, split), None, root.with_name("cache")).prepare()
 
     found = prepared("third")
@@ -105,7 +105,7 @@ def test_a_column_file_has_a_cache_of_its_own_and_names_the_groups(root):
 
 def test_nothing_goes_on_with_clips_that_are_others_by_now(root):
     """What was trained on one set of clips would be tested on another, under the first one's digest."""
-    source = MotionSource(ClipFolder(root, SeededSplit(0.2, 0.2)), None, root.with_name("cache"))
+    source = MotionSource(ClipFolder(root, SeededSplit(test=0.2, val=0.2)), None, root.with_name("cache"))
     before = source.prepare()
     assert len(before.open("train")) > 0
     write_clip(root / f"{NAMES[0]}_stageii.npz", still(60))

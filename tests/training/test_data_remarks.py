@@ -51,7 +51,8 @@ def test_unusual_test_clips_are_a_fact_of_the_run():
 
 
 def test_people_in_training_and_in_test_are_a_fact_of_the_run():
-    clips = [clip("CMU/01/a", "train"), clip("CMU/01/b", "test")]
+    names = (("CMU/01/a", "train"), ("CMU/01/b", "test"), ("CMU/02/c", "train"))
+    clips = [clip(name, part, group=name) for name, part in names]
     found = warnings(clips)
     assert "CMU/01" in found["divided"]
     assert found["partial"] is found["resampled"] is found["unusual"] is None

@@ -9,7 +9,6 @@ import click
 from memmlp.cli.data.importing import import_, skeleton, verify
 from memmlp.cli.data.printing import (
     show_exported,
-    show_files,
     show_manifest,
     show_pairs,
     show_rates,
@@ -71,42 +70,13 @@ def show(source: Path, out: Path, clips: int, body: str) -> None:
 
 @data.command("prepare")
 @click.argument("root", type=PATH)
+@click.argument("overrides", nargs=-1, metavar="[KEY=VALUE]...")
 @click.option("--out", required=True, type=PATH, help="Folder of the cache.")
-@click.option("--body", help="builtin, or an SMPL-H model.npz.")
-@click.option(
-    "--split", default="seeded", show_default=True, help="seeded, s2, or lists:FOLDER (AGRoL's format)."
-)
-@click.option("--val", type=float, help="Fraction for validation.")
-@click.option("--test", type=float, help="Fraction for testing, with --split seeded.")
-@click.option("--seed", type=int)
-@click.option(
-    "--group", multiple=True, metavar="REGEX", help="Clips that match stay on one side; repeatable."
-)
-@click.option("--min-frames", type=int, help="Shorter clips (at 60 Hz) are skipped.")
-@click.option(
-    "--interpolation",
-    type=click.Choice(["splines", "lines"]),
-    help="Between frames of other rates than 60 Hz.",
-)
-@strict_option
-def prepare(
-    root: Path,
-    out: Path,
-    body: str | None,
-    split: str,
-    val: float | None,
-    test: float | None,
-    seed: int | None,
-    group: tuple[str, ...],
-    min_frames: int | None,
-    interpolation: str | None,
-    strict: bool,
-) -> None:
+def prepare(root: Path, overrides: tuple[str, ...], out: Path) -> None:
     """Write the cache of a folder of AMASS npz.
 
     The cache is memory-mappable, and has a manifest with the outcome for each file. It is for custom code:
-    memmlp train makes its own cache of data.root. Without an option, the setting is that of memmlp train with
-    data=mocap for --split seeded, data=amass_s2 for s2 and data=amass_s1 for lists.
+    memmlp train makes its own cache of data.root. KEY=VALUE are those of memmlp train, by default data=mocap.
     """
     from omegaconf import OmegaConf
 
@@ -114,24 +84,9 @@ def prepare(
     from memmlp.config.compose import composed
     from memmlp.motion.preparing.cache import prepare as prepare_cache
 
-    protocols, lists = {"seeded": "mocap", "s2": "amass_s2"}, None
-    if split.startswith("lists:"):
-        protocol, lists = "amass_s1", split.removeprefix("lists:")
-    elif split in protocols:
-        protocol = protocols[split]
-    else:
-        raise InputError(f"--split {split}: must be seeded, s2 or lists:FOLDER")
-    if test is not None and split != "seeded":
-        raise InputError(f"--test {test:g}: needs --split seeded; --split {split} has its own test part")
-    given = {
-        "root": str(root), "body": body, "min_frames": min_frames, "strict": strict, "split.val": val,
-        "split.test": test, "split.seed": seed, "split.groups": list(group) or None, "split.folder": lists,
-        "interpolation": interpolation,
-    }  # fmt: skip
-    cfg = composed([f"data={protocol}", "data.root=.", *(["data.split.folder=."] if lists else [])])
-    for key, value in given.items():
-        if value is not None:
-            OmegaConf.update(cfg, f"data.{key}", value)
+    chosen = any(override.startswith("data=") for override in overrides)
+    cfg = composed([*([] if chosen else ["data=mocap"]), *overrides, "data.root=."])
+    OmegaConf.update(cfg, "data.root", str(root))
     show_manifest(prepare_cache(build_motion(cfg).clips, out))
 
 
@@ -142,7 +97,7 @@ def inspect(path: Path) -> None:
 
     PATH is a cache, whose splits are shown too, or a folder of npz files.
     """
-    from memmlp.motion.preparing.manifest import MANIFEST, Manifest
+    from memmlp.motion.preparing.manifest import MANIFEST, Manifest, Total
     from memmlp.motion.preparing.survey import survey
 
     if (path / MANIFEST).is_file():
@@ -150,11 +105,11 @@ def inspect(path: Path) -> None:
         return
     found = survey(path)
     show_skipped(found.skipped)
-    show_files(found.ignored, found.found.passed_over, found.found.links, found.unusual)
+    show_pairs("unusual", found.unusual, ": ")
     show_pairs("the same frames, or some of them", found.duplicates)
     show_rates(found.clips)
-    frames = sum(clip.length for clip in found.clips)
-    click.echo(f"{len(found.clips)} clips, {frames / 216000:.2f} h, {len(found.skipped)} bad files")
+    hours = Total(len(found.clips), sum(clip.length for clip in found.clips)).hours
+    click.echo(f"{len(found.clips)} clips, {hours:.2f} h, {len(found.skipped)} bad files")
 
 
 @data.command("export")

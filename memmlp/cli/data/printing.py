@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import click
@@ -11,10 +12,9 @@ from rich.console import Console
 from rich.table import Table
 
 from memmlp.common.errors import one_line
-from memmlp.motion.body import FPS
 from memmlp.motion.clip import INTERPOLATED, Skipped
 from memmlp.motion.preparing.find_clips import source_of
-from memmlp.motion.preparing.split_remarks import divided_remark, unmatched_patterns_remark
+from memmlp.motion.preparing.groups import divided_remark, unmatched_patterns_remark
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,16 +31,16 @@ def show_manifest(manifest: Manifest) -> None:
     for name in ("clips", "frames", "hours"):
         table.add_column(name, justify="right")
     for part, total in manifest.totals.items():
-        table.add_row(part, f"{total['clips']:.0f}", f"{total['frames']:.0f}", f"{total['hours']:.3f}")
+        table.add_row(part, str(total.clips), str(total.frames), f"{total.hours:.3f}")
     Console(highlight=False).print(table)
     for source in manifest.sources:
-        clips = [clip for clip in manifest.clips if source_of(clip.name) == source]
-        lengths = {part: [c.length for c in clips if c.split == part] for part in manifest.totals}
-        parts = [f"{part} {len(n)} clips, {sum(n) / FPS / 3600:.3f} h" for part, n in lengths.items()]
+        own = tuple(clip for clip in manifest.clips if source_of(clip.name) == source)
+        totals = replace(manifest, clips=own).totals.items()
+        parts = [f"{part} {total.clips} clips, {total.hours:.3f} h" for part, total in totals]
         click.echo(f"{source}: {'; '.join(parts)}")
     show_rates(manifest.clips, manifest.interpolation)
     show_skipped(manifest.skipped)
-    show_files(manifest.ignored, manifest.passed_over, manifest.links, manifest.unusual)
+    show_pairs("unusual", manifest.unusual, ": ")
     show_pairs("left out, since another part has the same frames or some of them", manifest.duplicates)
     left_out = sum(manifest.left_out.values())
     click.echo(
@@ -48,9 +48,9 @@ def show_manifest(manifest: Manifest) -> None:
         f"listed but missing {len(manifest.missing)}; body {manifest.body}"
     )
     names = [clip.name for clip in manifest.clips]
-    remarks = divided_remark(manifest), unmatched_patterns_remark(manifest.split, names)
-    for remark in filter(None, remarks):
-        click.echo(remark)
+    for remark in (divided_remark(manifest), unmatched_patterns_remark(manifest.split, names)):
+        if remark:
+            click.echo(remark)
     if not manifest.coverage.whole:
         click.echo(f"{manifest.coverage}: {manifest.coverage.gaps}")
 
@@ -60,18 +60,6 @@ def show_rates(clips: tuple[ClipRecord, ...], interpolation: str = "") -> None:
     for (fps, how), count in sorted(Counter((clip.fps, clip.resampling) for clip in clips).items()):
         by = f" by {interpolation}" if interpolation and how == INTERPOLATED else ""
         click.echo(f"{count} clips at {fps:g} Hz: {how}{by}")
-
-
-def show_files(
-    ignored: int, passed_over: Mapping[str, int], links: Mapping[str, str], unusual: Mapping[str, str]
-) -> None:
-    """Print the other content of a folder: files that are not clips, links, and clips that look odd."""
-    others = {"npz without poses": ignored, **dict(sorted(passed_over.items()))}
-    counts = [f"{count} {kind}" for kind, count in others.items() if count]
-    if counts:
-        click.echo(f"passed over: {', '.join(counts)}")
-    show_pairs("used once, since the other path is a link", links)
-    show_pairs("unusual", unusual, ": ")
 
 
 def show_pairs(label: str, pairs: Mapping[str, str], sign: str = " = ") -> None:

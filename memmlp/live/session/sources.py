@@ -236,11 +236,11 @@ def npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
     """
     import torch
 
+    from memmlp.motion.body import check_imported_body
     from memmlp.motion.clip import resample
     from memmlp.motion.formats.npz import read_clip
     from memmlp.motion.geometry import motion_frames
     from memmlp.motion.plausibility import check_plausible
-    from memmlp.motion.preparing.imported_body import check_imported_body
 
     recorded = read_clip(path, path.stem)
     check_imported_body([path], rest, "the network")

@@ -15,7 +15,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.common.progress import progress_bar
-from memmlp.motion.body import load_rest_joints
+from memmlp.motion.body import RECORD, body_record, load_rest_joints
 from memmlp.motion.clip import FRAME_RATE_RANGE, Skipped
 from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.formats.recording import Recording
@@ -24,7 +24,6 @@ from memmlp.motion.importing.convert import AUTO, JUMP, STRAIGHTEST, Converted, 
 from memmlp.motion.importing.fidelity import Fidelity, compare
 from memmlp.motion.importing.recordings import Rate, find_rate, find_recordings, folder_key, read_recording
 from memmlp.motion.importing.skeleton_map import SkeletonMap, find_skeleton, is_number, load_skeleton
-from memmlp.motion.preparing.imported_body import RECORD, body_record
 
 
 @dataclass(frozen=True)

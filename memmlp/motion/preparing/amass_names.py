@@ -10,8 +10,7 @@ each unpacked into a folder, have another folder in front, as in `BMLrub/BioMoti
 from __future__ import annotations
 
 import re
-from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 RENAMED = {
     "bmlrub": "biomotionlabntroje",
@@ -51,20 +50,8 @@ FOLDERS = frozenset((
 ))  # fmt: skip
 """The subsets' folders as the releases spell them."""
 
-SUBSETS = frozenset(map(subset, FOLDERS))
-
 PROTOCOLS = {"amass_s1": S1, "amass_s3": (*S2_TRAIN, *S2_TEST)}
 """Option of `data` -> the subsets that it must have to be complete."""
-
-PEOPLE = (
-    r"(?i)^ACCAD/((?:fe)?male\d)",
-    r"(?i)^(?:DFaust|DFaust_67|MoSh|MPI_mosh|PosePrior|MPI_Limits|SSM|SSM_synced)/(?:\d{8}_)?(\d{5})/",
-)
-"""Patterns of people with several folders, for `data.split.groups`.
-
-ACCAD has a folder for each kind of motion, such as `Female1Running_c3d`. The sets recorded at the MPI use the
-same number for a person.
-"""
 
 
 def strip_archives(name: str) -> str:
@@ -102,28 +89,3 @@ def absent_subsets(data: str, names: Iterable[str]) -> str:
     more = f" and {len(absent) - 3} more" if len(absent) > 3 else ""
     count = f"{len(protocol) - len(absent)} of {len(protocol)} subsets"
     return f"{count} (without {', '.join(absent[:3])}{more})"
-
-
-def divided_subjects(parts: Iterable[tuple[str, str]]) -> list[str]:
-    """Return the AMASS subjects, SUBSET/SUBJECT, that have clips in both training and test.
-
-    A subject is the same one under all names of the subset, and in all folders of one person (`PEOPLE`); the
-    first name that occurs is returned.
-
-    Args:
-        parts: clips' names and parts.
-    """
-    names: dict[tuple[str, str], str] = {}
-    found: dict[str, set[str]] = defaultdict(set)
-    for name, part in parts:
-        folders = strip_archives(name).split("/")[:-1]
-        if len(folders) >= 2 and subset(folders[0]) in SUBSETS:
-            found[names.setdefault(_subject_key(folders), "/".join(folders[:2]))].add(part)
-    return sorted(subject for subject, of in found.items() if {"train", "test"} <= of)
-
-
-def _subject_key(folders: Sequence[str]) -> tuple[str, str]:
-    for pattern in PEOPLE:
-        if match := re.search(pattern, "/".join(folders) + "/"):
-            return pattern, match[1].lower()
-    return subset(folders[0]), folders[1].replace(" ", "_")

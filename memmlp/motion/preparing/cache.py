@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -23,13 +22,12 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.common.lease import Lock, check_owner, publish, temporary
 from memmlp.common.progress import progress_bar
-from memmlp.motion.body import FPS, FRAME_DIM, load_rest_joints
+from memmlp.motion.body import FRAME_DIM, body_name, check_imported_body, load_rest_joints
 from memmlp.motion.clip import INTERPOLATED, LINES, SPLINES, Clip, resample
 from memmlp.motion.formats.npz import read_clip
-from memmlp.motion.preparing.find_clips import Folders, Root, clip_name, find_clips
-from memmlp.motion.preparing.imported_body import body_name, check_imported_body
-from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manifest
-from memmlp.motion.preparing.splits import PARTS, Split
+from memmlp.motion.preparing.find_clips import Folders, Root, find_clips
+from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, PARTS, ClipRecord, Manifest
+from memmlp.motion.preparing.splits import Split
 from memmlp.runs.component_versions import VERSIONS
 
 FRAMES_VERSION = 1  # number of a frame's content; a new one changes every digest, and so repeats every run
@@ -61,8 +59,8 @@ def prepare(source: ClipFolder, out: Path) -> Manifest:
     """Make the cache in `out`, unless it is there already; concurrent callers wait for one another.
 
     Raises:
-        InputError: for a root without usable clips, an impossible split, a bad file under `strict`, a folder
-            that cannot be written, or too small a disk.
+        InputError: for a root without usable clips, an impossible split, a bad file under `strict`, or a
+            folder that cannot be written.
     """
     source = replace(source, body=str(source.body))
     if source.min_frames < 2:
@@ -103,15 +101,13 @@ def _plan(source: ClipFolder, rest: np.ndarray, request: str) -> Manifest:
     if not found.clips:
         first = f"; the first: {found.skipped[0].file}: {found.skipped[0].reason}" if found.skipped else ""
         raise InputError(
-            f"data.root={source.root}: no usable clip ({len(found.skipped)} bad, {found.ignored} without "
-            f"poses{first}); expected AMASS npz files"
+            f"data.root={source.root}: no usable clip ({len(found.skipped)} bad files{first}); "
+            "expected AMASS npz files"
         )
     names = [clip.name for clip in found.clips]
     parts, groups, duplicates = assign_parts(split, found.clips)
-    linked = [clip_name(path) for path, file in found.found.links.items() if parts.get(clip_name(file))]
-    every = [*names, *found.short, *found.damaged, *linked]
+    every = [*names, *found.short, *found.damaged]
     split.check_groups([name for name, part in parts.items() if part], every)
-    missing = split.missing(every)
     clips = _place(found.clips, parts, groups)
     if not any(clip.split == "train" for clip in clips):
         raise InputError(f"data.root={source.root}: no clip for training; check data.split")
@@ -129,16 +125,11 @@ def _plan(source: ClipFolder, rest: np.ndarray, request: str) -> Manifest:
         interpolation=source.interpolation,
         clips=clips,
         skipped=found.skipped,
-        ignored=found.ignored,
         left_out=dict(Counter(name.split("/")[0] for name in left_out)),
         listed=dict(split.listed),
-        missing=missing,
-        damaged=tuple(sorted(set(split.missing([*names, *found.short])) - set(missing))),
-        totals={part: _total(clips, part) for part in PARTS},
+        missing=split.missing([*names, *found.short]),
         duplicates=duplicates,
-        links=found.found.links,
         unusual=found.unusual,
-        passed_over=dict(found.found.passed_over),
         sources=tuple(source.root.sources) if isinstance(source.root, Folders) else (),
     )
 
@@ -157,16 +148,10 @@ def _place(
     return tuple(placed)
 
 
-def _total(clips: Sequence[ClipRecord], part: str) -> dict[str, float]:
-    lengths = [clip.length for clip in clips if clip.split == part]
-    return {"clips": len(lengths), "frames": sum(lengths), "hours": sum(lengths) / FPS / 3600}
-
-
 def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) -> None:
     """Write the arrays under temporary names, then rename them, then write the manifest."""
     check_owner(out)
     (out / MANIFEST).unlink(missing_ok=True)
-    _check_space(out, sum(int(manifest.totals[part]["frames"]) for part in PARTS) * FRAME_DIM * 4)
     unfinished = {part: temporary(out / f"{part}.npy") for part in PARTS}
     try:
         _write_frames(source, rest, manifest, unfinished)
@@ -189,7 +174,7 @@ def _write_frames(
         stack.enter_context(one_thread())
         files = {part: stack.enter_context(open(path, "wb")) for part, path in paths.items()}
         for part, file in files.items():
-            shape = (int(manifest.totals[part]["frames"]), FRAME_DIM)
+            shape = (manifest.totals[part].frames, FRAME_DIM)
             header = {"descr": "<f4", "fortran_order": False, "shape": shape}
             np.lib.format.write_array_header_1_0(file, header)
         for record in progress_bar(manifest.clips, "writing"):
@@ -243,14 +228,7 @@ def _load_finished(out: Path, request: str) -> Manifest | None:
         manifest = Manifest.load(out)
         # Opening an array raises ValueError if its size contradicts its header.
         lengths = {part: len(np.lib.format.open_memmap(out / f"{part}.npy", mode="r")) for part in PARTS}
-        whole = all(lengths[part] == manifest.totals[part]["frames"] for part in PARTS)
+        whole = all(lengths[part] == manifest.totals[part].frames for part in PARTS)
     except (InputError, OSError, ValueError, KeyError):
         return None
     return manifest if whole and manifest.request == request else None
-
-
-def _check_space(out: Path, needed: int) -> None:
-    free = shutil.disk_usage(out).free
-    if needed > free:
-        size, left = (f"{n / 1e9:.1f} GB" if n >= 1e9 else f"{n / 1e6:.1f} MB" for n in (needed, free))
-        raise InputError(f"{out}: the cache needs {size}, but only {left} are free")

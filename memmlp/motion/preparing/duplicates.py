@@ -29,8 +29,8 @@ from memmlp.motion.clip import LINES, Clip, resample
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.preparing.find_clips import Root
 from memmlp.motion.preparing.groups import find_root
-from memmlp.motion.preparing.manifest import STILL, ClipRecord
-from memmlp.motion.preparing.splits import PARTS, Split
+from memmlp.motion.preparing.manifest import PARTS, STILL, ClipRecord
+from memmlp.motion.preparing.splits import Split
 
 DEGREES, METRES = 1.0, 0.01  # largest mean deviation of a copy at another rate, over frames and joints
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -62,15 +61,11 @@ class FoundFiles:
 
     Attributes:
         files: the npz files, sorted, each by the path that is nearest to the folder, real before linked.
-        links: other paths of the same files or folders (symbolic or hard links) -> the path that is used.
         unreadable: folders that cannot be listed -> why.
-        passed_over: number of other files by suffix.
     """
 
     files: list[str] = field(default_factory=list)
-    links: dict[str, str] = field(default_factory=dict)
     unreadable: dict[str, str] = field(default_factory=dict)
-    passed_over: Counter[str] = field(default_factory=Counter)
 
 
 def find_clips(root: Root) -> FoundFiles:
@@ -85,9 +80,7 @@ def find_clips(root: Root) -> FoundFiles:
     for source, folder in root.sources.items():
         found = _find_in_folder(folder)
         result.files += [f"{source}/{file}" for file in found.files]
-        result.links |= {f"{source}/{path}": f"{source}/{file}" for path, file in found.links.items()}
         result.unreadable |= {f"{source}/{path}": why for path, why in found.unreadable.items()}
-        result.passed_over += found.passed_over
     result.files.sort()
     return result
 
@@ -106,20 +99,18 @@ def _find_in_folder(root: Path) -> FoundFiles:
     if not root.is_dir():
         raise InputError(f"data.root={root}: no such folder; expected the folder with your npz clips")
     found, files = FoundFiles(), dict[object, str]()
-    folders: dict[object, str] = {_identity(root): "."}
+    folders = {_identity(root)}
     level = [""]
     while level:  # one depth after the other, so that of two paths the shorter one counts
         entries = [entry for folder in level for entry in _list_folder(root, folder, found)]
         level = []
         for path, is_folder in entries:
-            if not is_folder and Path(path).suffix.lower() != SUFFIX:
-                found.passed_over[Path(path).suffix.lower() or "no suffix"] += 1
-                continue
-            first = (folders if is_folder else files).setdefault(_identity(root / path), path)
-            if first != path:
-                found.links[path] = first
-            elif is_folder:
+            identity = _identity(root / path)
+            if is_folder and identity not in folders:
+                folders.add(identity)
                 level.append(path)
+            elif not is_folder and path.lower().endswith(SUFFIX):
+                files.setdefault(identity, path)
     found.files = sorted(files.values())
     if not found.files:
         raise InputError(f"data.root={root}: no npz in it; make some with memmlp data synth or data import")

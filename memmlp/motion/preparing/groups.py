@@ -2,7 +2,8 @@
 
 Clips of one group are never divided between parts, and statistics count a group once. Patterns, a column
 file, or both say which clips belong together: two clips that match the same pattern anywhere (`re.search`)
-with the same captured groups are tied, and so are two clips with the same group in the file.
+with the same captured groups are tied, and so are two clips with the same group in the file. Remarks tell the
+user of clips that may belong together and are not tied.
 """
 
 from __future__ import annotations
@@ -11,12 +12,15 @@ import csv
 import hashlib
 import json
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
+from memmlp.motion.preparing.amass_names import strip_archives
+from memmlp.motion.preparing.manifest import Manifest
 
 COLUMNS = ("clip", "group")
 KEY = "data.split.groups_file"
@@ -140,3 +144,76 @@ def find_root(parents: dict[Any, Any], node: Any) -> Any:
         parents[node] = parents[parents[node]]
         node = parents[node]
     return node
+
+
+# Remarks
+
+
+def divided_remark(manifest: Manifest) -> str:
+    """Warn of folders with clips in both training and test that have no common group; empty without any.
+
+    A folder is often a person or a session, unless it holds all clips of its source. Published lists are used
+    as they were published.
+    """
+    if manifest.split.get("kind") == "lists":
+        return ""
+    records = {clip.name: clip for clip in manifest.clips}
+    folders: list[tuple[str, int]] = []
+    for prefix, split, names in _by_source(manifest.split, records):
+        held = Counter(folder for name in names for folder in _folders(name))
+        parts: dict[str, list[str]] = defaultdict(list)
+        for name in names:
+            clip = records[prefix + name]
+            if clip.group == clip.name and not _is_tied(split, name):
+                own, *above = _folders(name)
+                # Where each take has a folder to itself, the person is the one above.
+                parts[next((folder for folder in (own, *above) if held[folder] > 1), own)].append(clip.split)
+        folders += [
+            (prefix + folder, found.count("test"))
+            for folder, found in parts.items()
+            if held[folder] < len(names) and {"train", "test"} <= set(found)
+        ]
+    if not folders:
+        return ""
+    tested = f"{sum(count for _, count in folders)} test clips are tied to no others (data.split.groups)"
+    more = f" and {len(folders) - 1} more" if len(folders) > 1 else ""
+    return f"{tested}, but clips of their folders, {folders[0][0] or 'the top one'}{more}, are in training"
+
+
+def unmatched_patterns_remark(split: Mapping[str, Any], names: Collection[str]) -> str:
+    """Warn that a split has patterns of groups and none of them matches a clip; empty otherwise.
+
+    Args:
+        split: the split's settings (`Split.describe`).
+        names: clips' names.
+    """
+    remarks = []
+    for prefix, own, below in _by_source(split, names):
+        patterns = own.get("groups", ())
+        if patterns and not any(_is_tied(own, name) for name in below):
+            remarks.append(
+                f"{prefix.replace('/', ': ')}none of the {len(patterns)} patterns of data.split.groups "
+                f"matches a clip's name (the first is {patterns[0]}), so each clip counts as independent, "
+                "and clips of one person may be in training and in test; data/grouping@data.split=NAME has "
+                "patterns for other collections, and data.split.groups_file can list who is in which clip"
+            )
+    return "; ".join(remarks)
+
+
+def _by_source(
+    split: Mapping[str, Any], names: Iterable[str]
+) -> Iterator[tuple[str, Mapping[str, Any], list[str]]]:
+    """Yield the prefix of each source's clips, its split, and its clips' names without the prefix."""
+    sources = {f"{source}/": own for source, own in split.get("sources", {}).items()}
+    for prefix, own in (sources or {"": split}).items():
+        yield prefix, own, [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
+
+
+def _is_tied(split: Mapping[str, Any], name: str) -> bool:
+    return any(re.search(pattern, strip_archives(name)) for pattern in split.get("groups", ()))
+
+
+def _folders(name: str) -> list[str]:
+    """Return the folders that a clip is in, the innermost first; "" at the top."""
+    folders = name.split("/")[:-1]
+    return ["/".join(folders[:depth]) for depth in range(len(folders), 0, -1)] or [""]

@@ -8,17 +8,19 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
+from memmlp.motion.body import FPS
 from memmlp.motion.clip import Skipped
 from memmlp.motion.preparing.find_clips import Root
 
-FORMAT = 8  # number of the cache's format; a new one makes every cache again
+FORMAT = 9  # number of the cache's format; a new one makes every cache again
 MANIFEST = "manifest.json"
+PARTS = ("train", "val", "test")
 STILL = "still"  # the content of every clip without motion
 
 
@@ -50,6 +52,18 @@ class ClipRecord:
     content: str
     fps: float
     resampling: str
+
+
+class Total(NamedTuple):
+    """A number of clips, and of their frames at 60 Hz."""
+
+    clips: int
+    frames: int
+
+    @property
+    def hours(self) -> float:
+        """The clips' duration."""
+        return self.frames / FPS / 3600
 
 
 @dataclass(frozen=True)
@@ -113,16 +127,11 @@ class Manifest:
         interpolation: how clips of other rates were brought to 60 Hz: one of `INTERPOLATIONS`.
         clips: the clips, sorted by name.
         skipped: bad files.
-        ignored: number of npz files without poses (shape.npz and the like).
         left_out: number of sound clips without a part in the split, by top-level folder.
         listed: number of the split's entries (list entries, subsets) by subset; empty without a list.
-        missing: entries of the split for which there is no file.
-        damaged: entries of the split whose file is not a sound clip; clips that are too short do not count.
-        totals: part -> clips, frames, hours.
+        missing: entries of the split for which there is no sound clip; clips that are too short do not count.
         duplicates: clip that was left out -> the clip that shares motion with it in another part, and stays.
-        links: other path of a file or folder -> the path by which it was read.
-        unusual: clip -> what is odd about it, though it may be sound.
-        passed_over: number of files with other suffixes, by suffix.
+        unusual: clip -> its faults, though it may be sound (`plausibility.find_faults`).
         sources: names of the sources; every clip's name begins with one of them. Empty for one folder.
         format: format number of the cache.
     """
@@ -136,16 +145,11 @@ class Manifest:
     interpolation: str
     clips: tuple[ClipRecord, ...]
     skipped: tuple[Skipped, ...]
-    ignored: int
     left_out: dict[str, int]
     listed: dict[str, int]
     missing: tuple[str, ...]
-    damaged: tuple[str, ...]
-    totals: dict[str, dict[str, float]]
     duplicates: dict[str, str]
-    links: dict[str, str]
     unusual: dict[str, str]
-    passed_over: dict[str, int]
     sources: tuple[str, ...] = ()
     format: int = FORMAT
 
@@ -164,7 +168,7 @@ class Manifest:
             data["clips"] = tuple(ClipRecord(**clip) for clip in data["clips"])
             data["skipped"] = tuple(Skipped(**file) for file in data["skipped"])
             data["rest_joints"] = tuple(map(tuple, data["rest_joints"]))
-            for name in ("missing", "damaged", "sources"):
+            for name in ("missing", "sources"):
                 data[name] = tuple(data[name])
             return cls(**data)
         except FileNotFoundError as error:
@@ -189,7 +193,13 @@ class Manifest:
     @property
     def coverage(self) -> Coverage:
         """The number of the split's entries that have a clip."""
-        return Coverage.of(self.listed, (*self.missing, *self.damaged))
+        return Coverage.of(self.listed, self.missing)
+
+    @cached_property
+    def totals(self) -> dict[str, Total]:
+        """part -> the number of its clips and frames."""
+        lengths = {part: [clip.length for clip in self.clips if clip.split == part] for part in PARTS}
+        return {part: Total(len(own), sum(own)) for part, own in lengths.items()}
 
     def part(self, part: str) -> list[ClipRecord]:
         """Return the clips of a part, in the order of its array."""

@@ -24,7 +24,6 @@ from memmlp.common.errors import InputError
 from memmlp.motion.preparing.amass_names import clip_key, present_subsets, strip_archives, subset
 from memmlp.motion.preparing.groups import Grouping
 
-PARTS = ("train", "val", "test")
 LISTED = ("train", "test")  # the parts for which there are published lists
 
 
@@ -71,14 +70,39 @@ class Split:
         return ()
 
 
+@dataclass(frozen=True, kw_only=True)
 class GroupedSplit(Split):
-    """A split that divides groups of clips in a seeded order; the base of all but MixedSplit."""
+    """A split that divides groups of clips in a seeded order; the base of all but MixedSplit.
 
-    groups: Sequence[str]
-    groups_file: Path | str | None
-    val: float
-    seed: int
-    train_fraction: float
+    Args:
+        val: fraction of the groups for validation; 0 leaves it empty.
+        seed: seed of the order in which groups are taken.
+        groups: patterns of clips that stay together.
+        groups_file: column file that says which clips stay together; None for none.
+        train_fraction: fraction of train's groups that are used; the others are left out.
+    """
+
+    val: float = 0.05
+    seed: int = 0
+    groups: Sequence[str] = ()
+    groups_file: Path | str | None = field(default=None, repr=False)
+    train_fraction: float = 1.0
+
+    def __post_init__(self) -> None:
+        self._check_fractions(val=self.val)
+
+    def _check_fractions(self, **fractions: float) -> None:
+        if not 0 < self.train_fraction <= 1:
+            raise InputError(
+                f"data.split.train_fraction={self.train_fraction}: must be above 0 and at most 1"
+            )
+        for key, value in fractions.items():
+            if not 0 <= value < 1:
+                raise InputError(f"data.split.{key}={value}: must be at least 0 and below 1")
+        if sum(fractions.values()) >= 1:
+            raise InputError(
+                "data.split.test, data.split.val: must add up to less than 1: training needs the rest"
+            )
 
     @cached_property
     def grouping(self) -> Grouping:
@@ -97,19 +121,6 @@ class GroupedSplit(Split):
         file = {"groups_file_sha256": digest} if digest else {}
         fewer = {"train_fraction": self.train_fraction} if self.train_fraction < 1 else {}
         return {"val": self.val, "seed": self.seed, "groups": list(self.groups), **file, **fewer}
-
-    def _check_fractions(self, **fractions: float) -> None:
-        if not 0 < self.train_fraction <= 1:
-            raise InputError(
-                f"data.split.train_fraction={self.train_fraction}: must be above 0 and at most 1"
-            )
-        for key, value in fractions.items():
-            if not 0 <= value < 1:
-                raise InputError(f"data.{key}={value}: must be at least 0 and below 1")
-        if sum(fractions.values()) >= 1:
-            raise InputError(
-                f"data.{', data.'.join(fractions)}: must add up to less than 1, as the rest is for training"
-            )
 
     def _divide(self, seen: Mapping[str, str], fractions: Mapping[str, float]) -> dict[str, str | None]:
         """Map clips to parts: the first groups in seeded order fill those of `fractions`, the others train.
@@ -159,27 +170,18 @@ def _counts(total: int, fractions: Mapping[str, float]) -> dict[str, int]:
     return counts
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SeededSplit(GroupedSplit):
     """A random split with a seed.
 
     Args:
         test: fraction of the groups for test (of the clips, if none are tied); 0 leaves it empty.
-        val: fraction of the groups for validation; 0 leaves it empty.
-        seed: seed of the order in which groups are taken.
-        groups: patterns of clips that stay together.
-        groups_file: column file that says which clips stay together; None for none.
-        train_fraction: fraction of train's groups that are used; the others are left out.
         per_group: the largest number of clips of a group in test, and in validation; the others are left out,
             since repetitions of a motion add little information. None for all clips.
     """
 
     test: float = 0.1
     val: float = 0.1
-    seed: int = 0
-    groups: Sequence[str] = ()
-    groups_file: Path | str | None = field(default=None, repr=False)
-    train_fraction: float = 1.0
     per_group: int | None = None
 
     def __post_init__(self) -> None:
@@ -258,23 +260,8 @@ class MixedSplit(Split):
             yield source, [rest for name in names if (rest := name.removeprefix(f"{source}/")) != name]
 
 
-@dataclass(frozen=True, kw_only=True)
 class PublishedSplit(GroupedSplit):
-    """A split with published training and test parts; a seeded part of training becomes validation.
-
-    Args:
-        val: fraction of train's groups that becomes the validation part.
-        seed: seed of the validation part.
-        groups: patterns of clips that stay together in the validation part.
-        groups_file: column file that says which clips stay together; None for none.
-        train_fraction: fraction of train's groups that are used; the others are left out.
-    """
-
-    val: float = 0.05
-    seed: int = 0
-    groups: Sequence[str] = ()
-    groups_file: Path | str | None = field(default=None, repr=False)
-    train_fraction: float = 1.0
+    """A split with published training and test parts; a seeded part of training becomes validation."""
 
     def _carve_validation(self, parts: Mapping[str, str | None], seen: Mapping[str, str]) -> Assignment:
         """Return the assignment with some of train's groups moved to "val"."""
@@ -302,7 +289,7 @@ class ListSplit(PublishedSplit):
     entries: Mapping[str, str] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        self._check_fractions(val=self.val)
+        super().__post_init__()
         object.__setattr__(self, "entries", _read_lists(Path(self.folder)))
 
     def assign(self, names: Sequence[str]) -> Assignment:
@@ -339,7 +326,7 @@ class SubsetSplit(PublishedSplit):
     test: Sequence[str]
 
     def __post_init__(self) -> None:
-        self._check_fractions(val=self.val)
+        super().__post_init__()
         if deeper := [name for name in (*self.train, *self.test) if "/" in name]:
             raise InputError(f"data.split: {deeper[0]} must be the name of a folder in data.root, without /")
         both = set(map(subset, self.train)) & set(map(subset, self.test))

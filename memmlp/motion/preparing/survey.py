@@ -23,7 +23,7 @@ from memmlp.motion.preparing.duplicates import (
     mark_frames,
     merge_contents,
 )
-from memmlp.motion.preparing.find_clips import FoundFiles, Root, clip_name, find_clips
+from memmlp.motion.preparing.find_clips import Root, clip_name, find_clips
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
 
 
@@ -34,18 +34,14 @@ class Survey:
     Attributes:
         clips: sound clips, without split and group yet.
         skipped: bad files.
-        ignored: number of npz files without motion.
         short: names of the bad files that are sound clips with too few frames.
-        unusual: clip -> what is odd about it, though it may be sound.
-        found: the files, and other paths to them.
+        unusual: clip -> its faults, though it may be sound.
     """
 
     clips: tuple[ClipRecord, ...]
     skipped: tuple[Skipped, ...]
-    ignored: int
     short: tuple[str, ...]
     unusual: dict[str, str]
-    found: FoundFiles
 
     @property
     def damaged(self) -> tuple[str, ...]:
@@ -75,7 +71,7 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
     firsts: dict[str, np.ndarray] = {}
     marks: dict[str, tuple[Marks, Marks]] = {}
     odd: dict[str, str] = {}
-    short, ignored, found = [], 0, find_clips(root)
+    short, found = [], find_clips(root)
     skipped = [Skipped(folder, reason) for folder, reason in found.unreadable.items()]
     for file in progress_bar(found.files, "reading"):
         path, name = root / file, clip_name(file)
@@ -87,8 +83,8 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
             if len(resampled) < min_frames:
                 few = f"{len(resampled)} frames at {FPS} Hz"
                 raise TooShort(f"{path}: {few}, fewer than data.min_frames={min_frames}")
-        except NoMotion:
-            ignored += 1
+        except NoMotion:  # such as AMASS' files of shapes
+            continue
         except InputError as error:
             if strict:
                 raise
@@ -102,7 +98,7 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
     records = list(clips.values())
     records = merge_contents(records, find_resampled_copies(root, records, firsts))
     records = merge_contents(records, find_shared_stretches(root, records, marks))
-    return Survey(tuple(records), tuple(skipped), ignored, tuple(short), odd, found)
+    return Survey(tuple(records), tuple(skipped), tuple(short), odd)
 
 
 def _check_name(path: Path, file: str, clips: dict[str, ClipRecord]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -43,60 +42,22 @@ def test_a_sheet_is_written_and_bad_files_are_named(tmp_path: Path):
     assert isinstance(gif.exception, InputError)
 
 
-@pytest.fixture
-def prepared(memmlp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., ClipFolder]:
-    """The source of a cache for some options, without reading it."""
-    for name in ("clips", "lists/CMU"):
-        (tmp_path / name).mkdir(parents=True)
-    for part in ("train", "test"):
-        (tmp_path / "lists" / "CMU" / f"{part}_split.txt").write_text(f"CMU/1/{part}.npz\n")
+def test_a_cache_has_the_clips_of_training(memmlp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """For the same overrides; without data= they are those of data=mocap."""
+    (tmp_path / "clips").mkdir()
     monkeypatch.chdir(tmp_path)
     found: list[ClipFolder] = []
     monkeypatch.setattr("memmlp.motion.preparing.cache.prepare", lambda source, out: found.append(source))
     monkeypatch.setattr(commands, "show_manifest", lambda manifest: None)
-
-    def of(*words: str) -> ClipFolder:
+    for words, train in (
+        (["data.split.val=0.2"], ["data=mocap", "data.split.val=0.2"]),
+        (["data=amass_s2"],) * 2,
+    ):
         ran = memmlp("data", "prepare", "clips", "--out", "cache", *words)
         assert ran.code == 0, ran.err
-        return found[-1]
-
-    return of
-
-
-@pytest.mark.parametrize(
-    ("words", "train"),
-    [
-        ([], ["data=mocap"]),
-        (["--split", "s2"], ["data=amass_s2"]),
-        (["--split", "lists:lists"], ["data=amass_s1", "data.split.folder=lists"]),
-        (
-            ["--val", "0.2", "--test", "0.3", "--seed", "4", "--min-frames", "50", "--strict",
-             "--group", "a(.)", "--group", "b", "--interpolation", "lines"],
-            [
-                "data=mocap", "data.split.val=0.2", "data.split.test=0.3", "data.split.seed=4",
-                "data.min_frames=50", "data.strict=true", "data.split.groups=['a(.)',b]",
-                "data.interpolation=lines",
-            ],
-        ),
-    ],
-    ids=str,
-)  # fmt: skip
-def test_a_cache_has_the_clips_of_training(
-    prepared: Callable[..., ClipFolder], words: list[str], train: list[str]
-):
-    assert prepared(*words) == build_motion(composed([*train, "data.root=clips"])).clips
-
-
-@pytest.mark.parametrize(
-    ("words", "key"),
-    [
-        (["--split", "s3"], "--split s3"),
-        (["--val", "2"], "data.val=2.0"),
-        (["--split", "s2", "--test", "0.4"], "--test 0.4"),
-    ],
-)
-def test_bad_options_are_refused(memmlp, words: list[str], key: str):
-    assert one_line(memmlp("data", "prepare", "clips", "--out", "cache", *words), key)
+        assert found[-1] == build_motion(composed([*train, "data.root=clips"])).clips
+    bad = memmlp("data", "prepare", "clips", "--out", "cache", "data.split.val=2")
+    assert one_line(bad, "data.split.val=2")
 
 
 def test_folders_in_training_and_in_test_are_reported(memmlp, tmp_path: Path):
@@ -107,7 +68,7 @@ def test_folders_in_training_and_in_test_are_reported(memmlp, tmp_path: Path):
             clip = Clip("", poses, 0.01 * np.cumsum(rng.normal(size=(90, 3)), 0), 60.0)
             write_clip(tmp_path / "own" / person / f"{take}.npz", clip)
     cache = str(tmp_path / "cache")
-    prepared = memmlp("data", "prepare", str(tmp_path / "own"), "--out", cache, "--test", "0.4")
+    prepared = memmlp("data", "prepare", str(tmp_path / "own"), "--out", cache, "data.split.test=0.4")
     for ran in (prepared, memmlp("data", "inspect", cache)):
         assert ran.code == 0, ran.err
         assert "test clips are tied to no others (data.split.groups)" in ran.out

@@ -73,7 +73,7 @@ def test_a_copy_leaves_the_limit_of_clips_of_a_group(source: str, copy: bool):
     contents = {name: name for name in names}
     if copy:
         contents[names[10]] = names[0]
-    own = SeededSplit(0.2, 0.2, 0, ["(take..)/"], per_group=2)
+    own = SeededSplit(test=0.2, val=0.2, groups=["(take..)/"], per_group=2)
     split = MixedSplit({"cmu": own}) if source else own
     parts, groups, gave_way = assign_parts(split, records(contents))
     held_out = Counter((groups[name], part) for name, part in parts.items() if part in ("val", "test"))
@@ -233,7 +233,7 @@ def test_copies_are_drawn_together(root: Path, tmp_path: Path):
         again = cut(recorded(activity), 60)
         write_clip(root / "b" / f"{activity}.npz", again if activity < "s" else resample(again, 30.0)[0])
     for seed in range(3):
-        manifest = prepare(ClipFolder(root, SeededSplit(0.3, 0.3, seed=seed)), tmp_path / "cache")
+        manifest = prepare(ClipFolder(root, SeededSplit(test=0.3, val=0.3, seed=seed)), tmp_path / "cache")
         parts = {clip.name: clip.split for clip in manifest.clips}
         assert set(parts.values()) == {"train", "val", "test"}
         assert all(parts[f"a/{activity}"] == parts[f"b/{activity}"] for activity in ACTIVITIES)

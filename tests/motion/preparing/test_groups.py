@@ -1,9 +1,13 @@
-"""Column files of groups, and what is said where they don't fit the clips."""
+"""Column files of groups, and remarks on clips that may belong together."""
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.motion.preparing.groups import Grouping, read_groups
+from memmlp.motion.preparing.groups import Grouping, divided_remark, read_groups, unmatched_patterns_remark
 
 
 def written(folder, text):
@@ -50,3 +54,57 @@ def test_a_group_is_named_by_the_file_else_after_its_first_clip(tmp_path):
     seen = {name: name for name in ("b", "a", "x2", "x1")}
     assert rows.names(seen) == {"a": "ann", "b": "ann", "x1": "ben", "x2": "ben"}
     assert Grouping.of(["^(x)"], None).names(seen) == {"a": "a", "b": "b", "x1": "x1", "x2": "x1"}
+
+
+# Remarks
+
+
+def manifest_of(parts: Sequence[tuple[str, str]], split: dict[str, Any], tied: Sequence[str] = ()) -> Any:
+    """A manifest with clips in parts; those of `tied` are in one group."""
+    clips = [
+        SimpleNamespace(name=name, split=part, group="tied" if name in tied else name) for name, part in parts
+    ]
+    return SimpleNamespace(clips=clips, split=split)
+
+
+SOURCES: dict[str, Any] = {"sources": {"x": {}, "y": {}}}
+TAKES = [("own/anna/1", "train"), ("own/anna/2", "test"), ("own/ben/1", "test"), ("own/ben/2", "train")]
+FLAT = [("salsa/1", "train"), ("salsa/2", "test"), ("own/1", "train"), ("own/2", "test")]  # salsa is tied
+SESSIONS = [(f"{name.rpartition('/')[0]}/session{name[-1]}/take", part) for name, part in TAKES]
+
+
+@pytest.mark.parametrize(
+    ("parts", "split", "said"),
+    [
+        (TAKES, {"groups": ["salsa/(.*)"]}, "2 test clips are tied to no others"),
+        (TAKES, {}, "2 test clips are tied to no others"),
+        (TAKES, {"groups": ["own/(.*?)/"]}, ""),
+        (TAKES[:2], {}, ""),  # all in one folder, which is no person
+        ([("a/1", "train"), ("a/2", "val"), ("b/1", "test")], {}, ""),
+        ([(f"x/{name}", part) for name, part in TAKES], SOURCES, "2 test clips"),
+        (FLAT, {"groups": ["salsa/(.*)"]}, "1 test clips are tied to no others"),
+        (SESSIONS, {}, "2 test clips are tied to no others"),
+        ([("c1/a", "train"), ("c2/a", "test"), ("c3/a", "train")], {}, ""),  # no folder is shared
+    ],
+)
+def test_folders_with_clips_in_training_and_in_test_are_told(parts, split, said):
+    """A folder is often a person, and no shipped pattern knows a custom folder."""
+    found = divided_remark(manifest_of(parts, split))
+    assert found.startswith(said) if said else found == ""
+    assert not divided_remark(manifest_of(parts, split | {"kind": "lists"}))
+    tied = [name for name, _ in parts]  # by a column file
+    assert not divided_remark(manifest_of(parts, split, tied))
+    if "sources" in split and said:
+        assert "x/own/anna and 1 more, are in training" in found
+
+
+def test_patterns_without_a_match_are_reported():
+    split = {"groups": ["^(S[0-9])_", "^([^/]+/[^/]+)/take"]}
+    remark = unmatched_patterns_remark(split, ["ann/1", "ben/2"])
+    assert "2 patterns" in remark
+    assert "^(S[0-9])_" in remark
+    assert unmatched_patterns_remark(split, ["ann/1", "S1_2"]) == ""
+    assert unmatched_patterns_remark({"groups": []}, ["ann/1"]) == ""
+    assert unmatched_patterns_remark(split, ["CMU/CMU/01/take1"]) == ""
+    mixed = {"kind": "mixed", "sources": {"one": split, "two": {"groups": ["(ann)"]}}}
+    assert unmatched_patterns_remark(mixed, ["one/ann/1", "two/ann/2"]).startswith("one: ")

@@ -1,6 +1,8 @@
 """Splits: seeded, by group, by published lists, by subset."""
 
 from collections import Counter
+from collections.abc import Sequence
+from typing import Any
 
 import pytest
 
@@ -12,23 +14,27 @@ NAMES = [f"salsa/{n:02}" for n in range(1, 31)] + [f"martial/{n:02}" for n in ra
 TWINS = [rf"salsa/(?:{n:02}|{n + 15:02})$" for n in range(1, 16)]
 
 
+def seeded(test: float, val: float, seed: int, groups: Sequence[str] = (), **more: Any) -> SeededSplit:
+    return SeededSplit(test=test, val=val, seed=seed, groups=groups, **more)
+
+
 def test_seeded_is_a_partition_whatever_the_order():
-    split = SeededSplit(test=0.2, val=0.1, seed=3)
+    split = seeded(0.2, 0.1, 3)
     parts = split.assign(NAMES).parts
     assert set(parts) == set(NAMES)
     assert split.assign(NAMES[::-1]).parts == parts
     counts = [list(parts.values()).count(part) for part in ("train", "val", "test")]
     assert counts == [28, 4, 8]
-    assert SeededSplit(0.2, 0.1, 4).assign(NAMES).parts != parts
+    assert seeded(0.2, 0.1, 4).assign(NAMES).parts != parts
 
 
 def test_groups_stay_on_one_side():
     for seed in range(5):
-        parts = SeededSplit(0.2, 0.2, seed, TWINS).assign(NAMES).parts
+        parts = seeded(0.2, 0.2, seed, TWINS).assign(NAMES).parts
         assert all(parts[f"salsa/{n:02}"] == parts[f"salsa/{n + 15:02}"] for n in range(1, 16))
-        folders = SeededSplit(0.5, 0.0, seed, ["^([^/]+)/"]).assign(NAMES).parts
+        folders = seeded(0.5, 0.0, seed, ["^([^/]+)/"]).assign(NAMES).parts
         assert len({folders[name] for name in NAMES if name.startswith("salsa")}) == 1
-    assert SeededSplit(0.2, 0.2, 0, TWINS).assign(NAMES).parts != SeededSplit(0.2, 0.2, 0).assign(NAMES).parts
+    assert seeded(0.2, 0.2, 0, TWINS).assign(NAMES).parts != seeded(0.2, 0.2, 0).assign(NAMES).parts
 
 
 def part(parts, name):
@@ -37,10 +43,10 @@ def part(parts, name):
 
 def test_a_fraction_of_the_training_groups():
     """It leaves validation and test as they are, and is part of a larger one; no group is divided."""
-    whole = SeededSplit(0.2, 0.2, 1, TWINS).assign(NAMES).parts
+    whole = seeded(0.2, 0.2, 1, TWINS).assign(NAMES).parts
     before = part(whole, "train")
     for fraction in (0.75, 0.5, 0.25):
-        fewer = SeededSplit(0.2, 0.2, 1, TWINS, train_fraction=fraction).assign(NAMES).parts
+        fewer = seeded(0.2, 0.2, 1, TWINS, train_fraction=fraction).assign(NAMES).parts
         assert [part(fewer, name) for name in ("val", "test")] == [
             part(whole, name) for name in ("val", "test")
         ]
@@ -51,15 +57,15 @@ def test_a_fraction_of_the_training_groups():
         before = used
     groups = {(int(name[-2:]) - 1) % 15 if "salsa" in name else name for name in used}
     assert len(groups) == round(0.25 * 15)
-    assert part(SeededSplit(0.2, 0.2, 1, train_fraction=1e-9).assign(NAMES).parts, "train")
+    assert part(seeded(0.2, 0.2, 1, train_fraction=1e-9).assign(NAMES).parts, "train")
 
 
 def test_no_more_than_some_clips_of_a_group_are_held_out():
     """Nothing else changes, fewer are part of more, and clips that nothing ties are groups of one."""
-    whole = SeededSplit(0.3, 0.3, 1, TWINS).assign(NAMES)
+    whole = seeded(0.3, 0.3, 1, TWINS).assign(NAMES)
     before = whole.parts
     for most in (2, 1):
-        found = SeededSplit(0.3, 0.3, 1, TWINS, per_group=most).assign(NAMES)
+        found = seeded(0.3, 0.3, 1, TWINS, per_group=most).assign(NAMES)
         assert found.groups == whole.groups
         assert part(found.parts, "train") == part(whole.parts, "train")
         for name in ("val", "test"):
@@ -218,23 +224,23 @@ def test_a_column_file_ties_clips_beside_patterns(tmp_path):
     file = tmp_path / "groups.csv"
     rows = {name: name.split("/")[0] for name in NAMES if name.startswith("martial")}
     file.write_text("clip,group\n" + "".join(f"{n}.npz,{rows.get(n, n)}\n" for n in NAMES))
-    split = SeededSplit(0.3, 0.1, 0, TWINS, groups_file=file)
+    split = seeded(0.3, 0.1, 0, TWINS, groups_file=file)
     found = split.assign(NAMES)
     assert {found.groups[name] for name in rows} == {"martial"}
     assert len({found.parts[name] for name in rows}) == 1
     assert all(found.parts[f"salsa/{n:02}"] == found.parts[f"salsa/{n + 15:02}"] for n in range(1, 16))
-    bare = SeededSplit(0.3, 0.1, 0, TWINS)
+    bare = seeded(0.3, 0.1, 0, TWINS)
     assert found.parts != bare.assign(NAMES).parts
     assert split.describe() != bare.describe()
     file.write_text(file.read_text().replace("martial\n", "other\n"))
-    assert SeededSplit(0.3, 0.1, 0, TWINS, groups_file=file).describe() != split.describe()
+    assert seeded(0.3, 0.1, 0, TWINS, groups_file=file).describe() != split.describe()
 
 
 @pytest.mark.parametrize("write", [in_archives, "archive-1/{}".format])
 def test_a_seeded_split_sees_subjects_within_archives(write):
     """A subject's folder is below the subset's, however deep that lies, and what is drawn is the same."""
     names = [f"CMU/{subject:02}/{subject:02}_0{take}_poses" for subject in range(20) for take in range(3)]
-    split = SeededSplit(0.2, 0.2, 1, ["^([^/]+/[^/]+)/"])
+    split = seeded(0.2, 0.2, 1, ["^([^/]+/[^/]+)/"])
     expected, found = split.assign(names), split.assign([write(name) for name in names])
     assert len(set(found.groups.values())) == 20
     assert found.parts == {write(name): part for name, part in expected.parts.items()}

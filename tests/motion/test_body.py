@@ -9,8 +9,7 @@ import pytest
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
-from memmlp.motion.body import builtin_rest_joints
-from memmlp.motion.preparing.imported_body import RECORD, body_name, body_record, check_imported_body
+from memmlp.motion.body import RECORD, body_name, body_record, builtin_rest_joints, check_imported_body
 
 BUILTIN, OTHER = builtin_rest_joints(), 1.1 * builtin_rest_joints()
 
