@@ -280,7 +280,7 @@ def test_a_run_that_was_killed_before_its_evaluation_is_trained_and_not_done(tmp
     run.want(["window-0", "stream-0"])
     for name, status in (("stream-0", "trained"), ("window-0", "done")):
         run.evaluation(name).write_text("{}")
-        assert (run.status, read_facts(run.folder)["complete"]) == (status, status == "done")
+        assert run.status == status
     run.want(["window-0", "stream-1"])
     with run.lock():
         assert run.status == "trained"  # somebody holds it, at none of its stages

@@ -1,8 +1,7 @@
-"""Replays: a network's predictions for test clips, computed in the background and stored in the cache."""
+"""Replays: a network's predictions for test clips, computed in the background."""
 
 from __future__ import annotations
 
-import hashlib
 import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -12,12 +11,10 @@ from typing import Any
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import read_json
 from memmlp.live.spaces import SPACES
 from memmlp.motion.body import FPS, JOINTS
 from memmlp.motion.limb_shapes import HEAT, LIMBS
 from memmlp.report.pictures.clip_piece import colour_scale_top
-from memmlp.runs.identity import evaluation_id
 from memmlp.runs.run import Run
 
 Predict = Callable[[Run, str, str], Mapping[str, np.ndarray]]
@@ -34,17 +31,17 @@ Motion = tuple[np.ndarray, np.ndarray]
 
 
 class Replays:
-    """Makes replays one after the other, and stores the predictions.
+    """Makes replays one after the other.
 
     Args:
         outputs: the folder of runs and caches.
-        predict: computes a prediction; None if only stored ones can be shown.
+        predict: computes a prediction.
     """
 
-    def __init__(self, outputs: Path, predict: Predict | None):
+    def __init__(self, outputs: Path, predict: Predict):
         self.outputs, self.predict = outputs, predict
         self.worker = ThreadPoolExecutor(1, "replay")
-        self.motions: dict[tuple[str, str, str], Future[Motion]] = {}
+        self.motions: dict[tuple[Any, ...], Future[Motion]] = {}
         self.lock = threading.Lock()
 
     def get(
@@ -69,12 +66,13 @@ class Replays:
         Returns:
             `state` is "computing", "failed" (with `reason`) or "ready".
         """
-        key = (run_id, clip, mode)
+        run = Run.of(self.outputs, run_id)
+        key = (run_id, clip, mode, run.marker.stat().st_mtime_ns if run.done else 0)  # the run may be redone
         with self.lock:
             if key not in self.motions:
                 if len(self.motions) >= MAX_KEPT:
                     del self.motions[next(iter(self.motions))]
-                self.motions[key] = self.worker.submit(self._motion, Run.of(self.outputs, run_id), clip, mode)
+                self.motions[key] = self.worker.submit(self._predict, run, clip, mode)
             future = self.motions[key]
         try:
             truth, prediction = future.result(timeout)
@@ -86,42 +84,13 @@ class Replays:
             return {"state": "failed", "reason": reason}
         return cut_piece(truth, prediction, begin, seconds)
 
-    def _motion(self, run: Run, clip: str, mode: str) -> Motion:
-        """Return truth and prediction, stored or newly computed.
-
-        The file is named by a hash of the weights, the data and everything else that affects the prediction.
-        """
-        weights = str(read_json(run.marker).get("artifacts", {}).get(run.model.name))
-        parts = [run.id, weights, str(run.manifest.get("data")), clip, evaluation_id(run.config, mode)]
-        name = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:24]
-        path = self.outputs / "cache" / "ui" / "replays" / f"{name}.npz"
-        if (stored := _read(path)) is not None:
-            return stored
-        if self.predict is None:
-            raise InputError("no prediction of this clip is stored here")
+    def _predict(self, run: Run, clip: str, mode: str) -> Motion:
         arrays = self.predict(run, clip, mode)
-        truth = np.asarray(arrays["true_positions"], np.float32)
-        prediction = np.asarray(arrays["predicted_positions"], np.float32)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_suffix(".tmp.npz")
-        np.savez(temporary, allow_pickle=False, truth=truth, joints=prediction)
-        temporary.replace(path)
-        return truth, prediction
+        return arrays["true_positions"], arrays["predicted_positions"]
 
     def close(self) -> None:
         """Cancel the computations that are still waiting."""
         self.worker.shutdown(wait=False, cancel_futures=True)
-
-
-def _read(path: Path) -> Motion | None:
-    """Return a stored prediction; None if its file is missing or damaged."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            truth, prediction = file["truth"], file["joints"]
-    except (OSError, ValueError, KeyError, EOFError):
-        return None
-    intact = truth.shape == prediction.shape and truth.shape[1:] == (len(JOINTS), 3)
-    return (truth, prediction) if intact else None
 
 
 def describe_body() -> dict[str, Any]:

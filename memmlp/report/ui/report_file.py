@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 from memmlp.report.tables.effects import RunsBySeed
 from memmlp.report.tables.table import Table
 from memmlp.report.ui.page_files import one_file
-from memmlp.report.ui.runs import thin_out
+from memmlp.report.ui.runs import read_curves, thin_out
 from memmlp.report.ui.server import Answers
 from memmlp.report.ui.sweeps import describe_results, name_sweep
+from memmlp.runs.run import Run
 from memmlp.sweep.definition import MODES, Sweep
 
 MAX_POINTS = 120  # of a curve, about
@@ -66,7 +67,7 @@ def write_page(answers: Answers, sweeps: Iterable[ReportedSweep], about: str, re
         "about": about,
         "runs": {**rows, "rows": [row for row in rows["rows"] if row["id"] in ids], "outputs": ""},
         "body": answers.answer("body", {}),
-        "curves": {run_id: _thin_curves(answers.curves.read(run_id)) for run_id in sorted(ids)},
+        "curves": {run_id: _read_curves(Run.of(answers.outputs, run_id)) for run_id in sorted(ids)},
         "sweeps": {
             "sweeps": [{key: page[key] for key in progress} for page in pages.values()], "damaged": {},
         },
@@ -95,10 +96,10 @@ def _progress_of_unplanned(one: ReportedSweep) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _thin_curves(curves: Mapping[str, Any]) -> dict[str, Any]:
+def _read_curves(run: Run) -> dict[str, Any]:
     return {
         name: thin_out(dict(zip(*points, strict=True)), MAX_POINTS)
-        for name, points in curves.items()
+        for name, points in read_curves(run).items()
         if name.startswith(CURVES)
     }
 

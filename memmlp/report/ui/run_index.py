@@ -7,14 +7,9 @@ import hashlib
 import json
 import math
 import os
-import re
-import threading
-from collections.abc import Iterator, Mapping
-from functools import lru_cache
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import plain, read_json
@@ -23,7 +18,7 @@ from memmlp.runs.evaluation_file import with_solvers
 from memmlp.runs.evaluations_as_configured import EvaluationsAsConfigured
 from memmlp.runs.identity import DEPLOYMENT, EVALUATION, ID, INFERENCE, flatten, training_settings
 from memmlp.runs.lookup import run_name
-from memmlp.runs.run import LOADER, Run, latency_name
+from memmlp.runs.run import Run, latency_name
 
 HIDDEN = ("paths", "loggers", "force", "hydra", "save_predictions")
 """Config groups that are not listed."""
@@ -47,59 +42,28 @@ class RunIndex:
 
     Attributes:
         outputs: the folder of runs and caches.
-        generation: a number that grows with every change.
-        runs: the facts by run id (`read_facts`), with the run's `status` and the `generation` of its last
-            change.
-        removed: the ids of deleted runs, with the generation in which they disappeared.
-        signatures: by run id, a text that changes with the run's files.
+        runs: the facts by run id (`read_facts`), with the run's `status`, and a `signature` that changes with
+            the run's files.
     """
 
     def __init__(self, outputs: Path):
-        self.outputs, self.generation = outputs, 0
+        self.outputs = outputs
         self.runs: dict[str, dict[str, Any]] = {}
-        self.removed: dict[str, int] = {}
-        self.signatures: dict[str, str] = {}
-        self.lock = threading.RLock()
 
-    def refresh(self) -> int:
-        """Look at all run folders again, and return the generation."""
-        with self.lock:
-            present = {folder.name: folder for folder in self._folders()}
-            following = self.generation + 1
-            changed = [one for one, folder in present.items() if self._update(one, folder, following)]
-            deleted = [run_id for run_id in self.runs if run_id not in present]
-            for run_id in deleted:
-                del self.runs[run_id], self.signatures[run_id]
-                self.removed[run_id] = following
-            if changed or deleted:
-                self.generation = following
-            return self.generation
+    def refresh(self) -> str:
+        """Look at all run folders again, and return a text that changes with any of them."""
+        try:
+            folders = [entry for entry in (self.outputs / "runs").iterdir() if ID.fullmatch(entry.name)]
+        except (FileNotFoundError, NotADirectoryError):
+            folders = []
+        self.runs = {folder.name: self._look(folder) for folder in folders if folder.is_dir()}
+        return repr([(run_id, facts["signature"], facts["status"]) for run_id, facts in self.runs.items()])
 
-    def _folders(self) -> Iterator[Path]:
-        with (
-            contextlib.suppress(FileNotFoundError, NotADirectoryError),
-            os.scandir(self.outputs / "runs") as entries,
-        ):
-            for entry in entries:
-                if ID.fullmatch(entry.name) and entry.is_dir():
-                    yield Path(entry.path)
-
-    def _update(self, run_id: str, folder: Path, generation: int) -> bool:
-        """Update a run's facts, and return whether they changed."""
-        signature = _signature(folder)
-        facts = self.runs.get(run_id)
-        if facts is None or self.signatures[run_id] != signature:
-            facts = read_facts(folder) | {"status": None}
-            self.signatures[run_id] = signature
-        if facts["complete"] and not facts["failure"] and not _is_claimed(folder):
-            status = "done"
-        else:
-            status = _read_status(folder)
-        if facts["status"] == status:
-            return False
-        self.removed.pop(run_id, None)
-        self.runs[run_id] = {**facts, "status": status, "generation": generation}
-        return True
+    def _look(self, folder: Path) -> dict[str, Any]:
+        signature, facts = _signature(folder), self.runs.get(folder.name)
+        if facts is None or facts["signature"] != signature:
+            facts = read_facts(folder) | {"signature": signature}
+        return {**facts, "status": _read_status(folder)}
 
 
 def read_facts(folder: Path) -> dict[str, Any]:
@@ -107,12 +71,9 @@ def read_facts(folder: Path) -> dict[str, Any]:
     run, damage = Run(folder), list[str]()
     if not (manifest := run.manifest):
         damage.append("manifest.json")
-    config: dict[str, Any] = {}
-    listed: dict[str, Any] = {}
-    try:
-        config, listed = read_config(run.config_path)
-    except ValueError:
+    if not (config := read_config(run)):
         damage.append("config.yaml")
+    listed = select_listed(config)
     git, seconds = (
         found if isinstance(found := manifest.get(key), dict) else {} for key in ("git", "seconds")
     )
@@ -123,7 +84,6 @@ def read_facts(folder: Path) -> dict[str, Any]:
         "name": run_name(manifest, listed),
         "kind": _text(manifest.get("kind")),
         "done": run.done,
-        "complete": run.complete,
         "started": _text(manifest.get("started")),
         "finished": _text(manifest.get("finished")),
         "seconds": sum(numbers) if numbers else None,
@@ -143,34 +103,21 @@ def read_facts(folder: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def read_config(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return a resolved config, and its listed values by dotted key.
-
-    The runs of a sweep share most groups of their configs, so each group's text is parsed only once.
-
-    Raises:
-        ValueError: if the file does not hold a config.
-    """
+def read_config(run: Run) -> dict[str, Any]:
+    """Return a run's resolved config; empty if it is missing or damaged."""
     try:
-        groups = [_parse_group(text) for text in re.split(r"\n(?=[^\s#-])", path.read_text(encoding="utf-8"))]
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, TypeError) as error:
-        raise ValueError(str(error)) from None
-    config: dict[str, Any] = {}
-    listed: dict[str, Any] = {}
-    for tree, flat in groups:
-        config |= tree
-        listed |= flat
-    return config, listed
+        return run.config
+    except InputError:
+        return {}
 
 
-@lru_cache(4096)
-def _parse_group(text: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    found = yaml.load(text, LOADER)  # a safe loader
-    if not isinstance(found, dict):
-        raise TypeError("not a config")
-    flat = plain(flatten(found))
-    hidden = {key for key in flat if key.split(".")[0] in HIDDEN or key.endswith(("._target_", "._partial_"))}
-    return found, {key: value for key, value in flat.items() if key not in hidden}
+def select_listed(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a config's listed values by dotted key."""
+    return {
+        key: value
+        for key, value in plain(flatten(config)).items()
+        if key.split(".")[0] not in HIDDEN and not key.endswith(("._target_", "._partial_"))
+    }
 
 
 def read_recent(path: Path) -> list[list[Any]]:
@@ -234,13 +181,6 @@ def _read_status(folder: Path) -> str:
         return Run(folder).status
     except (KeyError, ValueError, TypeError, AttributeError):  # a damaged claim
         return "stopped"
-
-
-def _is_claimed(folder: Path) -> bool:
-    """Return whether a process may be working on a run, as its folder has a claim that is not free."""
-    with contextlib.suppress(OSError), os.scandir(folder) as entries:
-        return any(re.fullmatch(r"\.lease-\d+", entry.name) for entry in entries)
-    return False
 
 
 def _signature(folder: Path) -> str:

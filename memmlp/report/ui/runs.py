@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ MAX_POINTS = 400  # of a curve, about
 
 ROW = (
     "id", "name", "kind", "status", "started", "finished", "seconds", "device", "tags", "note", "failure",
-    "damage", "data", "data_name", "code", "steps", "recent",
+    "damage", "data", "data_name", "code", "steps", "recent", "signature",
 )  # fmt: skip
 """The facts of a run that its row has."""
 
@@ -38,23 +38,13 @@ Places = Mapping[str, Sequence[Mapping[str, Any]]]
 """By run id, the sweeps and searches that use the run."""
 
 
-def list_rows(index: RunIndex, places: Places, since: int = 0, heads: str = "") -> dict[str, Any]:
-    """Return the rows that changed after a generation, and the ids of the runs that were deleted.
-
-    `keys` and `metrics` name the values of each row's `config` and `metrics`. If they differ from those that
-    the page has (`heads`), all rows are returned.
-    """
-    with index.lock:
-        runs, generation, removed = dict(index.runs), index.generation, dict(index.removed)
+def list_rows(index: RunIndex, places: Places) -> dict[str, Any]:
+    """Return a row for each run; `keys` and `metrics` name the values of its `config` and `metrics`."""
+    runs = index.runs
     keys = differing_keys(runs.values())
     metrics = list(dict.fromkeys(metric for run in runs.values() for metric in run["metrics"]))
-    present = str(hash((*keys, *metrics, sum(map(len, places.values())))))
-    whole = since == 0 or heads != present
     minor = [name for name in NEUTRAL if name != "data"]
     return {
-        "generation": generation,
-        "heads": present,
-        "whole": whole,
         "keys": keys,
         "minor": [key for key in keys if any(key == name or key.startswith(f"{name}.") for name in minor)],
         "paths": list(filter(is_data_path, keys)),
@@ -68,9 +58,7 @@ def list_rows(index: RunIndex, places: Places, since: int = 0, heads: str = "") 
                 "metrics": [_round(run["metrics"].get(metric), 6) for metric in metrics],
             }
             for run_id, run in runs.items()
-            if whole or run["generation"] > since
         ],
-        "removed": [run_id for run_id, when in removed.items() if when > since],
     }
 
 
@@ -117,9 +105,8 @@ def describe_run(index: RunIndex, run_id: str, control: str | None, places: Plac
         control: the id of the run with which its variant is compared; None for none.
         places: the sweeps and searches by run.
     """
-    with index.lock:
-        facts, known = dict(index.runs[run_id]), dict(index.runs)
-    run, config = Run.of(index.outputs, run_id), _read_whole_config(index.outputs, run_id)
+    facts, run = index.runs[run_id], Run.of(index.outputs, run_id)
+    config = _read_flat_config(run)
     return {
         **facts,
         "places": places.get(run_id, []),
@@ -127,8 +114,8 @@ def describe_run(index: RunIndex, run_id: str, control: str | None, places: Plac
         "paths": list(filter(is_data_path, config)),
         "control": control
         and {
-            **{key: known[control][key] for key in ("id", "name", "data")},
-            "config": _read_whole_config(index.outputs, control),
+            **{key: index.runs[control][key] for key in ("id", "name", "data")},
+            "config": _read_flat_config(Run.of(index.outputs, control)),
         },
         "manifest": flatten(run.manifest),
         "clips": read_clips(run),
@@ -140,11 +127,8 @@ def describe_run(index: RunIndex, run_id: str, control: str | None, places: Plac
     }
 
 
-def _read_whole_config(outputs: Path, run_id: str) -> dict[str, Any]:
-    try:
-        return plain(flatten(read_config(Run.of(outputs, run_id).config_path)[0]))
-    except ValueError:
-        return {}
+def _read_flat_config(run: Run) -> dict[str, Any]:
+    return plain(flatten(read_config(run)))
 
 
 def read_clips(run: Run) -> list[dict[str, Any]]:
@@ -207,53 +191,23 @@ def _list_files(folder: Path) -> list[dict[str, Any]]:
     ]
 
 
-class MetricsLogReader:
-    """A metrics log, of which only new lines are read again.
-
-    Attributes:
-        series: step -> value by name, such as "train loss".
-    """
-
-    def __init__(self, path: Path):
-        self.path, self.position, self.first = path, 0, b""
-        self.series: dict[str, dict[int, float]] = defaultdict(dict)
-
-    def update(self) -> None:
-        """Read the appended lines, or the whole file if another one has replaced it."""
-        try:
-            with open(self.path, "rb") as file:
-                first = file.readline()
-                if file.seek(0, 2) < self.position or first[: len(self.first)] != self.first:
-                    self.position = 0
-                    self.series.clear()
-                self.first = first if first.endswith(b"\n") else b""
-                file.seek(self.position)
-                new = file.read()
-        except OSError:
-            return
-        whole = new.rfind(b"\n") + 1
-        self.position += whole
-        for line in new[:whole].splitlines():
-            if entry := parse_line(line):
-                for name, value in entry["values"].items():
-                    self.series[f"{entry['phase']} {name}"][entry["step"]] = value
+def read_curves(run: Run) -> dict[str, Any]:
+    """Return a run's curves by name, such as "train loss": [steps, values]; None is a missing number."""
+    try:
+        stat = run.metrics_path.stat()
+    except OSError:
+        return {}
+    return _parse_log(run.metrics_path, stat.st_mtime_ns, stat.st_size)
 
 
-class Curves:
-    """The curves of all runs of an outputs folder."""
-
-    def __init__(self, outputs: Path):
-        self.outputs = outputs
-        self.logs: dict[str, MetricsLogReader] = {}
-        self.lock = threading.Lock()
-
-    def read(self, run_id: str) -> dict[str, Any]:
-        """Return a run's curves by name, such as "train loss": [steps, values]; None is a missing number."""
-        with self.lock:
-            path = Run.of(self.outputs, run_id).metrics_path
-            log = self.logs.setdefault(run_id, MetricsLogReader(path))
-            log.update()
-            return {name: thin_out(points) for name, points in log.series.items()}
+@lru_cache(1024)
+def _parse_log(path: Path, *stamp: int) -> dict[str, Any]:
+    series: dict[str, dict[int, float]] = defaultdict(dict)
+    for line in path.read_bytes().splitlines():
+        if entry := parse_line(line):
+            for name, value in entry["values"].items():
+                series[f"{entry['phase']} {name}"][entry["step"]] = value
+    return {name: thin_out(points) for name, points in series.items()}
 
 
 def thin_out(points: Mapping[int, float | None], most: int = MAX_POINTS) -> list[list[Any]]:

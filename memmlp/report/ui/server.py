@@ -1,16 +1,16 @@
-"""The server of the page: files, answers as JSON, and change events. No request can change a run."""
+"""The server of the page: files, and answers as JSON. No request can change a run."""
 
 from __future__ import annotations
 
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import plain
+from memmlp.common.files import digest, plain
 from memmlp.common.page_server import HOST, TEXT, PageHandler, PageServer, content_type, security_policy
 from memmlp.report.ui import page_files, runs
 from memmlp.report.ui.replay import Predict, Replays, describe_body
@@ -18,10 +18,10 @@ from memmlp.report.ui.run_index import RunIndex
 from memmlp.report.ui.searches import Searches
 from memmlp.report.ui.sweeps import Sweeps
 from memmlp.runs.identity import ID
+from memmlp.runs.run import Run
 from memmlp.sweep.definition import MODES
 
 MAX_CURVES = 60  # runs with curves in one answer
-HEARTBEAT = 15.0  # seconds without a change after which a comment shows that the connection lives
 
 
 class Answers:
@@ -29,21 +29,31 @@ class Answers:
 
     Args:
         outputs: the folder of runs and caches.
-        predict: computes a run's prediction for a test clip; None to show stored ones alone.
+        predict: computes a run's prediction for a test clip.
+        pause: the least number of seconds between two looks at the folder.
     """
 
-    def __init__(self, outputs: Path, predict: Predict | None = None):
-        self.outputs = outputs
+    def __init__(self, outputs: Path, predict: Predict, pause: float = 1.0):
+        self.outputs, self.pause = outputs, pause
         self.index = RunIndex(outputs)
         self.sweeps, self.searches = Sweeps(self.index), Searches(outputs)
-        self.curves, self.replays = runs.Curves(outputs), Replays(outputs, predict)
-        self.refreshed = False
+        self.replays = Replays(outputs, predict)
+        self.lock = threading.Lock()
+        self.state, self.next_look = "", 0.0
 
     def refresh(self) -> str:
-        """Look at everything again, and return a text that changes whenever anything has changed."""
-        generation = self.index.refresh()
-        self.refreshed = True
-        return f"{generation} {hash((self.sweeps.refresh(), self.searches.stamp()))}"
+        """Look at everything again, and return a text that changes whenever anything has changed.
+
+        However many pages ask, looking takes at most a tenth of the time.
+        """
+        with self.lock:
+            started = time.monotonic()
+            if started >= self.next_look:
+                found = self.index.refresh(), self.sweeps.refresh(), self.searches.stamp()
+                self.state = digest(found)[:16]
+                ended = time.monotonic()
+                self.next_look = ended + max(self.pause, 9 * (ended - started))
+            return self.state
 
     def places(self) -> dict[str, list[dict[str, Any]]]:
         """Return the sweeps and searches that use a run, by run id."""
@@ -63,17 +73,18 @@ class Answers:
             KeyError: if there is nothing with that name.
             ValueError: for a text that should be a number.
         """
-        if not self.refreshed:
-            self.refresh()
+        state = self.refresh()
         kind, _, name = path.partition("/")
         match kind, bool(name):
             case "runs", False:
-                since = int(query.get("since", 0))
-                rows = runs.list_rows(self.index, self.places(), since, query.get("heads", ""))
-                return {**rows, "outputs": str(self.outputs.absolute())}
+                if query.get("state") == state:
+                    return {"state": state}
+                rows = runs.list_rows(self.index, self.places())
+                return {**rows, "state": state, "outputs": str(self.outputs.absolute())}
             case "curves", False:
                 known = [one for one in ID.findall(query.get("runs", "")) if one in self.index.runs]
-                return {"curves": {run_id: self.curves.read(run_id) for run_id in known[:MAX_CURVES]}}
+                found = [Run.of(self.outputs, run_id) for run_id in known[:MAX_CURVES]]
+                return {"curves": {run.id: runs.read_curves(run) for run in found}}
             case "body", False:
                 return describe_body()
             case "sweeps", _:
@@ -106,53 +117,6 @@ class Answers:
         self.replays.close()
 
 
-class Watch:
-    """Looks at the runs repeatedly while a page is open, and reports changes."""
-
-    def __init__(self, look: Callable[[], str], every: float = 1.0):
-        self.look, self.every = look, every
-        self.condition = threading.Condition()
-        self.pages, self.closed = 0, False
-        self.state = ""
-
-    def wait(self, known: str, timeout: float = HEARTBEAT) -> str:
-        """Wait, at most `timeout` seconds, until the state differs from a known one; return the state."""
-        with self.condition:
-            self.condition.wait_for(lambda: self.closed or self.state not in ("", known), timeout)
-            return self.state
-
-    def loop(self) -> None:
-        """Look repeatedly until closed; looking takes at most a tenth of the time."""
-        while not self.closed:
-            started = time.monotonic()
-            if self.pages or not self.state:
-                state = self.look()
-                with self.condition:
-                    self.state = state
-                    self.condition.notify_all()
-            pause = max(self.every, 9 * (time.monotonic() - started))
-            with self.condition:
-                self.condition.wait_for(lambda: self.closed, pause)
-
-    def events(self) -> Iterator[bytes]:
-        """Yield the state as an event at each change, until closed; without changes a comment."""
-        self.pages += 1
-        try:
-            known = "-"
-            while not self.closed:
-                state = self.wait(known)
-                yield b": quiet\n\n" if state == known else f"data: {json.dumps(state)}\n\n".encode()
-                known = state
-        finally:
-            self.pages -= 1
-
-    def close(self) -> None:
-        """End the loop, and wake all waiting threads."""
-        with self.condition:
-            self.closed = True
-            self.condition.notify_all()
-
-
 class RunsHandler(PageHandler):
     """Answers one request."""
 
@@ -160,13 +124,11 @@ class RunsHandler(PageHandler):
     protocol_version = "HTTP/1.1"  # keeps connections open
 
     def answer(self, path: str, query: Mapping[str, str]) -> None:
-        """Send a file of the page, an answer, or the stream of changes until its end."""
+        """Send a file of the page, an answer, or a file of a run."""
         kind, _, name = path.partition("/")
         if path in ("", *page_files.FILES):
             file = path or "index.html"
             self.send(200, content_type(file), page_files.read(file))
-        elif path == "events":
-            self.send_events(self.server.watch.events())
         elif kind == "api":
             self._send_answer(name, query)
         elif kind == "files":
@@ -208,28 +170,14 @@ class RunsServer(PageServer):
     Args:
         answers: the answers about runs, sweeps and searches.
         port, host, token: as in `PageServer`.
-        every: the least number of seconds between two looks at the runs.
     """
 
-    def __init__(
-        self, answers: Answers, port: int, host: str = HOST, token: str | None = None, every: float = 1.0
-    ):
+    def __init__(self, answers: Answers, port: int, host: str = HOST, token: str | None = None):
         self.answers = answers
         policy = security_policy(page_files.read("index.html").decode())
         self.headers = {"Content-Security-Policy": f"{policy}; frame-ancestors 'none'"}
-        self.watch = Watch(answers.refresh, every)
         super().__init__(RunsHandler, port, host, token)
-
-    def end_events(self) -> None:
-        """End the events of all pages."""
-        self.watch.close()
-
-    def __enter__(self) -> Self:
-        self.watcher = threading.Thread(target=self.watch.loop, daemon=True)
-        self.watcher.start()
-        return super().__enter__()
 
     def __exit__(self, *error: object) -> None:
         super().__exit__(*error)
-        self.watcher.join()
         self.answers.close()

@@ -112,6 +112,10 @@ class Sweeps:
         counts = {True: Counter[str](), False: Counter[str]()}
         for task in plan.tasks:
             counts[task.kind == NETWORK][states[task.key]] += 1
+        steps = {task.key: self._steps(task, states[task.key]) for task in plan.tasks}
+        total = sum(number for number, _ in steps.values())
+        # An unfinished run has at least one step left: its evaluation may be missing.
+        left = sum(max(remaining, states[key] != "done") for key, (_, remaining) in steps.items())
         return {
             **name_sweep(plan.name, known.sweep),
             "variants": len({entry.label for entry in plan.entries}),
@@ -119,8 +123,8 @@ class Sweeps:
             "tasks": counts[True].total(),
             "counts": dict(counts[True]),
             "prerequisite_counts": dict(counts[False]),
-            "share": self._share(plan, states),
-            "remaining": self._remaining_seconds(plan, states),
+            "share": 1 - left / total if total else 0.0,
+            "remaining": self._remaining_seconds(plan, states, steps),
         }
 
     def find_control(self, run_id: str) -> str | None:
@@ -158,25 +162,16 @@ class Sweeps:
             "step": recent[-1][0], "steps": facts.get("steps"), "failure": facts.get("failure", ""),
         }  # fmt: skip
 
-    def _remaining_steps(self, task: RunTask, state: str) -> int:
-        total = int(training_settings(task.kind, task.config)["steps"] or 0)
-        facts = self.index.runs.get(task.id)
-        if state == "done" or facts is None or not facts["recent"]:
-            return 0 if state == "done" else total
-        return max(total - int(facts["recent"][-1][0]), 0)
+    def _steps(self, task: RunTask, state: str) -> tuple[int, int]:
+        """Return the number of a task's training steps, and how many of them remain."""
+        facts = self.index.runs.get(task.id) or {}
+        total = int(facts.get("steps") or training_settings(task.kind, task.config)["steps"] or 0)
+        last = facts["recent"][-1][0] if facts.get("recent") else 0
+        return total, 0 if state == "done" else max(total - int(last), 0)
 
-    def _share(self, plan: Plan, states: Mapping[str, str]) -> float:
-        """Return the share of all steps that is done; an unfinished run has at least one step left."""
-        total = sum(self._total_steps(task) for task in plan.tasks)
-        each = [(task, states[task.key]) for task in plan.tasks]
-        remaining = sum(max(self._remaining_steps(task, state), state != "done") for task, state in each)
-        return 1 - remaining / total if total else 0.0
-
-    def _total_steps(self, task: RunTask) -> int:
-        facts = self.index.runs.get(task.id)
-        return self._remaining_steps(task, "new") if facts is None else int(facts["steps"] or 0)
-
-    def _remaining_seconds(self, plan: Plan, states: Mapping[str, str]) -> float | None:
+    def _remaining_seconds(
+        self, plan: Plan, states: Mapping[str, str], steps: Mapping[str, tuple[int, int]]
+    ) -> float | None:
         """Return the estimated seconds of training left for the workers that train at present.
 
         It is None if no worker trains, or if everything is trained.
@@ -185,18 +180,14 @@ class Sweeps:
         paces = [pace for task in plan.tasks if (pace := _pace(self.index.runs.get(task.id))) is not None]
         if not running or not paces:
             return None
-        remaining = sum(
-            self._remaining_steps(task, states[task.key])
-            for task in plan.tasks
-            if states[task.key] not in ("failed", "blocked")
-        )
+        remaining = sum(left for key, (_, left) in steps.items() if states[key] not in ("failed", "blocked"))
         return remaining * statistics.median(paces) / len(running) if remaining else None
 
     def _results(self, known: KnownSweep) -> dict[str, Any]:
         """Return the results of a sweep's runs, computed again after a change of the sweep or of a run."""
         with self.lock:
-            plan = known.plan
-            stamp = (known.stamp, [self.index.signatures.get(entry.id) for entry in plan.entries])
+            plan, runs = known.plan, self.index.runs
+            stamp = known.stamp, [runs.get(entry.id, {}).get("signature") for entry in plan.entries]
             before = self.results.get(plan.name)
             if before is None or before[0] != stamp:
                 before = self.results[plan.name] = (stamp, self._compute(known))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from fake_runs import fake_run
 
@@ -13,6 +14,7 @@ from memmlp.sweep.definition import Sweep, keep_sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.sweep_file import parse_sweep
 
+FRAMES = 900
 VARIANTS = {"none": 1.0, "gru": 0.8}
 SEEDS = (0, 1, 2)
 
@@ -67,3 +69,19 @@ def started_run(outputs: Path, name: str = "abcdef0123456789", step: int = 500) 
     for at in range(0, step + 1, 100):
         run.log(at, {"loss": 5 - at / 1000})
     return run
+
+
+def motion(at: int = 300, centimetres: float = 20.0) -> dict[str, np.ndarray]:
+    """Truth and a prediction that is off by so much in one second, and by a centimetre elsewhere."""
+    truth = np.zeros((FRAMES, 22, 3))
+    truth[..., 2] = 1.0
+    off = np.full(FRAMES, 0.01)
+    off[at : at + 60] = centimetres / 100
+    predicted = truth.copy()
+    predicted[..., 0] += off[:, None]
+    return {"true_positions": truth, "predicted_positions": predicted}
+
+
+def predict(run: Run, clip: str, mode: str) -> dict[str, np.ndarray]:
+    """Stand in for a network."""
+    return motion(300 if clip == "kicks/01" else 120, 20.0 if run.config["memory"]["name"] == "gru" else 10.0)

@@ -11,8 +11,7 @@ from threading import Event
 
 import pytest
 from chromium import Browser
-from report.ui.conftest import SEEDS, make_outputs, run_of, started_run
-from report.ui.test_replay import motion
+from report.ui.conftest import SEEDS, make_outputs, predict, run_of, started_run
 
 from memmlp.cli.sweep import analyse
 from memmlp.evaluation.metric_facts import UNITS
@@ -28,11 +27,6 @@ from memmlp.sweep.plan import Plan
 EVIL = "<img src=x onerror=owned=1>"
 READY = "document.documentElement.dataset.ready !== undefined"
 NAMES = "[...document.querySelectorAll('.runs tbody th a')].map(a => a.textContent)"
-
-
-def predict(run: Run, clip: str, mode: str) -> dict:
-    """Stand in for a network."""
-    return motion(300 if clip == "kicks/01" else 120, 20.0 if run.config["memory"]["name"] == "gru" else 10.0)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +48,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def server(home: Path) -> Iterator[RunsServer]:
-    with RunsServer(Answers(home, predict), 0, every=0.05) as running:
+    with RunsServer(Answers(home, predict, 0.05), 0) as running:
         yield running
 
 
@@ -164,7 +158,7 @@ def test_units_and_directions_of_custom_metrics(
     none, gru = (run_of(tmp_path, variant, 0) for variant in ("none", "gru"))
     scored(none, Score=5.0, Odd=1.0)
     scored(gru, Score=7.0, Odd=2.0)
-    with RunsServer(Answers(tmp_path), 0, every=0.05) as running:
+    with RunsServer(Answers(tmp_path, predict), 0) as running:
         go(browser, running.url, f"run/{gru.id}", "document.querySelectorAll('.grid').length >= 2")
         rows = browser.value("[...document.querySelectorAll('.grid tbody tr')].map(r => r.textContent)")
         (row,) = (row for row in rows if row.startswith("Score"))
@@ -192,12 +186,12 @@ def test_no_difference_is_shown_from_a_control_on_other_data(browser: Browser, t
     gru, none = (run_of(tmp_path, variant, 0) for variant in ("gru", "none"))
     small = "[...document.querySelectorAll('.grid td.n > small')].length"
     told = "document.body.textContent.includes('The control has other data')"
-    with RunsServer(Answers(tmp_path), 0, every=0.05) as running:
+    with RunsServer(Answers(tmp_path, predict), 0) as running:
         go(browser, running.url, f"run/{gru.id}", "document.querySelectorAll('.grid').length >= 2")
         assert browser.value(small) > 0
         assert not browser.value(told)
     none.manifest_path.write_text(json.dumps({**none.manifest, "data": "e" * 64}))
-    with RunsServer(Answers(tmp_path), 0, every=0.05) as running:
+    with RunsServer(Answers(tmp_path, predict), 0) as running:
         go(browser, running.url, f"run/{gru.id}", "document.querySelectorAll('.grid').length >= 2")
         assert browser.value(told)
         assert browser.value(small) == 0
@@ -209,7 +203,7 @@ def test_no_difference_is_shown_from_a_control_on_other_data(browser: Browser, t
 def test_rounds_of_a_sweep(browser: Browser, tmp_path: Path):
     sweep, folder = make_outputs(tmp_path), tmp_path / "sweeps" / "mine"
     analyse(sweep, tmp_path, new_rounds(sweep), Plan.load(folder / "plan.json"))
-    with RunsServer(Answers(tmp_path), 0, every=0.05) as running:
+    with RunsServer(Answers(tmp_path, predict), 0) as running:
         go(browser, running.url, "sweep/mine", "document.body.textContent.includes('Rounds')")
         words = browser.value("document.body.textContent")
         assert "2 of 2 comparisons are decided" in words
@@ -269,7 +263,7 @@ def test_a_replay_says_that_the_other_run_s_is_being_computed(browser: Browser, 
             seen.wait()
         return predict(run, clip, mode)
 
-    with RunsServer(Answers(home, slow), 0, every=0.05) as server:
+    with RunsServer(Answers(home, slow), 0) as server:
         go(browser, server.url, f"run/{run_of(home, 'gru', 1).id}", "document.querySelector('.view .wait')")
         assert browser.value("document.querySelector('.view .wait').textContent") == "computing …"
         seen.set()

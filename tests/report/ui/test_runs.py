@@ -10,7 +10,7 @@ from own_package import registers_kept
 from report.ui.conftest import started_run
 
 from memmlp.evaluation.metric_facts import HIGHER, UNITS
-from memmlp.report.ui.runs import Curves, describe_units, differing_keys, outdated_modes, thin_out
+from memmlp.report.ui.runs import describe_units, differing_keys, outdated_modes, read_curves, thin_out
 from memmlp.runs.component_versions import VERSIONS
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.identity import evaluation_id_of, evaluation_settings, evaluation_versions
@@ -56,34 +56,25 @@ def test_modes_of_an_earlier_component_version_are_named(tmp_path: Path, monkeyp
     assert outdated_modes(run) == []
 
 
-def test_what_was_appended_is_added(tmp_path: Path):
+def test_curves_follow_a_log_that_is_being_written(tmp_path: Path):
     run = started_run(tmp_path, step=200)
-    curves = Curves(tmp_path)
-    assert curves.read(run.id)["train loss"] == [[0, 100, 200], [5.0, 4.9, 4.8]]
+    assert read_curves(run)["train loss"] == [[0, 100, 200], [5.0, 4.9, 4.8]]
     with open(run.metrics_path, "ab") as file:
         file.write(b'{"step": 300, "phase": "train", "time": 1, "values": {"loss": 1}}\n{"step": 400, "ph')
-    position = curves.logs[run.id].position
-    assert curves.read(run.id)["train loss"][0] == [0, 100, 200, 300]
-    assert position < curves.logs[run.id].position < run.metrics_path.stat().st_size
-
-
-def test_a_log_that_was_replaced_is_read_again(tmp_path: Path):
-    run = started_run(tmp_path, step=200)
-    curves = Curves(tmp_path)
-    curves.read(run.id)
+    assert read_curves(run)["train loss"][0] == [0, 100, 200, 300]
     line = b'{"step": %d, "phase": "train", "time": 1, "values": {"loss": 2}}\n'
-    run.metrics_path.write_bytes(b"".join(line % step for step in range(900)))
-    assert curves.read(run.id)["train loss"][0][-1] == 899
-    assert curves.read(run.id)["train loss"][1] == [2.0] * len(curves.read(run.id)["train loss"][0])
+    run.metrics_path.write_bytes(b"".join(line % step for step in range(900)))  # another log in its place
+    steps, values = read_curves(run)["train loss"]
+    assert (steps[-1], set(values)) == (899, {2.0})
 
 
 def test_a_step_done_twice_counts_once(tmp_path: Path):
     run = started_run(tmp_path, step=100)
     run.log(100, {"loss": 9.0, "other": float("nan")})
-    curves = Curves(tmp_path)
-    assert curves.read(run.id)["train loss"] == [[0, 100], [5.0, 9.0]]
-    assert curves.read(run.id)["train other"] == [[100], [None]]
-    assert curves.read("0" * 16) == {}
+    curves = read_curves(run)
+    assert curves["train loss"] == [[0, 100], [5.0, 9.0]]
+    assert curves["train other"] == [[100], [None]]
+    assert read_curves(Run.of(tmp_path, "0" * 16)) == {}
 
 
 def test_thinning_keeps_ends_and_peaks():

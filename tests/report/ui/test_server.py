@@ -10,7 +10,8 @@ from typing import NamedTuple
 from urllib.parse import quote
 
 import pytest
-from report.ui.conftest import run_of, started_run
+from processes import until
+from report.ui.conftest import predict, run_of, started_run
 
 from memmlp.common.errors import InputError
 from memmlp.report.ui import page_files
@@ -44,25 +45,22 @@ def get(server: RunsServer, path: str, **headers: str) -> Answer:
 
 @pytest.fixture
 def server(outputs: Path) -> Iterator[RunsServer]:
-    with RunsServer(Answers(outputs), 0, every=0.05) as running:
+    with RunsServer(Answers(outputs, predict, 0.0), 0) as running:
         yield running
 
 
-def test_runs_and_only_what_changed_since(server: RunsServer, outputs: Path):
+def test_runs_are_sent_again_when_anything_has_changed(server: RunsServer, outputs: Path):
     first = get(server, "/api/runs").json
-    assert (len(first["rows"]), first["whole"]) == (6, True)
     row = next(row for row in first["rows"] if row["id"] == run_of(outputs, "gru", 2).id)
-    assert (row["name"], row["status"]) == ("memory=gru · seed 2", "done")
+    assert (len(first["rows"]), row["name"], row["status"]) == (6, "memory=gru · seed 2", "done")
     assert dict(zip(first["keys"], row["config"], strict=True))["memory.name"] == "gru"
-    since = f"/api/runs?since={first['generation']}&heads={first['heads']}"
-    assert get(server, since).json["rows"] == []
+    again = f"/api/runs?state={first['state']}"
+    assert get(server, again).json == {"state": first["state"]}
     (run_of(outputs).folder / "notes.json").write_text('{"tags": ["good"]}')
-    server.answers.refresh()
-    changed = get(server, since).json
-    assert ([row["tags"] for row in changed["rows"]], changed["whole"]) == ([["good"]], False)
+    until(lambda: "rows" in get(server, again).json, "the change")
+    assert [row["tags"] for row in get(server, again).json["rows"]].count(["good"]) == 1
     started_run(outputs)
-    server.answers.refresh()
-    assert get(server, since).json["whole"]  # its config has values that no other run has
+    until(lambda: len(get(server, again).json["rows"]) == 7, "the new run")
 
 
 def test_pages_of_a_run_a_sweep_and_curves(server: RunsServer, outputs: Path):
@@ -96,9 +94,7 @@ def test_nothing_else_is_sent(server: RunsServer, outputs: Path, path: str):
     assert answer.json.keys() == {"error"}
 
 
-@pytest.mark.parametrize(
-    "path", ["/api/runs?since=x", "/api/replay/{id}?mode=other&clip=c", "/api/replay/{id}"]
-)
+@pytest.mark.parametrize("path", ["/api/replay/{id}?mode=other&clip=c", "/api/replay/{id}"])
 def test_a_bad_question_is_one_line(server: RunsServer, outputs: Path, path: str):
     answer = get(server, path.replace("{id}", run_of(outputs).id))
     assert (answer.code, list(answer.json)) == (400, ["error"])
@@ -138,17 +134,17 @@ def test_other_hosts_and_other_pages_get_nothing(server: RunsServer, headers: di
 
 
 def test_it_starts_again_where_a_page_was_left_open(outputs: Path):
-    with RunsServer(Answers(outputs), 0) as before:
+    with RunsServer(Answers(outputs, predict), 0) as before:
         page = http.client.HTTPConnection("127.0.0.1", before.server_port)
         page.request("GET", "/", headers={"Host": f"127.0.0.1:{before.server_port}"})
         assert page.getresponse().read()
-    with RunsServer(Answers(outputs), before.server_port):
+    with RunsServer(Answers(outputs, predict), before.server_port):
         page.close()
 
 
 def test_another_address_needs_the_token(outputs: Path):
-    with RunsServer(Answers(outputs), 0, "0.0.0.0", TOKEN) as server:
-        for path in ("/", "/api/runs", "/style.css", "/events", "/?token=wrong", "/api/runs?token="):
+    with RunsServer(Answers(outputs, predict), 0, "0.0.0.0", TOKEN) as server:
+        for path in ("/", "/api/runs", "/style.css", "/?token=wrong", "/api/runs?token="):
             answer = get(server, path)
             assert (answer.code, b"runs" in answer.body) == (403, False)
         entered = get(server, f"/?token={quote(TOKEN)}")
@@ -158,27 +154,15 @@ def test_another_address_needs_the_token(outputs: Path):
         assert len(get(server, "/api/runs", Cookie=cookie.partition(";")[0]).json["rows"]) == 6
         assert get(server, "/api/runs", Cookie=cookie.partition("=")[0] + "=other").code == 403
         assert f"?token={quote(TOKEN)}" in server.url
-    with RunsServer(Answers(outputs), 0, "0.0.0.0") as server:
+    with RunsServer(Answers(outputs, predict), 0, "0.0.0.0") as server:
         assert len(server.access.token or "") >= 32
-
-
-def test_news_come_when_something_changed(server: RunsServer, outputs: Path):
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=60)
-    connection.request("GET", "/events")
-    news = connection.getresponse()
-    first = news.readline()
-    assert first.startswith(b'data: "1 ')
-    assert news.readline() == b"\n"
-    started_run(outputs)
-    assert news.readline().startswith(b'data: "2 ')
-    connection.close()
 
 
 def test_a_port_that_is_taken_is_one_line(server: RunsServer, outputs: Path):
     with pytest.raises(InputError, match=f"--port {server.server_port}: .*; expected"):
-        RunsServer(Answers(outputs), server.server_port)
+        RunsServer(Answers(outputs, predict), server.server_port)
     with pytest.raises(InputError, match=r"--host nowhere\.invalid"):
-        RunsServer(Answers(outputs), 0, "nowhere.invalid")
+        RunsServer(Answers(outputs, predict), 0, "nowhere.invalid")
 
 
 def test_a_bug_in_an_answer_is_an_answer(server: RunsServer, monkeypatch: pytest.MonkeyPatch):

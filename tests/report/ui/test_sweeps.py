@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from fake_runs import fake_run
-from report.ui.conftest import run_of
+from report.ui.conftest import predict, run_of
 
 from memmlp.cli.sweep import analyse
 from memmlp.report.tables.build_table import finished_runs, make_table, run_finder, state_finder
@@ -156,12 +156,12 @@ def test_a_sweep_with_another_control_has_another_table(outputs: Path):
 
 def test_a_run_s_control_is_that_of_its_variant(outputs: Path):
     """Most of the paper's tables have a control that does not stand first."""
-    folder, answers = outputs / "sweeps" / "mine", Answers(outputs)
+    folder, answers = outputs / "sweeps" / "mine", Answers(outputs, predict, 0.0)
     sweep = kept_sweep(folder)
     assert sweep is not None
 
     def control(variant: str) -> dict | None:
-        answers.refresh()
+        answers.next_look = 0.0
         return answers.answer(f"run/{run_of(outputs, variant, 1).id}", {})["control"]
 
     assert control("none") is None

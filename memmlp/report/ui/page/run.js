@@ -23,7 +23,7 @@ export async function page(id) {
   }
   async function update() {
     const row = runs.get(id);
-    if (inFile || (row?.generation === run.generation && row?.status === run.status)) return;
+    if (inFile || (row?.signature === run.signature && row?.status === run.status)) return;
     run = await ask(`run/${id}`);
     draw();
     await panel.update();

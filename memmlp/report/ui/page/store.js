@@ -1,4 +1,4 @@
-// What the page knows: the runs, kept up to date by the server's events; other answers by their addresses.
+// What the page knows: the runs, read again when they change; other answers by their addresses.
 
 const embedded = document.getElementById('answers');
 const answers = embedded ? JSON.parse(embedded.textContent) : null;
@@ -6,7 +6,8 @@ export const inFile = answers !== null; // the page is a file without a server
 export const generated = answers?.about ?? '';
 
 export const runs = new Map();
-export const about = { keys: [], minor: [], paths: [], metrics: [], units: {}, outputs: '', generation: 0, heads: '' };
+export const about = { keys: [], minor: [], paths: [], metrics: [], units: {}, outputs: '', state: '' };
+const PAUSE = 1000; // milliseconds between two questions for changes
 const listeners = new Set();
 let dataNames = new Map();
 let ambiguous = new Set(); // names of runs on several data sets
@@ -30,18 +31,19 @@ export async function curvesOf(ids) {
   return Object.fromEntries(wanted.filter(id => id in answers.curves).map(id => [id, answers.curves[id]]));
 }
 
+// Read the runs again; return whether anything has changed.
 export async function load() {
-  const query = inFile || !about.generation ? '' : `?since=${about.generation}&heads=${about.heads}`;
-  const { rows, removed, whole, ...rest } = await ask(`runs${query}`);
+  const { rows, ...rest } = await ask(inFile ? 'runs' : `runs?state=${about.state}`);
+  if (!rows) return false;
   Object.assign(about, rest);
-  if (whole) runs.clear();
-  for (const id of removed) runs.delete(id);
+  runs.clear();
   for (const row of rows) runs.set(row.id, readable(row));
   // A VQ-VAE's config does not name its data; that of a network on the same data does.
   dataNames = new Map([...runs.values()].filter(run => run.data && run.data_name).map(run => [run.data, `${run.data_name} ${run.data}`]));
   const seen = new Map();
   for (const run of runs.values()) seen.set(run.name, (seen.get(run.name) ?? new Set()).add(run.data));
   ambiguous = new Set([...seen].filter(([, data]) => data.size > 1).map(([name]) => name));
+  return true;
 }
 
 export const dataName = data => dataNames.get(data) ?? data;
@@ -63,25 +65,16 @@ function readable(row) {
 export const connection = () => state;
 export const listen = listener => listeners.add(listener);
 
-// Follow the server's events; events during a fetch lead to one more fetch.
-export function follow() {
+// Ask the server for changes again and again.
+export async function follow() {
   if (inFile) return;
   const notify = what => { for (const listener of listeners) listener(what); };
-  const change = next => { state = next; notify('state'); };
-  const events = new EventSource('events');
-  let busy = false;
-  let again = false;
-  const refresh = async () => {
-    again = busy;
-    if (busy) return;
-    busy = true;
-    await load().then(() => notify('news'), console.warn);
-    busy = false;
-    if (again) refresh();
-  };
-  events.onopen = () => change('live');
-  events.onerror = () => change('gone');
-  events.onmessage = refresh;
+  for (;;) {
+    const [next, changed] = await load().then(news => ['live', news], () => ['gone', false]);
+    if (next !== state) { state = next; notify('state'); }
+    if (changed) notify('news');
+    await new Promise(done => setTimeout(done, PAUSE));
+  }
 }
 
 // The address: #/page/name?key=value
