@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,7 @@ from memmlp.evaluation.ik import IK, NoIK
 from memmlp.motion.body import FPS, SPARSE_DIM
 from memmlp.motion.clip import SPLINES, Clip, resample
 from memmlp.motion.dataset import MotionDataset
-from memmlp.motion.exporting import ExportPlan, ExportReport, Target, read_motion, read_targets, write_clips
+from memmlp.motion.exporting import ExportPlan, ExportReport, Target, export_converted
 from memmlp.motion.normalizer import Normalizer
 from memmlp.motion.preparing.cache import frame_blocks
 from memmlp.networks.motion_model import MotionModel
@@ -161,27 +160,16 @@ class ClipPredictor:
         Raises:
             InputError: if no clip could be read, or a file cannot be written.
         """
-        skipped, odd = list(plan.skipped), dict[str, str]()
-        frames = read_targets(plan, lambda target: self._frames(target, odd), skipped, strict)
+        batch = self.evaluation.batch
+        return export_converted(plan, self.rest, self._frames, self.predict, batch=batch, strict=strict)
 
-        def predicted() -> Iterator[tuple[Target, Clip]]:
-            while batch := list(islice(frames, self.evaluation.batch)):
-                targets, clips = zip(*batch, strict=True)
-                yield from zip(targets, self.predict([target.name for target in targets], clips), strict=True)
-
-        return write_clips(plan, predicted(), self.rest, skipped, odd)
-
-    def _frames(self, target: Target, odd: dict[str, str]) -> Tensor:
-        """Read a clip's frames (N, 252), computed on the network's body as in a cache.
-
-        Args:
-            target: the clip.
-            odd: gets a remark on a clip that is unusual, by its name.
+    def _frames(self, target: Target, clip: Clip) -> Tensor:
+        """Compute a clip's frames (N, 252) on the network's body as in a cache.
 
         Raises:
-            InputError: if the file can't be read, or has fewer than two frames at 60 Hz.
+            InputError: if the clip has fewer than two frames at 60 Hz.
         """
-        clip, _ = resample(read_motion(target, odd), interpolation=self.interpolation)
+        clip, _ = resample(clip, interpolation=self.interpolation)
         if len(clip) < 2:
             raise InputError(f"{target.source}: one frame at {FPS} Hz; must be two or more for a velocity")
         return torch.from_numpy(np.concatenate(list(frame_blocks(clip, self.rest))))

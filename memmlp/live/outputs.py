@@ -38,7 +38,7 @@ from memmlp.live.stream import BodyFrame
 from memmlp.motion.body import JOINTS, N_JOINTS, PARENTS, ROOT
 from memmlp.motion.clip import Clip
 from memmlp.motion.exporting import format_of, write_motion
-from memmlp.motion.formats.vrm import UNITY_BONES
+from memmlp.motion.formats.gltf import UNITY_BONES
 
 VMC_PORT, VRCHAT_PORT = 39539, 9000
 SPACE = SPACES["unity"]

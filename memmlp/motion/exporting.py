@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -107,7 +108,7 @@ class ExportReport:
         written: the files that were written.
         seconds: the total duration of the written clips.
         skipped: the clips that were skipped.
-        unusual: clip -> what is odd about it, though it may be sound.
+        unusual: clip -> its faults, though it may be sound.
     """
 
     written: tuple[Path, ...]
@@ -186,85 +187,64 @@ def export(
     rest = load_rest_joints(body)
     if plan.format.has_bones:
         check_imported_body([target.source for target in plan.targets], rest, f"--body {body}")
-    skipped, odd = list(plan.skipped), dict[str, str]()
 
-    def read(target: Target) -> Clip:
-        clip = read_motion(target, odd)
+    def at_rate(target: Target, clip: Clip) -> Clip:
         return clip if fps is None else resample(clip, fps)[0]
 
-    return write_clips(plan, read_targets(plan, read, skipped, strict), rest, skipped, odd)
+    return export_converted(plan, rest, at_rate, lambda names, clips: clips, strict=strict)
 
 
-def write_clips(
+def export_converted(
     plan: ExportPlan,
-    clips: Iterable[tuple[Target, Clip]],
     rest: np.ndarray,
-    skipped: Sequence[Skipped],
-    odd: Mapping[str, str],
+    prepare: Callable[[Target, Clip], T],
+    finish: Callable[[Sequence[str], Sequence[T]], Sequence[Clip]],
+    *,
+    batch: int = 1,
+    strict: bool = False,
 ) -> ExportReport:
-    """Write clips on a body with rest joints (22, 3), metres, to the targets of a plan.
+    """Convert a plan's clips and write them on a body, while a progress bar counts them.
 
     Args:
-        plan: the targets and the format.
-        clips: some of the plan's targets, each with its clip.
-        rest: the body's rest joints.
-        skipped: the skipped clips, for the report; complete once all clips are read.
-        odd: remarks on unusual clips, for the report; complete once all clips are read.
+        plan: what to write.
+        rest: the body's rest joints (22, 3), metres.
+        prepare: the first half of the conversion, clip by clip; may raise InputError.
+        finish: the other half, of up to `batch` clips at a time, given their names.
+        batch: number of clips that are finished together.
+        strict: whether a bad file raises; otherwise it is skipped and reported, if there are other files.
 
     Raises:
-        InputError: if a file cannot be written.
+        InputError: for a bad file as described above, if no clip could be read, or a file cannot be written.
     """
-    written, seconds = [], 0.0
-    for target, clip in clips:
-        write_motion(target.path, clip, rest, plan.format)
-        written.append(target.path)
-        seconds += len(clip) / clip.fps
-    return ExportReport(tuple(written), seconds, tuple(skipped), odd)
+    skipped, faults = list(plan.skipped), dict[str, str]()
+    written, seconds = list[Path](), 0.0
 
-
-def read_targets(
-    plan: ExportPlan, read: Callable[[Target], T], skipped: list[Skipped], strict: bool = False
-) -> Iterator[tuple[Target, T]]:
-    """Yield each target of a plan with the result of reading its source, while a progress bar counts them.
-
-    Args:
-        plan: the targets.
-        read: reads a target's source, or raises InputError: NoMotion for a file that is not a clip.
-        skipped: gets the other sources that cannot be read, unless the plan has only one target.
-        strict: whether the first source that cannot be read raises instead.
-
-    Raises:
-        InputError: as described above, and at the end if every source was skipped.
-    """
-    single, usable = len(plan.targets) == 1, False
-    for target in progress_bar(plan.targets, "export"):
-        try:
-            content = read(target)
-        except InputError as error:
-            if single or (strict and not isinstance(error, NoMotion)):
-                raise
-            if not isinstance(error, NoMotion):  # AMASS has files of shapes beside its clips
+    def read() -> Iterator[tuple[Target, T]]:
+        single = len(plan.targets) == 1
+        for target in progress_bar(plan.targets, "export"):
+            try:
+                clip = read_clip(target.source, target.name)
+                found = check_plausible(target.source, clip)
+                content = prepare(target, clip)
+            except InputError as error:
+                no_motion = isinstance(error, NoMotion)  # AMASS has files of shapes beside its clips
+                if single or (strict and not no_motion):
+                    raise
                 reason = str(error).removeprefix(one_line(f"{target.source}: "))
-                skipped.append(Skipped(target.name + target.source.suffix, reason))
-        else:
-            usable = True
+                skipped.extend([] if no_motion else [Skipped(target.name + target.source.suffix, reason)])
+                continue
+            faults.update({target.name: found} if found else {})
             yield target, content
-    if not usable:
+
+    contents = read()
+    while chunk := list(islice(contents, batch)):
+        targets, parts = zip(*chunk, strict=True)
+        clips = finish([target.name for target in targets], parts)
+        for target, clip in zip(targets, clips, strict=True):
+            write_motion(target.path, clip, rest, plan.format)
+            written.append(target.path)
+            seconds += len(clip) / clip.fps
+    if not written:
         first = f"; the first: {skipped[0].file}: {skipped[0].reason}" if skipped else ""
         raise InputError(f"no usable clip in {len(plan.targets)} files{first}; expected AMASS npz files")
-
-
-def read_motion(target: Target, odd: dict[str, str]) -> Clip:
-    """Read a target's clip.
-
-    Args:
-        target: the target.
-        odd: gets a remark on a clip that is unusual, by its name.
-
-    Raises:
-        InputError: if it is damaged or can't be a person's motion.
-    """
-    clip = read_clip(target.source, target.name)
-    if faults := check_plausible(target.source, clip):
-        odd[target.name] = faults
-    return clip
+    return ExportReport(tuple(written), seconds, tuple(skipped), faults)

@@ -24,8 +24,8 @@ from memmlp.live.outputs import VMC, Outputs, Receiver, Recorder, VRChat, euler_
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import BodyFrame, Stream
 from memmlp.motion.body import JOINTS, N_JOINTS, builtin_rest_joints
+from memmlp.motion.formats.gltf import UNITY_BONES
 from memmlp.motion.formats.npz import read_clip
-from memmlp.motion.formats.vrm import UNITY_BONES
 from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics
 
 REST = builtin_rest_joints()

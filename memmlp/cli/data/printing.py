@@ -64,10 +64,7 @@ def show_rates(clips: tuple[ClipRecord, ...], interpolation: str = "") -> None:
 
 def show_pairs(label: str, pairs: Mapping[str, str], sign: str = " = ") -> None:
     """Print the first few pairs of names, and the number of the others."""
-    for first, second in list(pairs.items())[:MOST_NAMED]:
-        click.echo(f"{label}: {one_line(first)}{sign}{one_line(second)}")
-    if len(pairs) > MOST_NAMED:
-        click.echo(f"{label}: {len(pairs) - MOST_NAMED} more")
+    show_some([f"{label}: {one_line(a)}{sign}{one_line(b)}" for a, b in pairs.items()], label)
 
 
 def show_skipped(skipped: Sequence[Skipped]) -> None:

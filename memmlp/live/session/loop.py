@@ -26,7 +26,7 @@ from memmlp.live.stream import FORGOTTEN, BodyFrame, Stream, raise_by
 from memmlp.live.tracker_input import OddSamples
 from memmlp.live.wearer import Calibration, save_calibration
 from memmlp.motion.body import FPS, JOINTS, PARENTS, ROOT
-from memmlp.motion.formats.vrm import VRM_BONES
+from memmlp.motion.formats.gltf import VRM_BONES
 from memmlp.motion.limb_shapes import HEAT, LIMBS
 
 PAGE_SPACE = SPACES["openxr"]  # the page's axes: those of three.js

@@ -20,7 +20,7 @@ import numpy as np
 from memmlp.common import npm
 from memmlp.common.errors import InputError, why_unreadable
 from memmlp.common.page_server import HOST, TEXT, PageHandler, PageServer, content_type, read_page_file
-from memmlp.motion.formats.vrm import write_vrm
+from memmlp.motion.formats.gltf import write_vrm
 
 QUEUED = 240  # the most frames that wait for a page; beyond, the oldest are dropped
 QUIET = 2.0  # seconds without a frame after which a comment shows that the connection lives

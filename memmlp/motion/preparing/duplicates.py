@@ -214,12 +214,9 @@ def _mark_turns(turns: np.ndarray) -> Marks:
     for signal in (sums[:, 0], -sums[:, 0]):
         extrema |= set(np.flatnonzero(signal == maximum_filter1d(signal, 2 * REACH + 1)))
     inside = sorted(frame for frame in extrema if REACH <= frame < len(turns) - REACH)
-    moving = [frame for frame in inside if _moves(turns[frame - REACH : frame + REACH + 1])]
+    stretches = ((frame, turns[frame - REACH : frame + REACH + 1]) for frame in inside)
+    moving = [frame for frame, each in stretches if _degrees(each, turns[frame]).max(0).mean() >= MOVING]
     return Marks(np.array(moving, int), sums[moving].astype(np.float32))
-
-
-def _moves(stretch: np.ndarray) -> bool:
-    return bool(_degrees(stretch, stretch[REACH]).max(0).mean() >= MOVING)
 
 
 def _degrees(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -245,33 +242,23 @@ def find_shared_stretches(
         clip = read_clip(root / clips[index].file, clips[index].name)
         return local_turns(resample(clip, interpolation=LINES)[0])
 
-    def collect(side: int) -> tuple[np.ndarray, np.ndarray, cKDTree]:
-        """Return the clip and the frame of each mark of all clips, and the tree of the signatures."""
-        every = [marks[clip.name][side] for clip in clips]
-        owners = np.repeat(np.arange(len(every)), [len(one.frames) for one in every])
-        frames = np.concatenate([one.frames for one in every])
-        return owners, frames, cKDTree(np.concatenate([one.signatures for one in every]))
-
-    owners, frames, tree = collect(0)
+    every = [marks[clip.name][side] for side in (0, 1) for clip in clips]  # as they are, then mirrored
+    owners = np.repeat(np.arange(len(every)), [len(one.frames) for one in every])
     if not len(owners):
         return
-    plain = np.sort(tree.query_pairs(NEAR, output_type="ndarray"), axis=1)
-    other_owners, other_frames, other_tree = collect(1)
-    near = tree.query_ball_tree(other_tree, NEAR)
-    mirrored = [(mark, other) for mark, others in enumerate(near) for other in others]
+    frames = np.concatenate([one.frames for one in every])
+    near = cKDTree(np.concatenate([one.signatures for one in every])).query_pairs(NEAR, output_type="ndarray")
     done: set[tuple[int, int]] = set()
-    for pairs, (theirs, their_frames), seen in (
-        (plain, (owners, frames), turns),
-        (mirrored, (other_owners, other_frames), lambda index: mirror_turns(turns(index))),
-    ):
-        for mark, other in pairs:
-            one, two = int(owners[mark]), int(theirs[other])
-            pair = min(one, two), max(one, two)
-            if pair in done or clips[one].content == clips[two].content:
-                continue
-            if _are_alike(turns(one), frames[mark], seen(two), their_frames[other]):
-                done.add(pair)
-                yield clips[pair[0]], clips[pair[1]]
+    for mark, other in np.sort(near, axis=1):
+        one, mirrored = int(owners[mark]), int(owners[other]) >= len(clips)
+        two = int(owners[other]) - len(clips) * mirrored
+        pair = min(one, two), max(one, two)
+        if one >= len(clips) or pair in done or clips[one].content == clips[two].content:
+            continue
+        seen = mirror_turns(turns(two)) if mirrored else turns(two)
+        if _are_alike(turns(one), frames[mark], seen, frames[other]):
+            done.add(pair)
+            yield clips[pair[0]], clips[pair[1]]
 
 
 def _are_alike(one: np.ndarray, frame: int, other: np.ndarray, other_frame: int) -> bool:

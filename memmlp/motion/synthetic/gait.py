@@ -18,29 +18,18 @@ LEFT_RIGHT = np.array([1.0, -1.0])
 
 @dataclass(frozen=True)
 class Style:
-    """The personal differences between clips; metres, radians.
+    """The personal differences between clips; metres, radians."""
 
-    Attributes:
-        origin: where (2,) the clip starts, world.
-        heading: in which direction the person faces at the start, world.
-        width: half the distance of the feet.
-        splay: how far each foot points outward.
-        lean: forward lean of the spine.
-        look: pitch of the gaze, positive down.
-        swing: factor on the arms' swing.
-        hands: positions (2, 3) of the wrists when the arms hang, from the shoulders: outward, up, forward.
-        uneven: factor (2,) on the amplitude of left and right.
-    """
-
-    origin: Array
-    heading: float
-    width: float
-    splay: float
-    lean: float
-    look: float
-    swing: float
+    origin: Array  # where (2,) the clip starts, world
+    heading: float  # in which direction the person faces at the start, world
+    width: float  # half the distance of the feet
+    splay: float  # how far each foot points outward
+    lean: float  # forward lean of the spine
+    look: float  # pitch of the gaze, positive down
+    swing: float  # factor on the arms' swing
+    # positions (2, 3) of the wrists when the arms hang, from the shoulders: outward, up, forward
     hands: Array
-    uneven: Array
+    uneven: Array  # factor (2,) on the amplitude of left and right
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> Style:
@@ -196,42 +185,25 @@ def bend_knees(puppet: Puppet, depth: Array) -> None:
 
 @dataclass(frozen=True)
 class Gait:
-    """A gait; metres, seconds, radians. A cycle is two steps.
+    """A gait; metres, seconds, radians. A cycle is two steps."""
 
-    Attributes:
-        speed: range of the full speed, m/s.
-        cadence: cycles per second at zero speed, and the increase for each m/s.
-        duty: part of the cycle during which a foot is on the floor.
-        ahead: part of the contact that passes before the pelvis is over the foot.
-        turn: largest turn of the path at one time.
-        width: factor on the distance of the feet.
-        sink: how much lower the pelvis is than in standing.
-        bounce: amplitude of the pelvis' height.
-        lift, heel, toe, push: see FootStep; push is in cycles.
-        lean: forward lean of the spine.
-        yaw: amplitude of the pelvis' turn at full speed.
-        swing: amplitude of the hands' swing at full speed.
-        elbow: how far the bent arms bring the hands up and forward.
-        settle: see Puppet.
-    """
-
-    speed: tuple[float, float]
-    cadence: tuple[float, float]
-    duty: float
-    ahead: float
-    turn: float
-    width: float
-    sink: float
-    bounce: float
-    lift: float
+    speed: tuple[float, float]  # range of the full speed, m/s
+    cadence: tuple[float, float]  # cycles per second at zero speed, and the increase for each m/s
+    duty: float  # part of the cycle during which a foot is on the floor
+    ahead: float  # part of the contact that passes before the pelvis is over the foot
+    turn: float  # largest turn of the path at one time
+    width: float  # factor on the distance of the feet
+    sink: float  # how much lower the pelvis is than in standing
+    bounce: float  # amplitude of the pelvis' height
+    lift: float  # this and the next three as in FootStep, push in cycles
     heel: float
     toe: float
     push: float
-    lean: float
-    yaw: float
-    swing: float
-    elbow: tuple[float, float]
-    settle: float
+    lean: float  # forward lean of the spine
+    yaw: float  # amplitude of the pelvis' turn at full speed
+    swing: float  # amplitude of the hands' swing at full speed
+    elbow: tuple[float, float]  # how far the bent arms bring the hands up and forward
+    settle: float  # as in Puppet
 
 
 WALK = Gait(
@@ -248,21 +220,13 @@ RUN = Gait(
 
 @dataclass(frozen=True)
 class Course:
-    """The path of a gait over N frames.
+    """The path of a gait over N frames."""
 
-    Attributes:
-        path: positions (N, 2), metres, world.
-        heading: directions (N,), radians, world.
-        pace: speeds (N,), m/s.
-        phase: phases (N,), cycles.
-        go: 0 while standing and 1 while moving (N,).
-    """
-
-    path: Array
-    heading: Array
-    pace: Array
-    phase: Array
-    go: Array
+    path: Array  # positions (N, 2), metres, world
+    heading: Array  # directions (N,), radians, world
+    pace: Array  # speeds (N,), m/s
+    phase: Array  # phases (N,), cycles
+    go: Array  # 0 while standing and 1 while moving (N,)
 
 
 def walking(rng: np.random.Generator, t: Array) -> Puppet:

@@ -99,50 +99,29 @@ def soft_minimum(a: Array, b: Array, width: float) -> Array:
 
 @dataclass(frozen=True)
 class FootStep:
-    """One step of one foot; seconds, metres, radians.
+    """One step of one foot; seconds, metres, radians."""
 
-    Attributes:
-        foot: 0 left, 1 right.
-        off: when the toes leave the floor.
-        on: when the heel touches the floor again.
-        to: position (2,) on the floor below the ankle, world.
-        yaw: direction of the foot after the step, world.
-        lift: how high the foot is lifted on the way.
-        heel: angle by which the heel is up when the toes leave.
-        toe: angle by which the toes are up when the heel arrives.
-        push: how long before `off` the heel rises.
-        roll: how long after `on` the toes come down.
-    """
-
-    foot: int
-    off: float
-    on: float
-    to: Array
-    yaw: float
-    lift: float = 0.05
-    heel: float = 0.4
-    toe: float = 0.1
-    push: float = 0.15
-    roll: float = 0.1
+    foot: int  # 0 left, 1 right
+    off: float  # when the toes leave the floor
+    on: float  # when the heel touches the floor again
+    to: Array  # position (2,) on the floor below the ankle, world
+    yaw: float  # direction of the foot after the step, world
+    lift: float = 0.05  # how high the foot is lifted on the way
+    heel: float = 0.4  # angle by which the heel is up when the toes leave
+    toe: float = 0.1  # angle by which the toes are up when the heel arrives
+    push: float = 0.15  # how long before `off` the heel rises
+    roll: float = 0.1  # how long after `on` the toes come down
 
 
 @dataclass
 class Feet:
-    """Both feet over N frames, left and right.
+    """Both feet over N frames, left and right."""
 
-    Attributes:
-        ground: position (N, 2, 3) of the flat foot, below the ankle, metres, world; z is 0 on the floor.
-        yaw: direction (N, 2), radians, world.
-        heel: angle (N, 2), radians, at least 0, by which the foot is turned about its ball.
-        toe: angle (N, 2), radians, at least 0, by which it is turned about its heel.
-        planted: whether (N, 2) ball or heel are on the floor.
-    """
-
-    ground: Array
-    yaw: Array
-    heel: Array
-    toe: Array
-    planted: Array
+    ground: Array  # position (N, 2, 3) of the flat foot, below the ankle, metres, world; z is 0 on the floor
+    yaw: Array  # direction (N, 2), radians, world
+    heel: Array  # angle (N, 2), radians, at least 0, by which the foot is turned about its ball
+    toe: Array  # angle (N, 2), radians, at least 0, by which it is turned about its heel
+    planted: Array  # whether (N, 2) ball or heel are on the floor
 
 
 def tread(t: Array, places: Array, yaws: Array, steps: Iterable[FootStep]) -> Feet:
@@ -177,31 +156,20 @@ def tread(t: Array, places: Array, yaws: Array, steps: Iterable[FootStep]) -> Fe
 
 @dataclass
 class Puppet:
-    """The controls of a person over N frames; metres, radians.
+    """The controls of a person over N frames; metres, radians."""
 
-    Attributes:
-        fps: frames per second.
-        heading: direction (N,) the body faces: 0 is world +X, pi/2 is +Y.
-        pelvis: position (N, 3) of the root, world; it is lowered if a standing leg would not reach the foot.
-        settle: seconds over which the pelvis is lowered.
-        tilt: rotation vector (N, 3) of the pelvis against the heading.
-        spine: rotation vector (N, 3) of the chest against the pelvis.
-        gaze: (pitch, yaw) (N, 2) of the head against the heading.
-        feet: the feet.
-        hands: wrists (N, 2, 3) from the shoulders at rest: outward, up, forward in the turned, upright trunk.
-        wrists: rotation vectors (N, 2, 3) of the left wrist, and of the right one as its mirror image.
-    """
-
-    fps: float
-    heading: Array
+    fps: float  # frames per second
+    heading: Array  # direction (N,) the body faces: 0 is world +X, pi/2 is +Y
+    # position (N, 3) of the root, world; it is lowered if a standing leg would not reach the foot
     pelvis: Array
-    settle: float
-    tilt: Array
-    spine: Array
-    gaze: Array
-    feet: Feet
+    settle: float  # seconds over which the pelvis is lowered
+    tilt: Array  # rotation vector (N, 3) of the pelvis against the heading
+    spine: Array  # rotation vector (N, 3) of the chest against the pelvis
+    gaze: Array  # (pitch, yaw) (N, 2) of the head against the heading
+    feet: Feet  # the feet
+    # wrists (N, 2, 3) from the shoulders at rest: outward, up, forward in the turned, upright trunk
     hands: Array
-    wrists: Array
+    wrists: Array  # rotation vectors (N, 2, 3) of the left wrist, and of the right one as its mirror image
 
 
 def solve(puppet: Puppet) -> tuple[Array, Array]:

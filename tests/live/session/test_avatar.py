@@ -20,7 +20,7 @@ from memmlp.live.session.server import Hub, LiveServer, mannequin_vrm, read_file
 from memmlp.live.session.sources import ClipSource, TrackedClip
 from memmlp.live.stream import BodyFrame
 from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
-from memmlp.motion.formats.vrm import VRM_BONES as VRM
+from memmlp.motion.formats.gltf import VRM_BONES as VRM
 
 REST = builtin_rest_joints()
 RANDOM = np.random.default_rng(2)

@@ -9,9 +9,9 @@ import pytest
 from glb import Glb
 
 from memmlp.motion.body import JOINTS, builtin_rest_joints
-from memmlp.motion.formats.vrm import UNITY_BONES as UNITY
-from memmlp.motion.formats.vrm import VRM_BONES as VRM
-from memmlp.motion.formats.vrm import write_vrm
+from memmlp.motion.formats.gltf import UNITY_BONES as UNITY
+from memmlp.motion.formats.gltf import VRM_BONES as VRM
+from memmlp.motion.formats.gltf import write_vrm
 
 REST = builtin_rest_joints()
 REQUIRED = {
