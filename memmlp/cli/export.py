@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from memmlp.cli.options import check_runs, outputs_option, plugins_option
+from memmlp.cli.options import outputs_option, plugins_option
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from memmlp.config.open_run import OpenedRun
     from memmlp.networks.motion_model import MotionModel, StreamingGraph
     from memmlp.runs.run import Run
@@ -59,9 +57,8 @@ class Form(NamedTuple):
 )
 @click.option(
     "--max-growth",
-    default=1.0,
-    show_default=True,
-    help="Limit of the growth of MPJPE in lower precision, percent; no file is written above it.",
+    type=float,
+    help="Limit of MPJPE's growth in lower precision, percent; no file is written above it.  [default: 1]",
 )
 @click.option(
     "--opset",
@@ -88,14 +85,6 @@ class Form(NamedTuple):
     type=click.Choice(["matrix", "quaternion"]),
     help="Format of the joints' rotations, with --scope full; quaternions are x, y, z, w.  [default: matrix]",
 )
-@click.option(
-    "--parity-clips",
-    "clips",
-    default=1,
-    show_default=True,
-    type=click.IntRange(0),
-    help="How many test clips a float32 file is compared with the network on, the longest first; 0 for all.",
-)
 @plugins_option
 @outputs_option
 def export(
@@ -103,12 +92,11 @@ def export(
     out: Path,
     graph: str,
     precision: str,
-    max_growth: float,
+    max_growth: float | None,
     opset: int,
     scope: str,
     space: str | None,
     rotations: str | None,
-    clips: int,
     outputs: Path,
 ) -> None:
     """Export a finished run (id, its beginning, or folder) as ONNX and check it on whole test clips.
@@ -125,31 +113,21 @@ def export(
     option = f"--space {space}" if space else f"--rotations {rotations}" if rotations else None
     if scope == "step" and option:
         raise InputError(f"{option}: needs --scope full; the network's own inputs are in AMASS' world")
-    if precision == "fp32" and _typed("max_growth"):
+    if precision == "fp32" and max_growth is not None:
         raise InputError(f"--max-growth {max_growth:g}: needs --precision fp16, int8 or int8_blocks")
-    if precision != "fp32" and _typed("clips"):
-        raise InputError(f"--parity-clips {clips}: needs fp32; {precision} is measured on all test clips")
-    check_runs(outputs, run)
-    form = Form(
-        graph, precision, opset, (space or "amass", rotations or "matrix") if scope == "full" else None
-    )
-    found = find_run(outputs, run)
-    said = None if clips != 1 else copy_deployed(found, out, form, max_growth / 100)
-    if said is None:
+    if precision.startswith("int8") and scope == "full":
+        raise InputError(f"--precision {precision}: needs --scope step")
+    full = (space or "amass", rotations or "matrix") if scope == "full" else None
+    form, limit = Form(graph, precision, opset, full), 0.01 if max_growth is None else max_growth / 100
+    line = copy_deployed(find_run(outputs, run), out, form, limit)
+    if line is None:
         from memmlp.config.open_run import open_run
 
         opened = open_run(outputs, run)
-        if precision == "fp32":
-            said = write_exact(opened, out, form, clips)
-        else:
-            said = write_lower(opened, out, form, max_growth / 100)
-    click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {said}")
-
-
-def _typed(name: str) -> bool:
-    """Return whether a parameter of the running command was typed."""
-    source = click.get_current_context().get_parameter_source(name)
-    return source is click.core.ParameterSource.COMMANDLINE
+        line = (
+            write_exact(opened, out, form) if precision == "fp32" else write_lower(opened, out, form, limit)
+        )
+    click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {line}")
 
 
 def copy_deployed(run: Run, out: Path, form: Form, max_growth: float) -> str | None:
@@ -160,27 +138,24 @@ def copy_deployed(run: Run, out: Path, form: Form, max_growth: float) -> str | N
     """
     from memmlp.common.files import atomic_write, file_digest
 
-    if form.full:
-        return None
     for folder in sorted(run.deployments.glob("*")):
         deployed = run.deployment(folder.name)
         record, settings, path = deployed.record, deployed.settings, deployed.file(form.precision)
         graphs = settings.get("graph", "auto"), record.get("graph")  # as requested then, and as made
-        if form.graph not in graphs or form.opset != settings.get("opset", 18):
+        if form.full or form.graph not in graphs or form.opset != settings.get("opset", 18):
             continue
         if not (deployed.done and deployed.current) or path.name not in record["artifacts"]:
             continue
         if record["artifacts"][path.name] != file_digest(path):
             continue
         if form.precision == "fp32":
-            said = f"copied from the run; differs from torch by at most {record['onnx_parity']:.1e}"
+            line = f"differs from torch by at most {record['onnx_parity']:.1e}"
+        elif (cost := record[form.precision])["growth"] <= max_growth:
+            line = f"on test clips {describe_cost(cost, form.precision)}"
         else:
-            cost = record[form.precision]
-            if not cost["growth"] <= max_growth:
-                continue
-            said = f"copied from the run; on test clips {describe_cost(cost, form.precision)}"
+            continue
         atomic_write(out, path.read_bytes())
-        return said
+        return f"copied from the run; {line}"
     return None
 
 
@@ -214,14 +189,8 @@ def write_graph(network: MotionModel | StreamingGraph, path: Path, run_id: str, 
         export_step(network, path, run_id, form.opset)
 
 
-def write_exact(opened: OpenedRun, out: Path, form: Form, count: int) -> str:
-    """Write the float32 ONNX file, provided that it matches the trained network.
-
-    Args:
-        opened: the run.
-        out: the file to write.
-        form: the requested form.
-        count: the number of test clips on which they are compared; 0 for all.
+def write_exact(opened: OpenedRun, out: Path, form: Form) -> str:
+    """Write the float32 ONNX file, provided that it matches the trained network on the longest test clip.
 
     Returns:
         A line about their difference.
@@ -229,34 +198,26 @@ def write_exact(opened: OpenedRun, out: Path, form: Form, count: int) -> str:
     Raises:
         ClickException: if file and network differ by more than rounding explains; nothing is written then.
     """
-    import numpy as np
-
     from memmlp.common.progress import announce
     from memmlp.deploy.parity import TOLERANCE, clips_to_check, differences, is_rounding
     from memmlp.live.trackers_to_body_graph import full_differences
 
     model, network = load(opened, form)
-    clips = clips_to_check(model, opened.data.open("test").clips(), count)
-    announce(f"export: write {out}, and compare it with torch on {count_clips(clips)}")
+    (clip,) = clips_to_check(model, opened.data.open("test").clips())
+    announce(f"export: write {out}, and compare it with torch on a test clip")
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
         path = Path(folder) / "step.onnx"
         write_graph(network, path, opened.run.id, form)
-        worst, matching = [], []
-        for clip in clips:
-            if form.full:
-                apart = full_differences(model, path, clip, form.full[0])
-            else:
-                apart = differences(model, path, clip)
-            matching.append(is_rounding(apart))
-            worst.append(float(apart.max()))
-        said = f"differs from torch by at most {np.max(worst):.1e} on {count_clips(clips)}"
-        if not all(matching):
+        space = form.full and form.full[0]
+        apart = full_differences(model, path, clip, space) if space else differences(model, path, clip)
+        line = f"differs from torch by at most {float(apart.max()):.1e} on a test clip"
+        if not is_rounding(apart):
             raise click.ClickException(
-                f"{out}: {said}, more than {TOLERANCE:.0e}: not written; please report it with the run's "
+                f"{out}: {line}, more than {TOLERANCE:.0e}: not written; please report it with the run's "
                 "config.yaml"
             )
         path.replace(out)
-    return said
+    return line
 
 
 def write_lower(opened: OpenedRun, out: Path, form: Form, max_growth: float) -> str:
@@ -275,7 +236,7 @@ def write_lower(opened: OpenedRun, out: Path, form: Form, max_growth: float) -> 
         A line about the cost.
 
     Raises:
-        InputError: for a network without a streaming graph, and for int8 of a full graph.
+        InputError: for a network without a streaming graph.
         ClickException: if MPJPE grows by more, or a full graph does not match the network; nothing is written
             then.
     """
@@ -289,30 +250,23 @@ def write_lower(opened: OpenedRun, out: Path, form: Form, max_growth: float) -> 
     model, network = load(opened, form)
     if not isinstance(network, StreamingGraph):
         raise InputError(f"--precision {precision}: needs a streaming graph")
-    if precision.startswith("int8") and form.full:
-        raise InputError(f"--precision {precision}: needs --scope step")
     test = opened.data.open("test").clips()
     train = opened.data.open("train").clips() if precision == "int8" else []
-    announce(f"export: write {out} in {precision}, and measure its cost on {count_clips(test)}")
+    announce(f"export: write {out} in {precision}, and measure its cost on the test clips")
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
         exact, other = Path(folder) / "fp32.onnx", Path(folder) / "other.onnx"
         write_graph(network, exact, opened.run.id, form._replace(full=None))
         lower(precision, exact, other, network, train)
         cost = compare_accuracy(exact, other, precision, network.normalizer, test)
-        said = f"on test clips {describe_cost(cost, precision)}"
+        line = f"on test clips {describe_cost(cost, precision)}"
         if not cost["growth"] <= max_growth:
-            raise click.ClickException(f"{said}: more than --max-growth {100 * max_growth:g} %, not written")
+            raise click.ClickException(f"{line}: more than --max-growth {100 * max_growth:g} %, not written")
         if form.full:
             write_graph(network, exact, opened.run.id, form)
             lower(precision, exact, other, network, train)
             apart = float(full_differences(model, other, test[0], form.full[0]).max())
-            said += f"; the full graph differs from torch by at most {apart:.1e} on the first"
+            line += f"; the full graph differs from torch by at most {apart:.1e} on the first"
             if not apart <= FULL_TOLERANCE:
-                raise click.ClickException(f"{said}, more than {FULL_TOLERANCE:g}: not written")
+                raise click.ClickException(f"{line}, more than {FULL_TOLERANCE:g}: not written")
         other.replace(out)
-    return said
-
-
-def count_clips(clips: list[Tensor]) -> str:
-    """Return the number of test clips, in words."""
-    return f"{len(clips)} test clip{'s' * (len(clips) != 1)}"
+    return line

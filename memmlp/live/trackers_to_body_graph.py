@@ -198,37 +198,18 @@ def full_differences(model: MotionModel, path: Path, clip: Tensor, space: str = 
     the network, and `Normalizer.pose`. Quaternions are converted to matrices for the comparison; others than
     unit quaternions differ by infinity.
     """
-    trackers, reference = trackers_of(clip[:, :SPARSE_DIM].cpu()), space_of(space)
-    stream, inputs = OnnxStream(path), _inputs(trackers, reference)
-    steps = [
-        stream.step(*(part[index : index + 1] for part in inputs.values())) for index in range(len(clip) + 1)
-    ]
-    found = [np.concatenate(parts) for parts in zip(*steps, strict=True)]
-    return _compare(found, _in_torch(model, trackers, reference))
-
-
-def _inputs(trackers: tuple[Tensor, Tensor], space: Space) -> dict[str, np.ndarray]:
-    positions, rotations = trackers
-    parts = space.positions_out(positions.numpy()), space.rotations_out(rotations.numpy())
-    return dict(zip(INPUTS, parts, strict=True))
-
-
-def _in_torch(model: MotionModel, trackers: tuple[Tensor, Tensor], space: Space) -> list[np.ndarray]:
-    """Return the model's rotations, positions and joints for trackers, in a frame of reference."""
-    positions, rotations = trackers
-    sparse = sparse_features(rotations, positions)
+    positions, rotations = trackers_of(clip[:, :SPARSE_DIM].cpu())
+    sparse, reference, stream = sparse_features(rotations, positions), space_of(space), OnnxStream(path)
     motion = in_torch(model.cpu().eval(), sparse)
     local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6))).numpy()
     joints = [model.normalizer.pose(motion, sparse), motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))]
-    return [space.pose_out(local), *(space.positions_out(part.numpy()) for part in joints)]
-
-
-def _compare(found: list[np.ndarray], expected: list[np.ndarray]) -> Tensor:
-    """Return each frame's largest difference (N,); the found arrays (N + 1, ...) begin a step earlier."""
-    found = [part[1:] for part in found]
+    expected = [reference.pose_out(local), *(reference.positions_out(part.numpy()) for part in joints)]
+    inputs = reference.positions_out(positions.numpy()), reference.rotations_out(rotations.numpy())
+    steps = [stream.step(*(part[index : index + 1] for part in inputs)) for index in range(len(clip) + 1)]
+    found = [np.concatenate(parts)[1:] for parts in zip(*steps, strict=True)]  # they begin a step earlier
     if found[0].shape[-1] == 4:
         if not np.abs(np.linalg.norm(found[0], axis=-1) - 1).max() <= UNIT:
-            return torch.full((len(found[0]),), torch.inf)
+            return torch.full((len(clip),), torch.inf)
         found[0] = quaternion_to_matrix(found[0].astype(np.float64))
     apart = [np.abs(one - other).reshape(len(one), -1) for one, other in zip(found, expected, strict=True)]
     return torch.from_numpy(np.concatenate(apart, 1).max(1))

@@ -201,12 +201,6 @@ def test_a_run_of_other_code_under_the_same_recipes_is_said(home, monkeypatch):
     assert "before the code of training/losses/terms.py changed" in said
 
 
-def test_the_live_stream_of_a_run(home, memmlp, monkeypatch):
-    monkeypatch.chdir(home)
-    run = motion_run(home)
-    assert "ratio" in memmlp("bench", "live-frame", "--run", run.id, "--frames", "5", "--rounds", "1").out
-
-
 def test_export_again_and_bad_names(home, memmlp, monkeypatch):
     monkeypatch.chdir(home)
     run = motion_run(home)
@@ -221,14 +215,12 @@ def test_export_again_and_bad_names(home, memmlp, monkeypatch):
     assert one_line(memmlp("eval", run.manifest["prerequisite"]), "a finished run of a motion network")
 
 
-def test_a_nan_on_a_later_clip_is_not_exported(home, memmlp, monkeypatch):
-    """Python's max would pass over it."""
+def test_a_nan_is_not_exported(home, memmlp, monkeypatch):
     monkeypatch.chdir(home)
-    found = iter([torch.tensor([1e-6]), torch.tensor([float("nan")])])
-    monkeypatch.setattr("memmlp.deploy.parity.differences", lambda *_: next(found))
+    monkeypatch.setattr("memmlp.deploy.parity.differences", lambda *_: torch.tensor([1e-6, float("nan")]))
     monkeypatch.setattr("memmlp.deploy.export.export", lambda model, path, run, opset: path.write_bytes(b""))
-    monkeypatch.setattr(MotionDataset, "clips", lambda self: [None, None])
-    ran = memmlp("export", motion_run(home).id, "--out", "never.onnx", "--parity-clips", "0")
+    monkeypatch.setattr(MotionDataset, "clips", lambda self: [torch.zeros(2, 252)])
+    ran = memmlp("export", motion_run(home).id, "--out", "never.onnx", "--opset", "17")
     assert (ran.code, "not written" in ran.err) == (1, True)
     assert not list(home.glob("*never*")) + list(home.glob(".export-*"))
 
