@@ -200,8 +200,8 @@ class FeatureMemorySettings(Settings):
     layers: list[int] = setting(each(at_least(1)), "${even_layers:${model.depth}}")
     # k, the width of the memory feature (reading 3), and the hidden size of a recurrent memory
     width: int = setting(at_least(1), tiny=8, small=48, paper=192, width_fraction=0.375)
-    # residual: x + f([x; z]); plain: f([x; z]) (reading 3)
-    fusion: str = setting(one_of("residual", "plain"), "residual")
+    # residual: x + f([x; z]); plain: Linear([block(x); z]), as Sec. 4.1 says (reading 3)
+    fusion: str = setting(one_of("residual", "plain"), "residual", literal="plain")
 
 
 class FeatureMemory(Memory):

@@ -60,10 +60,10 @@ def test_the_most_literal_reading():
     cfg = composed(["experiment=paper"])
     assert (cfg.model.width, cfg.model.depth, cfg.model.frames) == (512, 8, 41)
     assert (cfg.normalizer.coordinates, cfg.normalizer.z_scores) == ("world", False)
-    assert (cfg.memory.shift, cfg.memory.history, cfg.memory.fusion) == ("frame", "latest", "residual")
+    assert (cfg.memory.shift, cfg.memory.history, cfg.memory.fusion) == ("frame", "latest", "plain")
     assert cfg.rollout.name == "teacher_forcing"
     assert (cfg.optim.steps, cfg.optim.batch, cfg.optim.drop_at) == (300_000, 256, 0.75)
-    assert (cfg.vqvae.epochs, cfg.vqvae.steps, cfg.vqvae.codebook) == (100, None, "gradient")
+    assert (cfg.vqvae.epochs, cfg.vqvae.steps, cfg.vqvae.codebook) == (100, None, "ema")
     assert (cfg.data.drawn_by, cfg.evaluation.ik) == ("clips", "lbfgs")
     assert (composed([]).data.drawn_by, composed([]).evaluation.ik) == ("frames", "off")
 
