@@ -51,7 +51,7 @@ def import_(
     strict: bool,
     sound: bool,
 ) -> None:
-    """Import BVH files as AMASS npz.
+    """Import BVH and ASF/AMC files as AMASS npz.
 
     SOURCE is a folder or one file. The clips are brought to the 22-joint tree, and each is compared with its
     file; faults are reported.

@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 from memmlp.common.errors import InputError
 from memmlp.motion.formats.recording import END, Recording
 
-FPS = 120.0  # of both databases, by their indices: the files do not state a frame rate
 INCH = 0.0254  # metres
 LIMIT = 1e6  # the largest size of any number in the files
 MAX_BYTES = 2**28
@@ -121,7 +120,7 @@ def read_amc(path: Path) -> AsfAmc:
         nodes=(*names, *(names[node] + END for node in ends)),
         node_parents=(*parents, *ends),
         offsets=np.array(offsets),
-        fps=FPS,
+        fps=None,
         values=values,
         bones=tuple(bones),
         unit=unit,

@@ -131,7 +131,7 @@ class Stance:
         positions: their positions (22, 3).
         nodes: positions (nodes, 3) of all of the file's nodes.
         source: a description of the file's pose.
-        straight: whether it is a zero pose, whose limbs are assumed to have no twist.
+        straight: whether the limbs are as in the zero pose, and so assumed to have no twist.
     """
 
     rotations: np.ndarray
@@ -173,7 +173,8 @@ def find_stance(recording: Recording, skeleton: SkeletonMap, motion: MappedMotio
             raise InputError(f"{path}: in {source}, {why}; check left and right in the map, and the up axis")
         turn = anatomy.facing(pose)
         nodes = skeleton.unit * nodes @ upright.T @ turn.T
-        return Stance(turn @ rotations, pose @ turn.T, nodes, source, straight=source == "the zero pose")
+        straight = np.allclose(rotations[[*LIMBS]], np.eye(3))
+        return Stance(turn @ rotations, pose @ turn.T, nodes, source, straight)
 
     if skeleton.rest is not None:
         rotations, nodes = recording.pose(skeleton.rest)

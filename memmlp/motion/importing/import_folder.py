@@ -273,9 +273,8 @@ def _notes(clips: Sequence[Imported], how: ImportSettings) -> Iterator[str]:
     """Yield notes for the user, one line each."""
     corrected: dict[str, list[str]] = {}
     for clip in clips:
-        if clip.fps != clip.header_fps:
-            header = "no rate" if clip.header_fps is None else f"{clip.header_fps:g} Hz"
-            rates = f"{clip.fps:g} Hz, {clip.fps_reason}; the header says {header}"
+        if clip.header_fps not in (None, clip.fps):
+            rates = f"{clip.fps:g} Hz, {clip.fps_reason}; the header says {clip.header_fps:g} Hz"
             folder = Path(clip.source).parent.as_posix()
             corrected.setdefault(f"{folder}: {rates}", []).append(Path(clip.source).name)
     for correction, names in corrected.items():

@@ -15,10 +15,11 @@ from typing import NamedTuple
 import yaml
 
 from memmlp.common.errors import InputError
+from memmlp.motion.formats.asf_amc import read_amc
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.recording import Recording
 
-READERS: dict[str, Callable[[Path], Recording]] = {".bvh": read_bvh}
+READERS: dict[str, Callable[[Path], Recording]] = {".bvh": read_bvh, ".amc": read_amc}
 EXPECTED = f"expected a {' or '.join(READERS)} file, or a folder with some in it"
 HEADER = "the header's"
 DIGITS = 16  # of a file's digest, by which its true rate is known
@@ -34,6 +35,9 @@ class Rate(NamedTuple):
 
     fps: float
     reason: str
+
+
+DATABASES = Rate(120.0, "of CMU and HDM05, as AMC files do not state a rate")
 
 
 def find_recordings(source: Path) -> dict[Path, Path]:
@@ -60,15 +64,12 @@ def read_recording(path: Path) -> Recording:
 
 
 def find_rate(recording: Recording, relative: Path, given: Mapping[str, float]) -> Rate:
-    """Return a recording's true frame rate: given by the user, known of the file, or the header's.
+    """Return a recording's true frame rate: given by the user, known of the file, the header's, or 120 Hz.
 
     Args:
         recording: the recording.
         relative: the file's path below the imported folder.
         given: rates by folder below that folder ("" for all).
-
-    Raises:
-        InputError: if none of them has a rate.
     """
     for folder in relative.parents:
         if (key := folder_key(folder)) in given:
@@ -78,7 +79,7 @@ def find_rate(recording: Recording, relative: Path, given: Mapping[str, float]) 
     if known is not None:
         return Rate(known, "known of this file")
     if recording.fps is None:
-        raise InputError(f"{recording.path}: the format does not state a frame rate; give --fps HZ")
+        return DATABASES
     return Rate(recording.fps, HEADER)
 
 

@@ -9,9 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from asf_samples import DOFS, amc_text, asf_text, movement, plain_positions, write_take
+from plain_kinematics import npz_kinematics, to_world, worst_direction, worst_distance
 
 from memmlp.common.errors import InputError
-from memmlp.motion.formats.asf_amc import FPS, read_amc
+from memmlp.motion.formats.asf_amc import read_amc
+from memmlp.motion.importing.import_folder import import_folder
+from memmlp.motion.importing.skeleton_map import load_skeleton
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
 CUTS = {
@@ -29,11 +32,44 @@ def assert_posed(take: Path, asf: Path) -> None:
         assert np.abs(positions[:, node] - expected[name]).max() < 1e-6, name
 
 
+def assert_imported(source: Path, out: Path) -> None:
+    """The clips of a folder have every segment and joint within the limits of an import."""
+    report, joints = import_folder(source, out), load_skeleton("asf_amc").joints
+    assert not report.skipped
+    for clip in report.clips:
+        take = source / clip.source
+        (asf,) = take.parent.glob("*.asf")
+        file = {name: to_world(at, "y") for name, at in plain_positions(asf, take).items()}
+        angle, where = worst_direction(out / clip.clip, file, joints)
+        assert angle < 3, (clip.source, where)
+        distance, where = worst_distance(out / clip.clip, file, joints, 1.0)
+        assert distance < 1, (clip.source, where)
+        assert (clip.fps, clip.header_fps) == (120, None)
+
+
+def test_an_import_has_the_files_segments(tmp_path: Path):
+    write_take(tmp_path / "in" / "05", movement(60))
+    write_take(tmp_path / "in" / "HDM_bd", movement(40, size=10.0), first=7)
+    assert_imported(tmp_path / "in", tmp_path / "out")
+
+
+def test_a_head_that_looks_ahead_is_level(tmp_path: Path):
+    """In the zero pose the head leans back."""
+    values = np.zeros((2, 62))
+    values[:, 1] = 17.0
+    columns = [name for name, dofs in DOFS.items() for _ in dofs]
+    values[:, columns.index("head")] = 16.0
+    write_take(tmp_path / "05", values)
+    import_folder(tmp_path / "05", tmp_path / "out")
+    rotations, _ = npz_kinematics(tmp_path / "out" / "05_01.npz")
+    assert np.degrees(np.arcsin(rotations[0, 15, 2, 2])) == pytest.approx(0, abs=0.1)
+
+
 def test_joints_are_where_plain_kinematics_puts_them(tmp_path: Path):
     take = write_take(tmp_path / "05", movement(12, size=60.0))
     assert_posed(take, tmp_path / "05" / "05.asf")
     recording = read_amc(take)
-    assert recording.fps == FPS == 120
+    assert recording.fps is None
     zero = plain_positions(tmp_path / "05" / "05.asf", write_take(tmp_path / "05", np.zeros((1, 62))))
     for name, position in zip(recording.nodes, recording.zero_pose(), strict=True):
         assert np.allclose(position, zero[name][0], atol=1e-9), name
@@ -156,7 +192,7 @@ def database(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 
 
 @pytest.mark.slow
-def test_the_databases_have_the_frames_and_cuts_of_their_readmes(database: Path):
+def test_the_databases_have_the_frames_and_cuts_of_their_readmes(database: Path, tmp_path: Path):
     numbers = {take: re.findall(rb"(?m)^(\d+)\s*$", take.read_bytes()) for take in database.rglob("*.amc")}
     frames = sum(map(len, numbers.values()))
     cuts = {take.stem: int(first) for take, (first, *_) in numbers.items() if first != b"1"}
@@ -169,3 +205,7 @@ def test_the_databases_have_the_frames_and_cuts_of_their_readmes(database: Path)
         assert (len(recording), recording.first_frame) == (len(numbers[take]), int(numbers[take][0]))
         (asf,) = person.glob("*.asf")
         assert_posed(take, asf)
+        for file in (take, asf):
+            (tmp_path / "in" / person.name).mkdir(parents=True, exist_ok=True)
+            (tmp_path / "in" / person.name / file.name).symlink_to(file)
+    assert_imported(tmp_path / "in", tmp_path / "out")
