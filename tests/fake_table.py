@@ -7,8 +7,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from memmlp.report.tables.formats import show
 from memmlp.report.tables.table import Table
+from memmlp.report.tables.table_text import show
 
 SHIPPED = Path(__file__).parent.parent / "sweeps"
 FILE = {

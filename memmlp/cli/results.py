@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from memmlp.report.kept_results import Kept
     from memmlp.report.result_pages import KeptTable
     from memmlp.report.tables.table import Table
-    from memmlp.sweep.definition import Sweep
 
 FOLDER = Path("docs/results")
 
@@ -58,14 +57,13 @@ def save_command(
 ) -> None:
     """Keep a sweep's results, the per-clip results of its finished runs, in one small file.
 
-    SWEEP and OVERRIDES are those of `memmlp sweep`. The file keeps its results of other variants and seeds.
+    SWEEP and OVERRIDES are those of `memmlp sweep`. A file that has results of further runs is not replaced.
     """
     from memmlp.cli.table import shown_sweep
     from memmlp.common.files import plain
     from memmlp.config.compose_plan import find_sweep, is_path
     from memmlp.report.kept_results import Kept, list_overrides, load_kept, save, shorten_paths
     from memmlp.report.tables.build_table import finished_runs, run_finder
-    from memmlp.report.tables.flags import listed, missing_seeds
     from memmlp.report.tables.measured_run import load
 
     sweep = find_sweep(name, overrides)
@@ -86,24 +84,14 @@ def save_command(
     )
     if not kept.every:
         raise InputError(f"sweep {name}: no finished run to keep; make them with: {kept.command}")
-    path, added = out / f"{stem or sweep.name}.json", kept.count
+    path = out / f"{stem or sweep.name}.json"
     if path.exists():
-        # Runs that were kept before, and are not kept again now, must be those that the sweep has now.
-        entries = {(entry.label, entry.seed): entry.id for entry in shown.plan.entries}
-        planned = {key: run for key, run in entries.items() if key[1] not in kept.runs.get(key[0], {})}
         try:
-            kept = load_kept(path).merge(kept)
-            kept.check_runs(planned)
+            kept.check_replaces(load_kept(path))
         except InputError as error:
             raise InputError(f"{path}: {error}; give another --name or --out, or remove the file") from None
     save(path, kept)
-    click.echo(f"{path}: {kept.count} runs, {added} of them from here")
-    variants = shown.sweep.runnable()
-    present = {variant.label: kept.runs.get(variant.label, {}) for variant in variants}
-    missing = {variant.label: missing_seeds(shown.sweep, variant, present) for variant in variants}
-    lines = [f"'{label}' seed {', '.join(map(str, seeds))}" for label, seeds in missing.items() if seeds]
-    if lines:
-        click.echo(f"missing of the sweep: {listed(lines)}; make them with: {kept.command}")
+    click.echo(f"{path}: {kept.count} runs")
 
 
 folder_option = click.option(
@@ -124,14 +112,12 @@ def show(name: str, source: str | None, together: tuple[str, ...], folder: Path)
     """Print the table of kept results, without any run; NAME is that of their page."""
     from memmlp.cli.table import print_tables
     from memmlp.report.kept_results import load_kept
-    from memmlp.report.tables.build_table import titled
 
     path = folder / "data" / f"{name}.json"
     if not path.is_file():
         known = ", ".join(sorted(one.stem for one in path.parent.glob("*.json")))
         raise InputError(f"{path}: no such results; must be one of: {known or '(none are kept)'}")
-    table = _make_table(load_kept(path), source, together)
-    print_tables([titled(table, source) if source else table])
+    print_tables([_make_table(load_kept(path), source, together)])
 
 
 @results.command("docs")
@@ -169,7 +155,6 @@ def make_tables(folder: Path) -> dict[str, KeptTable]:
     """Return the tables of all results kept below a folder, by the stems of their files."""
     from memmlp.report.kept_results import load_kept
     from memmlp.report.result_pages import KeptTable
-    from memmlp.report.tables.build_table import titled
 
     if not (folder / "data").is_dir():
         raise InputError(f"{folder}/data: no such folder; memmlp results save --out {folder}/data makes it")
@@ -177,7 +162,7 @@ def make_tables(folder: Path) -> dict[str, KeptTable]:
     for path in sorted((folder / "data").glob("*.json")):
         kept = load_kept(path)
         sources = () if kept.rounds else kept.sources  # rounds decide verdicts of all clips together
-        by_source = tuple(titled(_make_table(kept, source), source) for source in sources)
+        by_source = tuple(_make_table(kept, source) for source in sources)
         found[path.stem] = KeptTable(kept, _make_table(kept), by_source, partial(_make_table, kept, None))
     return found
 
@@ -192,7 +177,7 @@ def _make_table(kept: Kept, source: str | None = None, patterns: Sequence[str] =
     """
     from memmlp.cli.table import flag_of_other_rounds
     from memmlp.config.compose_plan import find_sweep
-    from memmlp.report.tables.build_table import make_table, on_source, together
+    from memmlp.report.tables.build_table import make_table, restrict
     from memmlp.report.tables.seed_rounds import Rounds
     from memmlp.runs.component_versions import outdated
 
@@ -209,13 +194,11 @@ def _make_table(kept: Kept, source: str | None = None, patterns: Sequence[str] =
             spent, kept.runs_of(spent), command=f"{kept.command} --until-decided", rounds=rounds
         )
     else:
-        sweep = _with_kept_seeds(sweep, kept)
-        runs = kept.runs_of(sweep)
-        if source is not None:
-            sweep, runs, left_out = on_source(sweep, runs, source)
-            flags += left_out
-        runs, tied = together(runs, patterns)
-        flags += [*tied, *([other] if other else [])]
+        # Seeds of the definition without a kept run are missing: one seed of five is not a finished table.
+        seeds = sorted({*sweep.seeds, *(seed for by_seed in kept.runs.values() for seed in by_seed)})
+        sweep = sweep.with_overrides([f"seed={','.join(map(str, seeds))}"])
+        sweep, runs, restricted = restrict(sweep, kept.runs_of(sweep), source, patterns)
+        flags = [*restricted, *([other] if other else [])]
         table = make_table(sweep, runs, command=kept.command)
     changed = sorted({change for run in kept.every for change in outdated(run.origin.every_version)})
     flags += [
@@ -223,12 +206,3 @@ def _make_table(kept: Kept, source: str | None = None, patterns: Sequence[str] =
         *([f"made with earlier component versions: {', '.join(changed)}"] if changed else []),
     ]
     return replace(table, flags=(*table.flags, *flags))
-
-
-def _with_kept_seeds(sweep: Sweep, kept: Kept) -> Sweep:
-    """Return the sweep with the seeds of its definition, and further ones that any of the kept runs has.
-
-    Seeds of the definition without a kept run are missing: one seed of five is not a finished table.
-    """
-    seeds = sorted({*sweep.seeds, *(seed for runs in kept.runs.values() for seed in runs)})
-    return sweep.with_overrides([f"seed={','.join(map(str, seeds))}"])

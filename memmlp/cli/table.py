@@ -214,11 +214,9 @@ def table_of_plan(
     from memmlp.report.tables.build_table import (
         finished_runs,
         make_table,
-        on_source,
+        restrict,
         run_finder,
         state_finder,
-        titled,
-        together,
     )
 
     sweep, plan, rounds, flags = shown
@@ -231,14 +229,10 @@ def table_of_plan(
 
         runs, measured = with_costs(sweep, runs)
         flags = (*flags, *measured)
-    if selection.source:
-        sweep, runs, left_out = on_source(sweep, runs, selection.source)
-        flags = (*left_out, *flags)
-    runs, tied = together(runs, selection.together)
-    flags = (*tied, *flags)
+    sweep, runs, restricted = restrict(sweep, runs, selection.source, selection.together)
+    flags = (*restricted, *flags)
     command = f"{command} --until-decided" if rounds else command
     table = make_table(sweep, runs, modes, command, state_finder(plan), rounds)
-    table = titled(table, selection.source) if selection.source else table
     return SweepTable(sweep, runs, replace(table, flags=(*table.flags, *flags)))
 
 
@@ -260,7 +254,7 @@ def print_tables(tables: Sequence[Table]) -> None:
     """Print tables in the width of the screen."""
     from rich.console import Console
 
-    from memmlp.report.tables.formats import show
+    from memmlp.report.tables.table_text import show
 
     console = Console(highlight=False, markup=False)
     for one in tables:
@@ -295,7 +289,7 @@ def aligned(rows: Sequence[Sequence[str]], left: int) -> list[str]:
 
 def _formatted(tables: Sequence[Table], form: str, alone: bool) -> str:
     """Return the tables as one text; in JSON, it is a single object if `alone`, else a list."""
-    from memmlp.report.tables.formats import FORMATS
+    from memmlp.report.tables.table_text import FORMATS
 
     texts = [FORMATS[form](one) for one in tables]
     if form == "json" and not alone:
@@ -304,7 +298,7 @@ def _formatted(tables: Sequence[Table], form: str, alone: bool) -> str:
 
 
 def _form_of(out: Path | None) -> str:
-    from memmlp.report.tables.formats import FORMATS
+    from memmlp.report.tables.table_text import FORMATS
 
     ending = out.suffix.removeprefix(".") if out else ""
     if ending not in FORMATS:

@@ -56,11 +56,6 @@ class Kept:
         return " ".join(["memmlp sweep", self.sweep, *self.overrides])
 
     @property
-    def untrained(self) -> int:
-        """The number of networks whose costs were measured without a run."""
-        return len({run.id for run in self.every if not run.means})
-
-    @property
     def every(self) -> list[Measured]:
         """The runs, once for each evaluation and deployment that variants show, sorted by name."""
         return [run for _, run in sorted(self.named.items())]
@@ -70,11 +65,15 @@ class Kept:
         """The number of runs."""
         return len({run.id for run in self.every})
 
+    @property
+    def untrained(self) -> int:
+        """The number of networks whose costs were measured without a run."""
+        return len({run.id for run in self.every if not run.means})
+
     @cached_property
     def named(self) -> dict[str, Measured]:
         """The runs by their names in the file."""
-        objects = {id(run): run for by_seed in self.runs.values() for run in by_seed.values()}
-        return {self.names[key]: run for key, run in objects.items()}
+        return {self.names[id(run)]: run for by_seed in self.runs.values() for run in by_seed.values()}
 
     @cached_property
     def names(self) -> dict[int, str]:
@@ -83,68 +82,32 @@ class Kept:
         A name is the run's id. If variants show several evaluations or deployments of one run, a digest of
         its record is appended.
         """
-        by_id: dict[str, list[Measured]] = defaultdict(list)
-        for run in {id(run): run for by_seed in self.runs.values() for run in by_seed.values()}.values():
-            by_id[run.id].append(run)
+        by_id: dict[str, dict[int, Measured]] = defaultdict(dict)
+        for run in (run for by_seed in self.runs.values() for run in by_seed.values()):
+            by_id[run.id][id(run)] = run
         names: dict[int, str] = {}
         for run_id, runs in by_id.items():
-            digests = [_digest(_record(run))[:8] for run in runs] if len(runs) > 1 else [""]
-            several = len(set(digests)) > 1
-            names |= {
-                id(run): f"{run_id}/{digest}" if several else run_id
-                for run, digest in zip(runs, digests, strict=True)
-            }
+            ends = [f"/{_digest(_record(run))[:8]}" if len(runs) > 1 else "" for run in runs.values()]
+            several = len(set(ends)) > 1
+            names |= {key: f"{run_id}{end * several}" for key, end in zip(runs, ends, strict=True)}
         return names
 
-    def merge(self, other: Kept) -> Kept:
-        """Return the results with another's runs added; if both have a variant and seed, the other's is used.
+    def check_replaces(self, other: Kept) -> None:
+        """Check that writing these results over others loses none of them.
 
         Raises:
-            InputError: if the two are not from the same sweep with the same overrides, or if a fixed number
-                of seeds would join seeds that were spent in rounds, so that verdicts would lose their level.
+            InputError: if the others are of another sweep or other overrides, or have further runs.
         """
         if (self.sweep, self.overrides) != (other.sweep, other.overrides):
-            raise InputError(f"holds the results of '{self.command}', not of '{other.command}'")
-        if self.rounds and not other.rounds:
-            raise InputError("holds seeds that were spent in rounds, and these were not")
-        self.check(other.variants)
-        labels = dict.fromkeys([*self.runs, *other.runs])
-        runs = {label: {**self.runs.get(label, {}), **other.runs.get(label, {})} for label in labels}
-        flags = tuple(dict.fromkeys([*self.flags, *other.flags]))
-        variants = {**self.variants, **other.variants}
-        return replace(self, runs=runs, variants=variants, rounds=other.rounds, flags=flags)
-
-    def check_runs(self, planned: Mapping[tuple[str, int], str]) -> None:
-        """Check that the variants and seeds have the same runs that the sweep gives them now.
-
-        A variant's overrides may be unchanged although their meaning has changed, by a default or a component
-        version.
-
-        Args:
-            planned: the runs' ids by the variant's label and the seed; other runs are not checked.
-
-        Raises:
-            InputError: if a variant and seed has another run.
-        """
-        for label, runs in self.runs.items():
-            seeds = sorted(seed for seed, run in runs.items() if planned.get((label, seed), run.id) != run.id)
-            if seeds:
-                raise InputError(
-                    f"variant '{label}' has other runs than the current config, data and code make (seed "
-                    f"{', '.join(map(str, seeds))})"
-                )
-
-    def check(self, variants: Mapping[str, tuple[str, ...]]) -> None:
-        """Check that the variants have the overrides with which their runs were made.
-
-        Raises:
-            InputError: if a variant has other overrides, so that its runs belong to another variant with the
-                same label.
-        """
-        for label, words in variants.items():
-            if self.runs.get(label) and self.variants.get(label, words) != words:
-                before, now = ", ".join(self.variants[label]) or "none", ", ".join(words) or "none"
-                raise InputError(f"variant '{label}' was made with the overrides {before}, and now has {now}")
+            raise InputError(f"has the results of '{other.command}', not of '{self.command}'")
+        lost = [
+            f"'{label}' seed {seed}"
+            for label, runs in other.runs.items()
+            for seed in runs
+            if seed not in self.runs.get(label, {})
+        ]
+        if lost:
+            raise InputError(f"has results of runs that are not here: {', '.join(lost[:12])}")
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -155,9 +118,13 @@ class Kept:
         """Return the runs of the variants and seeds that the sweep has now.
 
         Raises:
-            InputError: as `check` does.
+            InputError: if a variant has other overrides now, so that its runs belong to another variant with
+                the same label.
         """
-        self.check(list_overrides(sweep))
+        for label, overrides in list_overrides(sweep).items():
+            if self.runs.get(label) and self.variants.get(label, overrides) != overrides:
+                before, now = (", ".join(one) or "none" for one in (self.variants[label], overrides))
+                raise InputError(f"variant '{label}' was made with the overrides {before}, and now has {now}")
         return {
             variant.label: {
                 seed: run

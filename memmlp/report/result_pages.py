@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 from memmlp.common.errors import InputError, require
 from memmlp.report.kept_results import Kept
-from memmlp.report.tables.formats import escaped, markdown
 from memmlp.report.tables.measured_run import UNKNOWN
 from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table import Cell, Row, Table
@@ -18,6 +17,8 @@ from memmlp.report.tables.table_text import (
     caption,
     decimals,
     effect_words,
+    escaped,
+    markdown,
     number_words,
     unit,
     value_words,
@@ -111,11 +112,8 @@ class Placeholders:
 
     def functions(self) -> dict[str, object]:
         """Return the placeholders by the names with which templates call them."""
-        functions = (
-            self.has, self.title, self.origin, self.effect, self.verdict, self.value, self.detectable,
-            self.summary, self.held, self.steps, self.decided,
-        )  # fmt: skip
-        return {"names": sorted(self.sources), **{one.__name__: one for one in functions}}
+        methods = {name: getattr(self, name) for name in dir(self) if not name.startswith("_")}
+        return {**methods, "names": sorted(self.sources)}
 
     def has(self, name: str) -> bool:
         """Return whether there are results with that name."""
@@ -156,34 +154,25 @@ class Placeholders:
 
         For a table without errors, return its costs beside the paper's.
         """
-        table = self._table(name)
-        metrics = table.measured_metrics
-        if not metrics:
-            return self._summarize_costs(name)
+        table, shown = self._table(name), [row for row in self._table(name).rows if row.found]
+        if metrics := table.measured_metrics:
+            rows = [
+                [row.label, row.against, *(self._compare(name, row, mode, metric) for metric in metrics)]
+                for row in shown
+                if row.against
+            ]
+            return f"In {mode} mode:\n\n{_markdown(['variant', 'compared with', *metrics], rows)}"
+        costs = [row.cells[table.modes[0]] for row in shown]
         rows = [
-            [row.label, row.against or "", *(self._summarize(name, row, mode, metric) for metric in metrics)]
-            for row in table.rows
-            if row.found and row.against
+            [row.label, *(_describe_cost(cells[metric], metric) for metric in table.metrics)]
+            for row, cells in zip(shown, costs, strict=True)
         ]
-        return f"In {mode} mode:\n\n{_markdown(['variant', 'compared with', *metrics], rows)}"
+        return _markdown(["variant", *map(with_unit, table.metrics)], rows)
 
-    def _summarize(self, name: str, row: Row, mode: str, metric: str) -> str:
+    def _compare(self, name: str, row: Row, mode: str, metric: str) -> str:
         printed = row.cells[mode][metric].paper_effect
         paper = "" if printed is None else f"; paper {printed:+.2f}".replace("-", MINUS)
         return f"{self.effect(name, row.label, mode, metric)}{paper}"
-
-    def _summarize_costs(self, name: str) -> str:
-        table = self._table(name)
-        rows = []
-        for row in (row for row in table.rows if row.found):
-            costs = row.cells[table.modes[0]]
-            papers = {metric: costs[metric].paper for metric in table.metrics}
-            cells = [
-                value_words(costs[metric], metric) + ("" if paper is None else f"; paper {paper:.2f}")
-                for metric, paper in papers.items()
-            ]
-            rows.append([row.label, *cells])
-        return _markdown(["variant", *map(with_unit, table.metrics)], rows)
 
     def held(self, names: Sequence[str], mode: str = "stream") -> str:
         """Return which of the paper's effects hold: the counts of verdicts, and a line for each variant.
@@ -275,6 +264,10 @@ def _markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     ]
     lines = [list(map(escaped, heads)), ["---"] * len(heads), *cells]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _describe_cost(cell: Cell, metric: str) -> str:
+    return value_words(cell, metric) + ("" if cell.paper is None else f"; paper {cell.paper:.2f}")
 
 
 def _share(step: Cell, total: Cell, metric: str) -> str:

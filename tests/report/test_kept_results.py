@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_runs import fake_run, runs_of
 
 from memmlp.common.errors import InputError
-from memmlp.report.kept_results import Kept, dumps, list_overrides, load_kept, save, shorten_paths
+from memmlp.report.kept_results import Kept, dumps, load_kept, save, shorten_paths
 from memmlp.report.tables.build_table import make_table
 from memmlp.sweep.definition import Sweep
 
@@ -115,21 +113,13 @@ def test_two_deployments_of_one_run_are_kept_apart(sweep: Sweep, kept: Kept, tmp
     )
 
 
-def test_results_of_several_machines_add_up(sweep: Sweep, kept: Kept, tmp_path: Path):
-    """Variants and seeds of both are present; a cell that both have is the newer one's."""
-    one = {label: {0: runs[0]} for label, runs in kept.runs.items()}
-    newer = fake_run(tmp_path, "again", 0)
-    other = runs_of(replace(sweep, seeds=(0,)), lambda variant, seed: newer if variant.label == "2" else None)
-    rest = {label: {seed: runs[seed] for seed in (1, 2)} for label, runs in kept.runs.items()}
-    merged = replace(kept, runs=one).merge(replace(kept, runs=rest)).merge(replace(kept, runs=other))
-    assert {label: sorted(runs) for label, runs in merged.runs.items()} == {
-        label: [0, 1, 2] for label in kept.runs
-    }
-    ids = set(json.loads(dumps(merged))["runs"])
-    assert newer.id in ids
-    assert kept.runs["2"][0].id not in ids
-    with pytest.raises(InputError, match="holds the results of"):
-        kept.merge(replace(kept, overrides=("data=synthetic",)))
+def test_results_with_further_runs_are_not_replaced(kept: Kept):
+    fewer = replace(kept, runs={label: {0: runs[0]} for label, runs in kept.runs.items()})
+    kept.check_replaces(fewer)
+    with pytest.raises(InputError, match=r"not here: '2' seed 1, '2' seed 2, '2, 4' seed 1"):
+        fewer.check_replaces(kept)
+    with pytest.raises(InputError, match="data=synthetic"):
+        kept.check_replaces(replace(kept, overrides=("data=synthetic",)))
 
 
 def test_kept_results_hold_no_path_of_a_machine():
@@ -158,14 +148,3 @@ def test_results_of_a_variant_with_other_overrides_are_rejected(sweep: Sweep, ke
     other = replace(sweep, variants=tuple(variants))
     with pytest.raises(InputError, match="variant '2' was made with the overrides"):
         kept.runs_of(other)
-    with pytest.raises(InputError, match="variant '2' was made with the overrides"):
-        kept.merge(replace(kept, variants=list_overrides(other)))
-
-
-def test_runs_that_a_variant_would_not_have_now_are_rejected(kept: Kept):
-    """Its words are the same where a default has changed, and its runs are not."""
-    today = {(label, seed): run.id for label, runs in kept.runs.items() for seed, run in runs.items()}
-    kept.check_runs(today)
-    kept.check_runs({("2", 9): "of a seed that is not kept"})
-    with pytest.raises(InputError, match=r"variant '2' has other runs than .* make \(seed 1, 2\)"):
-        kept.check_runs(today | {("2", 2): "f" * 16, ("2", 1): "e" * 16})

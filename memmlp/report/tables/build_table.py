@@ -21,9 +21,9 @@ from memmlp.report.tables.effects import (
     with_existing_branches,
 )
 from memmlp.report.tables.flags import DescribeRun, early_tables, find_flags, no_description
-from memmlp.report.tables.formats import FORMATS
 from memmlp.report.tables.measured_run import Measured, measured_for
 from memmlp.report.tables.table import Cell, Effect, Key, Row, Table
+from memmlp.report.tables.table_text import FORMATS
 from memmlp.sweep.definition import COSTS, MODES, Sweep, Variant
 from memmlp.sweep.plan import Plan, count_states
 
@@ -153,11 +153,6 @@ def without_runs(sweep: Sweep, modes: Sequence[str], reason: str) -> Table:
     return replace(make_table(sweep, runs, modes), flags=(reason,))
 
 
-def titled(table: Table, source: str) -> Table:
-    """Return a table of one source's test clips with a title that names the source."""
-    return replace(table, title=f"{table.title} (test clips of {source} alone)")
-
-
 def on_source(
     sweep: Sweep, runs: Mapping[str, RunsBySeed], source: str
 ) -> tuple[Sweep, dict[str, RunsBySeed], tuple[str, ...]]:
@@ -166,8 +161,9 @@ def on_source(
     If the control has no such clips, the first variant that has some becomes the control.
 
     Returns:
-        The sweep without the variants whose runs have no test clip from the source; the runs of the remaining
-        variants, by seed, evaluated on these clips alone; and a flag that names the variants left out.
+        The sweep without the variants whose runs have no test clip from the source, with a title that names
+        the source; the runs of the remaining variants, by seed, evaluated on these clips alone; and a flag
+        that names the variants left out.
 
     Raises:
         InputError: if no run has a test clip from the source.
@@ -193,7 +189,19 @@ def on_source(
         control = next(label for label, seeds in left.items() if seeds)
     quoted = ", ".join(f"'{one.label}'" for one in sweep.variants if one.label in without)
     flags = (f"no test clip of {source}, so left out: {quoted}",) if without else ()
-    return replace(sweep, variants=tuple(variants), control=control), left, flags
+    title = f"{sweep.title} (test clips of {source} alone)"
+    return replace(sweep, variants=tuple(variants), control=control, title=title), left, flags
+
+
+def restrict(
+    sweep: Sweep, runs: Mapping[str, RunsBySeed], source: str | None, patterns: Sequence[str]
+) -> tuple[Sweep, dict[str, RunsBySeed], tuple[str, ...]]:
+    """Restrict a sweep and its runs to a source (`on_source`), and put clips `together`, where given."""
+    flags: tuple[str, ...] = ()
+    if source:
+        sweep, runs, flags = on_source(sweep, runs, source)
+    grouped, tied = together(runs, patterns)
+    return sweep, grouped, (*flags, *tied)
 
 
 def together(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,28 +18,13 @@ LARGEST = 1_000_000  # bytes of a file
 GRAPHS = {"naive": "as published", "streaming": "stream"}
 BASE = ("AvatarPoser", "naive", "fp32")
 """The network to which ratios on the page refer: AvatarPoser as published."""
-
-
-def _is_number(value: Any) -> bool:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return number and math.isfinite(value) and value > 0
-
-
-CHECKS: dict[str, Callable[[Any], bool]] = {
-    "text": lambda value: isinstance(value, str) and 0 < len(value) <= 300,
-    "a number above 0": _is_number,
-    "a number above 0, or null": lambda value: value is None or _is_number(value),
-    "a count": lambda value: _is_number(value) and value == int(value),
-}
-TEXT, NUMBER_ABOVE_0, OR_NULL, COUNT = CHECKS
-FILE = {"device": TEXT, "browser": TEXT, "onnxruntime_web": TEXT, "date": TEXT, "clock_ms": NUMBER_ABOVE_0}
+ABOUT = {"device": str, "browser": str, "onnxruntime_web": str, "date": str, "clock_ms": float}
 ROW = {
-    "network": TEXT, "parameters": COUNT, "graph": TEXT, "precision": TEXT, "backend": TEXT,
-    "threads": COUNT, "steps": COUNT,
-    "median_ms": NUMBER_ABOVE_0, "p95_ms": NUMBER_ABOVE_0, "ratio_to_avatar_poser": OR_NULL,
-    "ratio_to_yardstick": OR_NULL, "whole_median_ms": OR_NULL, "whole_p95_ms": OR_NULL,
+    "network": str, "parameters": float, "graph": str, "precision": str, "backend": str, "threads": float,
+    "steps": float, "median_ms": float,
 }  # fmt: skip
-EXPECTED = "expected a file that the bench of a site of memmlp web copies or saves"
+MAYBE = ("ratio_to_yardstick", "whole_median_ms")
+"""Numbers of a row that may be null."""
 
 
 @dataclass(frozen=True)
@@ -62,32 +47,34 @@ def read(path: Path) -> BrowserBench:
         InputError: if the file can't be read, or is not a file of the bench.
     """
     try:
-        text = path.read_text(encoding="utf-8") if path.stat().st_size <= LARGEST else ""
-    except (OSError, UnicodeDecodeError) as error:
+        content = json.loads(path.read_bytes()[:LARGEST])
+        if content["format"] != FORMAT:
+            raise ValueError(f"its format is not '{FORMAT}'")
+        rows = tuple(
+            {name: _check(row, name, kind) for name, kind in ROW.items()}
+            | {name: _check(row, name, float, optional=True) for name in MAYBE}
+            for row in content["rows"]
+        )
+        if not rows:
+            raise ValueError("it has no rows")
+        return BrowserBench({name: _check(content, name, kind) for name, kind in ABOUT.items()}, rows)
+    except OSError as error:
         raise InputError(f"--add {path}: {why_unreadable(error)}") from None
-    try:
-        content = json.loads(text)
-    except ValueError as error:
-        raise InputError(f"--add {path}: not JSON ({error}); {EXPECTED}") from None
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise InputError(f"--add {path}: its format is not '{FORMAT}'; {EXPECTED}")
-    rows = content.get("rows")
-    if not isinstance(rows, list) or not rows or not all(isinstance(row, dict) for row in rows):
-        raise InputError(f"--add {path}: rows: {EXPECTED}")
-    about = _checked(path, "", content, FILE)
-    return BrowserBench(
-        about, tuple(_checked(path, f"rows[{index}].", row, ROW) for index, row in enumerate(rows))
-    )
+    except (ValueError, KeyError, TypeError) as error:
+        expected = "expected a file that the bench of a site of memmlp web copies or saves"
+        raise InputError(f"--add {path}: {error}; {expected}") from None
 
 
-def _checked(path: Path, where: str, found: Mapping[str, Any], fields: Mapping[str, str]) -> dict[str, Any]:
-    """Return the fields, with texts made safe to print on a terminal."""
-    for key, kind in fields.items():
-        if key not in found:
-            raise InputError(f"--add {path}: {where}{key}: missing; {EXPECTED}")
-        if not CHECKS[kind](found[key]):
-            raise InputError(f"--add {path}: {where}{key}: {str(found[key])[:60]}; expected {kind}")
-    return {key: one_line(found[key]) if isinstance(found[key], str) else found[key] for key in fields}
+def _check(found: Mapping[str, Any], name: str, kind: type, optional: bool = False) -> Any:
+    """Return a text that is safe to print on a terminal, or a number above 0."""
+    value = found[name]
+    if kind is str and isinstance(value, str) and 0 < len(value) <= 300:
+        return one_line(value)
+    if kind is float and type(value) in (int, float) and math.isfinite(value) and value > 0:
+        return value
+    if optional and value is None:
+        return None
+    raise ValueError(f"{name}: {str(value)[:60]}: must be a {'text' if kind is str else 'number above 0'}")
 
 
 def with_rows(table: Table, measured: BrowserBench) -> Table:
@@ -119,18 +106,18 @@ def with_rows(table: Table, measured: BrowserBench) -> Table:
 
 
 def _row(table: Table, measured: BrowserBench, row: Mapping[str, Any], base: Mapping[str, Any] | None) -> Row:
-    costs = _costs(row)
-    others = _costs(base) if base and base is not row else {}
+    other = base if base is not row else None
+    costs, others = _costs(row), _costs(other) if other else {}
 
     def cell(metric: str) -> Cell:
-        value, other = costs.get(metric), others.get(metric)
-        effect = None if value is None or other is None else Effect(value - other)
+        value, theirs = costs.get(metric), others.get(metric)
+        effect = None if value is None or theirs is None else Effect(value - theirs)
         return Cell({} if value is None else {0: value}, effect=effect)
 
     return Row(
         label=_label(measured, row),
         branch=table.rows[0].branch,
-        against=_label(measured, base) if base and base is not row else None,
+        against=_label(measured, other) if other else None,
         note=None,
         found=(0,),
         wanted=(0,),

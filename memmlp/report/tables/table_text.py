@@ -1,11 +1,18 @@
-"""The words of a table in rows and columns, shared by all formats."""
+"""A table as text: its words, and Markdown, LaTeX, JSON or lines on a terminal made of them."""
 
 from __future__ import annotations
 
+import itertools
+import json
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+import re
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 
+from rich.console import Console
+
+from memmlp.common.files import plain
 from memmlp.evaluation.metric_facts import HIGHER, UNITS
 from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table import STEADY, Cell, Row, Table
@@ -17,19 +24,17 @@ MINUS = "\N{MINUS SIGN}"
 ARROWS = {"lower": "↓", "higher": "↑"}
 
 
-@dataclass(frozen=True)
-class VariantLine:
-    """A line of a variant.
+GAP = "  "  # stands between columns on a terminal
+LABEL = 18  # the largest width of the variants' column on a terminal, characters
+TEX = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{",
+    "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$", MINUS: "$-$",
+    "↓": r"$\downarrow$", "↑": r"$\uparrow$", "✓": r"$\checkmark$", "✗": r"$\times$",
+    "²": r"\textsuperscript{2}", "³": r"\textsuperscript{3}", "<": r"$<$", ">": r"$>$",
+}  # fmt: skip
 
-    Attributes:
-        kind: "measured", "difference" (from the control) or "paper".
-        head: the words of the line's first two columns, variant and seeds.
-        cells: one cell for each metric, each with one to three parts.
-    """
-
-    kind: str
-    head: tuple[str, str]
-    cells: tuple[tuple[str, ...], ...]
+Line = tuple[tuple[str, ...], ...]
+"""A line of a variant: its cells, each with one to three parts. First come variant and seeds."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +43,12 @@ class Grid:
 
     mode: str | None
     header: tuple[str, ...]
-    groups: tuple[tuple[VariantLine, ...], ...]
+    groups: tuple[tuple[Line, ...], ...]
+
+    @property
+    def lines(self) -> list[list[str]]:
+        """All lines, with the parts of each cell joined."""
+        return [[" ".join(cell) for cell in line] for group in self.groups for line in group]
 
 
 def grids(table: Table) -> list[Grid]:
@@ -182,7 +192,7 @@ def _agreement(table: Table) -> str:
     return f"paper: value (difference; ✓ it holds here, ✗ the opposite does{signs}){summary}"
 
 
-def _lines(table: Table, row: Row, mode: str) -> Iterable[VariantLine]:
+def _lines(table: Table, row: Row, mode: str) -> Iterator[Line]:
     """Yield a variant's lines: measured values, their difference from the control, and the paper's values.
 
     A row with only the paper's values has just the last line.
@@ -190,17 +200,14 @@ def _lines(table: Table, row: Row, mode: str) -> Iterable[VariantLine]:
     cells = [(row.cells[mode][metric], metric) for metric in table.metrics]
     paper = tuple((paper_words(cell, metric),) for cell, metric in cells)
     if row.paper_only:
-        yield VariantLine("paper", (row.label, "paper"), paper)
+        yield ((row.label,), ("paper",), *paper)
         return
-    seeds = f"{len(row.found)}/{len(row.wanted)}"
-    yield VariantLine(
-        "measured", (row.label, seeds), tuple((value_words(cell, metric),) for cell, metric in cells)
-    )
+    values = ((value_words(cell, metric),) for cell, metric in cells)
+    yield ((row.label,), (f"{len(row.found)}/{len(row.wanted)}",), *values)
     if any(cell.effect for cell, _ in cells):
-        effects = tuple(effect_words(cell, metric) for cell, metric in cells)
-        yield VariantLine("difference", ("", "diff."), effects)
+        yield (("",), ("diff.",), *(effect_words(cell, metric) for cell, metric in cells))
     if any(cell.paper is not None for cell, _ in cells):
-        yield VariantLine("paper", ("", "paper"), paper)
+        yield (("",), ("paper",), *paper)
 
 
 def value_words(cell: Cell, metric: str) -> str:
@@ -283,3 +290,129 @@ def paper_words(cell: Cell, metric: str) -> str:
     mark = {None: "", True: " ✓", False: " ✗"}[cell.agrees]
     ratio = "".join(f" {words}" for words in _ratio(cell.paper, cell.paper_effect)) if metric in COSTS else ""
     return f"{value} ({signed(cell.paper_effect, f'+.{digits}f')}{mark}){ratio}"
+
+
+def markdown(table: Table) -> str:
+    """Return the table in GitHub's Markdown."""
+    parts = [f"### {escaped(caption(table))}"]
+    for grid in grids(table):
+        rows = [list(map(escaped, grid.header)), ["---", ":---:", *["---:"] * len(table.metrics)]]
+        rows += [list(map(escaped, line)) for line in grid.lines]
+        text = "\n".join(f"| {' | '.join(row)} |" for row in rows)
+        parts.append(f"**{grid.mode}**\n\n{text}" if grid.mode else text)
+    remarks = "\n".join(f"- {escaped(line)}" for line in _remarks(table))
+    return "\n\n".join([*parts, remarks] if remarks else parts) + "\n"
+
+
+def escaped(text: str) -> str:
+    """Return the text with all characters escaped that Markdown would interpret."""
+    return re.sub(r"([\\`*_|<>\[\]#])", r"\\\1", text)
+
+
+def latex(table: Table) -> str:
+    """Return a LaTeX table for the packages booktabs and amssymb."""
+    lines = ["% needs \\usepackage{booktabs,amssymb}", r"\begin{table}", r"\centering", r"\small"]
+    lines.append(rf"\caption{{{_tex(caption(table))}}}")
+    lines.append(rf"\begin{{tabular}}{{ll{'r' * len(table.metrics)}}}")
+    lines.append(r"\toprule")
+    for number, grid in enumerate(grids(table)):
+        columns = len(grid.header)
+        lines += [r"\midrule"] if number else []
+        lines += [rf"\multicolumn{{{columns}}}{{l}}{{\emph{{{grid.mode} mode}}}} \\"] if grid.mode else []
+        lines += [" & ".join(map(_tex, grid.header)) + r" \\", r"\midrule"]
+        lines += [" & ".join(map(_tex, line)) + r" \\" for line in grid.lines]
+    lines += [r"\bottomrule", r"\end{tabular}"]
+    lines += [rf"\par\smallskip\raggedright\footnotesize {_tex(line)}." for line in _remarks(table)]
+    return "\n".join([*lines, r"\end{table}"]) + "\n"
+
+
+def as_json(table: Table) -> str:
+    """Return the table's whole content as JSON, including the values of each seed."""
+    fields = asdict(table)
+    for row, words in zip(table.rows, fields["rows"], strict=True):
+        for mode, cells in row.cells.items():
+            for metric, cell in cells.items():
+                summary = {"mean": cell.mean, "sd": cell.sd, "agrees": cell.agrees}
+                words["cells"][mode][metric] |= summary
+    return json.dumps(plain(fields), indent=2, ensure_ascii=False) + "\n"
+
+
+def show(table: Table, console: Console) -> None:
+    """Print the table on a terminal; columns that do not fit are put into further blocks below."""
+    console.print(caption(table), style="bold", soft_wrap=True)
+    for grid in grids(table):
+        if grid.mode:
+            console.print(f"{grid.mode} mode", style="italic")
+        for columns in _fitting(grid, console.width):
+            console.out("\n".join(_lined(grid, columns)), "", sep="\n", highlight=False)
+    for line in _remarks(table):
+        console.print(f"- {line}")
+    console.print()
+
+
+FORMATS: dict[str, Callable[[Table], str]] = {"md": markdown, "tex": latex, "json": as_json}
+
+
+def _remarks(table: Table) -> list[str]:
+    return [*legend(table), *table.flags, *table.notes]
+
+
+def _tex(text: str) -> str:
+    return "".join(TEX.get(letter, letter) for letter in text)
+
+
+def _fitting(grid: Grid, width: int) -> list[list[int]]:
+    """Divide the metrics' columns into as few groups of nearly equal size as fit the width.
+
+    The variants' two columns are repeated before each group.
+    """
+    columns = range(2, len(grid.header))
+    widths = [
+        _width(block[column] for block in _blocks(grid)) + len(GAP) for column in range(len(grid.header))
+    ]
+    for groups in range(1, len(columns) + 1):
+        size = -(-len(columns) // groups)
+        fits = [list(columns[i : i + size]) for i in range(0, len(columns), size)]
+        if all(sum(widths[:2]) + sum(widths[i] for i in group) <= width for group in fits):
+            break
+    return fits
+
+
+def _lined(grid: Grid, columns: Sequence[int]) -> Iterator[str]:
+    """Yield some columns of a grid as lines. (Rich's table takes seconds for hundreds of variants.)"""
+    blocks = [[block[i] for i in (0, 1, *columns)] for block in _blocks(grid)]
+    widths = [_width(block[i] for block in blocks) for i in range(len(columns) + 2)]
+    for number, block in enumerate(blocks):
+        for words in itertools.zip_longest(*block, fillvalue=""):
+            padded = [
+                word.ljust(widths[i]) if i < 2 else word.rjust(widths[i]) for i, word in enumerate(words)
+            ]
+            yield GAP.join(padded).rstrip()
+        if number == 0:
+            yield "─" * (sum(widths) + len(GAP) * (len(widths) - 1))
+        elif len(block[1]) > 1:
+            yield ""
+
+
+def _width(parts: Iterable[Sequence[str]]) -> int:
+    return max(len(word) for part in parts for word in part)
+
+
+def _blocks(grid: Grid) -> list[list[Sequence[str]]]:
+    return [list(map(_header, grid.header)), *map(_block, grid.groups)]
+
+
+def _block(group: Sequence[Line]) -> list[Sequence[str]]:
+    """Return a variant's columns, each as words below each other."""
+    columns: list[list[str]] = [[] for _ in group[0][1:]]
+    for _, *cells in group:
+        height = max(map(len, cells))
+        for column, parts in zip(columns, cells, strict=True):
+            column += [*parts, *[""] * (height - len(parts))]
+    return [textwrap.wrap(group[0][0][0], LABEL), *columns]
+
+
+def _header(name: str) -> list[str]:
+    metric, _, rest = name.partition(" [")
+    unit, _, arrow = rest.partition("] ")
+    return [f"{metric} {arrow}", unit] if rest else [name]

@@ -17,12 +17,11 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import plain
 from memmlp.evaluation.metric_facts import UNITS
 from memmlp.report.tables.build_table import finished_runs, make_table
-from memmlp.report.tables.formats import as_json
 from memmlp.report.tables.measured_run import Measured, load
 from memmlp.report.tables.seed_rounds import ROUNDS_FILE, Rounds, check_same_runs, progress, subject
 from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table import Table
-from memmlp.report.tables.table_text import better, caption, heading, legend
+from memmlp.report.tables.table_text import as_json, better, caption, heading, legend
 from memmlp.report.ui.run_index import RunIndex
 from memmlp.runs.identity import NETWORK, training_settings
 from memmlp.runs.run import STAGE_WORDS

@@ -38,7 +38,7 @@ def test_collect_reads_each_run_once(sweep: Sweep, tmp_path: Path):
 
 def test_tables_need_no_torch():
     """Tables need no scipy.stats, matplotlib or Hydra either, for these take seconds to import."""
-    code = "import sys, memmlp.cli.table, memmlp.report.tables.formats as r; print(*sys.modules)"
+    code = "import sys, memmlp.cli.table, memmlp.report.tables.table_text as r; print(*sys.modules)"
     ran = finished([sys.executable, "-c", code])
     assert ran.returncode == 0, ran.stderr
     assert not {"torch", "scipy.stats", "matplotlib", "hydra"} & set(ran.stdout.split())
@@ -84,7 +84,8 @@ def test_variants_without_a_sources_clips_are_left_out_and_named(tmp_path: Path)
     assert [row.label for row in table.rows] == ["both", "more"]
     assert not any("missing" in flag for flag in table.flags)
     old, old_runs, flags = on_source(sweep, runs, "old")
-    assert (list(old_runs), old, flags) == (["one", "both", "more"], sweep, ())
+    assert (list(old_runs), old.variants, flags) == (["one", "both", "more"], sweep.variants, ())
+    assert "test clips of old alone" in old.title
     assert all(len(run.clips) == len(clips) // 2 for run in old_runs["both"].values())
     with pytest.raises(InputError, match=r"--source third: no finished run .* expected new, old"):
         on_source(sweep, runs, "third")

@@ -14,9 +14,9 @@ from fake_table import cell, printed
 
 from memmlp.report.kept_results import Kept, dumps, load_kept
 from memmlp.report.tables.build_table import make_table
-from memmlp.report.tables.formats import FORMATS
 from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table import Table
+from memmlp.report.tables.table_text import FORMATS
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import Sweep
 

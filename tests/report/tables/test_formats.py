@@ -10,8 +10,8 @@ import pytest
 from fake_runs import CLIPS, fake_sweep, table_of
 from fake_table import SHIPPED, cell, printed
 
-from memmlp.report.tables.formats import FORMATS
 from memmlp.report.tables.table import Table
+from memmlp.report.tables.table_text import FORMATS
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import load_sweep
 

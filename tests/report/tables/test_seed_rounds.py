@@ -12,10 +12,10 @@ import pytest
 
 from memmlp.report.tables.build_table import make_table
 from memmlp.report.tables.effects import RunsBySeed
-from memmlp.report.tables.formats import markdown
 from memmlp.report.tables.measured_run import Measured, Origin
 from memmlp.report.tables.seed_rounds import Rounds, advance, forecast_seeds, new_rounds
 from memmlp.report.tables.statistics import Verdict
+from memmlp.report.tables.table_text import markdown
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import parse_sweep
 

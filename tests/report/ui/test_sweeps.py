@@ -12,9 +12,9 @@ from report.ui.conftest import predict, run_of
 
 from memmlp.cli.sweep import analyse
 from memmlp.report.tables.build_table import finished_runs, make_table, run_finder, state_finder
-from memmlp.report.tables.formats import as_json
 from memmlp.report.tables.measured_run import load
 from memmlp.report.tables.seed_rounds import Rounds, new_rounds
+from memmlp.report.tables.table_text import as_json
 from memmlp.report.ui.run_index import RunIndex
 from memmlp.report.ui.server import Answers
 from memmlp.report.ui.sweeps import DAMAGED_ROUNDS, OTHER_ROUNDS, Sweeps
