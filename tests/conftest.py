@@ -109,7 +109,6 @@ LONGEST = (
     "kills/test_rounds", "config/test_compose", "cli/test_main", "live/test_stream",
     "kills/test_sweep", "report/tables/test_seed_rounds", "networks/test_baselines", "deploy/test_export",
     "cli/test_tune", "report/ui/test_page", "kills/test_command", "kills/test_training",
-    "cli/test_train_distributed", "runs/loggers/test_mlflow_server",
     "runs/loggers/test_mlflow", "live/session/test_live_page", "common/test_distributed",
     "cli/test_look",
 )  # fmt: skip

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.identity import evaluation_id_of
-from memmlp.runs.loggers.facts import CurvePoint, RunFacts, SweepFacts
+from memmlp.runs.loggers.facts import CurvePoint, RunFacts
 from memmlp.runs.run import Run
 
 
@@ -24,7 +24,6 @@ class Server:
     values: dict[str, list[tuple[str, int, float]]] = field(default_factory=dict)
     results: dict[str, list[str]] = field(default_factory=dict)
     fingerprints: dict[str, str] = field(default_factory=dict)
-    sweeps: list[str] = field(default_factory=list)
     begun: int = 0
 
     def ask(self) -> None:
@@ -58,11 +57,6 @@ class FakeLogger:
         shown = FakeShown(self.server, facts.id)
         shown.log(points)
         return shown
-
-    def sweep(self, facts: SweepFacts) -> None:
-        """Count it."""
-        self.server.ask()
-        self.server.sweeps.append(facts.name)
 
 
 class FakeShown:

@@ -15,9 +15,7 @@ from memmlp.cli.options import outputs_option
 from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
-    from memmlp.report.tables.table import Table
     from memmlp.runs.loggers.logger import RunLogger
-    from memmlp.sweep.plan import Plan
 
 LOGGERS = ("mlflow", "tensorboard", "wandb")
 
@@ -44,7 +42,7 @@ def loggers() -> None:
 @click.option("--full", is_flag=True, help="Show runs again that are up to date.")
 @outputs_option
 def sync(names: tuple[str, ...], uri: str | None, project: str, full: bool, outputs: Path) -> None:
-    """Update loggers with all runs and sweeps.
+    """Update loggers with all runs.
 
     Afterwards they have exactly what the run folders have, each thing once. Runs in progress are left to the
     process that works on them. The command may be repeated at any time.
@@ -54,14 +52,12 @@ def sync(names: tuple[str, ...], uri: str | None, project: str, full: bool, outp
     from memmlp.runs.lookup import list_runs
 
     started = [run for run in list_runs(outputs) if run.manifest]
-    sweeps = sorted(path.parent for path in outputs.glob("sweeps/*/summary.json"))
     warnings: list[str] = []
     for logger in _loggers(names or ("mlflow",), uri, project, outputs):
         counts = run_loggers.sync(logger, progress_bar(started, logger.name), warnings.append, full)
-        groups = run_loggers.sync_sweeps(logger, sweeps, warnings.append)
         live = f", {counts['live']} are in progress" if counts["live"] else ""
         runs = f"{counts['shown'] + counts['same']} runs ({counts['shown']} of them now)"
-        click.echo(f"{runs} and {groups} sweeps are in {logger.place}{live}")
+        click.echo(f"{runs} are in {logger.place}{live}")
     for line in warnings:
         click.echo(f"memmlp: warning: {line}", err=True)
     if warnings:
@@ -80,18 +76,6 @@ def _loggers(names: Sequence[str], uri: str | None, project: str, outputs: Path)
         "wandb": lambda: WandB(project, outputs),
     }
     return [makers[name]() for name in dict.fromkeys(names)]
-
-
-def show_in_loggers(plan: Plan, folder: Path, table: Table) -> None:
-    """Write the sweep's summary into its folder, and show it in the loggers that show its runs."""
-    from omegaconf import OmegaConf
-
-    from memmlp.config.build import build_loggers
-    from memmlp.report.tables.build_table import write_summary
-
-    write_summary(plan, table, folder)
-    if plan.tasks:
-        build_loggers(OmegaConf.create(dict(plan.tasks[0].config))).sweep(folder)
 
 
 @click.command("mlflow")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -41,12 +40,10 @@ if TYPE_CHECKING:
 )
 @click.option("--retry", is_flag=True, help="Run again what failed before.")
 @click.option("--again", is_flag=True, help="Train the sweep's networks again, but not their prerequisites.")
-@click.option("--fail-fast", is_flag=True, help="End the sweep with the first run that fails.")
 @click.option("--until-decided", is_flag=True, help="Add seeds to variants with inconclusive verdicts.")
 @click.option(
     "--max-seeds", type=int, help="Most seeds that a variant may get, with --until-decided.  [default: 13]"
 )
-@click.option("--yes", is_flag=True, hidden=True)
 @config_dir_option
 @plugins_option
 @outputs_option
@@ -59,10 +56,8 @@ def sweep(
     dry_run: bool,
     retry: bool,
     again: bool,
-    fail_fast: bool,
     until_decided: bool,
     max_seeds: int | None,
-    yes: bool,
     outputs: Path,
 ) -> None:
     """Run the missing runs of a sweep: NAME is a file's path, a shipped sweep, or a table's number.
@@ -76,7 +71,7 @@ def sweep(
     their controls, get more, up to --max-seeds.
     """
     from memmlp.cli.table import ShownSweep, flag_of_earlier_rounds
-    from memmlp.config.compose_plan import find_sweep, kept_or_new_plan, sweep_folder
+    from memmlp.config.compose_plan import find_sweep, make_plan, sweep_folder
 
     check_rounds_options(overrides, until_decided, max_seeds)
     if again and (until_decided or status or dry_run):
@@ -88,7 +83,7 @@ def sweep(
     outputs = outputs.absolute()
     rounds = current_rounds(chosen, outputs, max_seeds) if until_decided else None
     spent = rounds.spent(chosen) if rounds else chosen
-    plan = kept_or_new_plan(spent, outputs, prepare=not (status or dry_run))
+    plan = make_plan(spent, outputs, prepare=not (status or dry_run))
     wanted = plan.of_variants(labels)
     if status or dry_run:
         show(spent, plan, labels)
@@ -104,14 +99,13 @@ def sweep(
     work = partial(run_workers, workers=workers)
     given = [name, *overrides]
     if rounds:
-        rounds, plan = run_until_decided(chosen, outputs, rounds, work, fail_fast)
+        rounds, plan = run_until_decided(chosen, outputs, rounds, work)
         show_outcome(ShownSweep(rounds.spent(chosen), plan, rounds), given, chosen, labels)
         return
-    wanted = replace(wanted, fail_fast=fail_fast)
     if wanted.left():
         work(chosen, wanted)
     flags = flag_of_earlier_rounds(chosen, outputs)
-    show_outcome(ShownSweep(chosen, replace(plan, fail_fast=fail_fast), None, flags), given, chosen, labels)
+    show_outcome(ShownSweep(chosen, plan, None, flags), given, chosen, labels)
 
 
 def restart(plan: Plan, failed: bool, networks: bool) -> None:
@@ -143,7 +137,7 @@ def devices(plan: Plan) -> set[str]:
 
 
 def show(chosen: Sweep, plan: Plan, labels: Collection[str]) -> None:
-    """Print the board once, results of older code, and orphaned runs of earlier versions of the file.
+    """Print the board once, and results of older code.
 
     Args:
         chosen: the sweep.
@@ -165,15 +159,6 @@ def show(chosen: Sweep, plan: Plan, labels: Collection[str]) -> None:
             click.echo(line)
     if count := count_unprepared(chosen, shown, labels):
         click.echo(f"{count} runs: their data is not prepared yet; the sweep does that first")
-    show_orphans(chosen, plan)
-
-
-def show_orphans(chosen: Sweep, plan: Plan) -> None:
-    """Print the runs of earlier versions of the sweep's file that it no longer has."""
-    from memmlp.config.compose_plan import orphans
-
-    for entry in orphans(chosen, plan):
-        click.echo(f"orphan: run {entry.id} was '{entry.label}' seed {entry.seed} in an earlier version")
 
 
 def count_unprepared(chosen: Sweep, plan: Plan, labels: Collection[str]) -> int:
@@ -195,8 +180,6 @@ def show_forecast(chosen: Sweep, plan: Plan, labels: Collection[str], workers: W
     if not later and (found := forecast(plan)):
         minutes = found.seconds / count / 60
         line += f": about {minutes:.0f} min, estimated from {found.finished} finished runs"
-        if found.unlike:
-            line += f" ({found.unlike} runs are of variants without a finished one, estimated from others)"
     click.echo(line)
     click.echo(workers.script(folder), nl=False)
 
@@ -212,22 +195,21 @@ def show_outcome(shown: ShownSweep, given: Sequence[str], chosen: Sweep, labels:
         chosen: the sweep.
         labels: the labels of the variants that were run.
     """
-    from memmlp.cli.loggers import show_in_loggers
     from memmlp.cli.table import SHOWN_MODES, print_tables, table_of_plan
     from memmlp.config import plugins
     from memmlp.config.compose_plan import sweep_folder
+    from memmlp.report.tables.build_table import write_table
     from memmlp.report.tables.measured_run import load
 
     plan, rounds, command = shown.plan, shown.rounds, " ".join([*given, *plugins.config_dir_words()])
     states = plan.states()
     failed = [task for task in plan.of_variants(labels).tasks if states[task.key] in ("failed", "blocked")]
     found = table_of_plan(shown, SHOWN_MODES["both"], f"memmlp sweep {command}", load)
-    show_in_loggers(plan, sweep_folder(chosen, plan.outputs), found.table)
+    write_table(found.table, sweep_folder(chosen, plan.outputs))
     print_tables([found.table])
     for line in describe_end(rounds, chosen, found.runs) if rounds else ():
         click.echo(line)
     click.echo(f"{sum(state == 'done' for state in states.values())} of {len(states)} runs done")
-    show_orphans(chosen, plan)
     for task in failed:
         reason = plan.run_of(task).failure or "a prerequisite run failed"
         click.echo(f"failed: run {task.id}: {reason}", err=True)
@@ -281,7 +263,7 @@ def current_rounds(sweep: Sweep, outputs: Path, most: int | None) -> Rounds:
 
 
 def run_until_decided(
-    sweep: Sweep, outputs: Path, rounds: Rounds, work: Callable[[Sweep, Plan], None], fail_fast: bool
+    sweep: Sweep, outputs: Path, rounds: Rounds, work: Callable[[Sweep, Plan], None]
 ) -> tuple[Rounds, Plan]:
     """Do one interim analysis after another until none can be done, and return the last rounds and plan.
 
@@ -290,20 +272,17 @@ def run_until_decided(
         outputs: the folder of runs and caches.
         rounds: the rounds so far.
         work: finishes the runs of a sweep's plan.
-        fail_fast: whether the first failed run ends the rounds.
     """
     from memmlp.cli.table import rounds_path
-    from memmlp.config.compose_plan import kept_or_new_plan
+    from memmlp.config.compose_plan import make_plan
     from memmlp.report.tables.seed_rounds import check_same_runs
 
     while True:
         spent = rounds.spent(sweep)
-        plan = replace(kept_or_new_plan(spent, outputs, prepare=True), fail_fast=fail_fast)
+        plan = make_plan(spent, outputs, prepare=True)
         check_same_runs(rounds, sweep, plan, rounds_path(sweep, outputs))
         if plan.left():
             work(spent, plan)
-        if plan.stopped:
-            return rounds, plan
         after = analyse(sweep, outputs, rounds, plan)
         if after == rounds:
             return rounds, plan

@@ -337,18 +337,18 @@ def shown_sweep(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> ShownS
 
     Otherwise the sweep is shown with its own seeds; if analyses were done, a flag says so.
     """
-    from memmlp.config.compose_plan import kept_or_new_plan
+    from memmlp.config.compose_plan import make_plan
     from memmlp.report.tables.seed_rounds import Rounds, check_same_runs
 
     path = rounds_path(sweep, outputs)
     kept = Rounds.read(path)
     if kept is None or not kept.analyses:
-        return ShownSweep(sweep, kept_or_new_plan(sweep, outputs), None)
+        return ShownSweep(sweep, make_plan(sweep, outputs), None)
     seeds_given = any(override.startswith("seed=") for override in overrides)
     if flag := flag_of_other_rounds(kept, sweep, seeds_given):
-        return ShownSweep(sweep, kept_or_new_plan(sweep, outputs), None, (flag,))
+        return ShownSweep(sweep, make_plan(sweep, outputs), None, (flag,))
     spent = kept.spent(sweep)
-    plan = kept_or_new_plan(spent, outputs)
+    plan = make_plan(spent, outputs)
     try:
         check_same_runs(kept, sweep, plan, path)
     except InputError as error:

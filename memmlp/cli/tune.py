@@ -56,11 +56,7 @@ def tune(
     if status:
         show(setup)
         return
-    lock = Lock(setup.folder)
-    lock.settle()
-    with lock.hold(wait=False) as mine:
-        if not mine:
-            raise InputError(f"search {setup.folder.name}: in use by {lock.holder}; --status shows it")
+    with Lock(setup.folder).hold():
         write_json(setup.folder / "search.json", asdict(setup.search))
         study = Study.open(setup.search, setup.folder.name, setup.folder)
         search(setup, study, workers)
@@ -228,18 +224,13 @@ def search(setup: Setup, study: Study, workers: Workers) -> None:
 def write_results(setup: Setup, study: Study) -> None:
     """Write the results of the search into its folder."""
     from memmlp.config.package_data import packaged
-    from memmlp.runs.identity import option_in_slot
     from memmlp.sweep.search import results
 
     results.write_trials(study, setup.folder / "trials.csv")
     groups = [path.name for path in packaged("conf").iterdir() if path.is_dir()]
     results.write_experiments(study, setup.folder, groups)
-    model = option_in_slot(_requests(setup, {})[0].config, "model")
-    if model in (None, "mem_mlp"):  # Table 5 is about this network
-        table = f"table{results.TABLE:02d}.yaml"
-        results.write_table(study, packaged("sweeps") / table, setup.folder / table, setup.command_line)
     try:
-        results.write_plots(study, setup.folder)
+        results.write_plots(study, setup.folder / "study.html")
     except InputError as error:  # without the extra
         click.echo(str(error), err=True)
 

@@ -224,22 +224,6 @@ class Lock:
         last, idle = self._watch()
         return None if last is None or last.free else not last.open(idle)
 
-    def settle(self, say: Callable[[str], None] | None = None) -> None:
-        """Watch the process that holds the lock until it is known whether it is alive.
-
-        That takes up to LEASE for a process on another machine, and no time otherwise.
-
-        Args:
-            say: gets a line if it takes time; by default the line goes to stderr.
-        """
-        first, idle = self._watch()
-        last = first
-        if first and first.open(idle) is None:
-            (say or _to_stderr)(f"{self.description}: checking for {LEASE:.0f} s if {self.holder} is alive")
-        while last and last == first and last.open(idle) is None:
-            time.sleep(PAUSE)
-            last, idle = self._watch()
-
     def _watch(self) -> tuple[Claim | None, float]:
         """Return the last claim, and for how many seconds this process has seen it unchanged."""
         seen: list[Claim | None] = []

@@ -1,31 +1,24 @@
 """Makes the plan of a sweep file: every variant is composed and checked, and gets its run's identity.
 
 This is in config because only config composes.
-
-Composing takes a moment for each variant. So the plan of a sweep that was started is kept, and used again for
-as long as the sweep, the configs, the code and the data are unchanged.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import digest, read_json, write_json
+from memmlp.common.files import digest
 from memmlp.common.overrides import Override
 from memmlp.config.package_data import packaged
-from memmlp.config.plugins import activate, named, texts_outside_memmlp
+from memmlp.config.plugins import activate, named
 from memmlp.sweep.definition import Sweep, Variant, keep_sweep, key_of
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
 from memmlp.sweep.sweep_file import load_sweep
 
 if TYPE_CHECKING:
-    from omegaconf import DictConfig
-
     from memmlp.training.request import RunRequest
 
 
@@ -109,11 +102,8 @@ def sweep_folder(sweep: Sweep, outputs: Path) -> Path:
     return outputs / "sweeps" / f"{sweep.name}-{digest(ordered)[:8]}"
 
 
-def kept_or_new_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
-    """Return the kept plan of a sweep if it is still valid, or else a new one, which is kept.
-
-    Looking at a sweep that was never started writes nothing into the outputs. Looking at fewer of its seeds,
-    or while its data is absent, leaves the kept plan unchanged.
+def make_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
+    """Return the plan of a sweep; with `prepare`, it is also written into the sweep's folder.
 
     Args:
         sweep: the sweep with the command line's overrides.
@@ -124,63 +114,8 @@ def kept_or_new_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan
     Raises:
         InputError: if a config is wrong; the message names variant and key.
     """
-    path = sweep_folder(sweep, outputs) / "plan_stamp.json"
-    if not prepare and not path.parent.is_dir():
-        return plan_anew(sweep, outputs)
-    stamp = _stamp(sweep, outputs)
-    kept = read_json(path)
-    if kept.get("stamp") == stamp and all(_fresh(data, prepare) for data in kept["data"]):
-        keep_sweep(sweep, path.parent)
-        return Plan.load(path.with_name("plan.json"))
-    plan, data = _plan(sweep, outputs, prepare)
-    labels = {variant.label for variant in sweep.variants}
-    before = [
-        (e.get("label"), e.get("seed")) for e in read_json(path.with_name("plan.json")).get("entries", ())
-    ]
-    lost = {cell for cell in before if cell[0] in labels} - {(one.label, one.seed) for one in plan.entries}
-    if prepare or not lost:
-        keep_sweep(sweep, path.parent)
-        plan.save(path.with_name("plan.json"))
-        write_json(path, {"stamp": stamp if data is not None else None, "data": data or []})
-        ever = path.with_name("entries.json")  # all entries that the sweep has ever had, for `orphans`
-        entries = [*read_json(ever).get("entries", []), *map(asdict, plan.entries)]
-        unique_entries = {(e["label"], e["seed"], e["id"]): e for e in entries}
-        write_json(ever, {"entries": list(unique_entries.values())})
-    return plan
-
-
-def plan_anew(sweep: Sweep, outputs: Path) -> Plan:
-    """Return the plan of a sweep as far as its data is prepared, and write nothing into the outputs.
-
-    Raises:
-        InputError: as `kept_or_new_plan` does.
-    """
-    return _plan(sweep, outputs, prepare=False)[0]
-
-
-def orphans(sweep: Sweep, plan: Plan) -> list[Entry]:
-    """Return the begun runs of earlier versions of the sweep that the sweep no longer has.
-
-    Their variant's label is gone, or the variant has another config now.
-    """
-    recorded = read_json(sweep_folder(sweep, plan.outputs) / "entries.json").get("entries", [])
-    labels = {variant.label for variant in sweep.variants}
-    now = {(entry.label, entry.seed): entry.id for entry in plan.entries}
-    used = set(now.values())
-    entries = [Entry(entry["label"], entry["seed"], entry["id"]) for entry in recorded]
-    return [
-        entry
-        for entry in entries
-        if entry.id not in used
-        and plan.run_of(entry).manifest
-        and (entry.label not in labels or now.get((entry.label, entry.seed), entry.id) != entry.id)
-    ]
-
-
-def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[str, Any]] | None]:
-    """Make the plan, and list the data that it relies on; the list is None if some data is not prepared."""
     planned: list[tuple[Entry, list[RunTask]]] = []
-    data: dict[str, dict[str, Any]] = {}
+    data: dict[str, str | None] = {}
     for variant in sweep.runnable():
         for seed, request in _requests(sweep, variant, outputs):
             if (known := _data_digest(request, prepare, data)) is not None:
@@ -189,8 +124,11 @@ def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[s
     planned.sort(key=lambda one: sweep.seeds.index(one[0].seed))  # a half-done sweep then has every variant
     tasks = unique(task for _, found in planned for task in found)
     plan = Plan(sweep.name, outputs, tuple(entry for entry, _ in planned), tasks)
-    complete = all(one["digest"] is not None for one in data.values())
-    return plan, list(data.values()) if complete else None
+    if prepare:
+        folder = sweep_folder(sweep, outputs)
+        keep_sweep(sweep, folder)
+        plan.save(folder / "plan.json")
+    return plan
 
 
 def _requests(sweep: Sweep, variant: Variant, outputs: Path) -> Iterable[tuple[int, RunRequest]]:
@@ -222,51 +160,13 @@ def tasks_of(request: RunRequest, data: str) -> list[RunTask]:
     return [*tasks, RunTask(own.id, own.kind, request.config, last, request.stage_ids)]
 
 
-def _data_digest(request: RunRequest, prepare: bool, data: dict[str, dict[str, Any]]) -> str | None:
-    """Return the digest of the request's prepared data; None if it is not prepared.
+def _data_digest(request: RunRequest, prepare: bool, known: dict[str, str | None]) -> str | None:
+    """Return the digest of the request's prepared data, looked up once for each data config.
 
-    The digest is looked up once for each data config and kept in `data`.
+    Returns:
+        None if the data is not prepared.
     """
-    config = {"data": request.config["data"], "paths": request.config["paths"]}
-    key = digest(config)
-    if key not in data:
-        found = request.motion.prepare().digest if prepare else request.motion.digest()
-        data[key] = {"config": config, "digest": found, "groups": request.motion.groups_digest}
-    return data[key]["digest"]
-
-
-def _fresh(data: dict[str, Any], prepare: bool) -> bool:
-    """Return whether the data that a kept plan relies on is unchanged, and if `prepare`, fit to train on.
-
-    The groups of clips count, too, since identities of evaluations depend on them.
-    """
-    from omegaconf import OmegaConf
-
-    from memmlp.config.build_motion import build_motion
-
-    cfg: DictConfig = OmegaConf.create(data["config"])
-    try:
-        motion = build_motion(cfg)
-        found = motion.prepare().digest if prepare else motion.digest()
-        return (found, motion.groups_digest) == (data["digest"], data.get("groups"))
-    except InputError:
-        return False
-
-
-def _stamp(sweep: Sweep, outputs: Path) -> str:
-    """Return a digest of everything except the data on which a plan depends.
-
-    That is the sweep, the outputs folder, the configs, and the code of memmlp and of users' packages. A plan
-    that depends on folders or on the environment in another way has a digest of its own each time.
-    """
-    package = Path(__file__).parent.parent
-    files = [*packaged("conf").rglob("*.yaml"), *package.rglob("*.py")]
-    ours = [(str(file), file.read_text(encoding="utf-8")) for file in sorted(files)]
-    own = texts_outside_memmlp()
-    elsewhere = any(sign in repr((asdict(sweep), own)) for sign in ELSEWHERE)
-    unstable = [time.time_ns()] if elsewhere else []
-    return digest([asdict(sweep), str(outputs), ours, *([own] if own else []), *unstable])
-
-
-ELSEWHERE = ("oc.env", "hydra.searchpath")
-"""What an override or a user's config holds that takes values from the environment, or from other folders."""
+    key = digest([request.config["data"], request.config["paths"]])
+    if key not in known:
+        known[key] = request.motion.prepare().digest if prepare else request.motion.digest()
+    return known[key]

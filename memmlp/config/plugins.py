@@ -29,7 +29,6 @@ from memmlp.common.overrides import parse_overrides
 from memmlp.common.settings import MetricSettings
 from memmlp.config.package_data import packaged
 from memmlp.evaluation.metric_facts import HIGHER, SMALLEST, UNITS
-from memmlp.runs.environment import user_code_digests
 
 GROUP = "memmlp.plugins"
 VARIABLE = "MEMMLP_PLUGINS"
@@ -102,17 +101,6 @@ def config_dir_words() -> list[str]:
     """Return `--config-dir FOLDER` for a command that should search the same folder, or nothing."""
     own = _own.get()
     return ["--config-dir", str(own)] if own else []
-
-
-def texts_outside_memmlp() -> list[tuple[str, str]]:
-    """Return code and configs from outside memmlp, as (name, text), on which a plan depends."""
-    found = [
-        (f"{name}:{file}", text)
-        for name, files in user_code_digests(_active).items()
-        for file, text in files.items()
-    ]
-    paths = [path for _, folder in folders() for path in sorted(folder.rglob("*.yaml"))]
-    return [*found, *((str(path), path.read_text(encoding="utf-8")) for path in paths)]
 
 
 def _use(name: str) -> None:

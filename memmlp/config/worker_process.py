@@ -97,7 +97,7 @@ def check_identity(request: RunRequest, task: RunTask) -> None:
 
 
 def check_wanted(path: Path, run_id: str, step: int, values: dict[str, float]) -> None:
-    """Raise Cancelled once the plan in a file no longer wants this run, or was stopped as a whole."""
+    """Raise Cancelled once the plan in a file no longer wants this run."""
     plan = Plan.load(path)
-    if run_id in plan.cancelled or plan.stopped:
+    if run_id in plan.cancelled:
         raise Cancelled(f"run {run_id} was cancelled at step {step}")

@@ -12,7 +12,7 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from importlib import metadata
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
@@ -26,8 +26,6 @@ NOT_NUMBERS = ("cli", "config", "live", "report", "runs/loggers", "sweep")
 WIRING = ("config/build.py", "config/build_motion.py")
 """Files of these folders that count nevertheless, since they decide what reaches the constructors."""
 PATCH = 1_000_000  # at most so many characters of changes are kept with a run
-INSTALLED = ("site-packages", "dist-packages")
-"""Folders of installed packages, which are identified by their versions."""
 MIXED = "mixed"
 """Stands in place of a digest for a file whose code changed while the run was made."""
 NOT_USERS = ("memmlp", "torch", "numpy", *sys.stdlib_module_names)
@@ -97,8 +95,7 @@ def changes() -> str:
 def code_digests(packages: Iterable[str] = ()) -> dict[str, str]:
     """Return a digest of the code in each file on which a run's numbers depend.
 
-    Comments and docstrings don't matter. Files of users' packages, and of what these import, are named
-    PACKAGE:FILE.
+    Comments and docstrings don't matter. Files of users' packages are named PACKAGE:FILE.
     """
     return {name: code_digest(content) for name, content in code_files(packages).items()}
 
@@ -176,35 +173,25 @@ def code_digest(code: bytes) -> str:
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:12]
 
 
-def user_code_digests(packages: Iterable[str]) -> dict[str, dict[str, str]]:
-    """Return digests of the Python files of users' packages, by package and file; nothing is imported.
+def _user_files(packages: Iterable[str]) -> dict[str, dict[str, bytes]]:
+    """Return the content of the Python files of users' packages, by package and file; nothing is imported.
 
-    Other modules of the user that these import follow, each by itself: of a package only its __init__, as
-    PACKAGE.__init__. A package that is not found does not have files.
+    A package that is not found does not have files.
     """
     return {
-        name: {file: code_digest(code) for file, code in files.items()}
-        for name, files in _user_files(packages).items()
+        name: {file: _user_code(path) for file, path in _package_files(name).items()} for name in packages
     }
 
 
-def _user_files(packages: Iterable[str]) -> dict[str, dict[str, bytes]]:
-    """Return the content of the files that `user_code_digests` describes."""
-    files = {name: _package_files(name) for name in packages}
-    modules = {_module(name, file): path for name, paths in files.items() for file, path in paths.items()}
-    for name, path in _imported_modules(modules).items():
-        files[f"{name}.__init__" if path.stem == "__init__" else name] = {path.name: path}
-    return {name: {file: _user_code(path) for file, path in paths.items()} for name, paths in files.items()}
-
-
 def user_packages(names: Iterable[str]) -> dict[str, dict[str, str | None]]:
-    """Return the version and a digest of the code of users' packages and of what they import, by name."""
+    """Return the version and a digest of the code of users' packages, by name."""
+    digests = {
+        name: {file: code_digest(code) for file, code in files.items()}
+        for name, files in _user_files(names).items()
+    }
     return {
-        name: {
-            "version": _user_version(name),
-            "digest": hashlib.sha256(repr(files).encode()).hexdigest()[:12],
-        }
-        for name, files in user_code_digests(names).items()
+        name: {"version": _user_version(name), "digest": byte_digest(repr(files).encode())}
+        for name, files in digests.items()
     }
 
 
@@ -214,13 +201,8 @@ def _user_version(name: str) -> str | None:
     text = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
     if version := re.search(r'^__version__ = "(.+)"$', text, re.MULTILINE):
         return version[1]
-    distributions = _distributions().get(name.split(".")[0], [])
+    distributions = metadata.packages_distributions().get(name.split(".")[0], [])
     return _version(distributions[0]) if distributions else None
-
-
-@functools.cache
-def _distributions() -> Mapping[str, list[str]]:
-    return metadata.packages_distributions()
 
 
 @functools.cache
@@ -241,62 +223,9 @@ def _package_files(name: str) -> dict[str, Path]:
     return dict(sorted(files.items()))
 
 
-def _module(package: str, file: str) -> str:
-    """Return the dotted name of the module in a package's file; of a package of one file, that is its own."""
-    spec = _find_spec(package)
-    if spec is None or spec.submodule_search_locations is None:
-        return package
-    parts = Path(file).with_suffix("").parts
-    return ".".join([package, *(parts[:-1] if parts[-1] == "__init__" else parts)])
-
-
-def _imported_modules(modules: Mapping[str, Path]) -> dict[str, Path]:
-    """Return the files of further modules of the user that some modules import, directly or not.
-
-    Modules of memmlp, of the standard library and of installed packages are left out, and so is what is
-    imported by calls (`importlib.import_module`).
-
-    Args:
-        modules: the files to begin with, by the dotted names of the modules.
-    """
-    found: dict[str, Path] = {}
-    remaining = dict(modules)
-    while remaining:
-        for module in _imports(*remaining.popitem()):
-            if module not in found and module not in modules and (file := _user_file(module)):
-                found[module] = remaining[module] = file
-    return dict(sorted(found.items()))
-
-
-def _imports(module: str, file: Path) -> Iterator[str]:
-    """Yield dotted names that a module may import, with their parents; some may not be modules."""
-    names = [module]
-    package = module.split(".") if file.name == "__init__.py" else module.split(".")[:-1]
-    with contextlib.suppress(SyntaxError, ValueError):  # not Python of this version, as an extension module
-        for node in ast.walk(ast.parse(file.read_bytes())):
-            if isinstance(node, ast.Import):
-                names += [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom):
-                above = package[: len(package) - node.level + 1] if node.level else []
-                source = [*above, *([node.module] if node.module else [])]
-                names += [".".join([*source, alias.name]) for alias in node.names]
-    for name in names:
-        parts = name.split(".")
-        yield from (".".join(parts[:count]) for count in range(1, len(parts) + (name != module)))
-
-
-def _user_file(module: str) -> Path | None:
-    """Return the file of a user's module; None if it does not exist, or is not the user's."""
-    spec = _find_spec(module)
-    if spec is None or not spec.has_location or not spec.origin:  # such as a folder without __init__.py
-        return None
-    file = Path(spec.origin)
-    return file if file.is_file() and not set(INSTALLED) & set(file.parts) else None
-
-
-def _find_spec(module: str) -> ModuleSpec | None:
-    """Return where a module lies, without importing it or its parents; None if it is not the user's."""
-    top, *submodules = module.split(".")
+def _find_spec(name: str) -> ModuleSpec | None:
+    """Return where a user's package lies, without importing it or its parents; None if it is not found."""
+    top, *submodules = name.split(".")
     try:
         spec = None if top in NOT_USERS else importlib.util.find_spec(top)
     except ValueError:  # a module that was made by hand

@@ -79,21 +79,15 @@ def _reason(run: Run, orphans: Mapping[str, str]) -> tuple[str, str]:
 def _orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
     """Return the orphans' ids, each with the reason why it is an orphan.
 
-    Orphans are runs of earlier versions of a sweep, VQ-VAEs and parts that no run uses and no plan contains,
-    and folders of runs that never started.
+    Orphans are VQ-VAEs and parts that no run uses and no plan contains, and folders of runs that never
+    started.
     """
     planned = {task["id"] for path in _plans(outputs) for task in _listed(path, "tasks")}
-    before = {
-        run_id: f"no longer in sweep {folder.name}"
-        for folder in outputs.glob("sweeps/*/")
-        for run_id in _left(folder)
-    }
     used = {run.manifest.get("prerequisite") for run in runs} | planned
     kinds = {run.id: str(run.manifest.get("kind") or NETWORK) for run in runs}
     alone = [run_id for run_id, kind in kinds.items() if kind != NETWORK and run_id not in used]
     empty = [run for run in runs if not run.manifest]
-    found = {run_id: reason for run_id, reason in before.items() if run_id not in planned}
-    found |= {run_id: f"a {kind_words(kinds[run_id])} that no run uses" for run_id in alone}
+    found = {run_id: f"a {kind_words(kinds[run_id])} that no run uses" for run_id in alone}
     return found | {run.id: "an empty folder" for run in empty}
 
 
@@ -103,21 +97,6 @@ def _plans(outputs: Path) -> Iterator[Path]:
     for path in outputs.glob("*/*/controllers/*.process"):
         if (process := read_json(path)) and is_alive(process) is not False:
             yield path.with_suffix(".json")
-
-
-def _left(folder: Path) -> Iterator[str]:
-    """Yield the ids of runs that a sweep no longer has: their variant is gone, or has another run now.
-
-    A missing entry in a plan proves nothing about its run: the plan may have fewer seeds, or its data may be
-    absent.
-    """
-    now = {(one.get("label"), one.get("seed")): one["id"] for one in _listed(folder / "plan.json", "entries")}
-    variants = read_json(folder / "sweep.json").get("variants")
-    labels = {variant.get("label") for variant in variants} if variants else None
-    for one in _listed(folder / "entries.json", "entries"):
-        gone = labels is not None and one.get("label") not in labels
-        if gone or now.get((one.get("label"), one.get("seed")), one["id"]) != one["id"]:
-            yield one["id"]
 
 
 def _listed(path: Path, key: str) -> Iterator[Mapping[str, Any]]:

@@ -1,7 +1,6 @@
 """Conditions on runs, such as "memory=gru and stream.MPJPE<6.3", and the values that they can use.
 
-A condition is made of comparisons, `and`, `or`, `not` and parentheses. No part of it is ever executed as
-code.
+A condition is made of comparisons, `and` and `or`; `and` binds more tightly.
 """
 
 from __future__ import annotations
@@ -24,14 +23,12 @@ from memmlp.runs.run import STATUSES, Run
 Record = Mapping[str, Any]
 Condition = Callable[[Record], bool]
 
-TOKEN = re.compile(r"""\s*(?:(?P<op><=|>=|!=|==|[=<>()])|"(?P<quoted>[^"]*)"|(?P<word>[^\s<>=!()"]+))""")
+TOKEN = re.compile(r"""\s*(?:(?P<op><=|>=|!=|==|[=<>])|"(?P<quoted>[^"]*)"|(?P<word>[^\s<>=!"]+))""")
 ORDER: dict[str, Callable[[Any, Any], bool]] = {
     "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge,
 }  # fmt: skip
 COMPARISONS = ("=", "==", "!=", *ORDER)
-WORDS = ("and", "or", "not")
 SHORT = 8  # digits of a digest that tell data apart
-DEEPEST = 50  # parentheses and "not"s in one another
 
 
 def record(run: Run) -> dict[str, Any]:
@@ -166,74 +163,55 @@ class Query(NamedTuple):
 
 def parse(text: str) -> Query:
     """Parse a condition. Raises InputError, in one line, if it is not valid."""
-    return _Parser(text).parsed()
+    tokens = _Tokens(text)
+    groups: list[list[Condition]] = [[]]
+    while True:
+        groups[-1].append(tokens.comparison())
+        if tokens.ended:
+            break
+        if (word := tokens.next("and or or")[1]) not in ("and", "or"):
+            raise tokens.error(f"'{word}' is not expected")
+        if word == "or":
+            groups.append([])
+    keys, numbers = tuple(dict.fromkeys(tokens.keys)), tuple(dict.fromkeys(tokens.numbers))
+    return Query(lambda one: any(all(part(one) for part in group) for group in groups), keys, numbers)
 
 
-class _Parser:
-    """A recursive-descent parser over the tokens of a condition."""
+class _Tokens:
+    """The tokens of a condition, which are read one after another."""
 
     def __init__(self, text: str):
-        self.text, self.place, self.depth = text, 0, 0
+        self.text, self.rest = text, text.strip()
         self.keys: list[str] = []
         self.numbers: list[str] = []
-        self.tokens = list(self._tokens(text))
 
-    def _tokens(self, text: str) -> Iterable[tuple[str, str]]:
-        place, text = 0, text.rstrip()
-        while place < len(text):
-            found = TOKEN.match(text, place)
-            if found is None:
-                raise self._refusal(f"'{text[place:].strip()[:20]}' cannot be parsed")
-            yield found.lastgroup or "", found[found.lastgroup or 0]
-            place = found.end()
+    @property
+    def ended(self) -> bool:
+        return not self.rest
 
-    def parsed(self) -> Query:
-        condition = self._or()
-        if self.place < len(self.tokens):
-            raise self._refusal(f"'{self._peek()[1]}' is not expected")
-        return Query(condition, tuple(dict.fromkeys(self.keys)), tuple(dict.fromkeys(self.numbers)))
+    def next(self, expected: str) -> tuple[str, str]:
+        """Return the kind and text of the next token."""
+        if self.ended:
+            raise self.error(f"it ends where {expected} is expected")
+        found = TOKEN.match(self.rest)
+        if found is None:
+            raise self.error(f"'{self.rest[:20]}' cannot be parsed")
+        self.rest = self.rest[found.end() :].strip()
+        return found.lastgroup or "", found[found.lastgroup or 0]
 
-    def _or(self) -> Condition:
-        parts = [self._and()]
-        while self._take("word", "or"):
-            parts.append(self._and())
-        return parts[0] if len(parts) == 1 else lambda one: any(part(one) for part in parts)
-
-    def _and(self) -> Condition:
-        parts = [self._not()]
-        while self._take("word", "and"):
-            parts.append(self._not())
-        return parts[0] if len(parts) == 1 else lambda one: all(part(one) for part in parts)
-
-    def _not(self) -> Condition:
-        self.depth += 1
-        if self.depth > DEEPEST:
-            raise self._refusal("too many nested parentheses")
-        try:
-            if self._take("word", "not"):
-                inner = self._not()
-                return lambda one: not inner(one)
-            if self._take("op", "("):
-                inner = self._or()
-                if not self._take("op", ")"):
-                    raise self._refusal("a ) is missing")
-                return inner
-            return self._comparison()
-        finally:
-            self.depth -= 1
-
-    def _comparison(self) -> Condition:
-        kind, key = self._next("a key")
-        if kind != "word" or key in WORDS:
-            raise self._refusal(f"'{key}' stands where a key is expected")
-        _, sign = self._next(f"a comparison after {key}")
+    def comparison(self) -> Condition:
+        """Return the condition of the next comparison, and record its key."""
+        kind, key = self.next("a key")
+        if kind != "word" or key in ("and", "or"):
+            raise self.error(f"'{key}' stands where a key is expected")
+        _, sign = self.next(f"a comparison after {key}")
         if sign not in COMPARISONS:
-            raise self._refusal(f"after {key} comes '{sign}'")
-        kind, value = self._next(f"a value after {key}{sign}")
+            raise self.error(f"after {key} comes '{sign}'")
+        kind, value = self.next(f"a value after {key}{sign}")
         if kind == "op":
-            raise self._refusal(f"after {key}{sign} comes '{value}'")
+            raise self.error(f"after {key}{sign} comes '{value}'")
         if sign in ORDER and _number(value) is None and key != "started":
-            raise self._refusal(f"{key}{sign}{value}: {sign} compares with a number")
+            raise self.error(f"{key}{sign}{value}: {sign} compares with a number")
         if key == "status" and value not in (*STATUSES, "damaged"):
             known = ", ".join([*STATUSES, "damaged"])
             raise InputError(f"--where '{self.text}': status={value}: must be one of {known}")
@@ -243,25 +221,8 @@ class _Parser:
         self.numbers += [key] if sign in ORDER else []
         return lambda one: _holds(one.get(key), sign, value)
 
-    def _peek(self) -> tuple[str, str]:
-        return self.tokens[self.place] if self.place < len(self.tokens) else ("end", "")
-
-    def _take(self, kind: str, text: str) -> bool:
-        if self._peek() != (kind, text):
-            return False
-        self.place += 1
-        return True
-
-    def _next(self, wanted: str) -> tuple[str, str]:
-        if self._peek()[0] == "end":
-            raise self._refusal(f"it ends where {wanted} is expected")
-        self.place += 1
-        return self.tokens[self.place - 1]
-
-    def _refusal(self, reason: str) -> InputError:
-        return InputError(
-            f"--where '{self.text}': {reason}; use comparisons (= != < <= > >=), and, or, not, ( )"
-        )
+    def error(self, reason: str) -> InputError:
+        return InputError(f"--where '{self.text}': {reason}; use comparisons (= != < <= > >=), and, or")
 
 
 def _holds(own: Any, sign: str, value: str) -> bool:

@@ -74,8 +74,8 @@ class Fleet:
 def oversee(plan: Plan, fleet: Fleet, board: Board) -> None:
     """Keep the fleet working on the plan until nothing is left.
 
-    It waits for runs on which workers of other sweeps are working. If a failure stops the plan, or this
-    process is interrupted, the workers are ended.
+    It waits for runs on which workers of other sweeps are working. If this process is interrupted, the
+    workers are ended.
 
     Runs that are done are looked at again only when nothing seems left: a sweep may have many, on a disk that
     others use, too.
@@ -87,8 +87,6 @@ def oversee(plan: Plan, fleet: Fleet, board: Board) -> None:
                 fleet.keep(len(left))
                 time.sleep(LOOK)
                 board.update(plan, states := plan.states(states))
-        if plan.stopped:
-            fleet.cancel()
     except BaseException:
         fleet.cancel()
         raise

@@ -70,7 +70,6 @@ class Plan:
         tasks: the runs to be made.
         open: whether tasks may be added, so that workers stay (a search); a sweep's plan is closed.
         cancelled: ids of runs that workers must not go on with.
-        fail_fast: whether the first failed run ends the sweep.
     """
 
     name: str
@@ -79,7 +78,6 @@ class Plan:
     tasks: tuple[RunTask, ...]
     open: bool = False
     cancelled: tuple[str, ...] = ()
-    fail_fast: bool = False
 
     def of_variants(self, labels: Iterable[str]) -> Plan:
         """Return the part of the plan that variants with these labels need, with their prerequisites."""
@@ -131,7 +129,7 @@ class Plan:
         return found
 
     def left(self, states: Mapping[str, str] | None = None) -> list[RunTask]:
-        """Return the tasks that are still to be done; none if the plan is stopped.
+        """Return the tasks that are still to be done.
 
         Tasks that are done, failed, blocked or cancelled are left out.
 
@@ -139,15 +137,8 @@ class Plan:
             states: the tasks' states; by default they are looked up.
         """
         states = self.states() if states is None else states
-        if self.fail_fast and "failed" in states.values():
-            return []
         ended = ("done", "failed", "blocked")
         return [t for t in self.tasks if states[t.key] not in ended and t.id not in self.cancelled]
-
-    @property
-    def stopped(self) -> bool:
-        """Whether a run failed in a plan that ends with the first failure."""
-        return self.fail_fast and "failed" in self.states().values()
 
     def save(self, path: Path) -> None:
         """Write the plan to a file, completely or not at all."""
@@ -182,13 +173,10 @@ class Forecast(NamedTuple):
     Attributes:
         seconds: the time, seconds.
         finished: how many finished runs the estimate comes from.
-        unlike: how many remaining runs belong to variants without a finished run, and are estimated from
-            other variants.
     """
 
     seconds: float
     finished: int
-    unlike: int
 
 
 def forecast(plan: Plan) -> Forecast | None:
@@ -207,15 +195,14 @@ def forecast(plan: Plan) -> Forecast | None:
             kinds[task.kind].append(task.id)
     if not left or not all(kinds[task.kind] for task in left):
         return None
-    total, used, unlike = 0.0, set(), 0
+    total, used = 0.0, set[str]()
     for task in left:
         labels = {entry.label for entry in plan.entries if entry.id == task.id}
         same = {entry.id for entry in plan.entries if entry.label in labels}
         names = same & times.keys() or set(kinds[task.kind])
-        unlike += bool(same) and not same & times.keys()
         total += fmean(times[name] for name in names)
         used |= names
-    return Forecast(total, len(used), unlike)
+    return Forecast(total, len(used))
 
 
 def run_seconds(run: Run) -> float | None:

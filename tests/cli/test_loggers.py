@@ -9,7 +9,6 @@ from conftest import Memmlp, one_line
 from fake_logger import FakeLogger, Server, a_run
 
 from memmlp.cli import loggers
-from memmlp.common.files import write_json
 
 
 @pytest.fixture
@@ -20,16 +19,13 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Server:
     return logger.server
 
 
-def test_sync_shows_runs_and_sweeps_and_then_nothing_more(memmlp: Memmlp, tmp_path: Path, server: Server):
+def test_sync_shows_runs_and_then_nothing_more(memmlp: Memmlp, tmp_path: Path, server: Server):
     outputs = tmp_path / "outputs"
     a_run(outputs, "0" * 16).finish([])
     a_run(outputs, "1" * 16).fail("why")
-    names = {"name": "mine", "status": "done", "labels": {}, "aggregates": {}, "verdicts": {}}
-    (outputs / "sweeps" / "mine").mkdir(parents=True)
-    write_json(outputs / "sweeps" / "mine" / "summary.json", names)
-    assert memmlp("loggers", "sync").out == "2 runs (2 of them now) and 1 sweeps are in memory\n"
-    assert memmlp("loggers", "sync").out == "2 runs (0 of them now) and 1 sweeps are in memory\n"
-    assert memmlp("loggers", "sync", "--full").out == "2 runs (2 of them now) and 1 sweeps are in memory\n"
+    assert memmlp("loggers", "sync").out == "2 runs (2 of them now) are in memory\n"
+    assert memmlp("loggers", "sync").out == "2 runs (0 of them now) are in memory\n"
+    assert memmlp("loggers", "sync", "--full").out == "2 runs (2 of them now) are in memory\n"
     assert server.status == {"0" * 16: "done", "1" * 16: "failed"}
 
 

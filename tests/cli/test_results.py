@@ -23,7 +23,7 @@ def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
         found = [Entry(variant.label, seed, find(variant, seed).id) for variant, seed in entries]  # type: ignore[union-attr]
         return Plan(sweep.name, tmp_path / sweep.name, () if sweep.name == "table10" else tuple(found), ())
 
-    monkeypatch.setattr("memmlp.config.compose_plan.kept_or_new_plan", plan)
+    monkeypatch.setattr("memmlp.config.compose_plan.make_plan", plan)
 
 
 def test_kept_results_become_pages(memmlp: Memmlp, planned: None):

@@ -64,9 +64,8 @@ def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Runs:
     monkeypatch.chdir(tmp_path)
     write(VARIANTS)
     found = Runs(tmp_path / "outputs")
-    monkeypatch.setattr("memmlp.config.compose_plan.kept_or_new_plan", found.planned)
+    monkeypatch.setattr("memmlp.config.compose_plan.make_plan", found.planned)
     monkeypatch.setattr("memmlp.cli.sweep.run_workers", found.work)
-    monkeypatch.setattr("memmlp.cli.loggers.show_in_loggers", lambda *_: None)
     return found
 
 
@@ -226,12 +225,6 @@ def test_failed_runs_are_late_and_made_up_for(memmlp: Memmlp, runs: Runs):
     assert memmlp(*SWEEP).code == 1
     assert memmlp(*SWEEP, "--retry").code == 0
     assert analysed()[-1] == (3, ["worse"])
-
-
-def test_the_first_failure_may_end_it(memmlp: Memmlp, runs: Runs):
-    runs.failing = {"worse"}
-    assert memmlp(*SWEEP, "--fail-fast").code == 1
-    assert not Path("outputs/sweeps/trial/rounds.json").exists()
 
 
 def test_status_and_dry_run_say_the_schedule(memmlp: Memmlp, runs: Runs):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import os
 import re
 import shutil
@@ -21,12 +20,11 @@ from processes import PATIENCE, forked, ignoring_interrupts, started, until
 from memmlp.cli.main import main
 from memmlp.cli.workers import split_executor
 from memmlp.common.errors import InputError
-from memmlp.config.compose_plan import find_sweep, kept_or_new_plan, orphans, plan_anew
+from memmlp.config.compose_plan import find_sweep, make_plan
 from memmlp.config.worker_process import perform
 from memmlp.runs.component_versions import VERSIONS, version_of
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
-from memmlp.sweep.plan import Plan
 from memmlp.sweep.progress_table import task_name
 
 TINY = [*BRIEF, "export.graph=off"]
@@ -123,20 +121,9 @@ def test_a_first_dry_run_counts_the_runs_whose_data_is_not_prepared(tmp_path: Pa
     assert not list_runs(tmp_path / "outputs")
 
 
-def test_an_edited_file_adds_variants_and_lists_orphans(home: Path):
-    try:
-        write(home, {"full": [], "decay": ["optim.weight_decay=0.5"]})
-        said = command(home, "--status")
-        assert "2 done, 1 waiting" in said
-        assert said.count("orphan: run") == 2
-    finally:
-        write(home, VARIANTS)
-    assert "orphan" not in command(home, "--status")
-
-
 def test_seeds_come_one_after_another_each_with_all_variants(home: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(home)
-    plan = kept_or_new_plan(
+    plan = make_plan(
         find_sweep("trial.yaml").with_overrides([*TINY, "seed=1,0"]), (home / "outputs").absolute()
     )
     cells = [(entry.seed, entry.label) for entry in plan.entries]
@@ -152,24 +139,6 @@ def test_seeds_come_one_after_another_each_with_all_variants(home: Path, monkeyp
     said = command(home, "seed=1,0", "--status")
     assert re.search(r"variant +seed 0 +seed 1", said)
     assert re.search(r"none +[\d.]+ cm +waiting", said)
-
-
-@pytest.mark.slow
-def test_the_first_failure_ends_the_sweep_where_that_is_wanted(tmp_path: Path):
-    endless, failing = ["memory=none", "optim.steps=100000"], ["memory=none", "optim.lr=1e30"]
-    write(tmp_path, {"endless": endless, "failing": failing, "late": ["memory=none"]})
-    settings = [word for word in TINY if not word.startswith("optim.")]  # which a variant sets itself
-    words = ["sweep", "trial.yaml", *settings, "--workers", "2", "--fail-fast"]
-    said = run_apart(tmp_path, *words, code=1)
-    assert "0 of 3 runs done" in said
-    assert "failing seed 0: failed, loss is nan" in said
-    assert re.search(r"^failed: run .*: loss is nan", said, re.M)
-    runs = list_runs(tmp_path / "outputs")
-    assert len(runs) <= 2  # the last variant's was not begun
-    until(lambda: not any(run.doing for run in runs), "the workers end")
-    assert [run.status for run in runs].count("failed") == 1
-    assert "0 of 3 runs done" in run(tmp_path, *words, code=1)  # a run that failed before ends it again
-    assert len(list_runs(tmp_path / "outputs")) == len(runs)
 
 
 def test_retry_takes_failed_runs_up_again(home: Path):
@@ -195,44 +164,6 @@ def test_again_does_networks_again_and_force_is_refused(
     assert kinds == {"vqvae"}
     assert "--again: " in command(copy, "--again", "--status", code=2)
     assert "force=true: " in command(copy, "force=true", code=2)
-
-
-def test_debug_mode_works_in_this_process(home: Path):
-    assert "3 of 4 runs done" in command(home, "executor=debug", code=1)
-
-
-def test_a_plan_is_kept_until_the_data_changes(home: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.chdir(home)
-    chosen = find_sweep("trial.yaml").with_overrides(TINY)
-    outputs = (home / "outputs").absolute()
-    kept = json.loads(next(outputs.glob("sweeps/trial-*/plan_stamp.json")).read_text())
-    assert kept["stamp"]
-    first = kept_or_new_plan(chosen, outputs)
-    clip = next((home / "outputs" / "data").rglob("*.npz"))
-    os.utime(clip)
-    assert kept_or_new_plan(chosen, outputs).entries == ()
-    assert [task.id for task in kept_or_new_plan(chosen, outputs, prepare=True).tasks] == [
-        t.id for t in first.tasks
-    ]
-    assert orphans(chosen, kept_or_new_plan(chosen, outputs)) == []
-
-
-def test_a_plan_is_kept_until_the_groups_of_clips_change(home: Path, monkeypatch: pytest.MonkeyPatch):
-    """Which clips belong together is no part of the data, but evaluations have their identity from it."""
-    monkeypatch.chdir(home)
-    chosen = find_sweep("trial.yaml").with_overrides([*TINY, "data.split.groups_file=groups.csv"])
-    outputs = (home / "outputs").absolute()
-    clips = [f"{path.parent.name}/{path.stem}" for path in (outputs / "data").rglob("*.npz")]
-
-    def planned(word: str) -> Plan:
-        rows = [f"{clip},{word} {clip}\n" for clip in clips]
-        (home / "groups.csv").write_text("clip,group\n" + "".join(rows))
-        return kept_or_new_plan(chosen, outputs, prepare=True)
-
-    before, after = planned("take"), planned("person")
-    assert [entry.id for entry in after.entries] == [entry.id for entry in before.entries]
-    assert [entry.stages for entry in after.entries] != [entry.stages for entry in before.entries]
-    assert after == plan_anew(chosen, outputs)
 
 
 def test_a_look_at_a_sweep_that_was_never_started_leaves_nothing(home: Path):
@@ -344,7 +275,7 @@ def test_shipped_sweeps_are_found_by_name_and_number(name: str):
 
 def test_a_worker_of_other_code_or_data_leaves_the_run_alone(home: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(home)
-    plan = kept_or_new_plan(find_sweep("trial.yaml").with_overrides(TINY), (home / "outputs").absolute())
+    plan = make_plan(find_sweep("trial.yaml").with_overrides(TINY), (home / "outputs").absolute())
     other = replace(next(task for task in plan.tasks if task.kind == "memmlp"), id="0" * 16)
     with pytest.raises(InputError, match="the data or the code changed since the sweep began"):
         perform(home / "plan.json", 1, plan, other)

@@ -27,7 +27,7 @@ def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
         found = [Entry(variant.label, seed, find(variant, seed).id) for variant, seed in entries]  # type: ignore[union-attr]
         return Plan(sweep.name, tmp_path / sweep.name, tuple(found), ())
 
-    monkeypatch.setattr("memmlp.config.compose_plan.kept_or_new_plan", plan)
+    monkeypatch.setattr("memmlp.config.compose_plan.make_plan", plan)
 
 
 def test_command_prints_a_table(memmlp: Memmlp, planned: None, monkeypatch: pytest.MonkeyPatch):

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
-import os
 import re
 import shlex
 import shutil
@@ -16,16 +14,14 @@ from benchmarks.chaos import examine
 from command_line import BRIEF, run_apart
 from command_line import run as command
 
-from memmlp.cli.tune import _tasks, prepare_search, search, training, write_results
+from memmlp.cli.tune import _tasks, prepare_search, search, training
 from memmlp.cli.workers import Workers
 from memmlp.common.errors import InputError
-from memmlp.common.lease import current_process
 from memmlp.config.build_request import build_request
 from memmlp.config.compose import composed
 from memmlp.runs.component_versions import VERSIONS
 from memmlp.runs.run import Run
 from memmlp.sweep.search import director as director_module
-from memmlp.sweep.search import results
 from memmlp.sweep.search.director import Director
 from memmlp.sweep.search.search_file import Range
 from memmlp.sweep.search.study import Study
@@ -69,14 +65,6 @@ def test_the_same_command_does_nothing_and_status_shows_the_same(home: Path):
     assert (folder_of(home) / "study.journal").read_bytes() == before
 
 
-def test_the_best_is_an_variant_of_table_5(home: Path):
-    table = folder_of(home) / "table05.yaml"
-    words = [str(table), "seed=0"]  # data and profile are those of the search
-    assert "manual, searched" in command(home, "sweep", *words, "--dry-run")
-    shown = command(home, "table", *words)
-    assert re.search(r"manual, searched .*1", shown)
-
-
 def test_a_trial_of_two_seeds_goes_on_from_a_search_of_one(home: Path, tmp_path: Path):
     """The first trial's first run is that of a search with one seed; its other run has the next seed."""
     shutil.copytree(home / "outputs/runs", tmp_path / "outputs/runs")
@@ -93,16 +81,6 @@ def test_a_trial_of_two_seeds_goes_on_from_a_search_of_one(home: Path, tmp_path:
     assert float(row["MPJPE"]) == (float(row["MPJPE, run 1"]) + float(row["MPJPE, run 2"])) / 2
     assert f"{float(row['MPJPE']):.3f} ± {float(row['MPJPE sd']):.3f}" in said
     assert "1 complete" in command(tmp_path, "tune", *TINY, *words[:2], "--status")
-
-
-def test_a_second_owner_is_refused(home: Path):
-    claim = json.dumps({**current_process(), "since": "now"})
-    (mine := folder_of(home) / ".lease-1000").write_text(claim)  # of another thread, as it were
-    try:
-        said = command(home, "tune", *TINY, "search.n_trials=4", code=2)
-    finally:
-        mine.unlink()
-    assert f"in use by process {os.getpid()} since now; --status shows it" in said
 
 
 BAD_SEARCHES = {
@@ -156,18 +134,6 @@ def test_a_search_is_named_after_what_its_trials_follow_from(tmp_path: Path, mon
 def test_what_is_trained_on_alone_may_be_searched(tmp_path: Path):
     space = ["search.space.loss=null", "+search.space.data.split.train_fraction={low: 0.5, high: 1.0}"]
     assert prepare_search([*TINY, *space], None, tmp_path).search.space[0].key == "data.split.train_fraction"
-
-
-@pytest.mark.slow
-def test_table_5_is_of_mem_mlp_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    written: list[Path] = []
-    for name in ("write_trials", "write_experiments", "write_plots"):
-        monkeypatch.setattr(results, name, lambda *_: None)
-    monkeypatch.setattr(results, "write_table", lambda _study, _shipped, path, _words: written.append(path))
-    space = ["search.base=[]", "search.space.loss=null", "+search.space.optim.lr={low: 1e-4, high: 1e-2}"]
-    for words in ([], [*space, "model=avatar_poser"]):
-        write_results(prepare_search([*TINY, *words], None, tmp_path), None)
-    assert [path.name for path in written] == ["table05.yaml"]
 
 
 def test_a_search_ends_where_its_clips_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

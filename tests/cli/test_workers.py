@@ -30,7 +30,7 @@ def found(monkeypatch: pytest.MonkeyPatch) -> None:
         ("0,1", {"gpus_per_worker": 0, "count": 3}, ["auto"], [], 3),
         ("0,1", {"count": 3}, ["cpu"], [], 3),
         ("", {"count": 3}, ["auto"], [], 3),
-        ("0,1", {"executor": "slurm", "count": 3}, ["cuda"], [], 3),
+        ("0,1", {"executor": "ray", "count": 3}, ["cuda"], [], 3),
     ],
 )
 def test_gpus_of_workers(found, monkeypatch, visible, options, wanted, shares, number):
@@ -44,7 +44,7 @@ def test_gpus_of_workers(found, monkeypatch, visible, options, wanted, shares, n
     ("wanted", "visible", "executor", "line"),
     [
         ("cuda:1", "0,1", "local", "device=cuda:1"),
-        ("cuda:1", "", "slurm", "device=cuda:1"),
+        ("cuda:1", "", "ray", "device=cuda:1"),
         ("cuda", "", "local", "device=cuda: no GPU is visible here"),
         ("auto", "0", "local", "torch .* finds none"),
     ],
@@ -82,9 +82,9 @@ class Shelf:
 @pytest.mark.parametrize(
     ("executor", "gives", "wanted", "gpu"),
     [
-        ("local", True, ["auto"], True), ("local", False, ["auto"], False), ("slurm", True, ["cuda"], True),
-        ("slurm", True, ["cpu"], False), ("ray", True, ["cpu", "auto"], True),
-        ("slurm", False, ["auto"], False),
+        ("local", True, ["auto"], True), ("local", False, ["auto"], False), ("ray", True, ["cuda"], True),
+        ("ray", True, ["cpu"], False), ("ray", True, ["cpu", "auto"], True),
+        ("ray", False, ["auto"], False),
     ],
 )  # fmt: skip
 def test_workers_know_whether_they_are_to_have_a_gpu(

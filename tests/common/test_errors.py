@@ -1,19 +1,13 @@
 """Messages of one line."""
 
-from pathlib import Path
-
 import pytest
 import yaml
 
-from memmlp.common.errors import InputError, one_line, require, why_unreadable
+from memmlp.common.errors import InputError, require, why_unreadable
 
 
 def test_a_message_is_one_line_whatever_is_in_it():
     assert str(InputError("a\nb\r\x1b[2J\u2028\udcff.npz: bad")) == r"a\nb\r\x1b[2J\u2028\udcff.npz: bad"
-
-
-def test_words_stay_as_they_are():
-    assert one_line("Läufer/走る\u3000\xa0.npz \\n") == "Läufer/走る\u3000\xa0.npz \\n"
 
 
 @pytest.mark.parametrize(
@@ -30,20 +24,7 @@ def test_what_is_no_yaml_is_told_by_line_and_column(text: str, words: str):
     assert "<unicode string>" not in why_unreadable(error.value)
 
 
-def test_a_missing_file_has_the_words_of_all_missing_files(tmp_path: Path):
-    with pytest.raises(OSError, match="No such file") as missing:
-        (tmp_path / "none").read_text()
-    assert why_unreadable(missing.value) == "no such file"
-
-
 def test_a_missing_package_is_named_with_its_extra():
     assert require("json.decoder", "plots", "--figure").JSONDecoder
     with pytest.raises(InputError, match=r"--figure: needs nowhere: pip install 'memmlp\[plots\]'"):
         require("nowhere.at.all", "plots", "--figure")
-
-
-def test_a_broken_package_is_not_a_missing_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    (tmp_path / "broken.py").write_text("import nowhere_at_all")
-    monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(ModuleNotFoundError):
-        require("broken", "plots", "--figure")

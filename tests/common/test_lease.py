@@ -22,10 +22,9 @@ from processes import started, until
 
 from memmlp.common import lease
 from memmlp.common.errors import LeaseLost
-from memmlp.common.files import atomic_write, write_json
+from memmlp.common.files import atomic_write
 from memmlp.common.lease import (
     LEASE,
-    Changes,
     Lease,
     Lock,
     check_owner,
@@ -98,17 +97,6 @@ def test_this_process_is_alive_and_an_earlier_one_with_its_number_is_not(monkeyp
     assert is_alive(here) is None
 
 
-def test_what_changes_is_as_young_as_its_last_change():
-    clock, values = Clock(), iter("aabbb")
-    changes = Changes(clock)
-    ages = []
-    for _ in range(5):
-        ages.append(changes.seconds_unchanged("it", lambda: next(values)))
-        clock.now += 10
-    assert ages == [0, 10, 0, 10, 20]
-    assert changes.seconds_unchanged("another", lambda: "b") == 0
-
-
 def test_another_process_waits_and_says_for_whom(tmp_path: Path):
     said: list[str] = []
     with holding(tmp_path) as (holder, _):
@@ -135,19 +123,6 @@ def test_a_killed_holder_of_this_machine_is_followed_at_once(tmp_path: Path):
         with taken(lock) as mine:
             assert mine.number == 2
             assert lock.held
-
-
-def test_numbers_grow_and_one_claim_stays(tmp_path: Path):
-    lock = Lock(tmp_path)
-    for other in (".other.lease-7", ".lease-x", ".lease-", ".lease-3.tmp"):
-        (tmp_path / other).touch()
-    for turn in range(6):
-        with taken(lock) as outer, taken(Lock(tmp_path)) as inner:
-            assert inner is outer
-            assert outer.number == 2 * turn + 1
-        assert lock.held is None
-        assert [path.name for _, path in lock.claims()] == [f".lease-{2 * turn + 2}-free"]
-    assert len(list(tmp_path.iterdir())) == 5  # the other files stay
 
 
 def test_a_dead_holder_of_another_machine_is_followed_after_its_lease(pair, clock: Clock):
@@ -219,43 +194,6 @@ def test_who_wakes_up_superseded_publishes_nothing(pair, tmp_path: Path, clock: 
     atomic_write(result, "nobody's")  # who holds nothing is not checked
 
 
-def test_a_freeze_between_check_and_rename_publishes_nothing(pair, tmp_path: Path, clock: Clock, monkeypatch):
-    one, two = pair
-    replace, taken_over = os.replace, []
-
-    def frozen(unfinished: Path, path: Path) -> None:
-        if not taken_over:
-            assert two.take() is None
-            clock.now += LEASE + 1
-            taken_over.append(two.take())
-        replace(unfinished, path)
-
-    monkeypatch.setattr("memmlp.common.lease.os.replace", frozen)
-    with pytest.raises(LeaseLost):
-        one(atomic_write, tmp_path / "DONE", "late")
-    assert taken_over[0].number == 2
-    assert not (tmp_path / "DONE").exists()
-    assert not list(tmp_path.glob(".*.tmp"))
-
-
-def test_a_claim_that_was_decided_on_long_ago_is_given_up(tmp_path: Path, clock: Clock, monkeypatch):
-    """A process sees a free folder, and sleeps while others have it, one after another."""
-    one, two = Holder("one", tmp_path), Holder("two", tmp_path)
-    watch = one.lock._watch
-
-    def late() -> object:
-        seen = watch()
-        assert two.take().number == 1
-        two.let_go()
-        assert two.take().number == 3
-        return seen
-
-    monkeypatch.setattr(one.lock, "_watch", late)
-    assert one.take() is None
-    two(atomic_write, tmp_path / "DONE", "two's")
-    assert [path.name for path in tmp_path.glob(".lease-*")] == [".lease-3"]
-
-
 @pytest.mark.parametrize("text", ["", '{"pid": 1', "[]"])
 def test_a_claim_that_cannot_be_read_expires(tmp_path: Path, clock: Clock, text: str):
     """Its maker may be about to write it, or may have died before it did."""
@@ -277,39 +215,6 @@ def test_a_full_disk_refuses_a_claim_and_leaves_none(tmp_path: Path, monkeypatch
             pass
     with taken(Lock(tmp_path)) as mine:
         assert mine.number == 1
-
-
-def test_a_disk_that_refuses_the_release_lets_the_lease_expire(pair, clock: Clock, monkeypatch):
-    one, two = pair
-    with monkeypatch.context() as readonly:
-
-        def refuse(*_: object) -> Path:
-            raise OSError(errno.EROFS, "Read-only file system")
-
-        readonly.setattr(Path, "rename", refuse)
-        one.let_go()
-    assert two.take() is None
-    clock.now += LEASE + 1
-    assert two.take().number == 2
-
-
-def test_settling_waits_until_the_holder_shows_life_or_its_lease_is_over(pair, clock, monkeypatch):
-    one, two = pair
-    said: list[str] = []
-    pauses: list[float] = []
-
-    def show_life(seconds: float) -> None:
-        pauses.append(seconds)
-        one(lambda: check_owner(one.lock.folder / "any"))
-
-    monkeypatch.setattr(lease.time, "sleep", show_life)
-    two(two.lock.settle, said.append)
-    assert len(pauses) == 1
-    assert "of another machine since" in said[0]
-    assert two.take() is None
-    monkeypatch.setattr(lease.time, "sleep", lambda s: setattr(clock, "now", clock.now + 7))
-    two(two.lock.settle, said.append)
-    assert two.take().number == 2
 
 
 def test_a_folder_beside_its_lock(tmp_path: Path, clock: Clock):
@@ -407,14 +312,6 @@ def test_nothing_of_a_lost_run_changes(tmp_path: Path, way: str):
         with pytest.raises(LeaseLost):
             WAYS[way](Run(run.folder))
         assert contents(run.folder) == before
-
-
-def test_folders_beside_a_lost_one_are_free(tmp_path: Path):
-    with losing(tmp_path / "mine"):
-        write_json(tmp_path / "mine too.json", {})
-        with pytest.raises(LeaseLost):
-            write_json(tmp_path / "mine" / "a.json", {})
-    write_json(tmp_path / "mine" / "a.json", {})
 
 
 def test_a_folder_is_the_same_by_its_other_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

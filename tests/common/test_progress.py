@@ -13,15 +13,7 @@ from memmlp.common.progress import (
     notify,
     progress_bar,
     show_progress,
-    to_log,
 )
-
-
-@pytest.mark.parametrize(("terminal", "said"), [(True, ""), (False, "data: once\n")])
-def test_a_terminal_has_its_progress_bars_alone(capsys, monkeypatch: pytest.MonkeyPatch, terminal, said):
-    monkeypatch.setattr("sys.stderr.isatty", lambda: terminal, raising=False)
-    to_log("data: once")
-    assert capsys.readouterr().err == said
 
 
 @pytest.mark.parametrize("terminal", [True, False])
@@ -46,13 +38,6 @@ def test_long_work_tells_how_far_it_is(monkeypatch: pytest.MonkeyPatch):
         count.advance()
     assert told[0].startswith("network: 399 of 4000")
     assert re.fullmatch(r"network: 400 of 4000, loss 2\.31(, \d+ (s|min) left)?", told[1])
-
-
-def test_quick_work_tells_nothing_of_how_far_it_is():
-    told: list[str] = []
-    with announce_to(told.append):
-        assert list(progress_bar("abc", "reading")) == ["a", "b", "c"]
-    assert told == []
 
 
 def test_a_line_names_the_unit_and_the_stage(monkeypatch: pytest.MonkeyPatch):

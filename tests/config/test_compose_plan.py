@@ -11,26 +11,7 @@ from memmlp.common.errors import InputError
 from memmlp.config import plugins
 from memmlp.config.build_request import build_request, build_requests
 from memmlp.config.compose import composed
-from memmlp.config.compose_plan import _stamp, find_sweep, sweep_folder
-from memmlp.sweep.sweep_file import parse_sweep
-
-
-@pytest.mark.parametrize(
-    ("words", "kept"),
-    [
-        (["optim.lr=1e-3"], True),
-        (["optim.lr=${oc.env:MYLR}"], False),
-        (["hydra.searchpath=[file://own]", "experiment=mine"], False),
-    ],
-    ids=str,
-)
-def test_a_plan_that_depends_on_the_environment_or_on_other_folders_is_made_anew(
-    words: list[str], kept: bool, tmp_path: Path
-):
-    for content in ({"variants": {"a": words}}, {"base": words, "variants": {"a": []}}):
-        sweep = parse_sweep("s", content)
-        assert (_stamp(sweep, tmp_path) == _stamp(sweep, tmp_path)) == kept
-
+from memmlp.config.compose_plan import find_sweep, sweep_folder
 
 NESTED = {
     "inner": "defaults: [{override /memory: gru}]\nmodel: {width: 24}\n",

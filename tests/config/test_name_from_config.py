@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from memmlp.config.compose import composed
@@ -50,14 +49,3 @@ def test_a_vqvae_and_a_component_of_ones_own():
     assert readable_name("vqvae", codes) == "VQ-VAE · vqvae.codes=9 · seed 4"
     mine = whole | {"memory": {"name": "mine", "knob": 3}}
     assert readable_name("memmlp", mine) == "memory=mine · seed 0"
-
-
-def test_hydra_is_as_busy_afterwards_as_before():
-    whole = config("optim.lr=0.5")
-    busy = GlobalHydra.instance()
-    busy.hydra = "a job's"  # type: ignore[assignment]
-    try:
-        assert readable_name("memmlp", whole) == "optim.lr=0.5 · seed 0"
-        assert GlobalHydra.instance().hydra == "a job's"
-    finally:
-        GlobalHydra.instance().clear()

@@ -215,7 +215,6 @@ def test_a_folder_of_configs_is_searched_while_a_command_runs(folder: Path):
     with plugins.searching(folder / "conf"):
         assert composed(["experiment=own"]).seed == 7
         assert plugins.config_dir_words() == ["--config-dir", str(folder / "conf")]
-        assert any("own.yaml" in name for name, _ in plugins.texts_outside_memmlp())
     with pytest.raises(InputError, match=r"experiment=own: no such option"):
         composed(["experiment=own"])
 
@@ -324,39 +323,6 @@ def test_a_record_cannot_reach_beyond_the_package(on_path: Path):
     ):
         with pytest.raises(InputError, match=line):
             config_of(recorded({**config, **change}))
-
-
-IMPORTING = {
-    "mine.py": "import os\nimport torch\nfrom helper import W\nfrom lab.deep import util\n",
-    "helper.py": "W = 1.0\n",
-    "lab/__init__.py": "from . import constants\n",
-    "lab/constants.py": "C = 1\n",
-    "lab/unused.py": "U = 1\n",
-    "lab/deep/util.py": "def late():\n    from ..later import X\n    return X\n",
-    "lab/later.py": "X = 1\n",
-}
-
-
-def test_code_that_a_package_imports_is_its_code_too(folder: Path):
-    """Directly or not, be it imported late; what is installed, memmlp's or imported by nobody is not."""
-    write(folder, IMPORTING)
-    plugins.activate(["mine"])
-    run, packages = Run(folder / "run"), user_packages(["mine"])
-    imported = ["helper", "lab.__init__", "lab.constants", "lab.deep.util", "lab.later"]
-    assert [*packages] == ["mine", *imported]
-    run.begin("memmlp", {}, data="d", prerequisite=None, plugins=packages)
-    assert run.changed_sources == []
-    for module in imported[1:]:
-        file = f"{module.replace('.', '/')}.py"
-        write(folder, {file: f"{IMPORTING[file]}Z = 1\n"})
-    assert run.changed_sources == [f"{name}:{name.split('.')[-1]}.py" for name in imported[1:]]
-    write(folder, {**IMPORTING, "helper.py": "W = 100.0\n"})
-    assert run.changed_sources == ["helper:helper.py"]
-    names = [name for name, one in user_packages(["mine"]).items() if one != packages[name]]
-    assert names == ["helper"]
-    assert any(
-        name.startswith("helper:") for name, _ in plugins.texts_outside_memmlp()
-    )  # a plan may depend on it
 
 
 def test_code_that_changed_since_is_told_where_nothing_imports_it(folder: Path):

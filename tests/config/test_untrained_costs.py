@@ -44,19 +44,6 @@ def test_networks_without_a_run_are_measured_and_said_to_be_untrained(tmp_path: 
     assert "1 run and 1 untrained network" in beside
 
 
-@pytest.mark.slow
-def test_times_are_measured_where_the_table_shows_them():
-    timed = {
-        "metrics": ["ms", "network ms", "pose ms", "ratio"],
-        "base": ["profile=tiny", "export.alone=true", "model.depth=1"],
-    }
-    sweep = parse_sweep("times", {"variants": {"AvatarPoser": ARMS["AvatarPoser"]}, "seeds": [0], **timed})
-    runs, _ = with_costs(sweep, {"AvatarPoser": {}})
-    found = runs["AvatarPoser"][0]
-    assert all(found.costs[metric] > 0 for metric in sweep.metrics)
-    assert (found.latency["steps"], found.latency["threads"]) == (200, 1)
-
-
 def test_the_command_refuses_it_for_other_tables(memmlp: Memmlp):
     said = memmlp("table", "5", "--untrained")
     assert one_line(said, "--untrained: sweep table05 shows MPJRE, MPJPE", "FLOPs, MACs")

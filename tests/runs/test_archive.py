@@ -12,7 +12,6 @@ import pytest
 from memmlp.common.errors import InputError
 from memmlp.common.files import file_digest
 from memmlp.runs.archive import INDEX, export_run, import_run
-from memmlp.runs.deployment_folder import ONNX_FILES
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.notes import add_tags, read_notes
 from memmlp.runs.run import Run
@@ -104,17 +103,6 @@ def test_what_a_run_lacks_that_is_there_already_is_named(run: Run, archive: Path
     assert f"has deployments/int8-0, evaluations/window-1.json, which is not added to run {NAME}" in line
 
 
-def test_deployments_of_every_precision_arrive(run: Run, tmp_path: Path):
-    for precision in ONNX_FILES:
-        made = run.deployment(f"{precision}-0")
-        made.folder.mkdir(exist_ok=True)
-        made.file(precision).write_bytes(precision.encode())
-        made.finish({"settings": {}})
-    export_run(run, tmp_path / "run.zip")
-    there, _ = import_run(tmp_path / "run.zip", tmp_path / "there")
-    assert all(there.deployment(f"{precision}-0").done for precision in ONNX_FILES)
-
-
 def test_only_a_finished_and_unchanged_run_leaves(run: Run, tmp_path: Path):
     run.model.write_bytes(b"other")
     with pytest.raises(InputError, match=r"changed since it was made: model\.safetensors"):
@@ -163,23 +151,6 @@ def test_no_other_name_is_unpacked(archive: Path, tmp_path: Path):
         changed(archive, {name: b"evil"})
         refused(archive, tmp_path / "there", "is not a file of a run|both in the archive")
     assert list(tmp_path.rglob("*evil*")) == []
-
-
-@pytest.mark.parametrize("index", [
-    b"[]", b"{", b"{}", b'{"format": "memmlp run 1", "run": "../x", "files": {}}',
-    b'{"format": "memmlp run 1", "run": "0123456789abcdef", "files": {"DONE": {"size": -1, "sha256": "x"}}}',
-    b'{"format": "memmlp run 2", "run": "0123456789abcdef", "files": {}}',
-])  # fmt: skip
-def test_an_index_that_is_none_is_refused(archive: Path, tmp_path: Path, index: bytes):
-    changed(archive, {INDEX: index})
-    refused(archive, tmp_path / "there", "not an archive|format|run id")
-
-
-def test_what_is_no_zip_is_refused(tmp_path: Path):
-    path = tmp_path / "x.zip"
-    for content in (b"", b"text", b"PK\x03\x04" + bytes(50)):
-        path.write_bytes(content)
-        refused(path, tmp_path / "there", "not an archive of a run")
 
 
 def test_an_archive_cut_anywhere_is_refused(archive: Path, tmp_path: Path):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from memmlp.runs import environment as module
-from memmlp.runs.environment import environment, user_code_digests
+from memmlp.runs.environment import environment, user_packages
 
 
 def test_environment_says_what_ran_without_the_machines_name():
@@ -27,9 +27,9 @@ def test_code_that_is_edited_while_it_runs_is_recorded_as_it_runs(
     """A worker does many runs with what it imported, whatever its files say later."""
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "lab_of_mine.py").write_text("A = 1\n")
-    before = user_code_digests(["lab_of_mine"])
+    before = user_packages(["lab_of_mine"])
     (tmp_path / "lab_of_mine.py").write_text("A = 2\n")
-    assert user_code_digests(["lab_of_mine"]) == before
+    assert user_packages(["lab_of_mine"]) == before
 
 
 def test_a_file_is_parsed_only_if_its_bytes_differ(monkeypatch: pytest.MonkeyPatch):
@@ -66,27 +66,3 @@ def test_a_patch_is_of_the_code_that_runs(tmp_path: Path, monkeypatch: pytest.Mo
     finally:
         for one in cached:
             one.cache_clear()
-
-
-FILES = {
-    "lab/__init__.py": "",
-    "lab/mine.py": "import os, memmlp.api, site_module\nfrom . import near\nfrom ..nowhere import x\n",
-    "lab/near.py": "if True:\n    import lab.far.thing as t\n    from lab.mine import *\n",
-    "lab/far/thing.py": "this is no Python",
-    "lab/unused.py": "import lab.mine\n",
-    "site-packages/site_module.py": "",
-}
-
-
-def test_only_what_is_imported_of_the_users_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Whatever it imports in turn, and the packages that it lies in; circles end."""
-    for name, text in FILES.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(text)
-    for folder in ("", "site-packages"):
-        monkeypatch.syspath_prepend(tmp_path / folder)
-    assert module._imported_modules({"lab.mine": tmp_path / "lab/mine.py"}) == {
-        "lab": tmp_path / "lab/__init__.py",
-        "lab.far.thing": tmp_path / "lab/far/thing.py",
-        "lab.near": tmp_path / "lab/near.py",
-    }

@@ -89,12 +89,6 @@ def test_a_plan_that_does_not_name_a_run_condemns_none(outputs: Path, file: str,
     assert {GONE, GOOD} & set(found(outputs)) == set()
 
 
-def test_runs_of_an_arm_that_is_gone_may_go(outputs: Path):
-    write_json(outputs / "sweeps" / "mine" / "sweep.json", {"variants": [{"label": "b"}]})
-    write_json(outputs / "sweeps" / "mine" / "plan.json", {"entries": [], "tasks": []})
-    assert found(outputs)[GOOD] == "orphaned"
-
-
 def test_a_trained_run_whose_export_failed_stays(outputs: Path):
     made(outputs, "7" * 16).fail("step.int8.onnx: ONNX Runtime differs")
     assert "7" * 16 not in found(outputs)

@@ -12,7 +12,6 @@ from memmlp.runs.identity import (
     changes_training,
     deployment_id,
     evaluation_id,
-    flatten,
 )
 
 
@@ -78,10 +77,6 @@ def test_neutral_keys_do_not_count():
 def test_equal_numbers_and_orders_are_one_identity():
     same = {"optim": {"log_every": 5, "lr": 0.001}, "model": {"layers": (2.0, 4), "width": 16.0}, "seed": 0}
     assert identity(same) == identity()
-
-
-def test_flatten_keeps_lists_and_empty_mappings():
-    assert flatten({"a": {"b": 1, "c": {}}, "d": [1]}) == {"a.b": 1, "a.c": {}, "d": [1]}
 
 
 def test_keys_of_later_stages_and_neutral_keys_cannot_change_a_training():

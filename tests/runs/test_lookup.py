@@ -9,7 +9,7 @@ from begun_runs import CONFIG, begun
 from fake_runs import fake_run
 
 from memmlp.common.errors import InputError
-from memmlp.runs.lookup import LITTLE, find_run, frames_seen, hardly_trained, list_runs
+from memmlp.runs.lookup import find_run, frames_seen, list_runs
 from memmlp.runs.run import Run
 
 
@@ -53,15 +53,3 @@ def test_a_refiner_saw_its_network_s_frames_and_its_own_pieces(tmp_path: Path):
     above = {"prerequisite": network.id}
     config = SEEN | {"refiner": {"frames": 20}}
     assert frames_seen(fake_run(tmp_path, "refiner", config=config, origin=above)) == 100 * 8 * (11 + 20)
-
-
-def test_what_is_not_known_is_0(tmp_path: Path):
-    for lacking in ("optim", "model"):
-        config = {key: value for key, value in SEEN.items() if key != lacking}
-        assert frames_seen(fake_run(tmp_path, lacking, config=config)) == 0
-
-
-def test_less_than_half_an_hour_of_motion_is_warned_of():
-    assert hardly_trained(LITTLE) == hardly_trained(0) == ""
-    assert "30 minutes" in hardly_trained(LITTLE - 1)
-    assert "2.5 minutes" in hardly_trained(9000)

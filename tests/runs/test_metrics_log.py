@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 
 import pytest
-from begun_runs import CONFIG, begun, complete
+from begun_runs import begun, complete
 from machines import fenced
 
 from memmlp.common.errors import InputError
@@ -62,15 +62,6 @@ def test_values_that_are_no_numbers_stay_json(tmp_path: Path):
     assert values["inf"] == -math.inf
     write_json(run.results_path, {"a": [math.nan]})
     assert run.results == {"a": ["nan"]}
-
-
-def test_a_log_may_go_on_after_a_reset(tmp_path: Path):
-    run = begun(tmp_path)
-    run.log(1, {"loss": 1.0})
-    run.reset()
-    run.begin("memmlp", CONFIG, data="d", prerequisite=None)
-    run.log(2, {"loss": 1.0})
-    assert [entry.step for entry in run.metrics()] == [2]
 
 
 def test_a_line_that_is_written_late_goes_to_the_old_file(tmp_path: Path):

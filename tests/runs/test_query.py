@@ -30,16 +30,15 @@ def holds(text: str) -> bool:
 HOLDING = [
     "memory=gru", "memory==gru", "memory!=vq", "memory=gru and stream.MPJPE<6.3", "seed=1", "seed=1.0",
     "optim.lr=1e-3", "optim.lr<=0.001", "memory.layers=[2,4]", 'memory.layers="[2, 4]"', "tag=good",
-    "tag!=bad", 'note="two words"', "force=false", "force=False", "vqvae.epochs=null", "not memory=vq",
-    "memory=vq or seed=1",
-    "memory=vq and seed=2 or seed=1", "not (memory=vq or seed=2)", "not not seed=1", "started>2026-01-01",
-    "(seed>0)and(seed<2)", "stream.MPJPE>=6.25",
+    "tag!=bad", 'note="two words"', "force=false", "force=False", "vqvae.epochs=null", "memory=vq or seed=1",
+    "memory=vq and seed=2 or seed=1", "seed=1 or memory=vq and seed=2", "started>2026-01-01",
+    "seed>0 and seed<2", "stream.MPJPE>=6.25",
 ]  # fmt: skip
 
 
 NOT_HOLDING = [
     "memory=vq", "memory!=gru", "seed=2", "force!=False", "force=True", "seed<1", "tag=bad", "tag!=good",
-    "memory=vq and (seed=1 or seed=2)", "vqvae.epochs<5", "vqvae.epochs>=0", "force>0", "note=two",
+    "memory=vq and seed=1 or seed=2", "vqvae.epochs<5", "vqvae.epochs>=0", "force>0", "note=two",
 ]  # fmt: skip
 
 
@@ -54,11 +53,10 @@ def test_what_a_run_does_not_have_is_neither_smaller_nor_larger():
 
 WRONG = [
     ("", "a key is expected"), ("memory", "a comparison after memory"), ("memory=", "a value after memory="),
-    ("memory=gru or or seed=1", "'or' stands where a key"), ("(memory=gru", "a ) is missing"),
-    ("memory=gru)", "')' is not expected"), ("memory gru", "after memory comes 'gru'"),
+    ("memory=gru or or seed=1", "'or' stands where a key"),
+    ("memory gru", "after memory comes 'gru'"),
     ("status=running", "training, evaluating"), ("seed<many", "compares with a number"),
-    ("seed=(", "comes '('"), ('note="open', "cannot be parsed"), ("memory=gru seed=1", "'seed' is not"),
-    ("(" * 60 + "a=1" + ")" * 60, "nested"), ("not " * 60 + "a=1", "nested"),
+    ("seed=<", "comes '<'"), ('note="open', "cannot be parsed"), ("memory=gru seed=1", "'seed' is not"),
 ]  # fmt: skip
 
 
@@ -70,25 +68,10 @@ def test_what_is_no_condition_is_one_line():
         assert str(error.value).startswith("--where '")
 
 
-def test_words_are_neither_smaller_nor_larger_than_a_number():
-    wrong = {"memory": "memory>5", "memory.layers": "memory.layers<3 or seed=1", "note": "seed=1 and note>=2"}
-    for key, text in wrong.items():
-        with pytest.raises(InputError, match=key):
-            parse(text).of([ONE])
-        assert parse(f"{key}>1").of([ONE, {**ONE, key: 2.0}]) == [False, True]
-    assert parse("started<2027").of([ONE, {**ONE, "started": None}]) == [True, False]
-
-
 @given(st.text(alphabet='ab1.<>=!()" andort', max_size=30))
 def test_any_text_is_a_condition_or_one_line(text: str):
     with contextlib.suppress(InputError):
         parse(text).condition(ONE)
-
-
-def test_an_unknown_key_names_its_neighbour():
-    with pytest.raises(InputError, match="no run has the key 'memry'; did you mean memory"):
-        parse("memry=gru").of([ONE])
-    assert parse("anything=1").of([]) == []
 
 
 @pytest.mark.parametrize("own", [float("nan"), "nan"])

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
 from begun_runs import CONFIG, begun, complete
-from processes import finished
 
 import memmlp.runs.component_versions
 from memmlp.cli.runs.listing import shown_number
@@ -249,14 +247,6 @@ def test_a_damaged_config_is_named(tmp_path: Path):
             _ = run.config
 
 
-def test_a_retry_of_a_run_that_never_began_leaves_it_new(tmp_path: Path):
-    run = Run.of(tmp_path, "a" * 16)
-    run.folder.mkdir(parents=True)
-    run.fail("its data is gone")
-    run.retry()
-    assert run.status == "new"
-
-
 def test_the_status_names_the_stage_that_somebody_is_at(tmp_path: Path):
     run = begun(tmp_path)
     with run.lock():
@@ -287,20 +277,6 @@ def test_a_run_that_was_killed_before_its_evaluation_is_trained_and_not_done(tmp
     assert run.status == "trained"
     run.want(["window-0", "stream-0"])
     assert run.status == "done"
-
-
-def test_a_run_of_which_nothing_but_training_is_asked_is_done_then(tmp_path: Path):
-    run, codes = begun(tmp_path, CONFIG | {"evaluation": {"modes": []}}), begun(tmp_path, kind="vqvae")
-    for one in (run, codes):
-        one.model.write_bytes(b"weights")
-        one.finish(["model.safetensors"])
-    run.want([])
-    assert run.status == codes.status == "done"
-
-
-def test_runs_need_neither_torch_nor_hydra():
-    code = "import sys, memmlp.runs.run; print([m for m in ('torch', 'hydra', 'mlflow') if m in sys.modules])"
-    assert finished([sys.executable, "-c", code]).stdout == "[]\n"
 
 
 def test_a_config_that_was_read_belongs_to_whoever_read_it(tmp_path: Path):

@@ -71,30 +71,6 @@ def test_a_fleet_replaces_the_dead_and_is_no_larger_than_the_work(tmp_path: Path
     assert not any(handle.alive() for handle in shelf.handles)
 
 
-@pytest.mark.parametrize("fail_fast", [True, False])
-def test_the_first_failure_ends_the_workers_where_that_is_wanted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fail_fast: bool
-):
-    monkeypatch.setattr(controller, "LOOK", 0)
-    one, two = (RunTask(name * 16, "memmlp", {}) for name in "12")
-    plan = Plan("trial", tmp_path, (), (one, two), fail_fast=fail_fast)
-    shelf = Shelf(Living)
-
-    class Looks(Board):
-        """One run fails at the second look, the other one at the third; a last look sees what was left."""
-
-        def update(self, plan: Plan, states: Mapping[str, str]) -> None:
-            looked.append(len(plan.left(states)))
-            for task in plan.tasks[: len(looked) - 1]:
-                plan.run_of(task).folder.mkdir(parents=True, exist_ok=True)
-                plan.run_of(task).fail("the loss is nan")
-
-    looked: list[int] = []
-    controller.oversee(plan, Fleet(shelf, lambda: None, 2, tmp_path), Looks())
-    assert len(looked) == (3 if fail_fast else 4)
-    assert [handle.cancelled for handle in shelf.handles] == [fail_fast] * 2
-
-
 def test_what_ends_right_after_a_look_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(controller, "LOOK", 0)
     task = RunTask("1" * 16, "memmlp", {})

@@ -120,13 +120,6 @@ def test_what_is_read_is_what_was_kept(tmp_path: Path):
         assert kept_sweep(tmp_path) == each
 
 
-def test_a_copy_of_the_same_content_is_not_written_again(tmp_path: Path):
-    keep_sweep(parse_sweep("mine", CONTENT), tmp_path)
-    before = (tmp_path / NAME).stat().st_mtime_ns
-    keep_sweep(parse_sweep("mine", CONTENT), tmp_path)
-    assert (tmp_path / NAME).stat().st_mtime_ns == before
-
-
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"variants": [{"no": 1}]}'])
 def test_a_damaged_copy_is_named(tmp_path: Path, text: str):
     (tmp_path / NAME).write_text(text)

@@ -75,7 +75,7 @@ def test_a_run_is_judged_by_its_variant(plan: Plan):
     finish(plan, CODES[0], 10.0)
     finish(plan, QUICK[0], {"train": 50.0, "evaluate": 10.0})
     finish(plan, SLOW[0], {"train": 1000.0, "evaluate": 200.0})
-    assert forecast(plan) == Forecast(60.0 + 1200.0, finished=2, unlike=0)
+    assert forecast(plan) == Forecast(60.0 + 1200.0, finished=2)
 
 
 def test_a_trained_run_without_what_the_plan_wants_of_it_judges_none(plan: Plan):
@@ -87,13 +87,13 @@ def test_a_trained_run_without_what_the_plan_wants_of_it_judges_none(plan: Plan)
     wanting = replace(task, stages=("e" * 16,))
     again = replace(plan, tasks=tuple(wanting if one.id == task.id else one for one in plan.tasks))
     assert wanting in again.left()
-    assert forecast(again) == Forecast(3 * 60.0, finished=1, unlike=2)
+    assert forecast(again) == Forecast(3 * 60.0, finished=1)
 
 
 def test_an_variant_without_a_finished_run_is_judged_by_the_others_and_counted(plan: Plan):
     finish(plan, CODES[0], 10.0)
     finish(plan, QUICK[0], 60.0)
-    assert forecast(plan) == Forecast(60.0 + 2 * 60.0, finished=1, unlike=2)
+    assert forecast(plan) == Forecast(60.0 + 2 * 60.0, finished=1)
 
 
 def test_of_a_finished_plan_nothing_is_foretold(plan: Plan):
@@ -106,4 +106,4 @@ def test_a_run_too_short_for_the_clock_counts_as_finished(plan: Plan):
     finish(plan, CODES[0], {"vqvae": 0.0})
     finish(plan, QUICK[0], {"train": 0.0})
     finish(plan, SLOW[0], 20.0)
-    assert forecast(plan) == Forecast(20.0, finished=2, unlike=0)
+    assert forecast(plan) == Forecast(20.0, finished=2)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,10 +10,9 @@ import pytest
 from rich.console import Console
 
 from memmlp.runs.metrics_log import LogRecord
-from memmlp.runs.run import Run
 from memmlp.sweep import progress_table
 from memmlp.sweep.plan import Entry, Plan, RunTask
-from memmlp.sweep.progress_table import QUIET, Board, device_name, progress_text, render, time_left
+from memmlp.sweep.progress_table import QUIET, Board, progress_text, render, time_left
 
 CARD = {"device": "cuda", "gpu": "A card", "gpu_index": "1"}
 
@@ -63,43 +61,12 @@ def test_a_log_is_not_silent_while_runs_go_on(plan: Plan, monkeypatch: pytest.Mo
     assert told("running", "new", "new", "done") == []
 
 
-def test_what_a_finished_cell_shows_is_said_below(
-    plan: Plan, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-):
-    states = dict.fromkeys([task.key for task in plan.tasks], "done")
-    Console(width=200).print(render(plan, states))
-    assert "MPJPE" not in capsys.readouterr().out
-    monkeypatch.setattr(Run, "results", {"stream": {"rotation": {"MPJPE": 4.321}}})
-    Console(width=200).print(render(plan, states))
-    said = capsys.readouterr().out
-    assert "4.32 cm" in said
-    assert "cm: done; MPJPE in stream mode of the rotation branch" in said
-
-
 def test_a_run_whose_training_is_over_shows_its_stage(plan: Plan):
     run = plan.run_of(plan.tasks[0])
     with run.lock():
         assert progress_text(run, 9) == "starting"
         run.attempt("deployment")
         assert progress_text(run, 9) == "exporting"
-
-
-def test_names(plan: Plan):
-    assert [device_name(plan.run_of(task)) for task in plan.tasks[1:3]] == ["GPU 1 (A card)", "cpu"]
-    assert device_name(plan.run_of(RunTask("f" * 16, "memmlp", {}))) == ""
-
-
-def test_a_name_is_not_broken_into_letters_where_there_are_many_seeds(
-    plan: Plan, capsys: pytest.CaptureFixture
-):
-    """Seen with five seeds at 80 columns: a variant's name had three letters a line."""
-    only = plan.entries[0]
-    wide = replace(
-        plan, entries=tuple(replace(only, label="AvatarPoser + refiner", seed=n) for n in range(5))
-    )
-    states = dict.fromkeys([task.key for task in plan.tasks], "trained")
-    Console(width=80).print(render(wide, states))
-    assert "AvatarPoser +" in capsys.readouterr().out
 
 
 def test_the_time_left_follows_from_the_last_five_entries(monkeypatch: pytest.MonkeyPatch):

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import fcntl
 import os
-import signal
 import subprocess
 import sys
 import threading
@@ -17,12 +15,10 @@ from pathlib import Path
 
 import pytest
 from machines import Clock, apart
-from processes import PATIENCE, forked, started, until
+from processes import PATIENCE, started, until
 
-from memmlp.common import lease
 from memmlp.common.errors import InputError, TrainingDiverged
-from memmlp.common.lease import Changes, Lock
-from memmlp.config.worker_process import check_wanted
+from memmlp.common.lease import Changes
 from memmlp.runs.run import Run
 from memmlp.sweep import worker
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
@@ -65,53 +61,6 @@ def test_prerequisite_runs_come_first_and_each_task_once(tmp_path: Path):
     assert seen[0] == CODES.id
     work_off(saved(tmp_path, ONE, TWO, CODES, ALONE), perform)
     assert len(seen) == 4
-
-
-def test_what_a_worker_saw_done_it_looks_at_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A sweep may have many runs, and many workers that wait at its end, on one disk."""
-    looks: list[str] = []
-    complete = Plan.complete
-
-    def counted(self: Plan, task: RunTask) -> bool:
-        looks.append(task.id)
-        return complete(self, task)
-
-    path = saved(tmp_path, CODES, ONE, TWO, ALONE)
-    finish(Plan.load(path), CODES)
-    finish(Plan.load(path), ALONE)
-    monkeypatch.setattr(Plan, "complete", counted)
-    work_off(path, finish)
-    assert looks.count(ALONE.id) == 1
-    assert looks.count(TWO.id) > 1
-
-
-def test_a_prerequisite_run_stands_right_before_the_first_that_needs_it():
-    other = RunTask("d" * 16, "vqvae", {})
-    four = RunTask("4" * 16, "memmlp", {}, other.id)
-    assert unique([CODES, ONE, ALONE, other, four, CODES, TWO]) == (CODES, ONE, ALONE, other, four, TWO)
-    assert unique([ALONE, TWO, ONE, CODES]) == (ALONE, CODES, TWO, ONE)
-
-
-def test_a_plan_that_ends_with_its_first_failure(tmp_path: Path):
-    begun: list[str] = []
-
-    def perform(plan: Plan, task: RunTask) -> None:
-        begun.append(task.id)
-        if task == ONE:
-            raise InputError("a bad key")
-        finish(plan, task)
-
-    path = saved(tmp_path, CODES, ONE, TWO, ALONE, fail_fast=True)
-    assert len(Plan.load(path).left()) == 4
-    work_off(path, perform)
-    assert begun == [CODES.id, ONE.id]
-    assert Plan.load(path).stopped
-    assert Plan.load(path).left() == []
-    with pytest.raises(Cancelled, match=f"run {TWO.id} was cancelled at step 3"):
-        check_wanted(path, TWO.id, 3, {})
-    Plan.load(path).run_of(ONE).retry()
-    check_wanted(path, TWO.id, 3, {})
-    assert not plan(tmp_path, CODES, ONE, TWO, ALONE).stopped
 
 
 def test_a_failure_is_left_with_its_run_and_the_others_go_on(tmp_path: Path):
@@ -248,67 +197,6 @@ def _log_tasks(path: Path, log: Path, locks: bool) -> None:
         run.finish(["results.json"])
 
     work_off(path, perform)
-
-
-@pytest.mark.slow
-def test_many_workers_perform_each_task_exactly_once(tmp_path: Path):
-    """Some with the kernel's locks, some with such that do nothing."""
-    tasks = [RunTask(f"{n:016x}", "memmlp", {}, CODES.id if n % 2 else None) for n in range(12)]
-    path = saved(tmp_path, CODES, *tasks)
-    log = tmp_path / "log"
-    with contextlib.ExitStack() as stack:
-        workers = [
-            stack.enter_context(forked(_log_tasks, path, log, locks)) for locks in (True, True, False, False)
-        ]
-        assert [process.wait() for process in workers] == [0] * 4
-    assert Counter(log.read_text().split()) == Counter([CODES.id, *(task.id for task in tasks)])
-    assert not any(Lock(folder).held for folder in tmp_path.glob("runs/*"))
-
-
-FREEZING = """
-import sys, time
-from pathlib import Path
-from memmlp.common import lease
-from memmlp.sweep.worker import work_off
-
-lease.BEAT, stop = 0.01, sys.argv[2]
-
-def perform(plan, task):
-    run = plan.run_of(task)
-    run.begin(task.kind, {}, data="d", prerequisite=None)
-    print(f"at {task.id[0]}", flush=True)
-    if task.id[0] == stop:
-        sys.stdin.readline()
-    run.log(1, {"loss": 0.5})
-    run.results_path.write_text("{}")
-    run.finish(["results.json"])
-
-work_off(Path(sys.argv[1]), perform)
-"""
-
-
-@pytest.mark.slow
-def test_a_worker_that_is_stopped_for_longer_than_its_lease_goes_on_elsewhere(tmp_path: Path, monkeypatch):
-    """By SIGSTOP, while it has the kernel's lock; another worker does its run meanwhile, and does it once."""
-    path = saved(tmp_path, ALONE, ONE, CODES)
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with started([sys.executable, "-c", FREEZING, str(path), "3"], **pipes) as frozen:
-        assert frozen.stdout.readline() == b"at 3\n"
-        frozen.send_signal(signal.SIGSTOP)
-        assert not attempt(Plan.load(path), ALONE, finish)
-        monkeypatch.setattr(lease, "LEASE", 0.2)
-        until(lambda: attempt(Plan.load(path), ALONE, finish), "its lease is over", frozen)
-        run = Plan.load(path).run_of(ALONE)
-        assert run.done
-        before = {file: file.read_bytes() for file in run.folder.iterdir()}
-        frozen.send_signal(signal.SIGCONT)
-        said, why = frozen.communicate(b"go on\n", PATIENCE)
-    assert said == b"at c\nat 1\n"  # the other tasks
-    assert f"run {ALONE.id}: another process took it over".encode() in why
-    assert frozen.returncode == 0
-    assert {file: file.read_bytes() for file in run.folder.iterdir()} == before
-    assert len(run.manifest["attempts"]) == 2
-    assert set(Plan.load(path).states().values()) == {"done"}
 
 
 @pytest.mark.parametrize("where", [lambda monkeypatch: None, apart])

@@ -59,9 +59,8 @@ def note(run: str, text: str | None, outputs: Path) -> None:
 def gc(kinds: tuple[str, ...], yes: bool, outputs: Path) -> None:
     """Show, or delete, runs that are not needed.
 
-    These are runs that failed, runs by older component versions, and orphans: no longer in a sweep, a VQ-VAE
-    that no run uses, a folder without a run. Runs with a tag or a note, runs in progress, and runs that other
-    runs need are kept.
+    These are failed runs, runs with older component versions, and orphans: a VQ-VAE that no run uses, or a
+    folder without a run. Runs with a tag or a note, runs in progress, and runs that other runs need are kept.
     """
     from memmlp.runs.garbage_runs import REASONS, delete, garbage
 

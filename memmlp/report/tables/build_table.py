@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import atomic_write, write_json
+from memmlp.common.files import atomic_write
 from memmlp.report.tables.effects import (
     RunsBySeed,
     control_variant,
@@ -25,7 +25,7 @@ from memmlp.report.tables.measured_run import Measured, measured_for
 from memmlp.report.tables.table import Cell, Effect, Key, Row, Table
 from memmlp.report.tables.table_text import FORMATS
 from memmlp.sweep.definition import COSTS, MODES, Sweep, Variant
-from memmlp.sweep.plan import Plan, count_states
+from memmlp.sweep.plan import Plan
 
 if TYPE_CHECKING:
     from memmlp.report.tables.seed_rounds import Rounds
@@ -248,35 +248,7 @@ def together(
     return own, (f"{counts}: those whose names match {quoted} alike are together (--together)",)
 
 
-def write_summary(plan: Plan, table: Table, folder: Path) -> None:
-    """Write table.md and summary.json of a sweep, whose runs need not all be done."""
+def write_table(table: Table, folder: Path) -> None:
+    """Write a sweep's table into its folder, as table.md."""
     folder.mkdir(parents=True, exist_ok=True)
     atomic_write(folder / "table.md", FORMATS["md"](table))
-    write_json(folder / "summary.json", summarize(plan, table))
-
-
-def summarize(plan: Plan, table: Table) -> dict[str, Any]:
-    """Return a sweep's status and runs' labels, and means over seeds and verdicts by LABEL/MODE/METRIC."""
-    cells = {
-        f"{row.label}/{mode}/{metric}": cell
-        for row in table.rows
-        for mode, metrics in row.cells.items()
-        for metric, cell in metrics.items()
-    }
-    states = count_states(plan)
-    status = next((name for name in ("failed", "running") if states[name]), "")
-    labels: dict[str, dict[str, None]] = {}  # all variants of each started run
-    for entry in plan.entries:
-        if plan.run_of(entry).manifest:
-            labels.setdefault(entry.id, {})[entry.label] = None
-    return {
-        "name": plan.name,
-        "status": status or ("stopped" if plan.left() else "done"),
-        "labels": {run: ", ".join(found) for run, found in labels.items()},
-        "aggregates": {key: cell.mean for key, cell in cells.items() if cell.mean is not None},
-        "verdicts": {
-            key: str(cell.effect.verdict)
-            for key, cell in cells.items()
-            if cell.effect and cell.effect.verdict
-        },
-    }

@@ -1,4 +1,4 @@
-"""What loggers show of runs and sweeps, read from their folders alone."""
+"""What loggers show of runs, read from their folders alone."""
 
 from __future__ import annotations
 
@@ -160,42 +160,6 @@ class Tail:
             for record in records.values()
             for key, value in record.values.items()
         ]
-
-
-@dataclass(frozen=True)
-class SweepFacts:
-    """The facts in a sweep's folder.
-
-    Attributes:
-        name: the name of its folder, which differs between command lines of one sweep file.
-        folder: the sweep's folder.
-        status: "running", "stopped" (unfinished, and no process works on it), "done" or "failed".
-        variants: run id -> the label of its variant.
-        aggregates: means over seeds, by LABEL/MODE/METRIC.
-        verdicts: verdicts on differences from the controls, by LABEL/MODE/METRIC.
-        files: the sweep's table as Markdown and HTML.
-    """
-
-    name: str
-    folder: Path
-    status: str
-    variants: Mapping[str, str]
-    aggregates: Mapping[str, float]
-    verdicts: Mapping[str, str]
-    files: tuple[Path, ...]
-
-    RECORD = "summary.json"
-
-    @classmethod
-    def read(cls, folder: Path) -> SweepFacts | None:
-        """Read a sweep's facts; None if its folder does not have a complete summary."""
-        found = read_json(folder / cls.RECORD)
-        if not {"name", "status", "labels", "aggregates", "verdicts"} <= found.keys():
-            return None
-        files = tuple(path for path in [folder / "table.md"] if path.is_file())
-        means = {key: value for key, value in found["aggregates"].items() if _is_number(value)}
-        status, labels, verdicts = found["status"], found["labels"], found["verdicts"]
-        return cls(folder.name, folder.absolute(), status, labels, means, verdicts, files)
 
 
 def _is_number(value: Any) -> bool:

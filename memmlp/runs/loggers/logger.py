@@ -6,7 +6,6 @@ nothing is lost if a logger is slow or fails. `memmlp loggers sync` fills in wha
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import sys
 import threading
@@ -17,13 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from memmlp.runs.loggers.facts import CurvePoint, RunFacts, SweepFacts, Tail, read_run
+from memmlp.runs.loggers.facts import CurvePoint, RunFacts, Tail, read_run
 from memmlp.runs.run import Run
 
 PACE = 1.0  # seconds between two looks at a run's log
 MAX_PAUSE = 60.0  # seconds between two tries of a logger that fails
-MAX_WAIT = 5.0  # seconds for which a run's end waits for a logger, until it was too slow once
-EXIT_WAIT = 30.0  # seconds for which the end of the process waits for the loggers
+MAX_WAIT = 30.0  # seconds for which a run's end waits for its loggers
 
 
 class ShownRun(Protocol):
@@ -57,9 +55,6 @@ class RunLogger(Protocol):
 
     def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> ShownRun:
         """Show a run with exactly these facts and points, replacing whatever the logger had of it."""
-
-    def sweep(self, facts: SweepFacts) -> None:
-        """Show a sweep as a group that contains its runs, replacing whatever the logger had of it."""
 
 
 class Session:
@@ -131,8 +126,8 @@ class Loggers:
     def following(self, run: Run) -> Iterator[None]:
         """Show a run during the context, and then its end or failure.
 
-        A logger never stops the run. One that fails costs a line on stderr. One that is slow costs at most
-        MAX_WAIT at the end of the first run, and EXIT_WAIT at the end of the process.
+        A logger never stops the run. One that fails costs a line on stderr, and one that is slow at most
+        MAX_WAIT at the end of the run.
         """
         ended = threading.Event()
         threads = self._start(lambda logger: _follow(Session(logger, run), ended), f"run {run.id}")
@@ -142,36 +137,19 @@ class Loggers:
             ended.set()
             _join(threads)
 
-    def sweep(self, folder: Path) -> None:
-        """Show a sweep's runs as one group, read from its folder."""
-        _join(self._start(lambda logger: sync_sweeps(logger, [folder], _warn), f"sweep {folder.name}"))
-
     def _start(self, work: Callable[[RunLogger], object], subject: str) -> list[threading.Thread]:
         threads = []
         for one in self.loggers:
-            warning = f"{subject} is not shown in {one.name}"  # see `_join_slow`
+            warning = f"{subject} is not shown in {one.name}"  # see `_join`
             threads.append(threading.Thread(target=work, args=(one,), name=warning, daemon=True))
             threads[-1].start()
         return threads
 
 
-_slow: list[threading.Thread] = []
-"""The threads for which this process has waited in vain."""
-
-
 def _join(threads: Sequence[threading.Thread]) -> None:
-    """Wait for threads, for at most MAX_WAIT; not at all while others are late."""
-    end = time.monotonic() + (0 if any(thread.is_alive() for thread in _slow) else MAX_WAIT)
+    """Wait for threads, for at most MAX_WAIT, and report those that are not done."""
+    end = time.monotonic() + MAX_WAIT
     for thread in threads:
-        thread.join(max(end - time.monotonic(), 0))
-    _slow[:] = [thread for thread in (*_slow, *threads) if thread.is_alive()]
-
-
-@atexit.register
-def _join_slow() -> None:
-    """Wait for the late threads, for at most EXIT_WAIT, and report those that are not done."""
-    end = time.monotonic() + EXIT_WAIT
-    for thread in _slow:
         thread.join(max(end - time.monotonic(), 0))
         if thread.is_alive():
             _warn(f"{thread.name}: it is too slow")
@@ -235,15 +213,3 @@ def sync(
             counts["failed"] += 1
             say(f"run {run.id} is not shown in {logger.name}: {_reason(error)}")
     return counts
-
-
-def sync_sweeps(logger: RunLogger, folders: Iterable[Path], say: Callable[[str], None]) -> int:
-    """Show the sweeps whose folders have a summary, and return how many were shown."""
-    shown = 0
-    for facts in filter(None, map(SweepFacts.read, folders)):
-        try:
-            logger.sweep(facts)
-            shown += 1
-        except Exception as error:
-            say(f"sweep {facts.name} is not shown in {logger.name}: {_reason(error)}")
-    return shown

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import logging
 import os
-import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from memmlp.common.components import component
 from memmlp.common.errors import check_installed
 from memmlp.common.settings import Settings, setting
-from memmlp.runs.loggers.facts import CurvePoint, RunFacts, SweepFacts
+from memmlp.runs.loggers.facts import CurvePoint, RunFacts
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -94,26 +92,6 @@ class MLflow:
         shown = ShownInMLflow(self, run_id)
         shown.log(points)
         return shown
-
-    def sweep(self, facts: SweepFacts) -> None:
-        """Make a sweep the parent of its runs, with its aggregates, verdicts and table.
-
-        A run that several sweeps share is a child of the last one shown; one tag per sweep holds the run's
-        label in that sweep.
-        """
-        with self.client() as (client, experiment):
-            verdicts = {f"verdict/{allowed_name(key)}": verdict for key, verdict in facts.verdicts.items()}
-            tags = {"memmlp.sweep": facts.name, **verdicts}
-            parent = _replace_run(client, experiment, "memmlp.sweep", facts.name, tags, None)
-            points = [CurvePoint(allowed_name(key), value, 0, 0.0) for key, value in facts.aggregates.items()]
-            _log(client, parent, points)
-            for run_id, label in facts.variants.items():
-                for child in client.search_runs([experiment], f"tags.`memmlp.run_id` = '{run_id}'"):
-                    client.set_tag(child.info.run_id, f"memmlp.variant.{facts.name}", label)
-                    client.set_tag(child.info.run_id, "mlflow.parentRunId", parent)
-            for path in facts.files:
-                client.log_artifact(parent, str(path))
-            client.set_terminated(parent, STATUS[facts.status])
 
     @contextlib.contextmanager
     def client(self) -> Iterator[tuple[MlflowClient, str]]:
@@ -211,9 +189,3 @@ def _tags(facts: RunFacts) -> dict[str, str]:
     }
     tags |= {key: value for key, value in given.items() if value}
     return {key: value[:TAG_LENGTH] for key, value in tags.items()}
-
-
-def allowed_name(name: str) -> str:
-    """Return a name with the characters that MLflow allows; if any were replaced, a digest is appended."""
-    plain = re.sub(r"[^\w./ -]", "_", name)
-    return plain if plain == name else f"{plain} {hashlib.sha256(name.encode()).hexdigest()[:4]}"

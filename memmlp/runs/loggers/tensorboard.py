@@ -12,7 +12,7 @@ from typing import Any
 from memmlp.common.components import component
 from memmlp.common.errors import check_installed
 from memmlp.common.settings import Settings
-from memmlp.runs.loggers.facts import CurvePoint, RunFacts, SweepFacts
+from memmlp.runs.loggers.facts import CurvePoint, RunFacts
 
 MAX_NAME = 120  # characters of a folder's name
 FINGERPRINT = "memmlp-fingerprint"
@@ -59,17 +59,6 @@ class TensorBoard:
         shown = ShownInTensorBoard(Path(self.place) / _folder_name(facts.name, facts.id))
         shown.log(points)
         return shown
-
-    def sweep(self, facts: SweepFacts) -> None:
-        """Write a sweep's status and table as text and its aggregates as values."""
-        folder = Path(self.place) / _folder_name(f"sweep {facts.name}")
-        shutil.rmtree(folder, ignore_errors=True)
-        shown = ShownInTensorBoard(folder)
-        tables = {path.stem: path.read_text("utf-8") for path in facts.files if path.suffix == ".md"}
-        verdicts = _markdown("comparison", "verdict", facts.verdicts)
-        shown.write_texts({"status": facts.status, **tables, "verdicts": verdicts})
-        shown.log([CurvePoint(key, value, 0, 0.0) for key, value in facts.aggregates.items()])
-        shown.close()
 
     def _folders(self, run_id: str) -> Iterator[Path]:
         return Path(self.place).glob(f"* {run_id[:8]}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import shutil
 import time
@@ -15,7 +14,7 @@ from typing import Any
 from memmlp.common.components import component
 from memmlp.common.errors import check_installed
 from memmlp.common.settings import Settings, setting, text
-from memmlp.runs.loggers.facts import CurvePoint, RunFacts, SweepFacts
+from memmlp.runs.loggers.facts import CurvePoint, RunFacts
 
 OFFLINE = {"WANDB_MODE": "offline", "WANDB_SILENT": "true", "WANDB_ERROR_REPORTING": "false"}
 FINGERPRINT = "memmlp-fingerprint"
@@ -68,18 +67,6 @@ class WandB:
         shown = ShownInWandB(run, self._folders(facts.id)[0])
         shown.log(points)
         return shown
-
-    def sweep(self, facts: SweepFacts) -> None:
-        """Write a sweep as a run, with aggregates, verdicts and table."""
-        sweep_id = hashlib.sha256(facts.name.encode()).hexdigest()[:16]
-        run = self._start(
-            sweep_id, f"sweep {facts.name}", tags=["sweep"], config={"variants": dict(facts.variants)}
-        )
-        verdicts = {f"verdict/{key}": verdict for key, verdict in facts.verdicts.items()}
-        run.summary.update({"status": facts.status, **facts.aggregates, **verdicts})
-        for path in facts.files:
-            run.save(str(path), base_path=str(facts.folder), policy="now")
-        run.finish(exit_code=0 if facts.status == "done" else 1)
 
     def _start(self, run_id: str, name: str, **options: Any) -> Any:
         os.environ.update(OFFLINE)

@@ -21,7 +21,6 @@ from memmlp.sweep.executors import Work
 TIME = re.compile(r"(?:(?P<days>\d+)-)?(?P<first>\d+)(?::(?P<second>\d+))?(?::(?P<third>\d+))?")
 OURS = ("array", "output", "error", "open_mode", "signal", "wrap", "wait", "parsable", "test_only")
 ONE = ("nodes", "ntasks", "ntasks_per_node", "ntasks_per_gpu")  # a worker is one task
-UNLIMITED = 365 * 24 * 60  # minutes, for submitit, which needs a limit
 
 
 @dataclass(frozen=True)
@@ -33,14 +32,14 @@ class SlurmOptions:
         srun: arguments for srun, which starts the worker inside the job.
         setup: a shell command that each job runs first; None for none.
         python: the command that starts Python in the job; None for this process' own.
-        minutes: the time limit, if `parameters` has one that is given in minutes.
+        minutes: the time limit.
     """
 
     parameters: Mapping[str, str | bool] = field(default_factory=dict)
     srun: tuple[str, ...] = ()
     setup: str | None = None
     python: str | None = None
-    minutes: int | None = None
+    minutes: int = 60
 
     @property
     def gpu(self) -> bool:
@@ -64,8 +63,9 @@ def slurm_options(settings: Mapping[str, str]) -> SlurmOptions:
     parameters: dict[str, str | bool] = {}
     for key, value in known.items():
         parameters |= _parameter(key, value)
-    limit = _minutes(known["time"]) if "time" in known else None
-    return SlurmOptions(parameters, tuple(srun), setup, python, limit)
+    if "time" not in known:
+        raise InputError("slurm.time: has no value; give the time limit of a job with slurm.time=H:MM:SS")
+    return SlurmOptions(parameters, tuple(srun), setup, python, _minutes(known["time"]))
 
 
 def _parameter(key: str, value: str) -> dict[str, str | bool]:
@@ -118,21 +118,8 @@ class Requeued:
         return submitit.helpers.DelayedSubmission(self)
 
 
-class DelayedSubmission(submitit.helpers.DelayedSubmission):  # submitit looks for this name
-    """Submitit's record of work that is being submitted, changed so that the job may have no time limit."""
-
-    def set_timeout(self, timeout_min: int | None, max_num_timeout: int) -> None:
-        """Keep the time limit in minutes, by which submitit tells a timeout from a preemption."""
-        super().set_timeout(timeout_min or UNLIMITED, max_num_timeout)
-
-
 class SubmititSlurm(submitit.SlurmExecutor):
-    """Submitit's executor, also for jobs without a time limit of their own, where the cluster's applies."""
-
-    def _internal_process_submissions(self, delayed_submissions: list) -> list:
-        return super()._internal_process_submissions(
-            [DelayedSubmission(one.function, *one.args, **one.kwargs) for one in delayed_submissions]
-        )
+    """Submitit's executor with memmlp's options."""
 
     def set(self, options: SlurmOptions) -> None:
         """Set the options with which jobs are submitted."""

@@ -1,4 +1,4 @@
-"""The results of a search: its trials as CSV, the best as experiments, Table 5 with the best, and plots."""
+"""The results of a search: its trials as CSV, the best as experiments, and plots."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import io
 import itertools
 import math
 import warnings
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,6 @@ from memmlp.common.files import atomic_write
 from memmlp.common.overrides import last_by_key
 from memmlp.sweep.search.study import Study, deviations, reason, trial_values
 
-TABLE = 5  # the paper's table of manual weights against learned ones
 IMPORTANCE = "by which keys the best tenth of the trials differs"
 ENOUGH_TRIALS = 25
 """From so many complete trials on a tenth of them is more than two, and importance more than chance.
@@ -111,30 +110,6 @@ def experiment(study: Study, trial: FrozenTrial, groups: Collection[str]) -> str
         f"{', '.join(f'{value:.4f}' for value in trial.values)}; run {' '.join(trial.user_attrs['runs'])}.\n"
     )
     return head + yaml.safe_dump({"defaults": [*options, "_self_"], **tree}, sort_keys=False)
-
-
-def write_table(study: Study, shipped: Path, path: Path, overrides: Sequence[str]) -> bool:
-    """Write the paper's Table 5 with the best trial as one more variant, if only loss weights were searched.
-
-    Args:
-        study: the study.
-        shipped: the file of Table 5.
-        path: the file to write.
-        overrides: the overrides of the search's command line, which all variants get, since the weights were
-            searched with them. The table has its own seeds.
-
-    Returns:
-        Whether the table was written.
-    """
-    best = study.best()
-    if not best or not all(one.key.startswith("loss.") for one in study.search.space):
-        return False
-    content = yaml.safe_load(shipped.read_text(encoding="utf-8"))
-    own = [*study.search.base, *study.search.overrides(trial_values(best[0], study.search))]
-    content["base"] = [*content.get("base", []), *(one for one in overrides if not one.startswith("seed="))]
-    content["variants"] = {"manual, searched": {"overrides": own}, **content["variants"]}
-    atomic_write(path, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
-    return True
 
 
 def importances(study: optuna.Study) -> list[tuple[str, float]]:
@@ -230,33 +205,17 @@ def plots(study: Study) -> dict[str, dict[str, Any]]:
     return found
 
 
-def write_plots(study: Study, folder: Path) -> list[Path]:
-    """Write the plots as PNG files, and all of them into study.html, which works offline."""
-    wanted = plots(study)
-    if not wanted:
-        return []
-    files: list[Path] = []
-    parts: list[str] = []
-    matplotlib = require("matplotlib", "plots", "the plots of a search")
+def write_plots(study: Study, path: Path) -> None:
+    """Write the plots into one HTML page, which works offline; nothing for fewer than two trials."""
     require("plotly", "plots", "the page of a search")
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    with warnings.catch_warnings(), pyplot.rc_context():
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for name, keywords in wanted.items():
-            axes = getattr(optuna.visualization.matplotlib, f"plot_{name}")(study.study, **keywords)
-            figure = next(iter(axes.flat)).figure if hasattr(axes, "flat") else axes.figure
-            figure.set_size_inches(max(figure.get_size_inches()[0], 9), 5)
-            figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
-            pyplot.close("all")
-            files.append(folder / f"{name}.png")
-            page = getattr(optuna.visualization, f"plot_{name}")(study.study, **keywords)
-            parts.append(page.to_html(full_html=False, include_plotlyjs=not parts))
+        figures = [
+            getattr(optuna.visualization, f"plot_{name}")(study.study, **keywords)
+            for name, keywords in plots(study).items()
+        ]
+    parts = [figure.to_html(full_html=False, include_plotlyjs=not n) for n, figure in enumerate(figures)]
     title = f"search {study.search.name}: {len(study.trials)} trials"
-    atomic_write(
-        folder / "study.html",
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title>'
-        f"<body><h1>{title}</h1>{''.join(parts)}</body></html>\n",
-    )
-    return [*files, folder / "study.html"]
+    head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title>'
+    if parts:
+        atomic_write(path, f"{head}<body><h1>{title}</h1>{''.join(parts)}</body></html>\n")

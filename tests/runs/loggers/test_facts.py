@@ -9,7 +9,7 @@ from fake_logger import a_run, an_outdated_evaluation
 
 from memmlp.common.files import write_json
 from memmlp.runs.component_versions import VERSIONS
-from memmlp.runs.loggers.facts import SweepFacts, Tail, read_run
+from memmlp.runs.loggers.facts import Tail, read_run
 from memmlp.runs.notes import add_tags, set_note
 
 
@@ -63,12 +63,6 @@ def test_results_by_an_earlier_recipe_are_told(tmp_path: Path, monkeypatch: pyte
     assert read_run(run).fingerprint != now
 
 
-def test_results_lie_at_the_last_step(tmp_path: Path):
-    run = a_run(tmp_path)
-    write_json(run.results_path, {"stream": {"rotation": {"MPJPE": 6.5}}, "words": "text", "yes": True})
-    assert [point[:3] for point in read_run(run).results] == [("stream/rotation/MPJPE", 6.5, 3)]
-
-
 def test_a_tail_reads_the_last_of_repeated_steps_and_then_what_follows(tmp_path: Path):
     run = a_run(tmp_path)
     run.log(3, {"loss": 9.0})
@@ -108,9 +102,3 @@ def test_the_fingerprint_changes_with_all_that_is_shown(tmp_path: Path):
         seen.append(read_run(run).fingerprint)
     assert len(set(seen)) == len(seen)
     assert read_run(run).fingerprint == seen[-1]
-
-
-def test_a_sweep_without_a_whole_summary_has_no_facts(tmp_path: Path):
-    assert SweepFacts.read(tmp_path) is None
-    write_json(tmp_path / "summary.json", {"name": "mine"})
-    assert SweepFacts.read(tmp_path) is None

@@ -4,26 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from fake_logger import FakeLogger, Server, a_run, losses
 from processes import until
 
-from memmlp.common.files import write_json
 from memmlp.runs.loggers import logger as module
-from memmlp.runs.loggers.logger import Loggers, Session, sync, sync_sweeps
+from memmlp.runs.loggers.logger import Loggers, Session, sync
 from memmlp.runs.notes import add_tags
 from memmlp.runs.run import Run
 
 
 @pytest.fixture(autouse=True)
-def _quick(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "PACE", 0.005)
     monkeypatch.setattr(module, "MAX_PAUSE", 0.02)
-    yield
-    module._slow.clear()
 
 
 def loggers_of(outputs: Path, *servers: Server) -> Loggers:
@@ -34,7 +30,6 @@ def test_without_loggers_there_is_no_thread_and_no_file(tmp_path: Path):
     run, threads = a_run(tmp_path), threading.active_count()
     with loggers_of(tmp_path).following(run):
         assert threading.active_count() == threads
-    loggers_of(tmp_path).sweep(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
 
 
@@ -86,19 +81,14 @@ def test_a_logger_that_stays_down_costs_one_line(tmp_path: Path, capsys: pytest.
 
 def test_a_logger_that_hangs_holds_up_neither_the_run_nor_another(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.setattr(module, "MAX_WAIT", 0.3)
-    monkeypatch.setattr(module, "EXIT_WAIT", 0.3)
     hung, other = Server(gate=threading.Event()), Server()
-    loggers = loggers_of(tmp_path, hung, other)
-    for name in "01":
-        run = a_run(tmp_path, name * 16)
-        with loggers.following(run):
-            run.finish([])
-        until(lambda run=run: other.status.get(run.id) == "done", "the other's end")
-        monkeypatch.setattr(module, "MAX_WAIT", 1e6)  # later runs do not wait while one hangs
-    module._join_slow()
-    assert capsys.readouterr().err.count("not shown in fake0: it is too slow") == 2
+    run = a_run(tmp_path)
+    with loggers_of(tmp_path, hung, other).following(run):
+        run.finish([])
+    until(lambda: other.status.get(run.id) == "done", "the other's end")
+    assert capsys.readouterr().err.count("not shown in fake0: it is too slow") == 1
     hung.gate.set()
-    until(lambda: len(hung.fingerprints) == 2, "both ends, late")
+    until(lambda: len(hung.fingerprints) == 1, "the end, late")
 
 
 def test_a_resumed_run_that_repeats_steps_is_replaced_at_its_end(tmp_path: Path):
@@ -143,21 +133,3 @@ def test_a_sync_leaves_runs_in_progress_and_tells_what_fails(tmp_path: Path):
     with live.lock():
         assert sync(logger, [live, bad, good], said.append) == {"live": 1, "failed": 1, "shown": 1}
     assert "config.yaml" in said[0]
-
-
-def test_sweeps_that_left_a_summary_are_shown_by_their_folders(tmp_path: Path, capsys):
-    """A sweep file with two command lines has two folders."""
-    logger, said = FakeLogger(), []
-    folders = [tmp_path / "mine", tmp_path / "mine-9b8d1a20", tmp_path / "without"]
-    summary = {"name": "mine", "status": "done", "labels": {}, "aggregates": {}, "verdicts": {}}
-    for folder in folders:
-        folder.mkdir()
-    for folder in folders[:2]:
-        write_json(folder / "summary.json", summary)
-    assert sync_sweeps(logger, folders, said.append) == 2
-    assert logger.server.sweeps == ["mine", "mine-9b8d1a20"]
-    logger.server.down = True
-    assert sync_sweeps(logger, folders[:1], said.append) == 0
-    assert said == ["sweep mine is not shown in fake: connection refused"]
-    Loggers((logger,), tmp_path).sweep(folders[0])
-    assert said[0] in capsys.readouterr().err

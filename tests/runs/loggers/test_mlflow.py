@@ -13,9 +13,8 @@ from fake_logger import an_outdated_evaluation
 from processes import finished
 
 from memmlp.common.files import write_json
-from memmlp.runs.loggers.facts import SweepFacts
 from memmlp.runs.loggers.logger import Session, sync
-from memmlp.runs.loggers.mlflow import MLflow, allowed_name
+from memmlp.runs.loggers.mlflow import MLflow
 from memmlp.runs.notes import add_tags, remove_tags, set_note
 from memmlp.runs.run import Run
 
@@ -142,13 +141,6 @@ def test_many_values_go_in_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert len(history(tmp_path, run, "train/b")) == 600
 
 
-def test_the_environment_names_the_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    assert MLflow(None, tmp_path).place == f"sqlite:///{tmp_path / 'mlflow.db'}"
-    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://somewhere")
-    assert MLflow(None, tmp_path).place == "http://somewhere"
-    assert MLflow("http://else", tmp_path).place == "http://else"
-
-
 def test_a_server_that_is_not_there_is_told(tmp_path: Path):
     said: list[str] = []
     assert sync(MLflow("http://127.0.0.1:9", tmp_path), [begun(tmp_path)], said.append) == {"failed": 1}
@@ -181,33 +173,3 @@ def test_cold_starts_at_once_do_not_ruin_the_store(tmp_path: Path):
     ran = finished([sys.executable, "-c", COLD, str(tmp_path), *names])
     assert (ran.returncode, ran.stderr) == (0, "")
     assert shown(tmp_path).keys() == set(names)
-
-
-def test_a_sweep_is_the_parent_of_its_runs(tmp_path: Path):
-    logger, (first, second) = MLflow(None, tmp_path), ("a" * 16, "b" * 16)
-    sync(logger, [begun(tmp_path, first), begun(tmp_path, second)], print)
-    (tmp_path / "table.md").write_text("| a table |")
-    means, verdicts = {"none/stream/MPJPE": 6.5, "gone": 1.0}, {"none (w/o codes)/stream/MPJPE": "holds"}
-    for aggregates in (means, {"none/stream/MPJPE": 6.5}):
-        logger.sweep(SweepFacts("table11", tmp_path, "failed", {first: "with VQ-VAE"}, {}, {}, ()))
-        logger.sweep(
-            SweepFacts(
-                "table04", tmp_path, "done", {first: "full", second: "none"}, aggregates, verdicts,
-                (tmp_path / "table.md",),
-            )
-        )  # fmt: skip
-    found = shown(tmp_path)
-    assert found.keys() == {first, second, "table04", "table11"}
-    shared, own, parent = found[first].data.tags, found[second].data.tags, found["table04"]
-    assert shared["mlflow.parentRunId"] == own["mlflow.parentRunId"] == parent.info.run_id
-    assert (shared["memmlp.variant.table04"], shared["memmlp.variant.table11"]) == ("full", "with VQ-VAE")
-    assert "memmlp.variant.table11" not in own
-    assert (parent.info.status, found["table11"].info.status) == ("FINISHED", "FAILED")
-    assert parent.data.metrics == {"none/stream/MPJPE": 6.5}
-    assert parent.data.tags[f"verdict/{allowed_name('none (w/o codes)/stream/MPJPE')}"] == "holds"
-    assert files(tmp_path, "table04") == {"table.md"}
-
-
-def test_names_that_mlflow_does_not_allow_stay_different():
-    assert allowed_name("stream/MPJPE cm") == "stream/MPJPE cm"
-    assert len({allowed_name("a,b"), allowed_name("a;b"), "a_b"}) == 3

@@ -9,7 +9,6 @@ import pytest
 from fake_logger import a_run, an_outdated_evaluation
 from processes import until
 
-from memmlp.runs.loggers.facts import SweepFacts
 from memmlp.runs.loggers.logger import Session, sync
 from memmlp.runs.loggers.tensorboard import TensorBoard
 from memmlp.runs.notes import set_note
@@ -79,18 +78,3 @@ def test_it_tells_how_a_run_ended_and_what_people_said(tmp_path: Path):
     assert (texts["status"], texts["reason"], texts["note"]) == ("failed", "loss is nan", "a note")
     assert "| seed | 0 |" in texts["config"]
     assert texts["outdated results"].startswith("stream (mode.stream 0 -> ")
-
-
-def test_a_sweep_is_its_table_verdicts_and_aggregates(tmp_path: Path):
-    logger = TensorBoard(tmp_path)
-    (tmp_path / "table.md").write_text("| a table |")
-    facts = SweepFacts(
-        "mine", tmp_path, "done", {}, {"a/stream/MPJPE": 6.5}, {"a/stream/MPJPE": "holds"},
-        (tmp_path / "table.md",),
-    )  # fmt: skip
-    for _ in range(2):
-        logger.sweep(facts)
-    found = {tag.split("/text")[0]: value for tag, _, value in events(Path(logger.place) / "sweep mine")}
-    assert (found["status"], found["table"]) == ("done", "| a table |")
-    assert "| a/stream/MPJPE | holds |" in str(found["verdicts"])
-    assert found["a/stream/MPJPE"] == 6.5

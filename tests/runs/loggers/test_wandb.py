@@ -13,7 +13,6 @@ from fake_logger import a_run, an_outdated_evaluation
 from processes import until
 
 from memmlp.common.files import write_json
-from memmlp.runs.loggers.facts import SweepFacts
 from memmlp.runs.loggers.logger import Session, sync
 from memmlp.runs.loggers.wandb import WandB
 from memmlp.runs.notes import add_tags
@@ -100,18 +99,3 @@ def test_a_failed_run_with_its_curve_name_and_tags_once(tmp_path: Path):
     (end,) = [record.exit for record in found if record.WhichOneof("record_type") == "exit"]
     assert end.exit_code == 1
     assert summary(found)["outdated results"].startswith("stream (mode.stream 0 -> ")
-
-
-def test_a_sweep_is_a_run_with_its_verdicts(tmp_path: Path):
-    logger = WandB("mine", tmp_path)
-    facts = SweepFacts(
-        "mine", tmp_path, "running", {}, {"a/stream/MPJPE": 6.5}, {"a/stream/MPJPE": "holds"}, ()
-    )
-    for _ in range(2):
-        logger.sweep(facts)
-    (folder,) = Path(logger.place).glob("offline-run-*")
-    found = records(logger, folder.name.rsplit("-", 1)[-1])
-    kept = summary(found)
-    assert (kept["a/stream/MPJPE"], kept["verdict/a/stream/MPJPE"]) == (6.5, "holds")
-    (end,) = [record.exit for record in found if record.WhichOneof("record_type") == "exit"]
-    assert end.exit_code == 1  # not finished

@@ -12,7 +12,7 @@ from memmlp.sweep.executors.slurm import Requeued, Slurm, SlurmOptions, batch_sc
 
 
 def lines(tmp_path: Path, workers: int = 1, **words: str) -> list[str]:
-    return batch_script(tmp_path / "%j", slurm_options(words), workers).splitlines()
+    return batch_script(tmp_path / "%j", slurm_options({"time": "60", **words}), workers).splitlines()
 
 
 def test_options_reach_sbatch(tmp_path: Path):
@@ -27,17 +27,6 @@ def test_options_reach_sbatch(tmp_path: Path):
     assert "module load cuda" in found
     assert f"submitit.core._submit {tmp_path}/%j" in "\n".join(found)
     assert "overcommit" not in "\n".join(found)
-
-
-def test_nothing_is_asked_for_that_nobody_asked_for(tmp_path: Path):
-    found = "\n".join(lines(tmp_path))
-    for word in ("wckey", "time", "array", "gpus", "partition"):
-        assert f"--{word}" not in found
-    assert "#SBATCH --wckey=lab" in lines(tmp_path, wckey="lab")
-
-
-def test_workers_are_one_array(tmp_path: Path):
-    assert "#SBATCH --array=0-7%8" in lines(tmp_path, 8)
 
 
 def test_times_are_slurms(tmp_path: Path):
@@ -65,7 +54,7 @@ def test_whether_a_job_is_to_have_a_gpu():
         ({"gres": "gpu:1"}, True),
         ({"gres": "disk:1"}, False), ({"mem_per_gpu": "8G"}, False), ({}, False),
     ):  # fmt: skip
-        assert slurm_options(settings).gpu is gpu, settings
+        assert slurm_options({"time": "60", **settings}).gpu is gpu, settings
 
 
 def test_bad_options_are_one_line():
@@ -75,7 +64,7 @@ def test_bad_options_are_one_line():
         ({"mem_gb": "x"}, "slurm.mem_gb=x"),
         ({"gpus": "-1"}, "slurm.gpus=-1"), ({"nodes": "2"}, "slurm.nodes: cannot be set"),
         ({"ntasks-per-node": "2"}, "cannot be set"), ({"Q": "x"}, "expected the long name"),
-        ({"comment": ""}, "expected the long name"),
+        ({"comment": ""}, "expected the long name"), ({"gpus": "1"}, "slurm.time: has no value"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=line) as error:
             slurm_options(settings)
@@ -122,21 +111,12 @@ def test_jobs_import_the_package_that_submits_them(tmp_path: Path, cluster: Path
     assert ("PYTHONSAFEPATH=1" in given) == (python is None)
 
 
-def test_a_replaced_worker_is_a_job_without_a_time_limit_of_its_own(tmp_path: Path, cluster: Path):
-    (handle,) = Slurm(tmp_path / "logs" / "%j", SlurmOptions()).submit(partial(print, "work"))
-    assert handle.job.job_id == "42"
-    given = (cluster / "given.sh").read_text()
-    assert "--array" not in given
-    assert "--time" not in given
-    assert handle.job.submission()._timeout_min > 0  # so that submitit can compare
-
-
 def test_what_sbatch_refuses_is_one_line(tmp_path: Path, cluster: Path):
     (cluster / "sbatch").write_text(
         "#!/bin/sh\necho \"sbatch: unrecognized option '--patition=x'\" >&2; exit 1\n"
     )
     with pytest.raises(InputError, match=r"executor=slurm: .*unrecognized option '--patition=x'") as error:
-        Slurm(tmp_path / "logs" / "%j", slurm_options({"patition": "x"})).submit(print)
+        Slurm(tmp_path / "logs" / "%j", slurm_options({"time": "60", "patition": "x"})).submit(print)
     assert "\n" not in str(error.value)
 
 

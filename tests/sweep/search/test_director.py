@@ -42,15 +42,6 @@ def test_a_search_has_the_trials_it_wants_and_the_papers_first(tmp_path: Path):
     assert study.best()[0].value == min(trial.value for trial in study.trials)
 
 
-def test_the_number_of_trials_is_a_total(tmp_path: Path):
-    to_the_end(open_study(tmp_path), tmp_path)
-    again = open_study(tmp_path)
-    assert director(again, tmp_path).update(2).tasks == ()
-    more = open_study(tmp_path, n_trials=8)
-    to_the_end(more, tmp_path)
-    assert len(more.trials) == 8
-
-
 def test_capacity_is_kept_and_each_plan_holds_what_is_under_way(tmp_path: Path):
     one = director(open_study(tmp_path), tmp_path)
     assert len(one.update(3).tasks) == 3
@@ -129,21 +120,6 @@ def test_a_trial_worse_than_the_median_is_pruned_and_its_run_cancelled(tmp_path:
     assert study.trials[0].intermediate_values == {10: 5.0, 20: 5.0, 30: 5.0}
     resumed = director(open_study(tmp_path, pruner="median", prune_after=2), tmp_path)
     assert set(resumed.update(1).cancelled) == {run.id, failed}
-
-
-def test_no_trial_is_pruned_at_its_last_step_or_without_a_pruner(tmp_path: Path):
-    for name, pruner, step in (("last", "median", STEPS), ("none", "none", 10)):
-        (tmp_path / name).mkdir()
-        study = open_study(tmp_path / name, pruner=pruner, prune_after=1)
-        one = director(study, tmp_path / name)
-        for level in (5.0, 6.0):
-            run = begun(one.update(1))
-            log(run, step, level)
-            if step < STEPS:
-                log(run, STEPS, level)
-            run.finish([])
-        log(begun(one.update(1)), step, 50.0)
-        assert one.update(1).cancelled == ()
 
 
 def test_a_failed_run_fails_its_trial_and_the_search_goes_on(tmp_path: Path):
@@ -267,25 +243,6 @@ def test_one_failed_seed_fails_the_trial_and_cancels_the_others(tmp_path: Path):
     assert study.trials[0].user_attrs["reason"] == "the loss is nan"
     assert {bad.id, other.id} <= set(plan.cancelled)
     assert other.id not in {task.id for task in plan.tasks}
-
-
-def test_a_director_killed_between_seeds_repeats_and_loses_none(tmp_path: Path):
-    (tmp_path / "calm").mkdir()
-    calm = open_study(tmp_path / "calm", seeds=3, n_trials=3)
-    one = seeded(calm, tmp_path / "calm")
-    while (plan := one.update(1)).tasks:
-        finish(plan)
-    stopped = open_study(tmp_path, seeds=3, n_trials=3)
-    made: list[str] = []
-    while tasks := (plan := seeded(stopped, tmp_path).update(1)).left():  # a director of its own for each run
-        made.append(tasks[0].id)
-        finish(replace(plan, tasks=tasks[:1]))
-        stopped = open_study(tmp_path, seeds=3, n_trials=3)
-    assert len(made) == len(set(made)) == 9
-    assert [trial.values for trial in stopped.trials] == [trial.values for trial in calm.trials]
-    assert [trial.user_attrs["runs"] for trial in stopped.trials] == [
-        trial.user_attrs["runs"] for trial in calm.trials
-    ]
 
 
 def test_validations_of_a_network_used_otherwise_are_no_trials(tmp_path: Path):

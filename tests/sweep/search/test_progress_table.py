@@ -6,7 +6,7 @@ import io
 from pathlib import Path
 
 import pytest
-from fake_search import STEPS, begun, director, finish, log, open_study
+from fake_search import director, finish, open_study
 from rich.console import Console
 
 from memmlp.sweep.search.progress_table import SearchBoard, describe_end, render
@@ -54,24 +54,3 @@ def test_a_trial_that_ended_says_on_which_device(tmp_path: Path, facts: dict, sa
     plan.run_of(plan.tasks[0]).write_manifest(facts)
     one.update(1)
     assert f"trial 0 {said}" in describe_end(study.trials[0], tmp_path)
-
-
-def test_a_trial_that_ended_is_told_with_values_of_any_kind(tmp_path: Path):
-    choices = {"model": {"cell": {"choices": ["gru", "lstm"], "first": "gru"}}}
-    choices |= {"data": {"mirror": {"choices": [False, True], "first": True}}}
-    space = {**choices, "optim": {"lr": {"low": 1e-3, "high": 1e-2, "first": 0.00123456}}}
-    study = open_study(tmp_path, space=space)
-    one = director(study, tmp_path)
-    run = begun(one.update(1))
-    log(run, STEPS, 1.0)
-    run.finish([])
-    one.update(1)
-    said = describe_end(study.trials[0], tmp_path)
-    assert said.endswith("1.000 (model.cell=gru, data.mirror=True, optim.lr=0.001235)")
-
-
-def test_brackets_of_a_value_are_shown(tmp_path: Path):
-    choices = {"evaluation": {"modes": {"choices": ["[stream]", "[window]"], "first": "[stream]"}}}
-    study = open_study(tmp_path, space=choices)
-    director(study, tmp_path).update(1)
-    assert "[stream]" in drawn(study, tmp_path)

@@ -31,17 +31,6 @@ def test_a_resumed_search_proposes_what_the_undisturbed_one_does(tmp_path: Path)
     assert [trial.params for trial in last.trials] == [trial.params for trial in calm.trials]
 
 
-def test_the_seed_changes_what_is_proposed_and_the_sampler_too(tmp_path: Path):
-    proposed = []
-    for name, changes in {"a": {}, "b": {"seed": 1}, "c": {"sampler": "random"}}.items():
-        (tmp_path / name).mkdir()
-        study = open_study(tmp_path / name, **changes)
-        to_the_end(study, tmp_path / name, capacity=1)
-        proposed.append([tuple(trial.params.values()) for trial in study.trials])
-    assert proposed[0] != proposed[1]
-    assert proposed[0] != proposed[2]
-
-
 def test_a_grid_has_each_combination_once_in_order_however_often_it_is_stopped(tmp_path: Path):
     space = {"loss": {"rotation_all": {"choices": [1.0, 2.0]}, "hand": {"choices": [0.1, 0.2, 0.3]}}}
     grid = {"sampler": "grid", "space": space, "n_trials": 6, "startup": None, "prune_after": None}
@@ -102,15 +91,6 @@ def test_an_owner_that_wakes_up_superseded_tells_the_study_nothing(tmp_path: Pat
         study.ask()
     assert journal(tmp_path).read_bytes() == before
     assert open_study(tmp_path).trials == []
-
-
-def test_mending_leaves_a_whole_journal_alone(tmp_path: Path):
-    open_study(tmp_path)
-    content = journal(tmp_path).read_bytes()
-    mend(journal(tmp_path))
-    assert journal(tmp_path).read_bytes() == content
-    mend(tmp_path / "none.journal")
-    assert not (tmp_path / "none.journal").exists()
 
 
 def test_a_study_is_looked_at_while_its_owner_works(tmp_path: Path):
