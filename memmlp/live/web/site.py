@@ -46,7 +46,7 @@ OTHER_PAGES = {
         "stage.js", "history.js", "three/three.module.min.js", "three/three.core.min.js",
         "three/OrbitControls.js", "three/LICENSE",
     ),
-    "memmlp.common": ("theme.js", "dom.js", "style.css"),
+    "memmlp.common": ("dom.js", "style.css"),
 }  # fmt: skip
 """Files of other pages that a site uses, by the package that contains them."""
 RUNTIME = {

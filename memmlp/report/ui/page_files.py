@@ -12,7 +12,7 @@ from typing import Any
 from memmlp.common.page_server import read_page_file
 
 OWN, LIVE, SHARED = "memmlp.report.ui", "memmlp.live.session", "memmlp.common"
-SCRIPTS = {"theme.js": SHARED, "plot/d3.min.js": OWN, "plot/plot.umd.min.js": OWN}
+SCRIPTS = {"plot/d3.min.js": OWN, "plot/plot.umd.min.js": OWN}
 MODULES = {
     **dict.fromkeys(
         ("main.js", "store.js", "filter.js", "format.js", "charts.js", "runs.js", "run.js", "sweeps.js",

@@ -251,6 +251,5 @@ def check_bench(browser: Browser, file: Path) -> None:
     kinds = [(row["network"], row["graph"], row["precision"]) for row in measured.rows]
     graphs = [("naive", "fp32"), ("streaming", "fp32"), ("streaming", "int8"), ("streaming", "fp16")]
     assert kinds == [(name, *graph) for name in ("AvatarPoser", "tiny") for graph in graphs]
-    assert measured.rows[0]["ratio_to_avatar_poser"] == 1
     assert {row["steps"] for row in measured.rows} == {500}
     assert [row["whole_median_ms"] is not None for row in measured.rows] == [True, True, False, True] * 2

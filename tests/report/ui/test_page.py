@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from threading import Event
 
 import pytest
 from chromium import Browser
@@ -243,34 +242,6 @@ def test_a_phone_s_page_is_not_wider_than_the_phone(browser: Browser, server: Ru
     assert browser.value("document.querySelector('.runs thead th.n').getBoundingClientRect().right") <= 390
 
 
-def test_colours_are_a_choice_that_is_kept(browser: Browser, server: RunsServer):
-    paper = "getComputedStyle(document.body).backgroundColor"
-    go(browser, server.url, "runs", "document.querySelector('h1')")
-    light = browser.value(paper)
-    for _ in range(2):  # from the system's to light, and to dark
-        browser.click("#theme")
-    dark = browser.value(paper)
-    assert dark != light
-    go(browser, server.url, "sweeps", "document.querySelector('h1')")
-    assert browser.value(paper) == dark
-
-
-def test_a_replay_says_that_the_other_run_s_is_being_computed(browser: Browser, home: Path):
-    seen = Event()
-
-    def slow(run: Run, clip: str, mode: str) -> dict:
-        if run.config["memory"]["name"] == "none":
-            seen.wait()
-        return predict(run, clip, mode)
-
-    with RunsServer(Answers(home, slow), 0) as server:
-        go(browser, server.url, f"run/{run_of(home, 'gru', 1).id}", "document.querySelector('.view .wait')")
-        assert browser.value("document.querySelector('.view .wait').textContent") == "computing …"
-        seen.set()
-        browser.wait("/ 3$/.test(document.documentElement.dataset.replayed)")
-        assert browser.value("document.querySelector('.view .wait')") is None
-
-
 def test_a_file_without_a_server(browser: Browser, home: Path, tmp_path: Path):
     folder = home / "sweeps" / "mine"
     sweep, plan = kept_sweep(folder), Plan.load(folder / "plan.json")
@@ -289,7 +260,7 @@ def test_a_file_without_a_server(browser: Browser, home: Path, tmp_path: Path):
     file.write_text(text)
     go(browser, file.as_uri(), "", "document.querySelectorAll('main h2').length >= 2")
     heads = "[...document.querySelectorAll('main h2')].map(one => one.textContent)"
-    assert browser.value(heads) == ["Mine", "Other", "Accuracy and latency"]  # one without runs comes last
+    assert browser.value(heads) == ["Mine", "Other"]  # one without runs comes last
     assert browser.value("document.body.textContent.includes('Generated today')")
     assert browser.value("document.querySelectorAll('.verdict').length") == 2
     go(browser, file.as_uri(), "runs", f"{NAMES}.length == 6")

@@ -26,7 +26,6 @@ export class Stage {
     this.light();
     this.themed();
     matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => this.themed());
-    addEventListener('theme', () => this.themed()); // a switch on the page
   }
 
   light() {

@@ -163,13 +163,13 @@ export function history(trials, { label, open }) {
 }
 
 // Points { id, x, y, text } in two measures; those on the front have the second colour, and a line.
-export function scatter(points, { x, y, front, log = false, line = true }) {
+export function scatter(points, { x, y, front }) {
   const best = points.filter(point => front.has(point.id)).sort((a, b) => a.x - b.x);
   const draw = width => Plot.plot(base(width, 300, {
-    x: { label: x, type: log ? 'log' : 'linear', grid: true, nice: true, ticks: Math.min(width / 90, 8), tickFormat: '~r', labelAnchor: 'center', labelArrow: 'none' },
+    x: { label: x, grid: true, nice: true, ticks: Math.min(width / 90, 8), tickFormat: '~r', labelAnchor: 'center', labelArrow: 'none' },
     y: { label: y, grid: true, nice: true, ticks: 6 },
     marks: [
-      line ? Plot.line(best, { x: 'x', y: 'y', stroke: 'var(--series1)', strokeWidth: 1.5, curve: 'step-after', strokeDasharray: '4 3' }) : null,
+      Plot.line(best, { x: 'x', y: 'y', stroke: 'var(--series1)', strokeWidth: 1.5, curve: 'step-after', strokeDasharray: '4 3' }),
       Plot.dot(points, { x: 'x', y: 'y', r: 5, fill: point => (front.has(point.id) ? 'var(--series1)' : 'var(--series0)'), fillOpacity: 0.85 }),
       tip(points, { x: 'x', y: 'y', title: 'text' }),
     ],

@@ -8,11 +8,12 @@ import { number } from './format.js';
 
 const WAIT = 700; // milliseconds between two requests for a prediction
 const COLOURS = ['var(--series0)', 'var(--series1)'];
+const SPEED = 0.5; // of the motion
 const still = matchMedia('(prefers-reduced-motion: reduce)');
 
 export class Replay {
   constructor(place) {
-    Object.assign(this, { place, asked: 0, views: [], speed: 0.5 });
+    Object.assign(this, { place, asked: 0, views: [] });
   }
 
   close() {
@@ -29,25 +30,22 @@ export class Replay {
     this.views = [];
   }
 
-  // Show a run's clip in a mode, and another run beside it as soon as its prediction is computed.
+  // Show a run's clip in a mode, beside the truth and beside another run.
   async show(run, clip, mode, other) {
     const asked = ++this.asked;
     this.stop();
-    replace(this.place, h('p', { class: 'wait' }, 'Computing the network’s prediction for this clip; the first time takes some seconds.'));
+    replace(this.place, h('p', { class: 'wait' }, 'Computing the networks’ predictions for this clip; the first time takes some seconds.'));
     try {
       this.body ??= await ask('body');
       const mine = await this.fetch(asked, run.id, clip, mode);
-      const same = this.run === run && this.clip === clip;
-      Object.assign(this, { run, clip, mine, theirs: null, other });
+      const theirs = other && await this.fetch(asked, other.id, clip, mode, mine.from / mine.fps).catch(error => ({ reason: error.message }));
       if (asked !== this.asked) return;
-      this.start(asked, same);
-      if (!other) return;
-      const theirs = await this.fetch(asked, other.id, clip, mode, mine.from / mine.fps).catch(error => ({ reason: error.message }));
-      if (asked !== this.asked) return;
-      const comparable = theirs.frames === mine.frames && theirs.from === mine.from;
-      Object.assign(this, comparable ? { theirs } : { other: null });
-      this.start(asked, true);
-      if (!comparable) this.place.append(h('p', { class: 'faint' }, `${nameOf(other)}: ${theirs.reason ?? 'its clip has another motion'}`));
+      const comparable = theirs?.frames === mine.frames && theirs.from === mine.from;
+      const shown = [[run, mine], ...(comparable ? [[other, theirs]] : [])];
+      Object.assign(this, { run, mine, shown, loop: mine.worst[0], time: mine.worst[0].first / mine.fps, playing: !still.matches });
+      this.layout();
+      if (other && !comparable) this.place.append(h('p', { class: 'faint' }, `${nameOf(other)}: ${theirs.reason ?? 'its clip has another motion'}`));
+      this.animate(asked);
     } catch (error) {
       if (asked === this.asked) replace(this.place, h('div', { class: 'empty' }, h('p', { class: 'lead' }, 'This clip cannot be replayed.'), h('p', {}, error.message)));
     }
@@ -64,17 +62,11 @@ export class Replay {
     }
   }
 
-  // Lay the views out and play; `same` continues at the time of before.
-  start(asked, same) {
-    const { mine } = this;
-    this.stop();
-    if (!same || this.time === undefined) Object.assign(this, { time: mine.worst[0].first / mine.fps, playing: !still.matches, loop: mine.worst[0] });
-    else this.loop = mine.worst.find(one => one.first === this.loop?.first) ?? this.loop;
-    this.layout();
+  animate(asked) {
     let last = performance.now();
     const tick = now => {
       if (asked !== this.asked) return;
-      if (this.playing) this.forward((Math.min(Math.max(now - last, 0), 100) / 1000) * this.speed);
+      if (this.playing) this.forward((Math.min(Math.max(now - last, 0), 100) / 1000) * SPEED);
       last = now;
       this.draw();
       this.tick = requestAnimationFrame(tick);
@@ -96,15 +88,14 @@ export class Replay {
   }
 
   layout() {
-    const { mine, theirs, run, other, body } = this;
+    const { mine, shown, body } = this;
     const frames = mine.joints.length;
-    this.top = Math.max(mine.top, theirs?.top ?? 0);
-    const panels = [['Truth', null], [nameOf(run), mine], ...(theirs ? [[nameOf(other), theirs]] : [])].map(([name, data]) => {
+    this.top = Math.max(...shown.map(([, data]) => data.top));
+    const panels = [['Truth', null], ...shown.map(([one, data]) => [nameOf(one), data])].map(([name, data]) => {
       const canvas = h('canvas', { 'aria-label': `${name} in 3D` });
       const error = h('b', { class: 'n' });
       return { data, canvas, error, element: h('div', { class: 'view' }, h('div', { class: 'view-stage' }, canvas), h('p', { class: 'view-name' }, h('span', {}, name), data ? [error, ' cm'] : null)) };
     });
-    const waiting = other && !theirs ? h('div', { class: 'view' }, h('div', { class: 'view-stage' }, h('p', { class: 'wait', role: 'status' }, 'computing …')), h('p', { class: 'view-name' }, h('span', {}, nameOf(other)))) : null;
     const piece = (loop, ...text) => ({ loop, button: h('button', { type: 'button', class: 'small', onclick: () => this.repeat(loop) }, text) });
     this.pieces = [
       ...mine.worst.map((one, i) => piece(one, `${i ? `${i + 1}.` : 'Worst second'} at ${number(one.first / mine.fps, 1)} s: `, h('b', {}, number(one.mean, 1)), ' cm')),
@@ -113,13 +104,11 @@ export class Replay {
     this.play = h('button', { type: 'button', class: 'primary', onclick: () => { this.playing = !this.playing; } });
     this.slider = h('input', { type: 'range', 'aria-label': 'Time in the clip', min: mine.from, max: mine.from + frames - 1, step: 1, oninput: event => this.go(event.target.valueAsNumber / mine.fps) });
     this.clock = h('output', { class: 'n' });
-    const speeds = h('select', { 'aria-label': 'Speed', onchange: event => { this.speed = Number(event.target.value); } }, [0.1, 0.25, 0.5, 1].map(speed => h('option', { value: speed, selected: speed === this.speed }, `${speed}×`)));
-    const shown = [[run, mine], ...(theirs ? [[other, theirs]] : [])];
     this.chart = timeline(shown.map(([one, data]) => ({ errors: data.errors, name: nameOf(one) })), { fps: mine.fps, label: 'error [cm] by second', at: () => this.time, go: time => this.go(time), marks: mine.worst, colours: COLOURS });
     const scale = h('div', { class: 'scale' }, '0', h('i', { style: `background:linear-gradient(to right, ${body.heat.join(', ')})` }), `${this.top}+ cm`);
     const keys = h('div', { class: 'keys' }, shown.map(([one], i) => h('span', { class: 'key still' }, h('i', { style: `background:${COLOURS[i]}` }), nameOf(one))));
     replace(this.place, h('div', { class: 'replay', tabindex: 0, role: 'group', 'aria-label': 'Replay; space plays, arrows step a frame', onkeydown: event => this.press(event) },
-      h('div', { class: `views of${waiting ? 3 : panels.length}` }, panels.map(panel => panel.element), waiting), h('div', { class: 'transport' }, this.play, this.slider, this.clock, speeds),
+      h('div', { class: `views of${panels.length}` }, panels.map(panel => panel.element)), h('div', { class: 'transport' }, this.play, this.slider, this.clock),
       h('div', { class: 'pieces' }, this.pieces.map(one => one.button), scale), keys, this.chart));
     try {
       this.views = panels.map(panel => ({ ...panel, stage: new Stage(panel.canvas, { limbs: body.limbs, heat: body.heat, top: this.top }) }));

@@ -146,21 +146,11 @@ function config(run) {
   const paths = run.control?.data === run.data ? run.paths : [];
   const keys = [...new Set([...Object.keys(run.config), ...Object.keys(other ?? {})])].filter(key => !/\._(target|partial)_$/.test(key));
   const differs = key => other && !paths.includes(key) && JSON.stringify(run.config[key] ?? null) !== JSON.stringify(other[key] ?? null);
-  const list = h('div');
-  const tools = h('div', { class: 'tools' });
-  const set = { all: !other, text: '' };
-  function draw() {
-    const shown = keys.filter(key => (set.all || differs(key)) && `${key}=${run.config[key]}`.toLowerCase().includes(set.text.toLowerCase()));
-    const row = key => [differs(key) ? h('th', { scope: 'row', class: 'strong' }, key) : key, word(run.config[key]), ...(other ? [h('td', { class: 'faint' }, word(other[key]))] : [])];
-    replace(list, shown.length ? table(['key', 'this run', ...(other ? [nameOf(run.control)] : [])], shown.map(row), { n: false, kind: 'config' }) : h('p', { class: 'faint' }, set.text ? 'No key matches.' : 'No key differs.'));
-  }
-  function drawTools() {
-    replace(tools, other ? choice('Keys', [[false, 'differing'], [true, 'all']], set.all, all => { set.all = all; drawTools(); draw(); }) : null,
-      h('label', { class: 'field' }, h('span', {}, 'Key'), h('input', { type: 'text', value: set.text, oninput: event => { set.text = event.target.value; draw(); } })));
-  }
-  drawTools();
-  draw();
-  return keys.length ? section(other ? `Config against ${nameOf(run.control)}` : 'Config', tools, list) : null;
+  const rows = shown => table(['key', 'this run', ...(other ? [nameOf(run.control)] : [])],
+    shown.map(key => [key, word(run.config[key]), ...(other ? [h('td', { class: 'faint' }, word(other[key]))] : [])]), { n: false, kind: 'config' });
+  const differing = keys.filter(differs);
+  const first = other && (differing.length ? rows(differing) : h('p', { class: 'faint' }, 'No key differs.'));
+  return keys.length ? section(other ? `Config against ${nameOf(run.control)}` : 'Config', first, h('details', { open: !other }, h('summary', {}, 'All keys'), rows(keys))) : null;
 }
 
 function latency({ latency: found }) {

@@ -42,7 +42,7 @@ export function page() {
   const chosen = new Set((place().query.get('sel') ?? '').split(',').filter(Boolean));
   const ui = { drawn: STEP };
   const counted = h('p', { class: 'count', role: 'status' });
-  const best = h('p', { class: 'best' });
+  const dataSets = h('p', { class: 'best' });
   const chips = h('div', { class: 'chips', role: 'group', 'aria-label': 'Status' });
   const table = h('table', { class: 'runs' });
   const more = h('button', { type: 'button', class: 'more', onclick: () => { ui.drawn += STEP * 4; body(); } });
@@ -74,13 +74,13 @@ export function page() {
     const groups = [ui.auto.slice(0, KEYS), measured];
     ui.columns = query.get('cols') === null ? (NARROW.matches ? groups.reverse() : groups).flat() : query.get('cols').split('|').filter(Boolean);
     drawStates(found, settings.status);
-    drawBest();
+    drawDataSets();
     head(settings.sort);
     body();
     menu();
     selection();
     replace(counted, `${number(ui.list.length)} of ${number(runs.size)} runs`);
-    scroll.hidden = best.hidden = !ui.list.length;
+    scroll.hidden = !ui.list.length;
     replace(nothing, ui.list.length ? null : runs.size ? noMatch(settings) : noRuns());
   }
 
@@ -99,17 +99,11 @@ export function page() {
       h('button', { type: 'button', class: `chip ${name}`, 'aria-pressed': String(name === status), onclick: () => set({ status: name }) }, text, h('b', {}, number(many)))));
   }
 
-  function drawBest() {
-    if (ui.data.length > 1) {
-      const choose = data => set({ filter: `${place().query.get('filter') ?? ''} data=${data}`.trim() });
-      replace(best, `On ${ui.data.length} data sets, whose errors are not comparable: `, ui.data.slice(0, 5).map(data => h('button', { type: 'button', class: 'small', onclick: () => choose(data) }, dataName(data) || 'unknown', ' ', h('small', {}, number(ui.list.filter(run => run.data === data).length)))));
-      return;
-    }
-    const metric = ui.columns.find(name => name.startsWith('stream.')) ?? METRICS[0];
-    const known = ui.list.filter(run => FINISHED.includes(run.status) && typeof run.metrics[metric] === 'number');
-    const value = bestOf(metric, known.map(run => run.metrics[metric]));
-    const first = known.find(run => run.metrics[metric] === value);
-    replace(best, first ? ['Best of these by ', metricText(metric), ': ', link(address('run', first.id), nameOf(first)), ' ', h('b', {}, metricNumber(metric, value)), ' · ', link(address('run', first.id, { part: 'replay' }), 'its worst second')] : null);
+  // Errors on several data sets are not comparable: offer to filter by one.
+  function drawDataSets() {
+    const choose = data => set({ filter: `${place().query.get('filter') ?? ''} data=${data}`.trim() });
+    const buttons = ui.data.slice(0, 5).map(data => h('button', { type: 'button', class: 'small', onclick: () => choose(data) }, dataName(data) || 'unknown', ' ', h('small', {}, number(ui.list.filter(run => run.data === data).length))));
+    replace(dataSets, ui.data.length > 1 ? [`On ${ui.data.length} data sets, whose errors are not comparable: `, buttons] : null);
   }
 
   function head(sort) {
@@ -193,7 +187,7 @@ export function page() {
 
   const element = h('div', { class: 'page wide' },
     h('div', { class: 'bar' }, h('h1', {}, 'Runs'), counted, h('label', { class: 'search' }, h('span', { class: 'hidden' }, 'Filter of runs'), filter), kind, columns, compare),
-    h('div', { class: 'bar' }, chips, best), scroll, nothing);
+    h('div', { class: 'bar' }, chips, dataSets), scroll, nothing);
   draw();
   return { title: 'Runs', element, update: () => { draw(); say(`${ui.list.length} runs`); }, close: () => removeEventListener('click', closeMenu) };
 }

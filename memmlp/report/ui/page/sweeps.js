@@ -3,7 +3,7 @@
 import { h, replace, link, section, empty, choice, table } from './dom.js';
 import { address, ask, generated, inFile, nameOf, place, remember, runs } from './store.js';
 import { curvePanel } from './compare.js';
-import { forest, scatter } from './charts.js';
+import { forest } from './charts.js';
 import { ACTIVE, look, state, STATE_WORDS } from './runs.js';
 import { DASH, decimals, duration, effectDigits, metricNumber, metricText, number, signed } from './format.js';
 
@@ -57,7 +57,7 @@ export async function single(name) {
   return { title: sweep.title, element, update };
 }
 
-// The tables of all sweeps below each other, and errors against speed.
+// The tables of all sweeps below each other.
 export async function tables() {
   const { sweeps } = await ask('sweeps');
   const pages = await Promise.all(sweeps.map(sweep => ask(`sweeps/${sweep.name}`)));
@@ -69,29 +69,13 @@ export async function tables() {
     return own;
   };
   const element = h('div', { class: 'page' }, h('h1', {}, 'Tables'), generated ? h('p', { class: 'faint sub' }, generated) : null,
-    pages.length ? [h('details', { open: pages.length < 6 }, h('summary', {}, 'Contents'), contents), pages.map(part), speeds(pages)] : noSweeps());
+    pages.length ? [h('details', { open: pages.length < 6 }, h('summary', {}, 'Contents'), contents), pages.map(part)] : noSweeps());
   return { title: 'Tables', element };
 }
 
 function notes(found, head = 'h2') {
   const lines = [...found.flags, ...found.legend, ...found.notes];
   return lines.length ? h('section', {}, h(head, {}, 'How to read it'), h('ul', { class: 'remarks' }, lines.map(line => h('li', {}, line)))) : null;
-}
-
-// The paper's Fig. 1 with a point for each measured variant, and the paper's systems with both numbers.
-function speeds(pages) {
-  const measured = pages.flatMap(one => [...new Set(one.cells.map(cell => cell.variant))].map(variant => {
-    const found = one.cells.filter(cell => cell.variant === variant).map(cell => runs.get(cell.id)?.metrics ?? {}).filter(metrics => metrics['latency.median_ms'] && typeof metrics['stream.rotation.MPJRE'] === 'number');
-    const mean = name => found.reduce((sum, metrics) => sum + metrics[name], 0) / found.length;
-    return found.length ? { id: `${one.name} ${variant}`, x: 1000 / mean('latency.median_ms'), y: mean('stream.rotation.MPJRE'), text: `${one.table.caption}\n${variant}` } : null;
-  })).filter(Boolean);
-  if (!measured.length) return null;
-  const printed = metric => pages.flatMap(one => one.table.rows.map(row => [row.label, Object.values(row.cells)[0]?.[metric]?.paper])).filter(([, value]) => typeof value === 'number');
-  const systems = printed('FPS').map(([label, fps]) => [label, fps, printed('MPJRE').find(([other]) => other.toLowerCase().startsWith(label.toLowerCase()))?.[1]]).filter(([, , value]) => value !== undefined)
-    .map(([label, x, y]) => ({ id: `paper ${label}`, x, y, text: `${label}, paper` }));
-  const front = new Set(systems.map(point => point.id));
-  return section('Accuracy and latency', scatter([...measured, ...systems], { x: 'frames a second', y: 'MPJRE [°], stream mode', front, log: true, line: false }),
-    h('p', { class: 'faint' }, 'A point for each variant: its mean over seeds, against frames a second of one CPU core here. In the second colour: the paper’s systems, which ran on a Meta Quest 3 with other data.'));
 }
 
 function board(sweep) {
