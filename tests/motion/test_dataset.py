@@ -6,7 +6,7 @@ import tiny
 import torch
 from plain_body import posed
 
-from memmlp.motion.body import FRAME_DIM, JOINTS, ROTATION, SPARSE_DIM, SWAPPED
+from memmlp.motion.body import FRAME_DIM, JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.dataset import MirroredDataset, MotionDataset, WindowSampler, mirror_frames
 from memmlp.motion.geometry import motion_frames
 
@@ -44,19 +44,6 @@ def test_the_sampler_draws_every_window_alike_and_the_step_is_its_position(frame
 
 
 CLIP = tiny.clip(20)
-
-
-def test_left_and_right_change_places():
-    pairs = {(JOINTS[i], JOINTS[j]) for i, j in enumerate(SWAPPED)}
-    assert ("left_knee", "right_knee") in pairs
-    assert ("right_wrist", "left_wrist") in pairs
-    assert ("spine2", "spine2") in pairs
-    assert sum(a != b for a, b in pairs) == 16
-
-
-def test_twice_is_nothing_and_once_is_not():
-    assert torch.equal(mirror_frames(mirror_frames(CLIP)), CLIP)
-    assert not torch.allclose(mirror_frames(CLIP), CLIP)
 
 
 def test_joints_of_the_mirrored_rotations_are_the_mirrored_joints():

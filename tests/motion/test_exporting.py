@@ -38,20 +38,15 @@ def files(folder: Path) -> list[str]:
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
 
 
-@pytest.mark.parametrize("name", FORMATS)
-def test_names_are_kept_and_a_bad_clip_is_skipped(folder: Path, tmp_path: Path, name: str):
-    report = export(plan_export(folder, tmp_path / "out", name))
-    suffix = FORMATS[name].suffix
-    assert files(tmp_path / "out") == [f"dance/one.v2{suffix}", f"walk{suffix}"]
-    assert [path.relative_to(tmp_path / "out").as_posix() for path in report.written] == files(
-        tmp_path / "out"
-    )
-    assert [skipped.file for skipped in report.skipped] == ["bad.npz"]
-    assert str(tmp_path) not in report.skipped[0].reason
-    assert report.seconds == pytest.approx(2 * 5 / 120)
-
-
-def test_strict_stops_at_a_bad_clip(folder: Path, tmp_path: Path):
+def test_names_are_kept_and_a_bad_clip_is_skipped(folder: Path, tmp_path: Path):
+    for name, chosen in FORMATS.items():
+        out = tmp_path / f"out {name}"
+        report = export(plan_export(folder, out, name))
+        assert files(out) == [f"dance/one.v2{chosen.suffix}", f"walk{chosen.suffix}"]
+        assert [path.relative_to(out).as_posix() for path in report.written] == files(out)
+        assert [skipped.file for skipped in report.skipped] == ["bad.npz"]
+        assert str(tmp_path) not in report.skipped[0].reason
+        assert report.seconds == pytest.approx(2 * 5 / 120)
     with pytest.raises(InputError, match=r"bad\.npz: not a zip"):
         export(plan_export(folder, tmp_path / "out", "bvh"), strict=True)
 
@@ -103,39 +98,27 @@ def test_two_files_of_one_name_are_refused(folder: Path, tmp_path: Path):
         plan_export(folder, tmp_path / "out", "bvh")
 
 
-def test_a_file_behind_several_links_is_exported_once(folder: Path, tmp_path: Path):
-    (folder / "again").symlink_to(folder)
-    (folder / "other.npz").symlink_to(folder / "walk.npz")
-    assert len(export(plan_export(folder, tmp_path / "out", "bvh")).written) == 2
-
-
-@pytest.mark.parametrize(
-    ("source", "out", "name", "words"),
-    [
-        ("none.npz", "a.bvh", None, ("none.npz", "no such file or folder")),
-        ("walk.npz", "a.fbx", None, ("--out", "a.fbx", ".bvh, .npz, .glb")),
-        ("walk.npz", "a", "bvh", ("--out", "suffix")),
-        ("walk.npz", "a.glb", "bvh", ("--out", "--format bvh")),
-        ("walk.npz", "dance", "bvh", ("--out", "not a folder")),
-        ("walk.npz", "walk.npz", None, ("--out", "source")),
-        (".", "../a", None, ("--format", "bvh, npz, gltf")),
-        (".", "../a.bvh", "bvh", ("--out", "must be a folder")),
-        (".", "below", "npz", ("--out", "a folder beside it")),
-        ("dance", ".", "npz", ("--out", "a folder beside it")),
-        ("empty", "../a", "npz", ("no npz",)),
-    ],
-)
-def test_what_is_unclear_or_dangerous_is_refused(
-    folder: Path, source: str, out: str, name: str | None, words: tuple[str, ...]
-):
+def test_unclear_or_dangerous_targets_are_refused(folder: Path):
     (folder.parent / "file").write_text("")
     (folder / "empty").mkdir()
     before = files(folder.parent)
-    with pytest.raises(InputError) as error:
-        plan_export(folder / source, folder / out, name)
-    for word in words:
-        assert word in str(error.value)
-    assert len(str(error.value).splitlines()) == 1
+    for source, out, name, *words in (
+        ("none.npz", "a.bvh", None, "none.npz", "no such file or folder"),
+        ("walk.npz", "a.fbx", None, "--out", "a.fbx", ".bvh, .npz, .glb"),
+        ("walk.npz", "a", "bvh", "--out", "suffix"),
+        ("walk.npz", "a.glb", "bvh", "--out", "--format bvh"),
+        ("walk.npz", "dance", "bvh", "--out", "not a folder"),
+        ("walk.npz", "walk.npz", None, "--out", "source"),
+        (".", "../a", None, "--format", "bvh, npz, gltf"),
+        (".", "../a.bvh", "bvh", "--out", "must be a folder"),
+        (".", "below", "npz", "--out", "a folder beside it"),
+        ("dance", ".", "npz", "--out", "a folder beside it"),
+        ("empty", "../a", "npz", "no npz"),
+    ):
+        with pytest.raises(InputError) as error:
+            plan_export(folder / source, folder / out, name)
+        assert [word for word in words if word not in str(error.value)] == []
+        assert len(str(error.value).splitlines()) == 1
     assert files(folder.parent) == before
 
 
@@ -148,29 +131,19 @@ def test_a_place_that_cannot_be_written_is_named(folder: Path):
 # The command
 
 
-def test_the_command_says_what_it_did(folder: Path, memmlp: Memmlp, tmp_path: Path):
+def test_the_command_exports_or_refuses_in_one_line(folder: Path, memmlp: Memmlp, tmp_path: Path):
     ran = memmlp("data", "export", str(folder), "--out", "out", "--format", "gltf")
     assert ran.code == 0
     assert ran.out.startswith("skipped bad.npz: not a zip")
     assert ran.out.endswith("\n2 clips, 0.1 seconds, in out\n")
     assert memmlp("data", "export", str(folder / "walk.npz"), "--out", "w.bvh", "--fps", "30").code == 0
     assert read_bvh(tmp_path / "w.bvh").fps == 30
-
-
-def test_the_command_refuses_in_one_line(folder: Path, memmlp: Memmlp):
-    assert one_line(memmlp("data", "export", "none", "--out", "a.bvh"), "none", "no such file")
-    walk = str(folder / "walk.npz")
-    assert one_line(
-        memmlp("data", "export", walk, "--out", "a.bvh", "--body", "no.npz"), "data.body", "no.npz"
-    )
-    assert one_line(memmlp("data", "export", walk, "--out", "a.bvh", "--fps", "nan"), "--fps")
+    wrong = memmlp("data", "export", str(folder / "walk.npz"), "--out", "a.bvh", "--body", "no.npz")
+    assert one_line(wrong, "data.body", "no.npz")
     assert one_line(memmlp("data", "export", str(folder / "bad.npz"), "--out", "a.bvh"), "bad.npz")
 
 
 # Writing in pieces: a file is the same, however long the pieces are in which its clip is worked on
-
-
-REST = builtin_rest_joints()
 
 
 def spinning(frames: int = 50) -> Clip:
@@ -182,12 +155,12 @@ def spinning(frames: int = 50) -> Clip:
     return Clip("spinning", poses, random.normal(size=(frames, 3)), 60.0)
 
 
-@pytest.mark.parametrize("name", FORMATS)
-@pytest.mark.parametrize("frames", [1, 49])
-def test_pieces_leave_no_seam(name: str, frames: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("name", ["bvh", "gltf"])
+def test_pieces_leave_no_seam(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     chosen = FORMATS[name]
     whole, parted = (tmp_path / f"{kind}{chosen.suffix}" for kind in ("whole", "parted"))
     write_motion(whole, spinning(), REST, chosen)
-    monkeypatch.setattr(Clip.pieces, "__defaults__", (frames,))
-    write_motion(parted, spinning(), REST, chosen)
-    assert parted.read_bytes() == whole.read_bytes()
+    for frames in (1, 49):
+        monkeypatch.setattr(Clip.pieces, "__defaults__", (frames,))
+        write_motion(parted, spinning(), REST, chosen)
+        assert parted.read_bytes() == whole.read_bytes()

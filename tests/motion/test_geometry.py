@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from bvh_samples import performed, write
 from scipy.spatial.transform import Rotation
 
 from memmlp.motion import geometry
 from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.geometry import clip_kinematics, one_thread
-from memmlp.motion.importing import convert as module
-from memmlp.motion.importing.import_folder import import_folder, verify_folder
-from memmlp.motion.importing.skeleton_map import load_skeleton
-from memmlp.motion.synthetic import synthesize_clip
 
 ANGLES = (0.0, 1e-9, 1e-7, 1e-3, 1.0, 3.0, math.pi - 1e-4, math.pi - 1e-7, 10.0)
 
@@ -29,14 +22,14 @@ def vectors(angle: float, count: int = 50) -> torch.Tensor:
     return torch.tensor(angle * axis / np.linalg.norm(axis, axis=-1, keepdims=True))
 
 
-@pytest.mark.parametrize("angle", ANGLES)
-def test_axis_angle_is_scipys(angle):
-    matrix = Rotation.from_rotvec(vectors(angle).numpy()).as_matrix()
-    np.testing.assert_allclose(geometry.axis_angle_to_matrix(vectors(angle)).numpy(), matrix, atol=1e-12)
-    expected = Rotation.from_matrix(matrix).as_rotvec()
-    got = geometry.matrix_to_axis_angle(torch.tensor(matrix)).numpy()
-    np.testing.assert_allclose(got, expected, atol=1e-7)
-    assert (np.linalg.norm(got, axis=-1) <= math.pi + 1e-12).all()
+def test_axis_angle_is_scipys():
+    for angle in ANGLES:
+        matrix = Rotation.from_rotvec(vectors(angle).numpy()).as_matrix()
+        np.testing.assert_allclose(geometry.axis_angle_to_matrix(vectors(angle)).numpy(), matrix, atol=1e-12)
+        expected = Rotation.from_matrix(matrix).as_rotvec()
+        got = geometry.matrix_to_axis_angle(torch.tensor(matrix)).numpy()
+        np.testing.assert_allclose(got, expected, atol=1e-7)
+        assert (np.linalg.norm(got, axis=-1) <= math.pi + 1e-12).all()
 
 
 @pytest.mark.parametrize("angle", [1e-7, math.pi - 1e-3])
@@ -62,11 +55,11 @@ def test_sixd_of_exactly_three_rows():
     torch.testing.assert_close(geometry.sixd_to_matrix(geometry.matrix_to_sixd(matrix)), matrix)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-6, math.pi])
-def test_geodesic_angle(angle):
+def test_geodesic_angle():
     a = torch.tensor(Rotation.random(50, rng=2).as_matrix())
-    b = a @ geometry.axis_angle_to_matrix(vectors(angle))
-    np.testing.assert_allclose(geometry.geodesic_angle(a, b).numpy(), angle, atol=1e-7)
+    for angle in (0.0, 1e-6, math.pi):
+        b = a @ geometry.axis_angle_to_matrix(vectors(angle))
+        np.testing.assert_allclose(geometry.geodesic_angle(a, b).numpy(), angle, atol=1e-7)
 
 
 def test_forward_kinematics_is_a_recursion():
@@ -118,36 +111,10 @@ def test_a_body_that_is_turned_about_its_pelvis():
     np.testing.assert_allclose(positions[1], rest[0] + trans[1] + (rest - rest[0]) @ turn.T, atol=1e-7)
 
 
-# Torch's threads while clips are imported
-
-
-@pytest.fixture(autouse=True)
-def _two_threads() -> Iterator[None]:
+def test_one_thread_and_then_as_many_as_before() -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
-
-
-def test_one_thread_and_then_as_many_as_before() -> None:
     with one_thread():
         assert torch.get_num_threads() == 1
     assert torch.get_num_threads() == 2
-
-
-def test_imports_keep_torch_to_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With more, short clips wait for one another, and busily at that."""
-    seen, posed = [], module.clip_kinematics
-
-    def counted(*arguments: object) -> object:
-        seen.append(torch.get_num_threads())
-        return posed(*arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(module, "clip_kinematics", counted)
-    torch.set_num_threads(2)
-    path = write(
-        tmp_path, performed(load_skeleton("cmu_daz"), synthesize_clip("walking", 1, seconds=1.0)).text()
-    )
-    import_folder(path, tmp_path / "out")
-    list(verify_folder(path))
-    assert seen == [1, 1]
+    torch.set_num_threads(before)

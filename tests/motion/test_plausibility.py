@@ -47,12 +47,11 @@ def faults(clip: Clip) -> str:
     return "; ".join(find_faults(clip))
 
 
-@pytest.mark.parametrize("activity", ACTIVITIES)
-def test_what_people_do_passes(activity):
-    clip = motion(activity)
-    for sound in (clip, moved(clip, z=-2.5), moved(clip, z=8.0), moved(clip, 700.0, -300.0)):
-        assert why_implausible(sound) is None
-        assert faults(sound) == ""
+def test_what_people_do_passes():
+    for clip in map(motion, ACTIVITIES):
+        for sound in (clip, moved(clip, z=-2.5), moved(clip, z=8.0), moved(clip, 700.0, -300.0)):
+            assert why_implausible(sound) is None
+            assert faults(sound) == ""
     single = replace(clip, poses=clip.poses[:1], trans=clip.trans[:1])
     assert why_implausible(single) is None
 
@@ -134,9 +133,8 @@ def test_a_glitch_or_a_wound_up_root_passes():
     assert why_implausible(replace(clip, trans=trans, poses=poses)) is None
 
 
-@pytest.mark.parametrize("activity", ACTIVITIES)
-def test_other_units_and_another_axis_are_refused(activity):
-    clip = motion(activity)
+def test_other_units_and_another_axis_are_refused():
+    clip = motion("walking")
     assert "degrees" in why_implausible(replace(clip, poses=np.degrees(clip.poses)))
     for scale in (39.37, 100.0, 1000.0):
         assert "not in metres" in why_implausible(replace(clip, trans=scale * clip.trans))

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from memmlp.common.errors import InputError
 from memmlp.motion.body import JOINTS, builtin_rest_joints
 from memmlp.motion.clip import Clip
-from memmlp.motion.formats.bvh import MAX_JOINTS, TIPS, Bvh, euler_zxy, read_bvh, write_bvh
+from memmlp.motion.formats.bvh import MAX_JOINTS, TIPS, euler_zxy, read_bvh, write_bvh
 from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.importing.convert import NONE
 from memmlp.motion.importing.import_folder import ImportSettings, import_folder
@@ -103,7 +103,7 @@ def naive_kinematics(sample: Sample) -> tuple[np.ndarray, np.ndarray]:
 
 @QUICK
 @given(samples())
-def test_reads_what_was_written(tmp_path: Path, sample: Sample) -> None:
+def test_trees_and_kinematics_are_those_of_the_text(tmp_path: Path, sample: Sample) -> None:
     bvh = read_bvh(write(tmp_path, sample.text()))
     count = len(sample.names)
     assert bvh.nodes[:count] == tuple(sample.names)
@@ -111,72 +111,40 @@ def test_reads_what_was_written(tmp_path: Path, sample: Sample) -> None:
     assert bvh.channels == tuple(sample.channels)
     np.testing.assert_array_equal(bvh.offsets[:count], sample.offsets)
     np.testing.assert_array_equal(bvh.values, sample.values)
-    ends = zip(bvh.node_parents[count:], bvh.nodes[count:], bvh.offsets[count:].tolist(), strict=True)
-    assert {joint: rest for joint, *rest in ends} == {
-        joint: [f"joint{joint}.end", offset] for joint, offset in sample.ends
-    }
-
-
-@QUICK
-@given(samples())
-def test_kinematics_equals_a_naive_loop(tmp_path: Path, sample: Sample) -> None:
-    bvh = read_bvh(write(tmp_path, sample.text()))
-    order = list(bvh.node_parents[len(bvh.channels) :])
+    order = list(bvh.node_parents[count:])
     sample.ends.sort(key=lambda end: order.index(end[0]))
+    assert bvh.nodes[count:] == tuple(f"joint{joint}.end" for joint, _ in sample.ends)
+    np.testing.assert_array_equal(bvh.offsets[count:].tolist(), [offset for _, offset in sample.ends])
     for computed, expected in zip(bvh.kinematics(), naive_kinematics(sample), strict=True):
         np.testing.assert_allclose(computed, expected, atol=1e-9)
 
 
-def test_first_channel_is_the_outermost_rotation(tmp_path: Path) -> None:
-    """Z, then X: the tip on X goes to Y by Z alone; were X outermost, it would go on to Z."""
-    channels = ("Zrotation", "Xrotation")
-    sample = Sample(["a"], [-1], [[0.0, 0, 0]], [(0, [1.0, 0, 0])], [channels], np.array([[90.0, 90.0]]))
-    positions = read_bvh(write(tmp_path, sample.text())).kinematics()[1]
-    np.testing.assert_allclose(positions[0, 1], [0, 1, 0], atol=1e-12)
-
-
-def equal(a: Bvh, b: Bvh) -> bool:
-    return a.nodes == b.nodes and a.channels == b.channels and np.array_equal(a.values, b.values)
-
-
-def test_mixed_line_ends_tabs_blanks_case_and_byte_order_mark(tmp_path: Path) -> None:
+def test_line_ends_tabs_blanks_case_and_byte_order_mark_may_vary(tmp_path: Path) -> None:
     sample = person("cmu_daz", 3, 1)
     plain = read_bvh(write(tmp_path, sample.text()))
     lines = sample.text().splitlines()
     mixed = "".join(f"\t {line} \t" + ["\n", "\r\n", "\r", "\n\n"][n % 4] for n, line in enumerate(lines))
-    assert equal(read_bvh(write(tmp_path, "\ufeff" + mixed.replace(" ", "\t "))), plain)
-    assert equal(read_bvh(write(tmp_path, sample.text().replace("\n{", " {"))), plain)
+    texts = ["\ufeff" + mixed.replace(" ", "\t "), sample.text().replace("\n{", " {")]
     for word in ("HIERARCHY", "OFFSET", "JOINT", "ROOT", "End Site", "MOTION", "CHANNELS", "rotation"):
-        assert equal(read_bvh(write(tmp_path, sample.text().replace(word, word.swapcase()))), plain)
+        texts.append(sample.text().replace(word, word.swapcase()))
+    texts += [
+        sample.text(frames=frames, time="frametime : {}") for frames in ("frames :  {}", "Frames: 00{}")
+    ]
+    for text in texts:
+        bvh = read_bvh(write(tmp_path, text))
+        assert (bvh.nodes, bvh.channels) == (plain.nodes, plain.channels)
+        np.testing.assert_array_equal(bvh.values, plain.values)
 
 
-@pytest.mark.parametrize("frames", ["Frames:\t{}", "frames :  {}", "Frames: 00{}"])
-@pytest.mark.parametrize("time", ["Frame Time: {}", "frametime : {}"])
-def test_motion_headers(tmp_path: Path, frames: str, time: str) -> None:
-    sample = person("cmu_daz", 3, 1)
-    assert len(read_bvh(write(tmp_path, sample.text(frames=frames, time=time)))) == 3
-
-
-@pytest.mark.parametrize(
-    ("dt", "fps"),
-    [
-        ("0.00833333", 120),
-        ("0.016683", 1 / 0.016683),
-        ("0.0333", 30),
-        ("3.33e-2", 30),
-        ("0.0417", 24),
-        ("0.0167", 60),
-        ("0.0083", 120),
-        ("0.03337", 1 / 0.03337),  # 29.97, and so not 30
-        ("0.03330", 1 / 0.03330),  # with a digit more it is not 30
-        ("0.0166", 60),  # cut off, not rounded
-        ("0.0416", 24),
-        ("0.016", 62.5),
-        ("0.006", 1 / 0.006),  # one digit tells no rate
-    ],
-)
-def test_frame_rate(tmp_path: Path, dt: str, fps: float) -> None:
-    assert read_bvh(write(tmp_path, person("cmu_daz", 1, 1).text(dt=dt))).fps == fps
+def test_frame_rate(tmp_path: Path) -> None:
+    """A rate is rounded to a usual one only as far as the digits of the frame time allow."""
+    rates = {
+        "0.00833333": 120, "0.0333": 30, "3.33e-2": 30, "0.0417": 24, "0.0167": 60, "0.0083": 120,
+        "0.016683": 1 / 0.016683, "0.03337": 1 / 0.03337, "0.03330": 1 / 0.03330,
+        "0.0166": 60, "0.0416": 24, "0.016": 62.5, "0.006": 1 / 0.006,
+    }  # fmt: skip
+    for dt, fps in rates.items():
+        assert read_bvh(write(tmp_path, person("cmu_daz", 1, 1).text(dt=dt))).fps == fps, dt
 
 
 SMALL = """HIERARCHY
@@ -239,12 +207,11 @@ def refusal(path: Path) -> str:
     return message
 
 
-@pytest.mark.parametrize("damage", DAMAGE)
-def test_damage_is_named(tmp_path: Path, damage: str) -> None:
-    old, new, said = DAMAGE[damage]
-    assert old in SMALL
+def test_damage_is_named(tmp_path: Path) -> None:
     assert len(read_bvh(write(tmp_path, SMALL))) == 2
-    assert said in refusal(write(tmp_path, SMALL.replace(old, new, 1)))
+    for damage, (old, new, said) in DAMAGE.items():
+        assert old in SMALL
+        assert said in refusal(write(tmp_path, SMALL.replace(old, new, 1))), damage
 
 
 def test_bytes_that_are_no_text(tmp_path: Path) -> None:
@@ -311,7 +278,7 @@ def check_same(clip: Clip, back: Clip) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(clip=clips())
 def test_any_pose_comes_back(tmp_path_factory: pytest.TempPathFactory, clip: Clip):
     check_same(clip, there_and_back(tmp_path_factory.mktemp("clip"), clip, REST))
@@ -344,17 +311,15 @@ def test_up_is_up(tmp_path: Path):
     poses = np.zeros((1, 22, 3))
     poses[0, 0] = [np.pi / 2, 0, 0]
     write_bvh(tmp_path / "clip.bvh", Clip("clip", poses, np.array([[0.5, -2.0, 1.0]]), 60.0), REST)
-    bvh = read_bvh(tmp_path / "clip.bvh")
-    rotations, positions = bvh.kinematics()
+    rotations, positions = read_bvh(tmp_path / "clip.bvh").kinematics()
     np.testing.assert_allclose(positions[0, 0], [50, 100, 200], atol=1e-5)
     np.testing.assert_allclose(rotations[0], np.broadcast_to(np.eye(3), rotations[0].shape), atol=1e-7)
 
 
-@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (1, 0.3, 0.2)])
-def test_angles_do_not_jump(axis: tuple[float, ...]):
+def test_angles_do_not_jump():
     """Two turns at 3 degrees a frame, past both gimbal locks: halfway between two frames the angles' mean is
     the rotation halfway between them."""
-    axis = np.array(axis) / np.linalg.norm(axis)
+    axis = np.array([1, 0.3, 0.2]) / np.linalg.norm([1, 0.3, 0.2])
     turn = np.radians(np.arange(0, 720, 3) + 0.7)
     matrices = Rotation.from_rotvec(turn[:, None] * axis).as_matrix()
     angles = euler_zxy(matrices[:, None])[:, 0]

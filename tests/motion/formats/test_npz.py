@@ -32,21 +32,20 @@ def npz(**values: object) -> bytes:
     return buffer.getvalue()
 
 
-@pytest.mark.parametrize(
-    ("key", "rate", "width"),
-    [("mocap_framerate", np.array(120.0), 156), ("mocap_framerate", np.array([120.0]), 165),
-     ("mocap_framerate", 120, 72), ("mocap_framerate", np.array(b"120"), 66),
-     ("mocap_framerate", np.array("120.0"), 156), ("mocap_frame_rate", 120.0, 156), ("fps", 120, 156)],
-)  # fmt: skip
-def test_every_spelling_is_read(key, rate, width, tmp_path):
-    values = arrays(width=width)
-    del values["mocap_framerate"]
+def test_every_spelling_is_read(tmp_path):
     path = tmp_path / "a.npz"
-    path.write_bytes(npz(**values, **{key: rate}))
-    clip = read_clip(path, "a")
-    assert clip.fps == 120
-    np.testing.assert_allclose(clip.poses.reshape(20, 66), values["poses"][:, :66])
-    np.testing.assert_allclose(clip.trans, values["trans"])
+    for key, rate, width in (
+        ("mocap_framerate", np.array(120.0), 156), ("mocap_framerate", np.array([120.0]), 165),
+        ("mocap_framerate", 120, 72), ("mocap_framerate", np.array(b"120"), 66),
+        ("mocap_framerate", np.array("120.0"), 156), ("mocap_frame_rate", 120.0, 156), ("fps", 120, 156),
+    ):  # fmt: skip
+        values = arrays(width=width)
+        del values["mocap_framerate"]
+        path.write_bytes(npz(**values, **{key: rate}))
+        clip = read_clip(path, "a")
+        assert clip.fps == 120
+        np.testing.assert_allclose(clip.poses.reshape(20, 66), values["poses"][:, :66])
+        np.testing.assert_allclose(clip.trans, values["trans"])
 
 
 def parted(root: str, body: str, trans: str, width: int) -> dict[str, np.ndarray]:
@@ -56,21 +55,20 @@ def parted(root: str, body: str, trans: str, width: int) -> dict[str, np.ndarray
     return parts | {"mocap_frame_rate": np.array(120.0)}
 
 
-@pytest.mark.parametrize(
-    "values",
-    [parted("root_orient", "pose_body", "trans", 63), parted("global_orient", "body_pose", "transl", 63),
-     parted("global_orient", "body_pose", "transl", 69),
-     arrays() | {"poses": arrays()["poses"].reshape(20, 52, 3)},
-     {key: np.asfortranarray(value) for key, value in arrays().items()},
-     arrays() | {"poses": arrays()["poses"].astype(">f8")},
-     arrays() | {"poses": arrays()["poses"].astype("g")}],
-)  # fmt: skip
-def test_every_layout_gives_the_same_clip(values, tmp_path, monkeypatch):
+def test_every_layout_gives_the_same_clip(tmp_path, monkeypatch):
     monkeypatch.setattr(bounded_npz, "BLOCK", 15_000)  # several blocks an array
-    np.savez_compressed(tmp_path / "a.npz", **values)
-    clip = read_clip(tmp_path / "a.npz", "a")
-    np.testing.assert_array_equal(clip.poses.reshape(20, 66), arrays()["poses"][:, :66])
-    np.testing.assert_array_equal(clip.trans, arrays()["trans"])
+    for values in (
+        parted("root_orient", "pose_body", "trans", 63), parted("global_orient", "body_pose", "transl", 63),
+        parted("global_orient", "body_pose", "transl", 69),
+        arrays() | {"poses": arrays()["poses"].reshape(20, 52, 3)},
+        {key: np.asfortranarray(value) for key, value in arrays().items()},
+        arrays() | {"poses": arrays()["poses"].astype(">f8")},
+        arrays() | {"poses": arrays()["poses"].astype("g")},
+    ):  # fmt: skip
+        np.savez_compressed(tmp_path / "a.npz", **values)
+        clip = read_clip(tmp_path / "a.npz", "a")
+        np.testing.assert_array_equal(clip.poses.reshape(20, 66), arrays()["poses"][:, :66])
+        np.testing.assert_array_equal(clip.trans, arrays()["trans"])
 
 
 def test_parts_of_another_size_are_refused(tmp_path):
@@ -108,7 +106,8 @@ def structural() -> list[bytes]:
     """Sound zip files with wrong content."""
     good = arrays()
     wrong: list[dict[str, object]] = [
-        {"poses": good["poses"][:, :60]}, {"poses": good["poses"][0]}, {"poses": good["poses"].astype(int)},
+        {"poses": good["poses"][:, :60]}, {"poses": np.zeros((20, 88))},
+        {"poses": good["poses"][0]}, {"poses": good["poses"].astype(int)},
         {"poses": good["poses"][:0], "trans": good["trans"][:0]}, {"poses": np.full((20, 156), np.nan)},
         {"poses": np.full((20, 156), np.inf)}, {"poses": good["poses"] * 1e6}, {"trans": good["trans"][:5]},
         {"trans": good["trans"] * np.nan}, {"trans": good["trans"][:, :2]}, {"trans": np.array("a")},
@@ -140,45 +139,14 @@ def huge_header() -> bytes:
     return buffer.getvalue()
 
 
-def mutants(count: int = 130) -> list[bytes]:
-    """Seeded damage: flipped bytes, cuts, zeroed and repeated blocks."""
-    good, rng = npz(**arrays(6)), np.random.default_rng(1)
-    made = []
-    for i in range(count):
-        data, at = bytearray(good), int(rng.integers(len(good)))
-        if i % 4 == 0:
-            made.append(bytes(data[:at]))
-            continue
-        if i % 4 == 1:
-            for spot in rng.integers(len(good), size=40):
-                data[spot] ^= int(rng.integers(1, 256))
-        elif i % 4 == 2:
-            data[at : at + 200] = bytes(min(200, len(good) - at))
-        else:
-            data[at:at] = data[at // 2 : at // 2 + 64]
-        made.append(bytes(data))
-    return made
-
-
-def test_damage_raises_one_line_or_reads_as_finite(tmp_path):
-    path, refused = tmp_path / "bad.npz", 0
-    certain = [*structural(), huge_header()]
-    for number, content in enumerate([*certain, *mutants()]):
+def test_wrong_content_is_one_line(tmp_path):
+    path = tmp_path / "bad.npz"
+    for content in (*structural(), huge_header()):
         path.write_bytes(content)
-        message = ""
-        try:
-            clip = read_clip(path, "bad")
-        except InputError as error:
-            message = str(error)
-        if message:
-            refused += 1
-            assert str(path) in message
-            assert "\n" not in message
-        else:
-            assert number >= len(certain)
-            assert np.isfinite(clip.poses).all()
-            assert np.isfinite(clip.trans).all()
-    assert refused >= 120
+        with pytest.raises(InputError) as caught:
+            read_clip(path, "bad")
+        assert str(path) in str(caught.value)
+        assert "\n" not in str(caught.value)
 
 
 def repacked(data: bytes, **entries: bytes) -> bytes:
@@ -195,9 +163,8 @@ def entry(name: str) -> bytes:
         return packed.read(f"{name}.npy")
 
 
-@pytest.mark.parametrize(
-    "poses",
-    [
+def test_damaged_entries_are_one_line(tmp_path):
+    for poses in (
         npz(**arrays()),  # the entry is itself a zip
         entry("poses").replace(b"(20, 156)", b"(20, 156 "),  # tokenize.TokenError
         entry("poses").replace(b"'<f8'", b"'|O8'"),
@@ -207,13 +174,11 @@ def entry(name: str) -> bytes:
         b"\x93NUMPY\x02\x00\xff\xff\xff\xff" + bytes(20),
         b"\x93NUMPY\x03\x00" + entry("poses")[8:],
         b"",
-    ],
-)
-def test_damaged_entries_are_one_line(poses, tmp_path):
-    (tmp_path / "a.npz").write_bytes(repacked(npz(**arrays()), poses=poses))
-    with pytest.raises(InputError, match=r"a\.npz: .*(poses|readable)") as caught:
-        read_clip(tmp_path / "a.npz", "a")
-    assert "\n" not in str(caught.value)
+    ):
+        (tmp_path / "a.npz").write_bytes(repacked(npz(**arrays()), poses=poses))
+        with pytest.raises(InputError, match=r"a\.npz: .*(poses|readable)") as caught:
+            read_clip(tmp_path / "a.npz", "a")
+        assert "\n" not in str(caught.value)
 
 
 def peak_of_refusal(path: Path, match: str) -> int:
@@ -227,24 +192,14 @@ def peak_of_refusal(path: Path, match: str) -> int:
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize(
-    ("shape", "allowed"), [((5000, 156), "1 to 500 frames"), ((100, 8000), "expected floats")]
-)
-def test_a_small_file_that_unpacks_to_much_is_refused_before_it_does(shape, allowed, tmp_path, monkeypatch):
+def test_a_small_file_that_unpacks_to_much_is_refused_before_it_does(tmp_path, monkeypatch):
     """It says so itself; the bound is lowered, so that the test need not pack gigabytes."""
     monkeypatch.setattr(bounded_npz, "MAX_ROWS", 500)
     path = tmp_path / "a.npz"
-    np.savez_compressed(path, **(arrays() | {"poses": np.zeros(shape)}))
-    assert path.stat().st_size < 100_000
-    assert peak_of_refusal(path, f"poses is float64 .*{allowed}") < 500_000
-
-
-@pytest.mark.parametrize("width", [88, 198])
-def test_rotations_in_another_form_are_refused(width, tmp_path):
-    """Quaternions, 6D, and matrices of 22 joints would be read as rotation vectors of another motion."""
-    np.savez(tmp_path / "a.npz", **(arrays() | {"poses": np.zeros((50, width))}))
-    with pytest.raises(InputError, match=rf"a\.npz: poses is .*{width}.*\(N, 66\) or \(N, 72\)"):
-        read_clip(tmp_path / "a.npz", "a")
+    for shape, allowed in (((5000, 156), "1 to 500 frames"), ((100, 8000), "expected floats")):
+        np.savez_compressed(path, **(arrays() | {"poses": np.zeros(shape)}))
+        assert path.stat().st_size < 100_000
+        assert peak_of_refusal(path, f"poses is float64 .*{allowed}") < 500_000
 
 
 def test_a_file_that_unpacks_to_more_than_it_says_is_refused(tmp_path):

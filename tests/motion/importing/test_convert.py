@@ -22,14 +22,12 @@ from bvh_samples import (
     tree,
     write,
 )
-from plain_kinematics import bvh_positions, to_world, worst_direction, worst_distance
 from scipy.spatial.transform import Rotation
 from skeleton_families import walking as walking_sample
 
 from memmlp.motion.body import JOINTS, builtin_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.bvh import Bvh, read_bvh
-from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.formats.recording import END
 from memmlp.motion.geometry import clip_kinematics
 from memmlp.motion.importing.anatomy import segments
@@ -59,20 +57,12 @@ BANDAI_CLIPS = DATA / "bandai-namco" / "bandai-1.tar.xz"
 MM, DEGREES = 1.0, 3.0  # the largest errors that an import may have
 
 
-def imported(path: Path, chosen: SkeletonMap) -> Converted:
-    return convert(read_bvh(path), chosen, REST, name=path.stem, fps=120.0)
-
-
-def check(path: Path, chosen: SkeletonMap, unit: float, up: str) -> Converted:
-    """Import a file, and compare what is kept with the file's text."""
-    converted = imported(path, chosen)
-    npz = path.with_suffix(".npz")
-    write_clip(npz, converted.clip)
-    first = int(chosen.calibration_frame)
-    file = {name: to_world(places[first:], up) for name, places in bvh_positions(path).items()}
-    joints = dict(chosen.joints)
-    assert worst_direction(npz, file, joints)[0] < DEGREES
-    assert worst_distance(npz, file, joints, unit)[0] < MM
+def check(path: Path, chosen: SkeletonMap) -> Converted:
+    """Import a file; the clip must be as in the file."""
+    converted = convert(read_bvh(path), chosen, REST, name=path.stem, fps=120.0)
+    assert converted.fidelity.mm.value < MM
+    assert converted.fidelity.degrees.value < DEGREES
+    assert converted.fidelity.faults == ()
     return converted
 
 
@@ -86,7 +76,7 @@ def test_cmu_as_in_the_file(tmp_path: Path, path: Path) -> None:
         pytest.skip("CMU's clips are not here")
     copy = write(tmp_path, path.read_bytes())
     chosen = find_skeleton(read_bvh(copy))
-    assert check(copy, chosen, 0.01, "y").fidelity.faults == ()
+    check(copy, chosen)
 
 
 @pytest.mark.slow
@@ -98,7 +88,7 @@ def test_bandai_namco_as_in_the_file(tmp_path: Path) -> None:
         paths = [write(tmp_path, archive.extractfile(m).read(), Path(m.name).name) for m in members[::13]]  # type: ignore[union-attr]
     assert len(paths) >= 3
     for path in paths:
-        assert check(path, load_skeleton("bandai_namco"), 0.01, "y").fidelity.faults == ()
+        check(path, load_skeleton("bandai_namco"))
 
 
 # Zero poses turned at random
@@ -116,8 +106,7 @@ def test_any_zero_pose_is_as_in_the_file(tmp_path: Path, walk: Clip, skeleton: s
     given = chosen.rest is not None
     turns = rest_turns(chosen, sample) if given else random_turns(sample, 1)
     path = write(tmp_path, performed(chosen, walk, turns=turns).text())
-    converted = check(path, chosen, chosen.unit or 0.01, chosen.up or "y")
-    assert converted.fidelity.faults == ()
+    converted = check(path, chosen)
     assert ("frame" in converted.fitted.stance.source) == (not given)
 
 
@@ -133,11 +122,11 @@ def file(folder: Path, chosen: SkeletonMap, clip: Clip, turned: bool = True) -> 
     return read_bvh(write(folder, performed(chosen, clip, turns=turns).text()))
 
 
-@pytest.mark.parametrize("unit", UNITS)
-def test_unit_and_up_are_found(tmp_path: Path, walk: Clip, unit: float) -> None:
-    up = "z" if unit < 0.02 else "y"
-    settled = find_unit_and_up(file(tmp_path, replace(DAZ, unit=unit, up=up), walk), FOUND)
-    assert (settled.unit, settled.up) == (unit, up)
+def test_unit_and_up_are_found(tmp_path: Path, walk: Clip) -> None:
+    for unit in UNITS:
+        up = "z" if unit < 0.02 else "y"
+        settled = find_unit_and_up(file(tmp_path, replace(DAZ, unit=unit, up=up), walk), FOUND)
+        assert (settled.unit, settled.up) == (unit, up)
 
 
 def test_a_given_unit_and_axis_count_and_impossible_units_are_refused(tmp_path: Path, walk: Clip) -> None:
@@ -162,18 +151,10 @@ def test_another_up_axis_is_refused(tmp_path: Path, walk: Clip, axis: str) -> No
 
 def lying(clip: Clip, head: str) -> Clip:
     """Turn a clip's person down to lie with the head along an axis of Y-up axes."""
-    turn = {"z": [np.pi / 2, 0.0, 0.0], "x": [0.0, np.pi / 2, 0.0], "-z": [-np.pi / 2, 0.0, 0.0]}[head]
+    turn = {"z": [np.pi / 2, 0.0, 0.0], "-z": [-np.pi / 2, 0.0, 0.0]}[head]
     poses, trans = clip.poses.astype(float), np.zeros(clip.trans.shape)
     poses[:, 0] = (Rotation.from_rotvec(turn) * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
     return replace(clip, poses=poses, trans=trans)
-
-
-@pytest.mark.parametrize(("up", "head"), [("y", "-z"), ("z", "x")])
-def test_who_lies_in_a_file_whose_zero_pose_stands_lies(
-    tmp_path: Path, walk: Clip, up: str, head: str
-) -> None:
-    chosen = replace(DAZ, up=up)
-    assert find_unit_and_up(file(tmp_path, chosen, lying(walk, head), turned=False), FOUND).up == up
 
 
 def test_a_zero_pose_and_a_motion_of_two_minds_are_refused(tmp_path: Path, walk: Clip) -> None:
@@ -182,6 +163,7 @@ def test_a_zero_pose_and_a_motion_of_two_minds_are_refused(tmp_path: Path, walk:
     with refuse(tmp_path / "clip.bvh", "stands along y in the zero pose", "along z in the motion", "--up y"):
         find_unit_and_up(bvh, FOUND)
     assert [find_unit_and_up(bvh, replace(FOUND, up=up)).up for up in "yz"] == ["y", "z"]
+    assert find_unit_and_up(file(tmp_path, DAZ, lying(walk, "-z"), turned=False), FOUND).up == "y"
     upside_down = lying(lying(walk, "z"), "z")
     with refuse(tmp_path / "clip.bvh", "no up axis found"):
         find_unit_and_up(file(tmp_path, DAZ, upside_down, turned=False), FOUND)
@@ -197,14 +179,6 @@ def standing(frames: int) -> np.ndarray:
     """Positions (N, 22, 3) of a person who stands still, the toe joints 2 cm over the floor."""
     positions = REST @ Z_UP.T
     return np.tile(positions + np.array([0, 0, 0.02 - positions[FEET[0], 2]]), (frames, 1, 1))
-
-
-@pytest.mark.parametrize("activity", ["walking", "jumping", "sitting"])
-def test_the_floor_of_people(activity: str) -> None:
-    height, clip = 1.3, synthesize_clip(activity, 2, seconds=4.0)
-    positions = clip_kinematics(replace(clip, poses=clip.poses.astype(float)), REST)[1]
-    found = find_floor(positions + np.array([0, 0, height]), 60.0)
-    assert found == pytest.approx(height, abs=0.02)
 
 
 def test_the_lowest_step_of_stairs() -> None:
@@ -240,19 +214,11 @@ def test_no_floor_without_contact() -> None:
 # A first frame that is no motion is told by how far it is from the next
 
 
-@pytest.mark.parametrize("activity", ["walking", "waving"])
-def test_a_t_pose_before_the_motion_is_a_far_step_and_motion_is_none(activity: str):
-    sample = performed(load_skeleton("cmu_daz"), synthesize_clip(activity, 1, seconds=2.0))
+def test_a_t_pose_before_the_motion_is_a_far_step_and_motion_is_none():
+    sample = performed(load_skeleton("cmu_daz"), synthesize_clip("waving", 1, seconds=2.0))
     assert first_step(sample.hierarchy()) > JUMP
-    assert first_step(replace(sample, values=sample.values[1:]).hierarchy()) < JUMP
-
-
-def test_what_is_short_or_hardly_moves_has_none():
-    sample = performed(load_skeleton("cmu_daz"), synthesize_clip("walking", 1, seconds=2.0))
     assert first_step(replace(sample, values=sample.values[:3]).hierarchy()) == 0.0
-    nearly = np.repeat(sample.values[5:6], 9, 0)
-    nearly[0, 8] += 0.5
-    assert first_step(replace(sample, values=nearly).hierarchy()) == 0.0
+    assert first_step(replace(sample, values=sample.values[1:]).hierarchy()) < JUMP
 
 
 # The stance that is shown: the one that importing reads, with all nodes, and the body in it
@@ -308,29 +274,14 @@ def test_segments_point_as_in_the_file(tmp_path: Path, skeleton: str) -> None:
         np.testing.assert_allclose(unit(body[:, child] - body[:, joint]), expected, atol=1e-9)
 
 
-def test_another_body_keeps_limbs_too(tmp_path: Path) -> None:
-    rest = REST * [1.2, 0.8, 1.1] + [0.1, -0.2, 0.3]
-    rest[JOINT["left_elbow"], 1] -= 0.1
-    bvh, chosen = read(tmp_path, "cmu_daz"), load_skeleton("cmu_daz")
-    body = clip_kinematics(to_clip(bvh, chosen, rest), rest)[1]
-    positions = to_z_up(bvh.kinematics()[1])[1:]
-    start, end = bvh.nodes.index("lShldr"), bvh.nodes.index("lForeArm")
-    hips = [bvh.nodes.index("lThigh"), bvh.nodes.index("rThigh")]
-    middle = positions[:, hips].mean(1) * chosen.unit * fit(bvh, chosen, rest).scale
-    np.testing.assert_allclose(body[:, [1, 2]].mean(1), middle, atol=1e-9)
-    arm = body[:, JOINT["left_elbow"]] - body[:, JOINT["left_shoulder"]]
-    np.testing.assert_allclose(unit(arm), unit(positions[:, end] - positions[:, start]), atol=1e-9)
-
-
 # Axes, scale, calibration
 
 
-@pytest.mark.parametrize("skeleton", TREES)
-def test_a_standing_person_stands(tmp_path: Path, skeleton: str) -> None:
+def test_a_standing_person_stands(tmp_path: Path) -> None:
     """The file's zero pose, on the file's floor: upright in z, facing -y, left on +x, soles on the floor."""
-    sample = person(skeleton, 2, 0)
+    sample = person("cmu_daz", 2, 0)
     sample.values[:] = 0
-    bvh, chosen = read_bvh(write(tmp_path, sample.text())), load_skeleton(skeleton)
+    bvh, chosen = read_bvh(write(tmp_path, sample.text())), load_skeleton("cmu_daz")
     toes = bvh.zero_pose()[[bvh.nodes.index(chosen.joints[foot]) for foot in ("left_foot", "right_foot")], 1]
     sample.values[:, 1] = -toes.mean()
     clip = to_clip(read_bvh(write(tmp_path, sample.text())), chosen)
@@ -373,13 +324,12 @@ def test_calibration_frame_is_dropped(tmp_path: Path) -> None:
 # Motion of people
 
 
-@pytest.mark.parametrize("skeleton", TREES)
-def test_a_performance_comes_back_from_its_file(tmp_path: Path, skeleton: str) -> None:
+def test_a_performance_comes_back_from_its_file(tmp_path: Path) -> None:
     """The embedded motion, written as a file of the skeleton: all joints that it has are where they were."""
     clip, chosen, sample = (
         synthesize_clip("reaching", 0, seconds=2.0),
-        load_skeleton(skeleton),
-        tree(skeleton),
+        load_skeleton("cmu_daz"),
+        tree("cmu_daz"),
     )
     corrections = fit(zero_pose(sample), chosen, REST).corrections
     file = performed(chosen, clip, sample=sample, corrections=corrections)
@@ -417,21 +367,16 @@ def whole(turn: Rotation) -> np.ndarray:
     return np.tile(turn.as_matrix(), (len(own_tree(DAZ).names), 1, 1))
 
 
-@pytest.mark.parametrize("degrees", [180, -37])
-def test_a_zero_pose_that_stands_serves(tmp_path: Path, walk: Clip, degrees: float) -> None:
+def test_a_zero_pose_serves_if_it_stands(tmp_path: Path, walk: Clip) -> None:
     """Whichever way it faces, it is turned to face +Z."""
-    stance = found(tmp_path, walk, DAZ, turns=whole(Rotation.from_euler("y", degrees, degrees=True)))
+    lies = found(tmp_path, walk, DAZ, turns=whole(Rotation.from_euler("x", 90, degrees=True)))
+    assert lies.source.startswith(STRAIGHTEST)
+    assert not lies.straight
+    stance = found(tmp_path, walk, DAZ, turns=whole(Rotation.from_euler("y", -37, degrees=True)))
     assert (stance.source, stance.straight) == ("the zero pose", True)
     left = stance.positions[1] - stance.positions[2]
     np.testing.assert_allclose(left / np.linalg.norm(left), [1, 0, 0], atol=1e-6)
     assert (stance.positions[10] - stance.positions[7])[2] > 0
-
-
-@pytest.mark.parametrize(("axis", "degrees"), [("x", 90), ("z", 180)])
-def test_a_zero_pose_that_lies_does_not_serve(tmp_path: Path, walk: Clip, axis: str, degrees: float) -> None:
-    stance = found(tmp_path, walk, DAZ, turns=whole(Rotation.from_euler(axis, degrees, degrees=True)))
-    assert stance.source.startswith(STRAIGHTEST)
-    assert not stance.straight
 
 
 def test_a_runner_whose_feet_point_back_is_no_stance(tmp_path: Path, walk: Clip) -> None:
@@ -476,23 +421,17 @@ def swapped(chosen: SkeletonMap, parts: tuple[str, ...]) -> SkeletonMap:
     return replace(chosen, joints=joints)
 
 
-@pytest.mark.parametrize("turned", [False, True])
-@pytest.mark.parametrize(
-    ("parts", "said"),
-    [
+def test_swapped_sides_are_refused(tmp_path: Path, walk: Clip) -> None:
+    for parts, said in (
         ((*ARM, *LEG), "the feet point backward, so left and right may be swapped"),
         (ARM, "the left shoulder is on the side of the right hip"),
         (LEG, "the left shoulder is on the side of the right hip"),
-    ],
-)
-def test_swapped_sides_are_refused(
-    tmp_path: Path, walk: Clip, parts: tuple[str, ...], said: str, turned: bool
-) -> None:
-    turns = random_turns(own_tree(DAZ), 1) if turned else None
-    if turned and "hip" in parts:
-        said = "bends forward: left and right"
-    with refuse(tmp_path / "clip.bvh", said):
-        found(tmp_path, walk, swapped(DAZ, parts), turns=turns)
+    ):
+        with refuse(tmp_path / "clip.bvh", said):
+            found(tmp_path, walk, swapped(DAZ, parts))
+    turns = random_turns(own_tree(DAZ), 1)
+    with refuse(tmp_path / "clip.bvh", "bends forward: left and right"):
+        found(tmp_path, walk, swapped(DAZ, LEG), turns=turns)
 
 
 def test_joints_of_a_leg_that_stand_for_others_are_refused(tmp_path: Path, walk: Clip) -> None:

@@ -162,13 +162,12 @@ def test_a_wrong_rest_is_said(tmp_path: Path, joint: str, turn: list[float], sai
     assert any(said in fault for fault in faults(tmp_path, BANDAI, chosen, turns=turns))
 
 
-@pytest.mark.parametrize("degrees", [90.0, 180.0])
-def test_palms_that_face_elsewhere_are_said(tmp_path: Path, degrees: float) -> None:
+def test_palms_that_face_elsewhere_are_said(tmp_path: Path) -> None:
     """A T-pose whose arms are turned about themselves, which only the axes of the elbows show."""
     sample = own_tree(DAZ)
     turns = np.tile(np.eye(3), (len(sample.names), 1, 1))
     for name in ("lShldr", "lForeArm", "lHand"):
-        turns[sample.names.index(name)] = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
+        turns[sample.names.index(name)] = Rotation.from_euler("x", 90, degrees=True).as_matrix()
     said = faults(tmp_path, DAZ, DAZ, turns=turns)
     assert len(said) == 1
     assert said[0].startswith("left_elbow bends about an axis ")

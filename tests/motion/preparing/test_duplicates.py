@@ -22,10 +22,8 @@ from memmlp.motion.preparing.duplicates import (
     REACH,
     assign_parts,
     keep_one_part,
-    local_turns,
     mark_frames,
     merge_groups,
-    mirror_turns,
 )
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
 from memmlp.motion.preparing.splits import Assignment, ListSplit, MixedSplit, SeededSplit
@@ -33,7 +31,7 @@ from memmlp.motion.preparing.survey import survey
 from memmlp.motion.synthetic import synthesize_clip
 
 CONTENTS = {"a": "x", "b": "y", "c": "x", "d": "x", "e": "y", "f": "z", "g": STILL, "h": STILL}
-ACTIVITIES = ("walking", "running", "waving", "sitting", "punching", "squatting")
+ACTIVITIES = ("walking", "running", "waving", "sitting")
 
 
 def records(contents: dict[str, str]) -> list[ClipRecord]:
@@ -66,20 +64,17 @@ def test_a_published_list_is_kept_although_copies_join_its_groups():
     assert split.assign.call_count == 1
 
 
-@pytest.mark.parametrize(("source", "copy"), [("", False), ("", True), ("cmu/", True)])
-def test_a_copy_leaves_the_limit_of_clips_of_a_group(source: str, copy: bool):
+def test_a_copy_leaves_the_limit_of_clips_of_a_group():
     """Twelve takes of ten clips each; one clip of the first take is there again in the second."""
-    names = [f"{source}take{take:02}/{clip}" for take in range(12) for clip in range(10)]
-    contents = {name: name for name in names}
-    if copy:
-        contents[names[10]] = names[0]
+    names = [f"cmu/take{take:02}/{clip}" for take in range(12) for clip in range(10)]
+    contents = {name: name for name in names} | {names[10]: names[0]}
     own = SeededSplit(test=0.2, val=0.2, groups=["(take..)/"], per_group=2)
-    split = MixedSplit({"cmu": own}) if source else own
+    split = MixedSplit({"cmu": own})
     parts, groups, gave_way = assign_parts(split, records(contents))
     held_out = Counter((groups[name], part) for name, part in parts.items() if part in ("val", "test"))
     assert {part for _, part in held_out} == {"val", "test"}
     assert set(held_out.values()) == {2}
-    assert groups[names[10]] == (groups[names[0]] if copy else names[10])
+    assert groups[names[10]] == groups[names[0]]
     assert gave_way == {}
 
 
@@ -129,8 +124,7 @@ def at_120_hz(root: Path) -> Path:
     return root
 
 
-@pytest.mark.parametrize("fps", [20.0, 119.88])
-@pytest.mark.parametrize("change", [lambda clip: clip, mirrored], ids=["plain", "mirrored"])
+@pytest.mark.parametrize(("fps", "change"), [(20.0, lambda clip: clip), (119.88, mirrored)])
 def test_a_copy_at_another_rate_is_found(
     root: Path, monkeypatch: pytest.MonkeyPatch, fps: float, change: Callable[[Clip], Clip]
 ):
@@ -164,26 +158,11 @@ def test_a_clip_that_only_begins_like_another_is_not_a_copy(root: Path, monkeypa
     assert survey(root).duplicates == {}
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        rounded,
-        elsewhere,
-        lambda clip: rounded(cut(clip, 97, 230)),
-        lambda clip: rounded(cut(mirrored(clip), 97, 230)),
-        lambda clip: elsewhere(mirrored(clip)),
-    ],
-    ids=["precision", "place", "middle", "mirrored middle", "mirrored elsewhere"],
-)
+@pytest.mark.parametrize("change", [elsewhere, lambda clip: rounded(cut(mirrored(clip), 97, 230))])
 def test_a_clip_that_shares_a_stretch_is_found(root: Path, change: Callable[[Clip], Clip]):
     for activity in ACTIVITIES:
         write_clip(root / "b" / f"{activity}.npz", change(recorded(activity)))
     assert survey(root).duplicates == {f"b/{activity}": f"a/{activity}" for activity in ACTIVITIES}
-
-
-def test_mirrored_rotations_are_those_of_mirrored_frames():
-    clip = recorded("waving")
-    np.testing.assert_allclose(mirror_turns(local_turns(clip)), local_turns(mirrored(clip)), atol=1e-6)
 
 
 def test_overlapping_windows_of_a_recording_are_one_group(root: Path):
@@ -193,13 +172,6 @@ def test_overlapping_windows_of_a_recording_are_one_group(root: Path):
         write_clip(root / f"window_{start:03}.npz", cut(recording, start, start + 240))
     assert set(survey(root).duplicates.values()) == {"window_000"}
     assert len(survey(root).duplicates) == 4
-
-
-def test_a_cut_at_another_rate_is_found(root: Path):
-    recording = synthesize_clip("walking", 3, seconds=6.0, fps=120.0)
-    write_clip(root / "a.npz", recording)
-    write_clip(root / "b.npz", resample(cut(recording, 120, 600), 60.0)[0])
-    assert survey(root).duplicates == {"b": "a"}
 
 
 def test_repetitions_and_cuts_without_common_frames_are_different(root: Path):
@@ -221,23 +193,22 @@ def test_a_common_rest_pose_is_not_a_shared_stretch(root: Path):
     assert survey(root).duplicates == {}
 
 
-@pytest.mark.parametrize("frames", [1, 2 * REACH, 2 * REACH + 1])
-def test_a_clip_too_short_for_a_stretch_has_no_marks_beyond_its_middle(frames: int):
-    for marks in mark_frames(cut(recorded("walking"), 0, frames)):
-        assert set(marks.frames) <= {REACH}
-        assert marks.signatures.shape == (len(marks.frames), 24)
+def test_a_clip_too_short_for_a_stretch_has_no_marks_beyond_its_middle():
+    for frames in (1, 2 * REACH, 2 * REACH + 1):
+        for marks in mark_frames(cut(recorded("walking"), 0, frames)):
+            assert set(marks.frames) <= {REACH}
+            assert marks.signatures.shape == (len(marks.frames), 24)
 
 
 def test_copies_are_drawn_together(root: Path, tmp_path: Path):
     for activity in ACTIVITIES:
         again = cut(recorded(activity), 60)
         write_clip(root / "b" / f"{activity}.npz", again if activity < "s" else resample(again, 30.0)[0])
-    for seed in range(3):
-        manifest = prepare(ClipFolder(root, SeededSplit(test=0.3, val=0.3, seed=seed)), tmp_path / "cache")
-        parts = {clip.name: clip.split for clip in manifest.clips}
-        assert set(parts.values()) == {"train", "val", "test"}
-        assert all(parts[f"a/{activity}"] == parts[f"b/{activity}"] for activity in ACTIVITIES)
-        assert len({clip.group for clip in manifest.clips}) == len(ACTIVITIES)
+    manifest = prepare(ClipFolder(root, SeededSplit(test=0.3, val=0.3)), tmp_path / "cache")
+    parts = {clip.name: clip.split for clip in manifest.clips}
+    assert set(parts.values()) == {"train", "val", "test"}
+    assert all(parts[f"a/{activity}"] == parts[f"b/{activity}"] for activity in ACTIVITIES)
+    assert len({clip.group for clip in manifest.clips}) == len(ACTIVITIES)
 
 
 def test_the_training_part_of_a_list_gives_way_to_its_test_part(root: Path, tmp_path: Path):
