@@ -71,7 +71,8 @@ def memory(kind: type[Memory] = CodeMemory, **changes) -> Memory:
     """Make a memory for the tiny network, with changed settings."""
     if kind is NoMemory:
         return NoMemory(depth=DEPTH, **SIZES)
-    given: dict[str, Any] = {"layers": (2, 4), "width": 6, "shift": "window", "history": "first"}
+    given: dict[str, Any] = {"layers": (2, 4), "width": 6, "fusion": "residual"}
+    given |= {"shift": "window", "history": "first"}
     more: dict[str, Any] = {"depth": DEPTH, **SIZES}
     if kind is CodeMemory:
         more["codes"] = changes.pop("codes", None) or vqvae()

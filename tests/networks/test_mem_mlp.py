@@ -51,7 +51,8 @@ def run(model: MemMLP, sparse: torch.Tensor, new: int = 1) -> list[torch.Tensor]
 def test_paper_profile_has_the_papers_parameters():
     """4.10 M within 3 %: trainable parameters, the frozen VQ-VAE not counted (Table 16)."""
     sizes = {"hidden": 512, "frames": 41}
-    keys = CodeMemorySettings(layers=[2, 4, 6, 8], width=192, shift="window", history="first")
+    read = {"fusion": "residual", "shift": "window", "history": "first"}
+    keys = CodeMemorySettings(layers=[2, 4, 6, 8], width=192, **read)
     memory = CodeMemory(keys, codes=VQVAE(), depth=8, **sizes)
     normalizer = Normalizer.raw(HeadRelative(), torch.tensor(builtin_rest_joints()))
     model = MemMLP(normalizer, memory, TwoBranch(TwoBranchSettings(2), **sizes), depth=8, **sizes)
