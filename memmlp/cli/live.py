@@ -57,7 +57,6 @@ class LiveOptions(NamedTuple):
     host: str = "127.0.0.1"
     token: str | None = None
     no_browser: bool = True
-    send: bool = False
 
     @property
     def is_file(self) -> bool:
@@ -92,7 +91,7 @@ class LiveOptions(NamedTuple):
     default=SPACE,
     show_default=True,
     type=click.Choice(["amass", "openxr", "unity"]),
-    help="Frame of reference of the packets, also of those that --send sends.",
+    help="Frame of reference of the packets.",
 )
 @click.option(
     "--hz", default=HZ, show_default=True, type=Finite(10, 1000), help="Samples of a clip per second, Hz."
@@ -141,9 +140,6 @@ class LiveOptions(NamedTuple):
 @page_options(port=8765)
 @host_option
 @token_option
-@click.option(
-    "--send", is_flag=True, help="Send the clip once to the port of --udp or --osc, without a page."
-)
 @plugins_option
 @outputs_option
 def live(**options: Any) -> None:
@@ -157,10 +153,7 @@ def live(**options: Any) -> None:
     if not given.is_file:
         check_runs(given.outputs, given.network)
     with contextlib.suppress(KeyboardInterrupt):
-        if given.send:
-            send_clip(given)
-        else:
-            serve(given)
+        serve(given)
 
 
 def check_options(given: LiveOptions) -> None:
@@ -168,32 +161,21 @@ def check_options(given: LiveOptions) -> None:
     from memmlp.common.errors import InputError
     from memmlp.common.page_server import check_token
 
-    live_packets = given.packets and not given.send
     worn = {
         "--height": given.height is not None,
         "--floor": given.floor is not None,
         "--calibration": given.calibration is not None,
         "--sender": bool(given.senders),
     }
-    outputs = given.vmc or given.vrchat or given.record or given.avatar
-    sources = (given.udp is not None) + (given.osc is not None)
-    checks = {
-        "--clip, --udp, --osc: expected only one source": sources > 1 or (given.clip and live_packets),
-        "--send: needs --udp PORT or --osc PORT": given.send and not given.packets,
-        "--send: only sends trackers; leave out --vmc, --vrchat, --record and --avatar": given.send
-        and outputs,
-        f"--space {given.space}: must be {SPACE} with a clip; others are for packets": (
-            given.space != SPACE and not given.packets
-        ),
-        "--hz: needs a clip or --send; packets arrive at any rate": given.hz != HZ and live_packets,
-    } | {
-        f"{name}: needs --udp PORT or --osc PORT, the packets of a wearer's devices": said
-        and not live_packets
-        for name, said in worn.items()
-    }
-    for line, failed in checks.items():
-        if failed:
-            raise InputError(line)
+    sources = [given.udp, given.osc, given.clip]
+    if sum(source is not None for source in sources) > 1:
+        raise InputError("--clip, --udp, --osc: expected only one source")
+    if given.packets is None and given.space != SPACE:
+        raise InputError(f"--space {given.space}: must be {SPACE} with a clip; others are for packets")
+    if given.packets and given.hz != HZ:
+        raise InputError("--hz: needs a clip; packets arrive at any rate")
+    if given.packets is None and (names := [name for name, said in worn.items() if said]):
+        raise InputError(f"{names[0]}: needs --udp PORT or --osc PORT, the packets of a wearer's devices")
     osc = {"--osc": given.osc is not None, "--vmc": given.vmc, "--vrchat": given.vrchat}
     if (needing := [name for name, said in osc.items() if said]) and find_spec("pythonosc") is None:
         raise InputError(f"{needing[0]}: needs python-osc: pip install 'memmlp[osc]'")
@@ -235,22 +217,6 @@ def load_clip(given: LiveOptions) -> TrackedClip:
     test = open_run(given.outputs, given.network).test
     index = 0 if given.clip is None else clip_index(test, given.clip)
     return TrackedClip(test.names[index], test.clip(index).numpy())
-
-
-def send_clip(given: LiveOptions) -> None:
-    """Send the clip's packets once to the port of the options, in the frame of reference of --space."""
-    from memmlp.live.session.sources import ClipSource, send, to_json, to_osc
-    from memmlp.live.spaces import space_of
-
-    source = ClipSource(load_clip(given), given.hz, rounds=1)
-    assert given.packets is not None  # see check_options
-    kind, port = given.packets
-    click.echo(f"sending {source.name} to port {port}")
-    sent, refused = send(source, port, to_json if kind == "udp" else to_osc, space_of(given.space))
-    late = f" of {source.count}: this machine was too busy for the others" if sent < source.count else ""
-    click.echo(f"{sent} packets sent{late}")
-    if refused:
-        note(f"nothing listened at port {port} for some packets; start memmlp live RUN --{kind} {port}")
 
 
 def serve(given: LiveOptions) -> None:

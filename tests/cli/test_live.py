@@ -34,7 +34,6 @@ REFUSED = {
     "--hz 90 --udp 9000": "--hz",
     "--sender 192.168.1.9": "--sender: needs --udp PORT",
     "--udp 9001 --sender nowhere": "nowhere",
-    "--udp 9001 --send --vmc 127.0.0.1": "--send: ",
     "--udp 9001 --token a-token-of-many-letters": "--token: ",
     "--udp 9001 --host 0.0.0.0 --token short": "--token: ",
     "--vmc 127.0.0.1:none": "--vmc",

@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_line import MAIN, in_folder
+from command_line import MAIN
 from conftest import Memmlp, one_line
+from engine_clips import EXAMPLES
 from PIL import Image
-from processes import PATIENCE, forked, started
+from processes import PATIENCE, started
 
 from memmlp.live.session.sources import Packet, PacketSource
 from memmlp.runs.lookup import list_runs
@@ -134,7 +135,6 @@ def test_without_pyav_nothing_is_computed(memmlp: Memmlp, finished: Run, monkeyp
         (["--clip", "no.npz"], ("no.npz",)),
         (["--udp", "9000", "--osc", "9001"], ("--clip, --udp, --osc",)),
         (["--udp", "9000", "--clip", "a"], ("--clip, --udp, --osc",)),
-        (["--send"], ("--send", "--udp PORT or --osc PORT")),
         (["--hz", "nan"], ("--hz", "finite number")),
     ],
 )
@@ -214,16 +214,14 @@ def test_ctrl_c_ends_it_and_leaves_nothing(
         pass
 
 
-@pytest.mark.parametrize("kind", ["--udp", "--osc"])
-def test_a_clip_that_is_sent_is_predicted(home: Path, finished: Run, stack: contextlib.ExitStack, kind: str):
-    """In a space that both name: the body stands upright on the floor."""
+def test_packets_of_the_example_are_predicted(home: Path, finished: Run, stack: contextlib.ExitStack):
+    """The body stands upright on the floor."""
     free = PacketSource("any", 0, lambda data: Packet((None, None, None)), "amass")
     free.close()
-    at = [kind, str(free.port), "--space", "unity"]
-    watched = Watched(stack, home, finished.id, *at)
-    with forked(in_folder, home, "live", finished.id, "--send", *at):
-        frames = watched.frames()
-        seen = [next(frames) for _ in range(30)]
+    watched = Watched(stack, home, finished.id, "--udp", str(free.port), "--space", "openxr")
+    stack.enter_context(started([sys.executable, str(EXAMPLES / "udp/send.py"), "--port", str(free.port)]))
+    frames = watched.frames()
+    seen = [next(frames) for _ in range(30)]
     assert [f["number"] for f in seen] == list(range(seen[0]["number"], seen[0]["number"] + 30))
     assert all(f["truth"] is None and f["held"] == [] and f["malformed"] == 0 for f in seen)
     head = [f["positions"][3 * 15 + 1] for f in seen]

@@ -115,8 +115,8 @@ def run_loop(
         if outputs:
             outputs.take(frame)
         whole = 1000 * (time.perf_counter() - sample.arrived)
-        message = frame_message(stream, frame, source.truth(frame.time))
-        message |= {"number": number, "whole": round(whole, 3), **counts}
+        message = {"number": number, **frame_message(stream, frame, source.truth(frame.time))}
+        message |= {"whole": round(whole, 3), **counts}
         publish(message | (avatar_message(frame) if avatar else {}))
         number += 1
 

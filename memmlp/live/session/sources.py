@@ -17,7 +17,6 @@ from __future__ import annotations
 import errno
 import json
 import logging
-import math
 import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -30,9 +29,8 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.common.page_server import EVERYWHERE, HOST
 from memmlp.common.progress import notify
-from memmlp.live.outputs import encode_osc
-from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
-from memmlp.live.spaces import Space, SpaceName
+from memmlp.live.rotations import matrix_to_quaternion, sixd_to_matrix
+from memmlp.live.spaces import SpaceName
 from memmlp.live.tracker_resampling import TRACKERS, TrackerSample, interpolate
 from memmlp.motion.body import (
     FPS,
@@ -84,11 +82,6 @@ def from_json(datagram: bytes) -> Packet:
     return read_packet(fields)
 
 
-def to_json(packet: Packet) -> bytes:
-    """Return the JSON datagram of a packet."""
-    return json.dumps(_fields(packet)).encode()
-
-
 def from_osc(datagram: bytes) -> Packet:
     """Read the packet of an OSC bundle. Raises InputError for anything else."""
     from pythonosc.osc_bundle import OscBundle
@@ -104,16 +97,6 @@ def from_osc(datagram: bytes) -> Packet:
         logging.disable(logging.NOTSET)
     numbers = {key: arguments[key][0] for key in ("time", "seq") if arguments.get(key)}
     return read_packet(arguments | numbers)
-
-
-def to_osc(packet: Packet) -> bytes:
-    """Return the OSC bundle of a packet."""
-    kinds = {"time": "d", "seq": "i"}
-    fields = {name: value for name, value in _fields(packet).items() if value is not None}
-    return encode_osc(
-        (PREFIX + name, kinds.get(name, POSE * "f"), [value] if name in kinds else value)
-        for name, value in fields.items()
-    )
 
 
 def read_packet(fields: Mapping[str, Any]) -> Packet:
@@ -140,11 +123,6 @@ def _read_pose(name: str, values: Any) -> QuaternionPose:
     if pose.shape != (POSE,):
         raise InputError(f"{name}: must be {POSE} numbers")
     return pose[:3], pose[3:]
-
-
-def _fields(packet: Packet) -> dict[str, Any]:
-    poses = [None if pose is None else [float(v) for part in pose for v in part] for pose in packet.trackers]
-    return {"time": packet.time, "seq": packet.seq, **dict(zip(TRACKERS, poses, strict=True))}
 
 
 class SourceSample(NamedTuple):
@@ -254,14 +232,13 @@ def npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
 
 
 class ClipSource:
-    """Plays a clip as a headset would send it: at a fixed rate, in real time, in repeated rounds.
+    """Plays a clip as a headset would send it: at a fixed rate, in real time, in endless rounds.
 
     A sample that is due while the last one is still being processed is dropped, as with a device.
 
     Args:
         clip: the clip.
         hz: samples per second.
-        rounds: how often the clip is played; endlessly by default.
         clock: returns the time, seconds; the machine's by default.
         sleep: waits for a number of seconds; the machine's by default.
     """
@@ -273,28 +250,21 @@ class ClipSource:
         self,
         clip: TrackedClip,
         hz: float,
-        rounds: float = math.inf,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ):
         self.clip, self.hz, self.name = clip, float(hz), f"{clip.name} at {hz:g} Hz"
         self.count = int(clip.seconds * hz + 1e-9) + 1  # samples of a round
-        self.rounds, self.clock, self.sleep = rounds, clock, sleep
+        self.clock, self.sleep = clock, sleep
         self.next = 0
         self.start: float | None = None
-
-    @property
-    def over(self) -> bool:
-        """Whether all rounds have been played."""
-        return self.next >= self.rounds * self.count
 
     def read(self) -> SourceSample | None:
         """Wait for the sample that is due next, and return it."""
         now = self.clock()
         self.start = now if self.start is None else self.start
         due = int((now - self.start) * self.hz + 1e-6)
-        last = self.rounds * self.count - 1  # a late reader gets the last sample, not another round
-        dropped = int(max(min(due, last) - self.next, 0))
+        dropped = max(due - self.next, 0)
         index = self.next + dropped
         self.sleep(max(self.start + index / self.hz - now, 0))
         self.next = index + 1
@@ -393,27 +363,3 @@ class PacketSource:
     def close(self) -> None:
         """Release the port."""
         self.socket.close()
-
-
-def send(source: ClipSource, port: int, pack: Callable[[Packet], bytes], space: Space) -> tuple[int, bool]:
-    """Send a clip's samples in a frame of reference to a UDP port of this machine, for all rounds.
-
-    Returns:
-        The number of samples sent, and whether any was refused because nothing listened at the port. Not
-        every system reports that.
-    """
-    sent, refused = 0, False
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        sender.connect((HOST, port))  # so that the system reports a refusal, with the next packet
-        while not source.over and (sample := source.read()) is not None:
-            positions, rotations = (np.stack(p) for p in zip(*filter(None, sample.trackers), strict=True))
-            turned = matrix_to_quaternion(space.rotations_out(quaternion_to_matrix(rotations)))
-            head, left, right = zip(space.positions_out(positions), turned, strict=True)
-            datagram = pack(Packet((head, left, right), sample.time, source.next - 1))
-            try:
-                sender.send(datagram)
-            except ConnectionRefusedError:  # of the packet before
-                refused = True
-                sender.send(datagram)
-            sent += 1
-    return sent, refused

@@ -165,14 +165,14 @@ class Instant(ClipSource):
 
     def __init__(self, clip: TrackedClip, hz: float, stopped: threading.Event):
         self.now, self.stopped = 0.0, stopped
-        super().__init__(clip, hz, 1, lambda: self.now, self.pass_time)
+        super().__init__(clip, hz, lambda: self.now, self.pass_time)
 
     def pass_time(self, seconds: float) -> None:
         self.now += seconds
 
     def read(self) -> SourceSample | None:
         sample = super().read()
-        if self.over:
+        if self.next == self.count:
             self.stopped.set()
         return sample
 
