@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -207,7 +206,7 @@ def show_outcome(shown: ShownSweep, given: Sequence[str], chosen: Sweep, labels:
     found = table_of_plan(shown, SHOWN_MODES["both"], f"memmlp sweep {command}", load)
     write_table(found.table, sweep_folder(chosen, plan.outputs))
     print_tables([found.table])
-    for line in describe_end(rounds, chosen, found.runs) if rounds else ():
+    for line in describe_end(rounds, chosen) if rounds else ():
         click.echo(line)
     click.echo(f"{sum(state == 'done' for state in states.values())} of {len(states)} runs done")
     for task in failed:
@@ -335,30 +334,17 @@ def describe_progress(rounds: Rounds, sweep: Sweep, last: Analysis | None = None
     return [count, *(line.rstrip() for line in aligned(rows, left=len(rows[0])))]
 
 
-def describe_end(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> list[str]:
-    """Say why the rounds ended, what more seeds could do, and how many runs were spent."""
-    from memmlp.report.tables.seed_rounds import forecast_seeds
-
+def describe_end(rounds: Rounds, sweep: Sweep) -> list[str]:
+    """Say why the rounds ended, and how many runs were spent."""
     latest = [finding for finding, _ in rounds.latest().values()]
     still = [finding for finding in latest if finding.verdict == "inconclusive"]
-    evaluated = {mode for found in runs.values() for run in found.values() for mode in run.means}
-    without = Counter(key.label for key in rounds.without_findings(sweep) if key.mode in evaluated)
+    analysed = {label for one in rounds.analyses for label in one.runs}
+    without = sorted(analysed - {finding.label for finding in latest})
     lines = [] if still or without or rounds.upcoming(sweep) else ["all verdicts are decided"]
-    lines += [
-        f"of '{label}' {number} comparisons have no verdict: the runs have nothing to compare"
-        for label, number in without.items()
-    ]
+    if without:
+        lines.append(f"no verdict, as the runs have nothing to compare: {', '.join(without)}")
     if any(finding.p is None for finding in still):
         lines.append("test clips are one group, or a network diverged on one: no number of seeds decides")
-    forecasts: dict[str, list[int | None]] = {}
-    for key, seeds in forecast_seeds(rounds, sweep, runs).items():
-        forecasts.setdefault(key.label, []).append(seeds)
-    for label, numbers in forecasts.items():
-        some = [number for number in numbers if number is not None]
-        parts = [f"{len(some)} would take about {max(some)} seeds"] if some else []
-        if len(some) < len(numbers):
-            parts.append(f"{len(numbers) - len(some)} no number of seeds: the groups of clips are too few")
-        lines.append(f"inconclusive of '{label}', if its effects are as measured: {'; '.join(parts)}")
     used, variants = sum(rounds.seed_counts(sweep).values()), len(sweep.runnable())
     last = max((one.seeds for one in rounds.analyses), default=rounds.schedule[0])
     fixed = [

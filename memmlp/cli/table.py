@@ -29,10 +29,6 @@ if TYPE_CHECKING:
     from memmlp.sweep.definition import Sweep
     from memmlp.sweep.plan import Plan
 
-NEEDED = (
-    "needed: seeds for an effect of the paper's size to be significant with 80 % power, after Holm's "
-    "correction over this table, with these test clips; no number: the clips alone are too uncertain"
-)
 SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", "window")}
 
 
@@ -76,11 +72,6 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
     is_flag=True,
     help="Measure networks without a run untrained; for tables of costs alone (16, 17).",
 )
-@click.option(
-    "--seeds-needed",
-    is_flag=True,
-    help="Show how many seeds it would take to see the paper's effects on this data.",
-)
 @config_dir_option
 @plugins_option
 @outputs_option
@@ -95,7 +86,6 @@ def table(
     together: tuple[str, ...],
     add: tuple[Path, ...],
     untrained: bool,
-    seeds_needed: bool,
     outputs: Path,
 ) -> None:
     """Show the table of a sweep: NAME is a file's path, a shipped sweep, a table's number, or `all`.
@@ -105,8 +95,6 @@ def table(
     from memmlp.report.tables import rows_measured_in_browsers
     from memmlp.report.tables.measured_run import load
 
-    if seeds_needed and (form or out or add):
-        raise InputError("--seeds-needed: does not go with --format, --out and --add")
     measured = [rows_measured_in_browsers.read(path) for path in add]
     selection = TableSelection(branch, source, together, untrained)
     gc.disable()  # what is read from the runs stays in use, and searching it for garbage takes a second
@@ -114,9 +102,6 @@ def table(
         found = gathered([name], overrides, outputs, SHOWN_MODES[mode], functools.cache(load), selection)
     finally:
         gc.enable()
-    if seeds_needed:
-        print_needs(found, SHOWN_MODES[mode])
-        return
     tables = [functools.reduce(rows_measured_in_browsers.with_rows, measured, one.table) for one in found]
     if form is None and out is None:
         print_tables(tables)
@@ -259,23 +244,6 @@ def print_tables(tables: Sequence[Table]) -> None:
     console = Console(highlight=False, markup=False)
     for one in tables:
         show(one, console)
-
-
-def print_needs(found: Sequence[SweepTable], modes: Sequence[str]) -> None:
-    """Print, sweep by sweep, how many seeds the paper's effects would need."""
-    from memmlp.report.tables.effects import needs
-    from memmlp.report.tables.table_text import caption
-
-    for one in found:
-        wanted = needs(one.sweep, one.runs, modes)
-        click.echo(caption(one.table))
-        rows = [("variant", "mode", "metric", "paper", "here", "seeds", "needed")]
-        for need in wanted:
-            numbers = (f"{need.paper:+.2f}", f"{need.measured:+.2f}", str(need.have))
-            rows.append((need.label, need.mode, need.metric, *numbers, str(need.seeds or "no number")))
-        none = "no variant with an effect that the paper prints has two seeds and two groups of clips"
-        lines = [*aligned(rows, left=3), NEEDED] if wanted else [none]
-        click.echo("\n".join([*lines, ""]))
 
 
 def aligned(rows: Sequence[Sequence[str]], left: int) -> list[str]:

@@ -54,15 +54,6 @@ def test_command_puts_clips_together(memmlp: Memmlp, planned: None):
     )
 
 
-def test_command_plans_seeds(memmlp: Memmlp, planned: None):
-    out = memmlp("table", "14", "--seeds-needed", "--mode", "stream").out
-    rows = [line.split() for line in out.splitlines() if " stream " in line]
-    assert len(rows) == 3 * 4
-    assert all(row[-2] == "3" or row[-3] == "3" for row in rows)
-    assert "needed: seeds for an effect of the paper's size" in out
-    assert "no variant with an effect" in memmlp("table", "1", "--seeds-needed").out
-
-
 def test_command_writes_the_format_of_the_ending(memmlp: Memmlp, planned: None, tmp_path: Path):
     for ending, word in (
         ("md", "| variant |"),
@@ -102,7 +93,6 @@ def test_all_as_json_is_one_list(memmlp: Memmlp, planned: None):
         (["14", "--out", "/proc/nothing/t.md"], ("--out /proc/nothing/t.md",)),
         (["14", "--mode", "both modes"], ("--mode",)),
         (["14", "--branch", "head"], ("--branch", "rotation", "combined")),
-        (["14", "--seeds-needed", "--format", "md"], ("--seeds-needed",)),
     ],
 )
 def test_bad_input_is_one_line(memmlp: Memmlp, planned: None, arguments: list[str], words: tuple[str, ...]):

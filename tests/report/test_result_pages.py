@@ -133,7 +133,8 @@ def test_pages_of_the_clone_are_made_again_byte_for_byte():
 @pytest.mark.slow
 def test_every_interval_of_the_clone_follows_from_what_is_kept():
     """As many intervals as the pages print are computed here from the per-clip results, and are equal."""
-    for name, one in clones_tables().items():
+    for name in ("mix", "networks", "table14"):  # the first two have several sources
+        one = clones_tables()[name]
         text, printed = (DOCS / f"{name}.md").read_text(encoding="utf-8"), []
         content = json.loads((DOCS / "data" / f"{name}.json").read_text())
         sources_of = [None, *(one.kept.sources if one.by_source else ())]

@@ -18,11 +18,10 @@ from memmlp.report.tables.statistics import (
     equivalence_p,
     holm,
     paired_effects,
-    seeds_needed,
     verdict,
 )
 from memmlp.report.tables.table import STEADY, Effect, Key
-from memmlp.sweep.definition import COSTS, MODES, TIMES, Sweep, Variant
+from memmlp.sweep.definition import COSTS, TIMES, Sweep, Variant
 
 RunsBySeed = Mapping[int, Measured]  # a variant's finished runs by seed
 
@@ -274,45 +273,3 @@ def with_existing_branches(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Swee
 
     variants = (replace(one, branch="rotation") if single(one) else one for one in sweep.variants)
     return replace(sweep, variants=tuple(variants))
-
-
-class Need(NamedTuple):
-    """The seeds that a comparison needs for an effect of the paper's size to be seen with 80 % power.
-
-    Attributes:
-        label, mode, metric: which comparison it is.
-        paper: the paper's difference.
-        measured: the measured mean difference.
-        have: the number of seeds so far.
-        seeds: the number of seeds needed; None if no number of seeds would be enough with these clips.
-    """
-
-    label: str
-    mode: str
-    metric: str
-    paper: float
-    measured: float
-    have: int
-    seeds: int | None
-
-
-def needs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str] = MODES) -> list[Need]:
-    """Return the needs of all variants and metrics whose effects the paper prints, in the table's order.
-
-    The correction is over the comparisons that the present runs allow, in both modes, as a table's is. A
-    comparison without a p-value, such as that of a variant with one seed, is left out.
-
-    Args:
-        sweep: the sweep.
-        runs: the finished runs of every runnable variant, by seed.
-        modes: the modes of evaluation whose comparisons are returned.
-    """
-    shown = with_existing_branches(sweep, runs)
-    pairs, variants = paired(shown, runs, MODES), {variant.label: variant for variant in shown.variants}
-    found, comparisons = [], testable(pairs)
-    for key, pair in pairs.items():
-        effect = paper_effect(shown, variants[key.label], key.metric)
-        if effect and key.mode in modes and pair.testable:
-            number = seeds_needed(pair.matrix, effect, comparisons, pair.groups)
-            found.append(Need(*key, effect, float(pair.matrix.mean()), len(pair.matrix), number))
-    return found

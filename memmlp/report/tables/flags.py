@@ -77,7 +77,7 @@ def find_flags(
         yield from differences(what, values)
     yield from older_code((label, run.code, run.origin.plugins) for label, run in every)
     if set(TIMES) & set(sweep.metrics):
-        timed = [(run.origin.timed_on, label) for label, run in every if run.latency or run.costs]
+        timed = [(run.origin.timed_on, label) for label, run in every if run.costs]
         yield from differences("machine of the times", [one for one in timed if one[0] != UNKNOWN])
         yield from _busy_machine(sweep, runs)
     if has_errors:

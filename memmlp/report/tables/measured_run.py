@@ -113,7 +113,6 @@ class Measured:
             the ONNX file, frames per second, and the shares of the measured times in which the thread had a
             core (CORE_SHARES).
         origin: what the run was made from.
-        latency: all measurements of its streaming step.
         clip_sources: the source of each clip, if the data has several sources.
         run: the run's folder; None for results that were kept without it.
         training: what its training took, as far as known: `seconds`; `frames`, the frames seen, each counted
@@ -128,7 +127,6 @@ class Measured:
     groups: Mapping[str, str]
     costs: Mapping[str, float]
     origin: Origin
-    latency: Mapping[str, Any] = field(default_factory=dict)
     run: Run | None = None
     clip_sources: Mapping[str, str] = field(default_factory=dict)
     training: Mapping[str, float] = field(default_factory=dict)
@@ -257,7 +255,7 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     training = {"seconds": float(seconds)} if seconds is not None else {}
     training |= {"frames": frames} if frames else {}
     costs, code = _costs(latency), _code(manifest)
-    return Measured(run.id, means, clips, groups, costs, origin, latency, run, sources, training, code)
+    return Measured(run.id, means, clips, groups, costs, origin, run, sources, training, code)
 
 
 def of_untrained(
@@ -271,7 +269,7 @@ def of_untrained(
         environment: the code, the packages and the hardware, as a run's manifest has them.
     """
     digest = hashlib.sha256("\n".join(["untrained", *overrides]).encode()).hexdigest()[:16]
-    return Measured(digest, {}, {}, {}, _costs(record), _origin(environment), record)
+    return Measured(digest, {}, {}, {}, _costs(record), _origin(environment))
 
 
 def _join(known: dict[str, Any], more: Mapping[str, Any]) -> None:

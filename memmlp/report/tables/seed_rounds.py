@@ -36,7 +36,6 @@ from memmlp.report.tables.effects import (
 from memmlp.report.tables.statistics import (
     Verdict,
     analysis_schedule,
-    seeds_needed,
     sequential,
     spending,
     verdict,
@@ -172,15 +171,6 @@ class Rounds:
         keys = (key for variant in new for key in _possible_keys(sweep, variant))
         return list(dict.fromkeys([*self.latest(), *keys]))
 
-    def without_findings(self, sweep: Sweep) -> list[Key]:
-        """Return the comparisons without findings, for variants that were analysed.
-
-        Their runs have no numbers, or are one and the same.
-        """
-        analysed = [variant for variant, _ in _compared(sweep) if self.position(variant.label)]
-        keys = (key for variant in analysed for key in _possible_keys(sweep, variant))
-        return [key for key in keys if key not in self.latest()]
-
     def apply_verdicts(self, effects: Mapping[Key, Effect]) -> dict[Key, Effect]:
         """Return the effects with the analyses' verdicts in place of those from a fixed number of seeds."""
         latest, found = self.latest(), dict(effects)
@@ -283,27 +273,6 @@ def advance(
     analysis = Analysis(rounds.schedule[number], rounds.levels[number], named, ())
     analysis = replace(analysis, findings=tuple(_findings(rounds, sweep, runs, analysis)))
     return replace(rounds, analyses=(*rounds.analyses, analysis))
-
-
-def forecast_seeds(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> dict[Key, int | None]:
-    """Return how many seeds would decide each inconclusive comparison of variants without a next analysis.
-
-    The numbers are for 80 % power, if the effect is as measured, at a single analysis, with a correction over
-    all comparisons without a claim. None means that no number of seeds would be enough with these clips.
-    """
-    latest, upcoming = rounds.latest(), rounds.upcoming(sweep)
-    still = [key for key, (finding, _) in latest.items() if finding.undecided and key.label not in upcoming]
-    unclaimed = sum(
-        key not in latest or latest[key][0].verdict is Verdict.INCONCLUSIVE
-        for key in rounds.comparisons(sweep)
-    )
-    found = {}
-    for key, pair in paired(with_existing_branches(sweep, runs), runs, MODES).items():
-        if key in still:
-            mean = abs(float(pair.matrix.mean()))
-            effect = max(mean, sweep.smallest[key.metric] - mean)
-            found[key] = seeds_needed(pair.matrix, effect, unclaimed, pair.groups)
-    return found
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,6 @@ groups have the larger effects.)
 
 from __future__ import annotations
 
-import bisect
 import functools
 import itertools
 from collections.abc import Sequence
@@ -233,52 +232,9 @@ def detectable(
     known = error(differences, groups)
     if known.conditional:
         return np.full(len(differences), np.nan)
-    return found(components(known), differences.shape[1], known.groups, LEVEL / comparisons, power)
-
-
-def seeds_needed(
-    differences: np.ndarray,
-    effect: float,
-    comparisons: int,
-    groups: Groups = None,
-    power: float = 0.8,
-    most: int = 1000,
-) -> int | None:
-    """Return the fewest seeds with which this effect would be found, estimated from differences (S, C).
-
-    It is computed as in `detectable`, with the parts of seeds and noise divided by the number of seeds.
-
-    Args:
-        differences: the differences of one comparison (S, C).
-        effect: the effect to be found, in the unit of the differences.
-        comparisons: how many comparisons Holm's correction is over.
-        groups: the group of each clip (C,).
-        power: the share of tables in which the effect is to be found.
-        most: the largest number of seeds to consider.
-
-    Returns:
-        The number; None if not even `most` seeds are enough, because the groups of clips are too few or too
-        different, and with one seed or one group.
-    """
-    matrix = differences.reshape(1, *differences.shape[-2:])
-    known = error(matrix, groups)
-    if known.conditional:
-        return None
-
-    def enough(seeds: int) -> bool:
-        share = matrix.shape[1] / seeds
-        parts = components(known) * [[share], [1], [share]]
-        return bool(found(parts, seeds, known.groups, LEVEL / comparisons, power)[0] <= abs(effect))
-
-    if not enough(most):
-        return None
-    return bisect.bisect_left(range(most), True, lo=2, key=enough)
-
-
-def components(known: Error) -> np.ndarray:
-    """Return the parts (3, K) of seeds, groups and noise in the variances of the means."""
-    seeds, groups, noise = known.variances
-    return np.stack([np.maximum(seeds - noise, 0), np.maximum(groups - noise, 0), noise])
+    seeds, clips, noise = known.variances
+    parts = np.stack([np.maximum(seeds - noise, 0), np.maximum(clips - noise, 0), noise])
+    return found(parts, differences.shape[1], known.groups, LEVEL / comparisons, power)
 
 
 def found(parts: np.ndarray, seeds: int, groups: float, level: float, power: float) -> np.ndarray:

@@ -13,12 +13,12 @@ from fake_runs import CLIPS, fake_run, fake_sweep, runs_of, table_of
 from fake_table import EFFECTS, cell, printed
 
 from memmlp.report.tables.build_table import make_table
-from memmlp.report.tables.effects import mean_cost, needs
+from memmlp.report.tables.effects import mean_cost
 from memmlp.report.tables.measured_run import load
 from memmlp.report.tables.statistics import Verdict, holm, paired_effects
 from memmlp.report.tables.table import Table
 from memmlp.runs.evaluation_file import write_report
-from memmlp.sweep.definition import MODES, Sweep
+from memmlp.sweep.definition import Sweep
 
 
 def test_difference_is_paired_by_seed_and_clip(sweep: Sweep, tmp_path: Path):
@@ -251,7 +251,6 @@ def test_nothing_is_claimed_of_the_clips_that_a_divergence_leaves(
         assert cell(table, "no | memory", metric, "window").effect.significant
     assert cell(table, "no | memory", "Jitter").effect.clips == 11
     assert cell(table, "no | memory", "Jitter").effect.significant
-    assert {need.metric for need in needs(sweep, runs_of(sweep, find), ("stream",))} == set()
 
 
 @pytest.mark.parametrize("seeds", range(1, 11))
@@ -260,24 +259,3 @@ def test_equal_costs_differ_by_nothing_however_many_seeds_have_them(seeds: int):
     for size in (1.66427, 0.0016469, 0.357113):
         runs = {seed: SimpleNamespace(costs={"parameters": size}) for seed in range(seeds)}
         assert mean_cost(runs, "parameters") == size
-
-
-def test_seeds_that_the_papers_effects_need(sweep: Sweep, tmp_path: Path):
-    find = fake_sweep(tmp_path, sweep)
-    found = {(n.label, n.mode, n.metric): n for n in needs(sweep, runs_of(sweep, find))}
-    assert {key[::2] for key in found} == {("no | memory", "MPJRE"), ("no | memory", "MPJPE")}
-    big = replace(sweep.variants[1], paper={"MPJRE": 9.0, "MPJPE": 9.0})
-    louder = replace(sweep, variants=(sweep.variants[0], big, *sweep.variants[2:]))
-    fewer = {(n.label, n.mode, n.metric): n for n in needs(louder, runs_of(louder, find))}
-    for key, need in found.items():
-        assert need.have == 3
-        assert fewer[key].seeds <= (need.seeds or 1000)
-    assert fewer["no | memory", "stream", "MPJPE"].seeds <= 3 < found["no | memory", "stream", "MPJPE"].seeds
-    runs = runs_of(sweep, find)
-    alone = needs(sweep, {**runs, "by position": {}})
-    assert needs(sweep, {**runs, "by position": {0: runs["by position"][0]}}) == alone  # it has no p-values
-    assert needs(replace(sweep, seeds=(0,)), runs_of(replace(sweep, seeds=(0,)), find)) == []
-    for mode in MODES:  # the table's own correction is over both, whichever is shown
-        assert needs(sweep, runs, (mode,)) == [need for need in found.values() if need.mode == mode]
-    one = fake_sweep(tmp_path / "one", sweep, groups=dict.fromkeys(CLIPS, "one"))
-    assert needs(sweep, runs_of(sweep, one)) == []

@@ -13,7 +13,7 @@ import pytest
 from memmlp.report.tables.build_table import make_table
 from memmlp.report.tables.effects import RunsBySeed
 from memmlp.report.tables.measured_run import Measured, Origin
-from memmlp.report.tables.seed_rounds import Rounds, advance, forecast_seeds, new_rounds
+from memmlp.report.tables.seed_rounds import Rounds, advance, new_rounds
 from memmlp.report.tables.statistics import Verdict
 from memmlp.report.tables.table_text import markdown
 from memmlp.sweep.definition import Sweep
@@ -126,7 +126,6 @@ def test_open_variants_and_their_control_alone_go_on():
         "full": 13, "worse": 3, "same": 3, "unsure": 13
     }  # fmt: skip
     assert rounds.upcoming(SWEEP) == {}
-    assert {key.label for key in forecast_seeds(rounds, SWEEP, world.runs)} == {"unsure"}
 
 
 def test_what_is_decided_stays_though_later_data_would_reverse_it():

@@ -22,7 +22,6 @@ from memmlp.report.tables.statistics import (
     error,
     holm,
     paired_effects,
-    seeds_needed,
     sequential,
     skewed,
     spending,
@@ -90,7 +89,6 @@ def test_one_seed_or_one_group_has_an_interval_of_the_other_alone(shape, labels,
     assert (effects.mean < effects.high).all()
     assert np.isnan(equivalence_p(d, 100, labels)).all()
     assert np.isnan(detectable(d, 1, labels)).all()
-    assert seeds_needed(d[0], 100, 1, labels) is None
     if conditional == "clips":
         sample = d.mean(2)[0]
         assert effects.high[0] == pytest.approx(stats.ttest_1samp(sample, 0).confidence_interval().high)
@@ -273,34 +271,6 @@ def test_detectable_is_found_with_its_power(shape: tuple[int, int], comparisons:
         effect = detectable(d, comparisons, power=power)[0]
         found = np.mean(paired_effects(again + effect).p <= 0.05 / comparisons)
         assert found == pytest.approx(power, abs=0.03)
-
-
-def test_seeds_needed_are_the_first_that_suffice():
-    d = differences(4, 20, 1, (1, 0, 0.02, 0, 1), tables=1)[0]
-    few, many = seeds_needed(d, 12.0, TABLE), seeds_needed(d, 6.0, TABLE)
-    assert few is not None
-    assert many is not None
-    assert 2 <= few < many
-    assert seeds_needed(d[None], -6.0, TABLE) == many
-    assert seeds_needed(d, 6.0, TABLE, most=many) == many
-    assert seeds_needed(d, 6.0, TABLE, most=many - 1) is None
-    measured = detectable(d[None], TABLE)[0]
-    assert seeds_needed(d, 1.0001 * measured, TABLE) == 4
-    assert seeds_needed(d, 0.9999 * measured, TABLE) == 5
-
-
-def test_noise_goes_away_with_seeds():
-    noise = np.outer([1.0, -1.0, 1.0, -1.0], [1.0, -1.0] * 10)
-    half = detectable(noise[None], TABLE)[0] / 2
-    assert error(noise[None]).variances[:2].max() < 1e-12
-    needed = seeds_needed(noise, half, TABLE)
-    assert needed is not None
-    assert 4 < needed <= 16
-
-
-def test_no_number_of_seeds_makes_up_for_few_clips():
-    d = differences(4, 4, 1, (1, 0, 10, 0, 0.1), tables=1)[0]
-    assert seeds_needed(d, 3.0, TABLE) is None
 
 
 def test_holm_known_examples():
