@@ -17,9 +17,10 @@ from memmlp.motion.clip import LINES
 from memmlp.motion.motion_source import MotionSource
 from memmlp.motion.preparing.cache import ClipFolder
 from memmlp.motion.preparing.find_clips import Folders, Root
+from memmlp.motion.preparing.persons import Kind, PersonSplit
 from memmlp.motion.preparing.splits import ListSplit, MixedSplit, SeededSplit, Split, SubsetSplit
 
-SPLITS = {"seeded": SeededSplit, "lists": ListSplit, "subsets": SubsetSplit}
+SPLITS = {"seeded": SeededSplit, "lists": ListSplit, "subsets": SubsetSplit, "persons": PersonSplit}
 
 
 def build_motion(cfg: DictConfig) -> MotionSource:
@@ -87,6 +88,8 @@ class _Clips(NamedTuple):
 def _clips(data: DictConfig) -> _Clips:
     """Return the folder or folders of the clips, and their split; each source is split separately."""
     keys: dict[str, Any] = OmegaConf.to_container(data.split, resolve=True)  # type: ignore[assignment]
+    if "kinds" in keys:
+        keys["kinds"] = {name: Kind(**kind) for name, kind in keys["kinds"].items()}
     split: Any = SPLITS[keys.pop("name")](**keys)
     if sources := data.get("sources"):
         folders = Folders({name: Path(source.root) for name, source in sources.items()})

@@ -43,9 +43,10 @@ def _values(node: DictConfig, prefix: str) -> Iterator[tuple[str, Any, Any]]:
         InputError: for a key that is not in the schema.
     """
     schema: Any = OmegaConf.get_type(node)
-    if not dataclasses.is_dataclass(schema):  # a dictionary of groups
+    if not dataclasses.is_dataclass(schema):  # a dictionary of groups, or of values
         for name in map(str, node):
-            yield from _values(node[name], f"{prefix}{name}.")
+            if isinstance(node[name], DictConfig):
+                yield from _values(node[name], f"{prefix}{name}.")
         return
     known = [spec.name for spec in dataclasses.fields(schema)]
     for extra in sorted(set(map(str, node)) - set(known)):
@@ -105,9 +106,9 @@ def _data_problems(data: DictConfig) -> Iterator[str]:
     weights = [source.weight for source in sources.values()]
     if any(weights) and not all(weights):
         yield "data.sources: must have a weight for each source, or for none"
-    if (sources or OmegaConf.is_list(data.root)) and data.split.groups_file is not None:
+    if (sources or OmegaConf.is_list(data.root)) and data.split.get("groups_file") is not None:
         yield "data.split.groups_file: must be null with several folders; set data.sources.NAME.groups_file"
     split = data.split
-    held_out = split.val + (split.test if isinstance(split.get("test"), float) else 0)
+    held_out = split.get("val", 0) + (split.test if isinstance(split.get("test"), float) else 0)
     if held_out >= 1:
         yield f"data.split.val={split.val}: must be less than what data.split.test leaves of 1"

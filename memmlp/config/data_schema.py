@@ -53,6 +53,25 @@ class SubsetSplitConfig(SplitConfig):
 
 
 @dataclass
+class KindConfig:
+    """Persons with the same kind of motion, and how many of them are held out."""
+
+    persons: list[str] = setting(each())
+    test: int = setting(at_least(0))
+    val: int = setting(at_least(0))
+
+
+@dataclass
+class PersonSplitConfig:
+    """A split by person."""
+
+    name: str = setting(one_of("persons"), "persons")
+    persons: dict[str, str | None] = field(default_factory=dict)
+    kinds: dict[str, KindConfig] = field(default_factory=dict)
+    seed: int = setting(at_least(0), 0)
+
+
+@dataclass
 class DataConfig:
     """What all options of conf/data have in common; each adds where the motion is and how it is split."""
 
@@ -106,3 +125,11 @@ class SubsetDataConfig(DataConfig):
     synth: Settings | None = None
     partial: bool = False
     split: SubsetSplitConfig = group(SubsetSplitConfig)
+
+
+@dataclass
+class PersonDataConfig(DataConfig):
+    root: str = setting(existing("folder"))
+    synth: Settings | None = None
+    partial: bool = False
+    split: PersonSplitConfig = group(PersonSplitConfig)

@@ -27,6 +27,7 @@ from memmlp.common.settings import (
 from memmlp.config.data_schema import (
     DataConfig,
     ListDataConfig,
+    PersonDataConfig,
     SeededDataConfig,
     SubsetDataConfig,
     SynthDataConfig,
@@ -188,6 +189,7 @@ SCHEMAS: dict[str, type] = {
     "data_seeded": SeededDataConfig,
     "data_lists": ListDataConfig,
     "data_subsets": SubsetDataConfig,
+    "data_persons": PersonDataConfig,
 }
 """What a config file in conf/ may start from, as /schema/NAME."""
 
@@ -230,5 +232,10 @@ def _typed(kind: Any, content: Mapping[str, Any]) -> Any:
 
 
 def _data_schema(content: Mapping[str, Any]) -> type:
-    kinds = {"seeded": SeededDataConfig, "lists": ListDataConfig, "subsets": SubsetDataConfig}
+    kinds = {
+        "seeded": SeededDataConfig,
+        "lists": ListDataConfig,
+        "subsets": SubsetDataConfig,
+        "persons": PersonDataConfig,
+    }
     return SynthDataConfig if content.get("synth") else kinds[content["split"]["name"]]

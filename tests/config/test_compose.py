@@ -24,6 +24,7 @@ def test_every_option_composes_and_passes(tmp_path: Path):
     needed = {
         "data=mocap": [root],
         "data=cmu_bandai": [f"data.sources.{source}.root={tmp_path}" for source in ("cmu", "bandai")],
+        "data=persons": [root],
         "data=amass_s1": [root, lists],
         "data=amass_s2": [root],
         "data=amass_s3": [root],

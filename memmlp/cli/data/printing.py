@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from memmlp.common.errors import one_line
+from memmlp.motion.body import FPS
 from memmlp.motion.clip import INTERPOLATED, Skipped
 from memmlp.motion.preparing.find_clips import source_of
 from memmlp.motion.preparing.groups import divided_remark, unmatched_patterns_remark
@@ -38,6 +39,8 @@ def show_manifest(manifest: Manifest) -> None:
         totals = replace(manifest, clips=own).totals.items()
         parts = [f"{part} {total.clips} clips, {total.hours:.3f} h" for part, total in totals]
         click.echo(f"{source}: {'; '.join(parts)}")
+    if manifest.split["kind"] == "persons":
+        show_persons(manifest)
     show_rates(manifest.clips, manifest.interpolation)
     show_skipped(manifest.skipped)
     show_pairs("unusual", manifest.unusual, ": ")
@@ -53,6 +56,19 @@ def show_manifest(manifest: Manifest) -> None:
             click.echo(remark)
     if not manifest.coverage.whole:
         click.echo(f"{manifest.coverage}: {manifest.coverage.gaps}")
+
+
+def show_persons(manifest: Manifest) -> None:
+    """Print each person's part, clips and minutes."""
+    clips: dict[tuple[str, str], list[int]] = defaultdict(list)
+    for clip in manifest.clips:
+        clips[clip.split, clip.group].append(clip.length)
+    table = Table("part", "person")
+    for name in ("clips", "minutes"):
+        table.add_column(name, justify="right")
+    for (part, person), own in sorted(clips.items()):
+        table.add_row(part, person, str(len(own)), f"{sum(own) / FPS / 60:.1f}")
+    Console(highlight=False).print(table)
 
 
 def show_rates(clips: tuple[ClipRecord, ...], interpolation: str = "") -> None:

@@ -134,7 +134,7 @@ class GroupedSplit(Split):
         Raises:
             InputError: if there are fewer groups than parts.
         """
-        ranked = sorted(self.grouping.tie(seen), key=lambda group: _rank(seen[group[0]], self.seed))
+        ranked = sorted(self.grouping.tie(seen), key=lambda group: rank(seen[group[0]], self.seed))
         parts: dict[str, str | None] = dict.fromkeys(seen, "train")
         start = 0
         for part, count in _counts(len(ranked), fractions).items():
@@ -147,7 +147,7 @@ class GroupedSplit(Split):
         return parts
 
 
-def _rank(name: str, seed: int) -> str:
+def rank(name: str, seed: int) -> str:
     """Return the key by which names are sorted for an order that depends on the seed alone."""
     return hashlib.sha256(json.dumps([seed, name]).encode()).hexdigest()
 
@@ -196,7 +196,7 @@ class SeededSplit(GroupedSplit):
         if self.per_group is None:
             return dict(parts)
         held_out: dict[str, list[str]] = defaultdict(list)
-        for name in sorted(parts, key=lambda name: _rank(name, self.seed)):
+        for name in sorted(parts, key=lambda name: rank(name, self.seed)):
             if parts[name] in ("test", "val"):
                 held_out[groups[name]].append(name)
         left_out = (name for names in held_out.values() for name in names[self.per_group :])

@@ -1,0 +1,156 @@
+"""Splits by person: nobody of validation or test is in training."""
+
+from __future__ import annotations
+
+import re
+import tarfile
+from collections import defaultdict
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import Memmlp
+
+from memmlp.common.errors import InputError
+from memmlp.config.build_motion import build_motion
+from memmlp.config.compose import composed
+from memmlp.motion.clip import Clip
+from memmlp.motion.formats.npz import write_clip
+from memmlp.motion.motion_source import MotionSource
+from memmlp.motion.preparing.persons import Kind, PersonSplit
+
+DATA = Path(__file__).parents[4] / "shared" / "data"
+SETS = ("cmu-asfamc/cmu-asfamc", "cmu-bvh/cmu-daz", "cmu-bvh/cmu-3dsmax", "hdm05-asfamc/hdm05-asfamc")
+KINDS = {"walking": Kind(("a1", "a2", "a3"), 1, 1), "dance": Kind(("b1", "b2"), 1, 0)}
+
+
+def split(**changes: Any) -> PersonSplit:
+    settings: dict[str, Any] = {"persons": {r"^old/": None, r"^(\w+)/": r"\1"}, "kinds": KINDS}
+    return PersonSplit(**settings | changes)
+
+
+@pytest.fixture
+def shipped(tmp_path: Path) -> MotionSource:
+    (tmp_path / "clips").mkdir()
+    outputs = f"paths.outputs={tmp_path / 'outputs'}"
+    return build_motion(composed(["data=persons", f"data.root={tmp_path / 'clips'}", outputs]))
+
+
+def members(persons: Iterable[str]) -> list[str]:
+    """Names of clips in which the shipped patterns see these persons."""
+    names = []
+    for person in persons:
+        first, _, rest = person.partition("-")
+        names += [f"cmu-daz/{rest}/{rest}_02"] if first == "cmu" else [f"hdm05-asfamc/{rest}/HDM_{rest}_x"]
+    return [*names, "cmu-asfamc/38/38_01", "cmu-asfamc/39/39_01", "cmu/salsa/01", "cmu/salsa/16"]
+
+
+def assert_nobody_in_two_parts(clips: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
+    """Check the persons and parts of clips; return the persons of each part."""
+    parts: dict[str, set[str]] = defaultdict(set)
+    for person, part in clips:
+        parts[part].add(person)
+    assert not parts["test"] & parts["train"]
+    assert not parts["val"] & parts["train"]
+    assert not parts["val"] & parts["test"]
+    assert len(parts["test"]) >= 8
+    assert len(parts["val"]) >= 5
+    return parts
+
+
+def test_persons_of_a_kind_are_held_out_in_a_seeded_order():
+    names = [f"{person}/{take}" for person in ("a1", "a2", "a3", "b1", "b2", "c1") for take in "xy"]
+    drawn = set()
+    for seed in range(6):
+        found = split(seed=seed).assign([*names, "old/a1"])
+        assert found.parts["old/a1"] is None
+        assert {found.groups[name] for name in names} == {name.split("/")[0] for name in names}
+        assert {name for name in names if found.groups[name] == "c1"} <= {
+            name for name in names if found.parts[name] == "train"
+        }
+        persons = {
+            part: {found.groups[n] for n in names if found.parts[n] == part} for part in ("test", "val")
+        }
+        assert [len(persons["test"] & set(kind.persons)) for kind in KINDS.values()] == [1, 1]
+        assert [len(persons["val"] & set(kind.persons)) for kind in KINDS.values()] == [1, 0]
+        assert split(seed=seed).assign(names[::-1]).parts == split(seed=seed).assign(names).parts
+        drawn.add(frozenset(persons["test"]))
+    assert len(drawn) > 1
+
+
+def test_absent_persons_are_missing():
+    assert split().listed == {"walking": 3, "dance": 2}
+    assert split().missing(["a1/x", "a3/y", "b1/x", "b2/x", "c/x"]) == ("walking/a2",)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"persons": {"(": "a"}}, r"data.split.persons='('"),
+        ({"persons": {"a": r"\1"}}, r"data.split.persons='a'"),
+        ({"kinds": {**KINDS, "sports": Kind(("a1",), 0, 0)}}, "a1 has two kinds"),
+        (
+            {"kinds": {"walking": Kind(("a1", "a2"), 2, 1)}},
+            "data.split.kinds.walking: 2 persons for 2 in test",
+        ),
+    ],
+)
+def test_impossible_splits_are_refused(changes: dict[str, Any], said: str):
+    with pytest.raises(InputError, match=re.escape(said)):
+        split(**changes)
+
+
+def test_a_clip_of_nobody_is_refused():
+    with pytest.raises(InputError, match=r"data\.split\.persons: no pattern matches \?\?\?/x"):
+        split().assign(["a1/x", "???/x"])
+
+
+def test_the_shipped_persons_are_in_one_part_of_the_manifest(shipped: MotionSource, memmlp: Memmlp):
+    """Clips of all persons of the config are prepared; one take is left out, a conversion."""
+    by_rule = shipped.clips.split
+    assert isinstance(by_rule, PersonSplit)
+    names = [*members(by_rule.parts.keys() - {"cmu-05", "cmu-60-61", "cmu-indian", "cmu-135"})]
+    names += ["cmu-asfamc/05/05_01", "cmu-daz/05/05_01", "cmu/indian/04", "cmu/martial/03"]
+    names += ["bandai-1/dataset-1_walk_sad_001", "cmu-daz/03/03_01"]
+    random = np.random.default_rng(0)
+    for name in names:
+        poses = 0.1 * np.cumsum(random.normal(size=(60, 22, 3)), 0)
+        clip = Clip(name, poses, 0.01 * np.cumsum(random.normal(size=(60, 3)), 0), 60.0)
+        write_clip(Path(str(shipped.clips.root)) / f"{name}.npz", clip)
+    manifest = shipped.prepare().manifest
+    parts = assert_nobody_in_two_parts((clip.group, clip.split) for clip in manifest.clips)
+    assert {clip.name for clip in manifest.clips} == set(names) - {"cmu-daz/05/05_01"}
+    assert manifest.groups["cmu-asfamc/38/38_01"] == manifest.groups["cmu-daz/07/07_02"] == "cmu-07"
+    assert manifest.groups["cmu/salsa/01"] == manifest.groups["cmu/salsa/16"]
+    assert {"bandai", "cmu-03"} <= parts["train"]
+    assert all(
+        {by_rule.parts[p] for p in kind.persons} == {"train", "val", "test"}
+        for kind in by_rule.kinds.values()
+    )
+
+    shown = memmlp("data", "inspect", str(shipped.cache)).out
+    for person in set(manifest.groups.values()):
+        assert re.search(rf"(train|val|test) .* {person} ", shown), shown
+    (Path(str(shipped.clips.root)) / "hdm05-asfamc" / "bk" / "HDM_bk_x.npz").unlink()
+    with pytest.raises(InputError, match=r"1 of 22 entries .* \(hdm05 1 of 4\); data\.partial=true"):
+        shipped.prepare()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not DATA.is_dir(), reason="needs ../shared/data, which is not part of the project")
+def test_the_real_sets_persons_are_in_one_part(shipped: MotionSource):
+    takes = [path.relative_to(DATA) for path in (DATA / "cmu").rglob("*.bvh")]
+    for archive in SETS:
+        with tarfile.open(DATA / f"{archive}.tar.xz") as file:
+            takes += [Path(name) for name in file.getnames() if name.endswith((".amc", ".bvh"))]
+    names = [take.with_suffix("").as_posix() for take in takes]
+    assert len(names) == 37 + 142 + 125 + 3 + 233
+    found = shipped.clips.split.assign(names)
+    used = [name for name in names if found.parts[name]]
+    assert (
+        len(names) - len(used) == 2 + 20 + 3
+    )  # heads upside down, takes in another conversion, wrong elbows
+    assert shipped.clips.split.missing(used) == ()
+    assert_nobody_in_two_parts((found.groups[name], str(found.parts[name])) for name in used)
