@@ -7,7 +7,7 @@ from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from memmlp.common.errors import InputError
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.live.rotations import BodyTree, matrix_to_quaternion, sixd_to_matrix
 from memmlp.live.spaces import SpaceName, space_of
-from memmlp.live.tracker_input import OddSamples, TrackerPose, check_time, read_trackers, warn_caller
+from memmlp.live.tracker_input import OddSamples, TrackerPose, check_time, read_trackers
 from memmlp.live.tracker_resampling import (
     TRACKERS,
     UPRIGHT,
@@ -29,14 +29,11 @@ from memmlp.live.wearer import TILTED, Offsets, check_offsets, make_wearer
 from memmlp.motion.body import FEATURES
 from memmlp.runs.run import Run
 
-if TYPE_CHECKING:
-    from memmlp.evaluation.ik import LBFGS
-
 APART = 0.1  # metres between the hands, at least, in a T-pose
 FAR = 0.25  # metres; a device farther from a T-pose's joint is not attached there
 ROUNDED = 5e-4  # metres by which heights may differ, as on a page that shows millimetres
-FORGOTTEN = "the calibration was for another height, and is forgotten"
-NEEDED = ("joints", "parents", "rest", "fps", "T", "branches", "features")
+FORGOTTEN = "the calibration was for another height and is forgotten"
+NEEDED = ("joints", "parents", "rest", "fps", "T", "features")
 AGAIN = "export it again with memmlp export RUN --out FILE.onnx"
 
 RotationFormat = Literal["matrix", "quaternion"]
@@ -51,7 +48,6 @@ class ExportedNetwork(OnnxStream):
         body: its joints, their tree and the rest pose.
         fps: frames per second.
         frames: the window's length T.
-        branches: what the network learned to predict: rotations, and perhaps positions.
 
     Raises:
         InputError: if the file is not such a network, or lacks some of its metadata.
@@ -72,7 +68,6 @@ class ExportedNetwork(OnnxStream):
             rest = np.array(json.loads(meta["rest"]), np.float64)
             self.body = BodyTree(json.loads(meta["joints"]), json.loads(meta["parents"]), rest)
             self.fps, self.frames = float(meta["fps"]), int(meta["T"])
-            self.branches = frozenset(json.loads(meta["branches"]))
         except (ValueError, TypeError, LookupError):
             raise InputError(f"{path}: its metadata are damaged; {AGAIN}") from None
         if not 1 <= self.fps <= 1000:
@@ -151,8 +146,6 @@ class Stream:
         offsets: the offsets of the joints from the devices; None for zero offsets.
         height: the wearer's body height, metres; None for the height of the network's body.
         floor: the height of the floor in the space, metres.
-        ik: inverse kinematics towards the position branch (`memmlp.evaluation.ik.LBFGS()`), which needs
-            torch; None for no inverse kinematics.
 
     Attributes:
         wearer: height and floor (`memmlp.live.wearer`), as `fit` sets them.
@@ -173,7 +166,6 @@ class Stream:
         offsets: Offsets | None = None,
         height: float | None = None,
         floor: float = 0.0,
-        ik: LBFGS | None = None,
     ):
         self.space = space_of(space)
         if rotations not in ROTATION_FORMATS:
@@ -182,13 +174,10 @@ class Stream:
             raise InputError(f"source={source!r}: expected a run, its folder, or an ONNX file")
         run = source if isinstance(source, Run) else Run(Path(source))
         self.network = ExportedNetwork(run.preferred_onnx if run.folder.is_dir() else run.folder)
-        if ik is not None and "position" not in self.network.branches:
-            raise InputError(f"ik: must be None; {self.network.path} does not have a position branch")
         self.offsets = None if offsets is None else check_offsets(offsets)
         self.wearer = make_wearer(self.network.body, height, floor)
         self.step_seconds = 0.0
         self.odd = OddSamples()
-        self.solve = None if ik is None else Solver(ik, self.network.body.rest)
         self._output = ROTATION_FORMATS[rotations]
         self._trackers = TrackerFrames(self.network.body, self.network.fps)
         self._features = Features()
@@ -209,18 +198,12 @@ class Stream:
         Raises:
             InputError: if height or floor are out of range.
         """
-        if self.refit(height, floor):
-            warn_caller(f"offsets: {FORGOTTEN}")
-
-    def refit(self, height: float | None, floor: float) -> bool:
-        """Do as `fit` does, without the warning; return whether offsets were forgotten."""
         before = self.wearer.height
         self.wearer = make_wearer(self.network.body, height, floor)
         self.reset()
-        if self.offsets is None or abs(self.wearer.height - before) <= ROUNDED:
-            return False
-        self.offsets = None
-        return True
+        if self.offsets is not None and abs(self.wearer.height - before) > ROUNDED:
+            self.offsets = None
+            self.odd.report(f"offsets: {FORGOTTEN}")
 
     def reset(self) -> None:
         """Restart: the next sample counts as the first."""
@@ -285,10 +268,7 @@ class Stream:
             else:
                 self.network.advance()
             self.step_seconds += perf_counter() - began
-        sixd = self.network.rotation6d
-        if self.solve is not None:
-            sixd = self.solve(sixd, self.network.position, self._sparse)
-        local, scale = sixd_to_matrix(sixd), self.wearer.scale
+        local, scale = sixd_to_matrix(self.network.rotation6d), self.wearer.scale
         self._last = BodyFrame(
             frames[-1].time,
             local,
@@ -340,7 +320,8 @@ class Stream:
         pose = t_pose(self.network.body, world[0], heading)
         joints = pose.positions + (world - pose.positions).mean(0)
         inverse = rotations.swapaxes(1, 2)
-        away = self.space.positions_out(self.wearer.positions_out(joints)) - positions
+        worn = raise_by(joints / self.wearer.scale, self.wearer.floor)
+        away = self.space.positions_out(worn) - positions
         turned = inverse @ self.space.rotations_out(pose.rotations)
         offsets = Offsets((inverse @ away[:, :, None])[..., 0], turned)
         worst = int(offsets.distances.argmax())
@@ -351,7 +332,7 @@ class Stream:
                 "and give the body height; positions are in metres"
             )
         if offsets.doubt:
-            self.odd.tell(f"calibrate: {offsets.doubt}")
+            self.odd.report(f"calibrate: {offsets.doubt}")
         self.offsets = offsets
         self.reset()
         return offsets
@@ -360,29 +341,6 @@ class Stream:
         self.network.reset()
         self._features.reset()
         self._last = None
-
-
-class Solver:
-    """Inverse kinematics of one frame; this class imports torch."""
-
-    def __init__(self, ik: LBFGS, rest: np.ndarray):
-        import torch
-
-        from memmlp.motion.network_coordinates import World
-        from memmlp.motion.normalizer import Normalizer
-
-        self.ik, self.normalizer = ik, Normalizer.raw(World(), torch.tensor(rest))
-
-    def __call__(self, rotation6d: np.ndarray, position: np.ndarray, sparse: np.ndarray) -> np.ndarray:
-        """Return rotations (22, 6) whose joints are as near as possible to positions (22, 3).
-
-        The search starts from the given rotations (22, 6); `sparse` (54,) are the frame's inputs, which have
-        the head's position.
-        """
-        import torch
-
-        motion = torch.from_numpy(np.concatenate([rotation6d.reshape(1, -1), position.reshape(1, -1)], 1))
-        return self.ik.solve(self.normalizer, motion, torch.from_numpy(sparse[None])).numpy().reshape(-1, 6)
 
 
 def raise_by(positions: np.ndarray, height: float) -> np.ndarray:

@@ -105,7 +105,7 @@ ODD = {
         f"have the head over {HIGHEST:g} m above the floor; are positions in metres, and is `floor` right?",
     ),
 }
-"""Kinds of odd samples: the number of odd samples in a row that triggers the warning, and its words."""
+"""Kinds of odd samples: the number of odd samples in a row that triggers the warning, and its line."""
 
 
 def warn_caller(line: str) -> None:
@@ -124,11 +124,11 @@ class OddSamples:
     velocities of the trackers are wrong then. Positions in other units than metres are far apart, and high.
 
     Args:
-        tell: gets a line at the first detection of each kind; by default it becomes a `SampleWarning`.
+        report: gets a line at the first detection of each kind; by default it becomes a `SampleWarning`.
     """
 
-    def __init__(self, tell: Callable[[str], None] = warn_caller):
-        self.tell, self.reported = tell, set[str]()
+    def __init__(self, report: Callable[[str], None] = warn_caller):
+        self.report, self.reported = report, set[str]()
         self.last: float | None = None
         self.row = dict.fromkeys(ODD, 0)
 
@@ -146,24 +146,24 @@ class OddSamples:
                 axes.
             lost: which of them are lost.
         """
-        found: dict[str, bool] = {}
+        odd_kinds: dict[str, bool] = {}
         if not lost[0]:
             head, *hands = positions.tolist()
             near = (
                 gone or math.dist(head, hand) <= REACH for hand, gone in zip(hands, lost[1:], strict=True)
             )
-            found |= {"far": not all(near), "high": head[2] > HIGHEST}
+            odd_kinds |= {"far": not all(near), "high": head[2] > HIGHEST}
         if time is not None:
             later = math.inf if self.last is None else time - self.last
             self.last, single = time, np.float32(time)
-            found |= {
+            odd_kinds |= {
                 "jump": GAP < abs(later) < math.inf,
                 "still": -GAP <= later <= 0,
                 "coarse": float(single) == time and float(np.spacing(single)) > COARSE,
             }
-        for kind, odd in found.items():
+        for kind, odd in odd_kinds.items():
             self.row[kind] = self.row[kind] + 1 if odd else 0
-            least, words = ODD[kind]
+            least, line = ODD[kind]
             if self.row[kind] == least and kind not in self.reported:
                 self.reported.add(kind)
-                self.tell(f"{least} samples in a row {words}")
+                self.report(f"{least} samples in a row {line}")

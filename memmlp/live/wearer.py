@@ -11,7 +11,7 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -48,14 +48,7 @@ class Wearer:
 
     def positions_in(self, positions: np.ndarray) -> np.ndarray:
         """Convert the wearer's positions (..., 3), metres, AMASS' axes, to the network's size and floor."""
-        return (positions - self._up(positions)) * self.scale
-
-    def positions_out(self, positions: np.ndarray) -> np.ndarray:
-        """Convert the network's positions (..., 3), metres, AMASS' axes, to the wearer's size and floor."""
-        return positions / self.scale + self._up(positions)
-
-    def _up(self, positions: np.ndarray) -> np.ndarray:
-        return np.array([0.0, 0.0, self.floor], positions.dtype)
+        return (positions - np.array([0.0, 0.0, self.floor])) * self.scale
 
 
 def stature(body: BodyTree) -> float:
@@ -169,7 +162,6 @@ def save_calibration(path: Path, calibration: Calibration, body: BodyTree) -> No
     fields = {
         "memmlp": "calibration",
         "space": calibration.space,
-        "body": stature(body),
         "joints": _tracked_joints(body).tolist(),
         "height": calibration.height,
         "floor": calibration.floor,
@@ -201,29 +193,19 @@ def read_calibration(path: Path, space: SpaceName, body: BodyTree) -> Calibratio
         offsets = fields["offsets"]
         if offsets is not None:
             offsets = check_offsets(Offsets(offsets["positions"], offsets["rotations"]))
-        _check_body(fields, body)
+        away = np.linalg.norm(np.reshape(fields["joints"], (3, 3)) - _tracked_joints(body), axis=1).max()
+        if not away <= SAME:
+            raise InputError(f"it is for a network's body whose head or wrists are {100 * away:.1f} cm away")
         return Calibration(space, offsets, fields["height"], fields["floor"])
     except (KeyError, TypeError, ValueError, InputError) as error:
         raise InputError(f"{path}: cannot be used ({error}); {MADE}") from None
 
 
-def _check_body(fields: dict[str, Any], body: BodyTree) -> None:
-    """Raise InputError for offsets of another body: of another height, or with other arms."""
-    own = stature(body)
-    if abs(fields["body"] - own) > SAME:
-        raise InputError(
-            f"it is for a network's body of {fields['body']:.2f} m, and this one has {own:.2f} m"
-        )
-    joints = np.asarray(fields["joints"], float)
-    away = np.linalg.norm(joints.reshape(3, 3) - _tracked_joints(body), axis=-1).max()
-    if not away <= SAME:
-        raise InputError(f"it is for a network's body whose head or wrists are {100 * away:.1f} cm away")
-
-
 def _tracked_joints(body: BodyTree) -> np.ndarray:
-    """Return the rest positions (3, 3) of head and wrists relative to their mean, metres.
+    """Return the rest positions (3, 3) of head and wrists, metres, above the lowest joint.
 
     A calibration's offsets hold only for a body with these positions.
     """
     joints = body.rest[body.tracked]
-    return joints - joints.mean(0)
+    across, _, ahead = joints.mean(0)
+    return joints - [across, body.rest[:, 1].min(), ahead]

@@ -21,7 +21,6 @@ from scipy.spatial.transform import Rotation
 import memmlp
 from memmlp.common.errors import InputError
 from memmlp.deploy.export import export
-from memmlp.evaluation.ik import LBFGS
 from memmlp.evaluation.modes import joint_positions, local_rotations, stream
 from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.spaces import SPACES
@@ -83,20 +82,6 @@ def test_it_is_evaluations_stream(network, file, undisturbed, tmp_path):
     naive = wearer.at_ease(tiny.baseline("avatar_poser", depth=1), PERSON.frames)  # no position branch
     export(naive, tmp_path / "step.onnx", "0123456789abcdef")
     assert largest_difference(naive, tmp_path / "step.onnx", PERSON) < 1e-4
-
-
-def test_inverse_kinematics_bring_the_pose_to_the_position_branch(network, file):
-    plain = wearer.play(Stream(file), PERSON.positions[:20], PERSON.rotations[:20])
-    solved = wearer.play(Stream(file, ik=LBFGS()), PERSON.positions[:20], PERSON.rotations[:20])
-    frames = PERSON.frames[:19]
-    motion = stream(network, [frames])[0]
-    expected = LBFGS().solutions(network.normalizer, motion, frames[:, :SPARSE_DIM])["combined"]
-    there = network.normalizer.pose(expected, frames[:, :SPARSE_DIM]).numpy()
-    targets = np.stack([pose.position_branch for pose in solved])
-    assert wearer.apart(wearer.joints(solved[1:]), there).max() < 0.1
-    assert (
-        wearer.apart(wearer.joints(solved), targets) < 0.8 * wearer.apart(wearer.joints(plain), targets)
-    ).all()
 
 
 # Rates
@@ -370,7 +355,6 @@ def test_bad_arguments_are_rejected(file, step_files):
         (lambda: Stream(file).calibrate(one, None, one), r"calibrate: .*left"),
         (lambda: Stream(file).step(one, two, one), "left: a quaternion of norm 2"),
         (lambda: Stream(file).step(one, one, one, "1.0"), "time="),
-        (lambda: Stream(step_files("rotation_only"), ik=LBFGS()), "position branch"),
     ):
         with pytest.raises(InputError, match=words):
             make()

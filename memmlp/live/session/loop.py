@@ -257,9 +257,10 @@ class Fitting:
             )
             return f"{said} But {offsets.doubt}" if offsets.doubt else said
         if order.action == "height":
-            forgotten = stream.refit(value, stream.wearer.floor)
+            calibrated = stream.offsets is not None
+            stream.fit(value, stream.wearer.floor)
             self.height = value
-            return f"Calibrate again: {FORGOTTEN}." if forgotten else ""
+            return f"Calibrate again: {FORGOTTEN}." if calibrated and stream.offsets is None else ""
         if order.action == "touch_floor" and trackers:
             hands = [tracker[0] for tracker in trackers[1:] if tracker is not None]
             if not hands:

@@ -30,6 +30,7 @@ class Wearing:
         self.stream, self.path = Stream(network), folder / "me.json"
         self.states: list[Mapping[str, Any]] = []
         self.now = 10.0
+        self.stream.odd.report = lambda line: None  # the terminal
         self.fitting = Fitting(self.stream, "amass", self.path, self.publish, lambda: self.now)
 
     def publish(self, name: str, state: Mapping[str, Any]) -> None:
@@ -97,12 +98,12 @@ def test_a_failed_order_is_reported_and_changes_nothing(worn: Wearing):
     assert worn.states[-1]["said"].startswith("height=18.0: ")
     assert worn.stream.wearer.scale == 1
     assert worn.stream.offsets is before
-    worn.stream.odd.tell = (told := []).append
+    worn.stream.odd.report = (lines := []).append
     worn.order("calibrate", 0)
     worn.fitting.step(tuple((place, np.roll(turn, 1)) for place, turn in worn.pose()))
     assert worn.states[-1]["calibrated"]  # quaternions in another order are only warned of
     assert "90 degrees from upright" in worn.states[-1]["said"]
-    assert len(told) == 1
+    assert len(lines) == 1
 
 
 def test_height_and_floor(worn: Wearing):
