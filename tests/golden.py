@@ -1,7 +1,7 @@
 """The numbers that every component makes of fixed inputs, for tests/test_golden.py.
 
 `make golden` writes that file. It refuses where a component's numbers changed and its version
-did not: raise that first, in its declaration or in memmlp/runs/component_versions.py, in the same commit.
+did not: raise that first, in its declaration or in memmlp/runs/identity.py, in the same commit.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from memmlp.networks.predictor import (
 )
 from memmlp.networks.recurrent_memory import GRUMemory, LSTMMemory
 from memmlp.networks.recurrent_poser import CELLS
-from memmlp.runs.component_versions import version_of
+from memmlp.runs.identity import version_of
 from memmlp.training.loop import seed_step
 from memmlp.training.losses import (
     AGRoLLoss,

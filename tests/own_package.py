@@ -12,7 +12,7 @@ from command_line import SMALL
 from memmlp.common import components
 from memmlp.config import plugins
 from memmlp.evaluation.metric_facts import HIGHER, SMALLEST, UNITS
-from memmlp.runs.component_versions import VERSIONS
+from memmlp.runs.identity import VERSIONS
 
 EXAMPLE = Path(__file__).parent.parent / "docs/examples/feet"
 PACKAGE = "memmlp_feet"

@@ -7,7 +7,7 @@ import pytest
 from golden_numbers import changed, tolerance
 
 from memmlp.common.components import declared
-from memmlp.runs.component_versions import VERSIONS, version_of
+from memmlp.runs.identity import VERSIONS, version_of
 
 
 @pytest.mark.slow

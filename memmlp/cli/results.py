@@ -179,7 +179,7 @@ def _make_table(kept: Kept, source: str | None = None, patterns: Sequence[str] =
     from memmlp.config.compose_plan import find_sweep
     from memmlp.report.tables.build_table import make_table, restrict
     from memmlp.report.tables.seed_rounds import Rounds
-    from memmlp.runs.component_versions import outdated
+    from memmlp.runs.identity import outdated
 
     # With the command line's overrides, the table warns of other data than its own.
     sweep = replace(find_sweep(kept.sweep), command_line=kept.overrides)

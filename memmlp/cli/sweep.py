@@ -145,7 +145,6 @@ def show(chosen: Sweep, plan: Plan, labels: Collection[str]) -> None:
     """
     from rich.console import Console
 
-    from memmlp.report.tables.flags import older_code
     from memmlp.sweep.progress_table import render
 
     shown = plan.of_variants(labels)
@@ -154,8 +153,11 @@ def show(chosen: Sweep, plan: Plan, labels: Collection[str]) -> None:
         states = shown.states()
         Console(highlight=False).print(render(shown, states))
         done = [(e.label, shown.run_of(e).manifest) for e in shown.entries if states[e.key] == "done"]
-        for line in older_code((label, m.get("sources", {}), m.get("plugins", ())) for label, m in done):
-            click.echo(line)
+        if done:
+            from memmlp.report.tables.flags import older_code  # it imports SciPy
+
+            for line in older_code((label, m.get("sources", {}), m.get("plugins", ())) for label, m in done):
+                click.echo(line)
     if count := count_unprepared(chosen, shown, labels):
         click.echo(f"{count} runs: their data is not prepared yet; the sweep does that first")
 

@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 from memmlp.common import distributed
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 from memmlp.common.overrides import parse_overrides
+from memmlp.config.check import explain
 from memmlp.config.compose import (
     CONFIG,
     VERSION_BASE,
@@ -24,7 +25,6 @@ from memmlp.config.compose import (
     parse,
     preflight,
 )
-from memmlp.config.config_errors import explain
 from memmlp.config.package_data import packaged
 
 if TYPE_CHECKING:

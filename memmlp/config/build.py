@@ -17,8 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from memmlp.common.components import Component, chosen, find
 from memmlp.common.errors import InputError
 from memmlp.config import plugins
-from memmlp.config.build_motion import shares
-from memmlp.config.build_request import build_request
+from memmlp.config.build_request import build_request, shares
 from memmlp.config.check import check
 from memmlp.config.compose import composed
 from memmlp.config.name_from_config import readable_name

@@ -3,16 +3,117 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from typing import Any, cast
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, cast
 
 from omegaconf import DictConfig, OmegaConf
 
+from memmlp.common.components import Component, component, find
+from memmlp.common.errors import InputError
+from memmlp.common.settings import Settings, at_least, positive, setting
 from memmlp.config import plugins
-from memmlp.config.build_motion import build_motion
+from memmlp.motion.clip import LINES
+from memmlp.motion.motion_source import MotionSource
+from memmlp.motion.preparing.cache import ClipFolder
+from memmlp.motion.preparing.find_clips import Folders, Root
+from memmlp.motion.preparing.persons import Kind, PersonSplit
+from memmlp.motion.preparing.splits import ListSplit, MixedSplit, SeededSplit, Split, SubsetSplit
 from memmlp.runs.identity import flatten
 from memmlp.training.request import RunRequest
+
+SPLITS = {"seeded": SeededSplit, "lists": ListSplit, "subsets": SubsetSplit, "persons": PersonSplit}
+
+
+def build_motion(cfg: DictConfig) -> MotionSource:
+    """Build the source of an experiment's motion.
+
+    A synthetic folder's name contains its length and seed, or the name and settings of a custom generator,
+    and the generator's component version after the first, so that other settings and generators never find
+    stale files.
+
+    Raises:
+        InputError: if a list of groups can't be read, two folders of a list have the same name, or the
+            generator does not exist.
+    """
+    data = cfg.data
+    root, split = _clips(data)
+    generate: Callable[[Path], object] | None = None
+    if data.synth is not None:
+        settings = {str(key): value for key, value in data.synth.items() if key != "name"}
+        generator = find("generator", data.synth.name)
+        made = "-".join([generator.name, *(f"{key}{value}" for key, value in settings.items())])
+        if generator.name == "puppet":
+            made = f"{data.synth.minutes:g}min-seed{data.synth.seed}"
+        version = f"-v{generator.version}" if generator.version > 1 else ""
+        root, generate = Path(data.root) / f"{made}{version}", partial(_generate, generator, settings)
+
+    interpolation = data.get("interpolation", LINES)  # recorded configs from before the key mean lines
+    clips = ClipFolder(root, split, str(data.body), data.min_frames, data.strict, interpolation)
+    caches = Path(cfg.paths.outputs) / "cache"
+    return MotionSource(clips, generate, caches, partial=data.get("partial", False))
+
+
+def _generate(generator: Component, settings: Mapping[str, Any], folder: Path) -> None:
+    generator.kind(folder, **settings)
+
+
+@component("generator", "puppet", builds="synthesize")
+@dataclass
+class PuppetSettings(Settings):
+    """Procedural motion of a puppet."""
+
+    minutes: float = setting(positive(), "${profile.synth_minutes}")
+    seed: int = setting(at_least(0), 0)
+
+
+def synthesize(folder: Path, minutes: float, seed: int) -> None:
+    """Write synthetic clips of this many minutes to a folder; torch is imported first here."""
+    from memmlp.motion.synthetic import synthesize
+
+    synthesize(folder, minutes=minutes, seed=seed)
+
+
+def shares(data: DictConfig) -> Mapping[str, float] | None:
+    """Return the relative weight of each source in training windows; None if no source has a weight."""
+    weights = {name: source.get("weight") for name, source in (data.get("sources") or {}).items()}
+    return weights if any(weights.values()) else None
+
+
+class _Clips(NamedTuple):
+    """The folders of the clips, and the split."""
+
+    root: Root
+    split: Split
+
+
+def _clips(data: DictConfig) -> _Clips:
+    """Return the folder or folders of the clips, and their split; each source is split separately."""
+    keys: dict[str, Any] = OmegaConf.to_container(data.split, resolve=True)  # type: ignore[assignment]
+    if "kinds" in keys:
+        keys["kinds"] = {name: Kind(**kind) for name, kind in keys["kinds"].items()}
+    split: Any = SPLITS[keys.pop("name")](**keys)
+    if sources := data.get("sources"):
+        folders = Folders({name: Path(source.root) for name, source in sources.items()})
+        own = {name: _own_split(split, name, source) for name, source in sources.items()}
+        return _Clips(folders, MixedSplit(own))
+    roots = list(data.root) if OmegaConf.is_list(data.root) else [data.root]
+    if len(roots) == 1:
+        return _Clips(Path(roots[0]), split)
+    folders = Folders.of([Path(root) for root in roots])
+    return _Clips(folders, MixedSplit(dict.fromkeys(folders.sources, split)))
+
+
+def _own_split(split: SeededSplit, name: str, source: DictConfig) -> SeededSplit:
+    """Return the split of one source, with its own groups and fractions."""
+    own = {part: source.get(part) for part in ("test", "val") if source.get(part) is not None}
+    groups = [*split.groups, *(source.get("groups") or ())]
+    try:
+        return replace(split, groups=groups, groups_file=source.get("groups_file"), **own)
+    except InputError as error:
+        raise InputError(f"data.sources.{name}: {error}") from None
 
 
 def build_request(cfg: DictConfig) -> RunRequest:

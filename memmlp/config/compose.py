@@ -28,9 +28,8 @@ from memmlp.common.components import SLOTS, collected, declared, names
 from memmlp.common.errors import InputError
 from memmlp.common.overrides import Override, last_by_key, parse_overrides
 from memmlp.config import plugins
-from memmlp.config.check import check, unknown_key
+from memmlp.config.check import check, explain, unknown_key
 from memmlp.config.component_source import GROUPS, ONLY, SCHEME, is_group, register
-from memmlp.config.config_errors import explain
 from memmlp.config.package_data import packaged
 from memmlp.config.schema import Config
 from memmlp.runs.identity import flatten

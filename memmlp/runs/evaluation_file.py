@@ -9,10 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import now, plain, read_json, write_json
-from memmlp.runs.component_versions import outdated, version_of
+from memmlp.common.files import now, plain, read_json, to_number, write_json
 from memmlp.runs.environment import environment
-from memmlp.runs.identity import belongs, evaluation_id_of, solver_of
+from memmlp.runs.identity import (
+    belongs,
+    evaluation_id_of,
+    outdated,
+    solver_of,
+    used_as_configured,
+    version_of,
+)
 
 COMBINED = "combined"
 """The branch of the rotations after inverse kinematics, by the solver in the settings of the evaluation."""
@@ -124,3 +130,60 @@ def with_solvers(results: Mapping[str, Any], by: Mapping[str, str | None]) -> di
 
 def _content_digest(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+class EvaluationsAsConfigured:
+    """The evaluations with the settings of a run's config.
+
+    Attributes:
+        paths: their files, the one that counts last (`preference`).
+    """
+
+    def __init__(self, folder: Path, config: Mapping[str, Any]):
+        """Read the evaluations of a folder that match the config.
+
+        Args:
+            folder: the run's folder of evaluations.
+            config: the run's config.
+        """
+        every = {path: read_json(path) for path in sorted(folder.glob("*.json"))}
+        own = [
+            (path, one) for path, one in every.items() if used_as_configured(one.get("settings", {}), config)
+        ]
+        self._found = dict(sorted(own, key=lambda one: preference(one[0], one[1], config)))
+        self.paths = list(self._found)
+
+    @property
+    def results(self) -> dict[str, dict[str, dict[str, float | None]]]:
+        """The mean errors, by mode, branch and metric; `combined` is by one kind of inverse kinematics.
+
+        Raises:
+            InputError: if a file is damaged.
+        """
+        found: dict[str, dict[str, dict[str, float | None]]] = {}
+        for report in of_one_solver(self._reports()):
+            branches = found.setdefault(report["mode"], {})
+            for branch, errors in report["mean"].items():  # custom metrics may be in one branch only
+                numbers = {name: to_number(value) for name, value in errors.items()}
+                branches[branch] = {**branches.get(branch, {}), **numbers}
+        return found
+
+    @property
+    def combined_by(self) -> dict[str, str | None]:
+        """The inverse kinematics of the branch `combined` in `results`, by mode: "arms", "lbfgs-15".
+
+        It is None where that is not known. Raises InputError as `results` does.
+        """
+        return combined_by(self._reports())
+
+    @property
+    def outdated(self) -> dict[str, str]:
+        """The changed component versions of each mode whose `results` were measured with earlier ones."""
+        last = {report.get("mode"): outdated_by(path, report) for path, report in self._found.items()}
+        return {str(mode): changed for mode, changed in last.items() if changed}
+
+    def _reports(self) -> list[dict[str, Any]]:
+        """Return the reports. Raises InputError if one is damaged."""
+        for path, report in self._found.items():
+            check_report(path, report)
+        return list(self._found.values())

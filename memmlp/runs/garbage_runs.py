@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 
 from memmlp.common.files import read_json
 from memmlp.common.lease import is_alive
-from memmlp.runs.component_versions import outdated
-from memmlp.runs.identity import NETWORK
+from memmlp.runs.environment import prerequisite_versions
+from memmlp.runs.identity import NETWORK, outdated
 from memmlp.runs.lookup import kind_words, list_runs
 from memmlp.runs.notes import read_notes
-from memmlp.runs.origin import prerequisite_versions
 from memmlp.runs.run import Run
 
 REASONS = ("failed", "old", "orphaned")

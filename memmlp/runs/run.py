@@ -22,12 +22,10 @@ from memmlp.common.files import atomic_write, file_digest, now, read_json, sync_
 from memmlp.common.lease import Lease, Lock, check_owner
 from memmlp.runs import deployment_folder
 from memmlp.runs.deployment_folder import DeploymentFolder
-from memmlp.runs.environment import changed_since, changes, describe_sources, environment, host
-from memmlp.runs.evaluation_file import intact
-from memmlp.runs.evaluations_as_configured import EvaluationsAsConfigured
+from memmlp.runs.environment import changed_since, changes, describe_sources, environment, host, join_origins
+from memmlp.runs.evaluation_file import EvaluationsAsConfigured, intact
 from memmlp.runs.identity import belongs, deployment_settings, exported_otherwise, used_as_configured
 from memmlp.runs.metrics_log import LogRecord, MetricsLog
-from memmlp.runs.origin import join_origins
 
 STAGE_WORDS = {"training": "training", "evaluation": "evaluating", "deployment": "exporting"}
 """What a process does that works on a stage of a run."""

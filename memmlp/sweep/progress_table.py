@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Self
 
 from rich import box
@@ -107,8 +107,7 @@ class Board(Screen):
 def _describe_change(plan: Plan, task: RunTask, state: str) -> str:
     run = plan.run_of(task)
     reason = run.failure if state == "failed" else None
-    where = f" on {device_name(run)}" if state == "done" else ""
-    return f"{task_name(plan, task)}: {STATE_NAMES.get(state, state)}{where}{f', {reason}' if reason else ''}"
+    return f"{task_name(plan, task)}: {STATE_NAMES.get(state, state)}{f', {reason}' if reason else ''}"
 
 
 def task_name(plan: Plan, task: RunTask) -> str:
@@ -146,7 +145,6 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
     ]
     counts = Counter(STATE_NAMES.get(state, state).partition(",")[0] for state in states.values())
     below.append(Text(", ".join(f"{count} {state}" for state, count in counts.items())))
-    below += map(Text, devices(plan.run_of(task) for task in plan.tasks if states[task.key] == "running"))
     if any(states[task.key] == "done" and result(plan.run_of(task)) for task in plan.tasks):
         below.append(Text("cm: done; MPJPE in stream mode of the rotation branch, a table may show another"))
     below += [
@@ -204,17 +202,3 @@ def time_left(log: list[LogRecord], total: int) -> float | None:
     if steps <= 0 or seconds <= 0:
         return None
     return max((total - recent[-1].step) * seconds / steps - (time.time() - recent[-1].time), 0.0)
-
-
-def devices(running: Iterable[Run]) -> list[str]:
-    """Return a line with the number of running runs on each device; no line if nothing runs."""
-    names = Counter(name for run in running if (name := device_name(run)))
-    return [f"running on {', '.join(f'{name}: {count}' for name, count in names.items())}"] if names else []
-
-
-def device_name(run: Run) -> str:
-    """Return the device on which a run was last worked on, as text; empty if it is not known."""
-    manifest = run.manifest
-    if not manifest.get("gpu"):
-        return str(manifest.get("device") or "")
-    return f"GPU {manifest.get('gpu_index', '?')} ({manifest['gpu']})"

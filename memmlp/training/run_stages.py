@@ -26,6 +26,7 @@ from memmlp.live.pose_latency import measure_pose
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.motion_source import Prepared
 from memmlp.networks.motion_model import MotionModel
+from memmlp.runs.environment import PREREQUISITES, prerequisite_origins
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.identity import (
     NETWORK,
@@ -35,7 +36,6 @@ from memmlp.runs.identity import (
     evaluation_versions,
 )
 from memmlp.runs.loggers.logger import Loggers
-from memmlp.runs.origin import PREREQUISITES, prerequisite_origins
 from memmlp.runs.run import Run
 from memmlp.training.data_remarks import data_warnings, partial_words
 from memmlp.training.devices import described, overlooked_gpu

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from command_line import run
 
-from memmlp.config.build_motion import build_motion
+from memmlp.config.build_request import build_motion
 from memmlp.config.compose import composed
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.npz import write_clip

@@ -11,9 +11,8 @@ import pytest
 from conftest import Memmlp, Ran, one_line
 
 from memmlp.common.files import write_json
-from memmlp.runs.component_versions import VERSIONS
 from memmlp.runs.evaluation_file import write_report
-from memmlp.runs.identity import evaluation_id_of, evaluation_settings, evaluation_versions
+from memmlp.runs.identity import VERSIONS, evaluation_id_of, evaluation_settings, evaluation_versions
 from memmlp.runs.run import Run
 
 A, B, C = ("a" * 16, "b" * 16, "c" * 16)

@@ -22,7 +22,7 @@ from memmlp.cli.workers import split_executor
 from memmlp.common.errors import InputError
 from memmlp.config.compose_plan import find_sweep, make_plan
 from memmlp.config.worker_process import perform
-from memmlp.runs.component_versions import VERSIONS, version_of
+from memmlp.runs.identity import VERSIONS, version_of
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
 from memmlp.sweep.progress_table import task_name

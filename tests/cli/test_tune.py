@@ -19,7 +19,7 @@ from memmlp.cli.workers import Workers
 from memmlp.common.errors import InputError
 from memmlp.config.build_request import build_request
 from memmlp.config.compose import composed
-from memmlp.runs.component_versions import VERSIONS
+from memmlp.runs.identity import VERSIONS
 from memmlp.runs.run import Run
 from memmlp.sweep.search import director as director_module
 from memmlp.sweep.search.director import Director

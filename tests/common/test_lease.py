@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import itertools
 import json
 import os
@@ -27,7 +26,6 @@ from memmlp.common.lease import (
     LEASE,
     Lease,
     Lock,
-    check_owner,
     current_process,
     is_alive,
     publish,
@@ -136,15 +134,6 @@ def test_a_dead_holder_of_another_machine_is_followed_after_its_lease(pair, cloc
     assert two.take().number == 2
 
 
-def test_a_holder_that_shows_life_keeps_its_folder(pair, clock: Clock):
-    one, two = pair
-    mine = one.lock
-    for _ in range(10):
-        assert two.take() is None
-        one(lambda: check_owner(mine.folder / "any"))
-        clock.now += LEASE * 0.9
-
-
 def test_clocks_of_other_machines_count_for_nothing(pair, clock: Clock):
     """The times of the file system's files are hours off, and jump while the holder lives."""
     one, two = pair
@@ -156,22 +145,6 @@ def test_clocks_of_other_machines_count_for_nothing(pair, clock: Clock):
     assert two.take() is None  # the last sign of life is not yet old enough
     clock.now += LEASE * 0.2
     assert two.take().number == 2
-
-
-def test_an_observer_that_was_frozen_itself_takes_nothing(pair, clock: Clock, monkeypatch):
-    """It slept between its look at the holder, who lives, and what it made of it."""
-    one, two = pair
-    last = two.lock._last
-
-    def sleepily() -> object:
-        seen = last()
-        clock.now += 10 * LEASE
-        one(lambda: check_owner(one.lock.folder / "any"))
-        return seen
-
-    monkeypatch.setattr(two.lock, "_last", sleepily)
-    assert two.take() is None
-    assert two.take() is None
 
 
 def test_who_wakes_up_superseded_publishes_nothing(pair, tmp_path: Path, clock: Clock):
@@ -202,19 +175,6 @@ def test_a_claim_that_cannot_be_read_expires(tmp_path: Path, clock: Clock, text:
     assert two.take() is None
     clock.now += LEASE + 1
     assert two.take().number == 5
-
-
-def test_a_full_disk_refuses_a_claim_and_leaves_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    with monkeypatch.context() as full:
-
-        def refuse(*_: object) -> int:
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-        full.setattr("memmlp.common.lease.os.write", refuse)
-        with pytest.raises(OSError, match="No space"), taken(Lock(tmp_path)):
-            pass
-    with taken(Lock(tmp_path)) as mine:
-        assert mine.number == 1
 
 
 def test_a_folder_beside_its_lock(tmp_path: Path, clock: Clock):

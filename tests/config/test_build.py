@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
-from itertools import combinations
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any, NamedTuple
@@ -13,7 +11,6 @@ import tiny
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.deploy.export import export
@@ -46,10 +43,8 @@ TRAINED: dict[str, tuple[list[str], str]] = {
         [*SMALL, "hand=fk"], "two_branch two_branch_memory rotation_only rotation_only_memory"
     ),
     "rollout": (SMALL, ROLLOUTS),
-    "rollout, lstm": ([*SMALL, "memory=lstm"], ROLLOUTS),
     "loss": (SMALL, "uncertainty manual"),
     "hand": (SMALL, "position fk off"),
-    "normalizer.coordinates": (SMALL, "heading head_relative world"),
     "evaluation.ik": (SMALL, "off lbfgs arms"),
 }  # fmt: skip
 
@@ -140,12 +135,6 @@ def shapes(model: MemMLP) -> dict[str, torch.Size]:
     return {name: tensor.shape for name, tensor in model.state_dict().items()}
 
 
-@pytest.mark.slow
-def test_the_same_arm_again_is_no_different(home):
-    overrides = [*TINY, *SMALL]
-    assert differences(trained(overrides), train_and_stream(composed(overrides))) == set()
-
-
 SHORT = "normalizer.coordinates=head_relative"  # whose graphs are two thirds of those with a heading
 EXPORTED = [
     ["memory=no_codes", "memory.fusion=plain", SHORT],
@@ -179,59 +168,6 @@ def network(overrides: list[str]) -> MemMLP:
         if name.endswith("codebook.vectors"):
             buffer.normal_()
     return model.eval()
-
-
-GROUPS: dict[str, list[str]] = {
-    "memory": ["vq", "no_codes", "none", "vq_joint", "lstm", "gru"],
-    "memory.shift": ["frame"],
-    "memory.history": ["latest"],
-    "memory.fusion": ["plain"],
-    "memory.blend": ["1", "sampled"],
-    "predictor": ["two_branch", "two_branch_memory", "rotation_only", "rotation_only_memory"],
-    "rollout": ["teacher_forcing", "own_predictions", "streams"],
-    "loss": ["uncertainty", "manual"],
-    "hand": ["position", "fk", "off"],
-    "normalizer.coordinates": ["heading", "head_relative", "world"],
-    "evaluation.ik": ["off", "lbfgs", "arms"],
-    "vqvae.codebook": ["ema", "gradient"],
-    "loggers": ["mlflow", "none", "tensorboard", "wandb", "all"],
-}
-OPTIONS = [f"{group}={option}" for group, options in GROUPS.items() for option in options]
-PAIRS = [(a, b) for a, b in combinations(OPTIONS, 2) if a.split("=")[0] != b.split("=")[0]]
-
-
-def refused(options: tuple[str, str]) -> str:
-    """What the one line names where a pair is refused, or nothing."""
-    rotation_only = any(option.startswith("predictor=rotation_only") for option in options)
-    of_memory = next((o.split("=")[0] for o in options if o.startswith("memory.")), "")
-    if rotation_only and "hand=position" in options:
-        return "hand=position"
-    if rotation_only and "evaluation.ik=lbfgs" in options:
-        return "evaluation.ik=lbfgs"
-    if "memory=none" in options and any(option.endswith("_memory") for option in options):
-        return "memory=none"
-    if {"memory=none", "rollout=own_predictions"} == set(options):
-        return "rollout=own_predictions"
-    if {"memory.shift=frame", "rollout=own_predictions"} == set(options):
-        return "rollout.max_passes"
-    if of_memory and "memory=none" in options:
-        return of_memory
-    if of_memory not in ("", "memory.fusion") and {"memory=lstm", "memory=gru"} & set(options):
-        return of_memory
-    return ""
-
-
-@pytest.mark.slow
-def test_pairs_of_options_go_together_or_are_refused_in_one_line():
-    for pair in PAIRS:
-        word = refused(pair)
-        rotation_only = any(option.startswith("predictor=rotation_only") for option in pair)
-        hand = ["hand=fk"] if rotation_only and not any(option.startswith("hand=") for option in pair) else []
-        with pytest.raises(InputError) if word else nullcontext() as stop:
-            composed(["profile=tiny", *pair, *hand])
-        if word:
-            assert word in str(stop.value), pair
-            assert "\n" not in str(stop.value)
 
 
 @pytest.mark.slow

@@ -13,7 +13,6 @@ from memmlp.common.components import SLOTS, names
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import _hydra, composed, parse, preflight
 from memmlp.config.package_data import packaged
-from memmlp.runs.identity import NEUTRAL, flatten
 
 OF_TERMS = [path.stem for path in packaged("conf").glob("loss/*.yaml")]
 
@@ -69,15 +68,6 @@ def test_the_most_literal_reading():
     assert (composed([]).data.drawn_by, composed([]).evaluation.ik) == ("frames", "off")
 
 
-def test_the_literal_reading_leaves_other_networks_what_they_need():
-    """Their coordinates; and no inverse kinematics of a network that predicts no positions."""
-    for experiment in ("profile=paper", "experiment=paper"):
-        for model, seen in (("agrol_diffusion", ("world", True)), ("recurrent_poser", ("heading", True))):
-            features = composed([experiment, f"model={model}"]).normalizer
-            assert (features.coordinates, features.z_scores) == seen
-    assert composed(["experiment=paper", "model=agrol_mlp"]).evaluation.ik == "off"
-
-
 def test_a_vqvaes_epochs_are_of_the_training_frames():
     """100 epochs of 1000 frames in batches of 256 are 390.6 steps; steps are steps, whatever the frames."""
     optim = build_experiment(composed(["profile=paper"])).prerequisites[0].optim
@@ -87,12 +77,6 @@ def test_a_vqvaes_epochs_are_of_the_training_frames():
     assert half(5120).steps == 10
     steps = build_experiment(composed([])).prerequisites[0].optim
     assert [steps(frames).steps for frames in (1000, 5_000_000)] == [2000, 2000]
-
-
-def test_ignored_keys_are_keys_of_the_config():
-    keys = {*flatten(OmegaConf.to_container(composed([]), resolve=True))}
-    for ignored in set(NEUTRAL) - {"hydra"}:
-        assert any(key == ignored or key.startswith(f"{ignored}.") for key in keys), ignored
 
 
 def test_the_last_of_several_choices_wins():
@@ -217,20 +201,6 @@ def test_a_bad_command_line_is_one_line(memmlp: Memmlp, tmp_path: Path, kind: st
     assert list(tmp_path.iterdir()) == []
 
 
-EXTRA = """
-# @package _global_
-model:
-  width: {}
-"""
-
-
-def test_a_bad_file_of_the_users_own(memmlp: Memmlp, tmp_path: Path):
-    (tmp_path / "mine" / "experiment").mkdir(parents=True)
-    for value, word in (("wide", "an integer"), ("-3", "at least 1")):
-        (tmp_path / "mine" / "experiment" / "own.yaml").write_text(EXTRA.format(value))
-        assert one_line(memmlp("train", "--config-dir", "mine", "experiment=own"), "model.width", word)
-
-
 @pytest.mark.parametrize(
     ("place", "option"),
     [
@@ -247,7 +217,7 @@ def test_an_option_of_ones_own_that_ours_hides_is_refused(
     """Hydra takes ours, and says nothing."""
     own = tmp_path / "mine" / option
     own.parent.mkdir(parents=True)
-    own.write_text(EXTRA.format(16))
+    own.write_text("# @package _global_\nmodel:\n  width: 16\n")
     (tmp_path / "s.yaml").write_text("variants: {a: [experiment=paper]}\n")
     words = {
         "--config-dir": ["train", "--config-dir", "mine", "optim.lr=-1"],
@@ -267,14 +237,6 @@ def test_a_file_with_the_name_of_a_component_is_refused(memmlp: Memmlp, tmp_path
     assert one_line(memmlp("train", "--config-dir", "mine"), "mine/memory/gru.yaml", "another name")
 
 
-def test_a_folder_hides_no_option_of_another_one(memmlp: Memmlp, tmp_path: Path):
-    for name, width in (("a", 16), ("b", 24)):
-        (tmp_path / name / "experiment").mkdir(parents=True)
-        (tmp_path / name / "experiment" / "own.yaml").write_text(EXTRA.format(width))
-    both = ["hydra.searchpath=['file://a', b]", "experiment=own", "optim.lr=-1"]
-    assert one_line(memmlp("train", *both), "b/experiment/own.yaml", "a/experiment/own.yaml is used")
-
-
 def test_an_experiment_does_not_replace_another_one_in_silence(memmlp: Memmlp):
     for words in (["optim.lr=-1"], ["--cfg", "job"], ["--help"]):
         ran = memmlp("train", "experiment=no_codes", "experiment=manual_weights", *words)
@@ -289,11 +251,6 @@ def test_an_experiment_that_leads_back_to_itself_is_refused(memmlp: Memmlp, tmp_
     own.write_text("# @package _global_\ndefaults: [{/experiment: no_codes}]\n")
     ran = memmlp("train", "--config-dir", "mine", "experiment=own")
     assert one_line(ran, "experiment=own", "includes itself", "'- NAME'")
-
-
-def test_a_config_without_the_schema_is_refused(memmlp: Memmlp, tmp_path: Path):
-    (tmp_path / "bare.yaml").write_text("seed: 1\n")
-    assert one_line(memmlp("train", "--config-dir", ".", "--config-name", "bare"), "/schema/config")
 
 
 @pytest.mark.parametrize(

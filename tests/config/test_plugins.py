@@ -20,7 +20,7 @@ from memmlp.common import components
 from memmlp.common.errors import InputError
 from memmlp.config import plugins
 from memmlp.config.build import build_experiment, config_of
-from memmlp.config.build_motion import build_motion
+from memmlp.config.build_request import build_motion
 from memmlp.config.compose import composed
 from memmlp.config.compose_plan import find_sweep
 from memmlp.config.schema import restored
@@ -125,17 +125,6 @@ def test_a_loss_has_the_term_with_its_weight(on_path: Path):
         build_experiment(composed([*OWN, "predictor=rotation_only", "hand=off"]))
     with pytest.raises(InputError, match=r"term: .*model=agrol_mlp"):
         composed([f"plugins=[{PACKAGE}]", "model=agrol_mlp", "term=skate"])
-
-
-def test_a_memory_that_cannot_be_streamed_is_exported_as_it_was_trained(on_path: Path):
-    from memmlp.deploy.deployment import GRAPHS
-    from memmlp.motion.normalizer import Normalizer
-
-    architecture = build_experiment(composed(OWN)).architecture
-    model = architecture.build(Normalizer.raw(architecture.coordinates, torch.zeros(22, 3)), None).eval()
-    assert GRAPHS["auto"](model) is model
-    with pytest.raises(InputError, match=r"export.graph=streaming"):
-        GRAPHS["streaming"](model)
 
 
 def test_metrics_of_ones_own_are_those_of_sweeps_and_searches(on_path: Path):
@@ -269,14 +258,6 @@ def test_a_custom_data_source(folder: Path):
     config = build_experiment(cfg).config
     assert config["plugins"] == ["mine"]
     assert restored(config).data == cfg.data
-
-
-def test_a_new_version_of_a_data_source_makes_its_clips_again(folder: Path):
-    write(
-        folder, {"mine/__init__.py": WALKS.replace("VERSION", "2"), "mine/conf/data/walks.yaml": WALKS_YAML}
-    )
-    source = build_motion(composed(["plugins=[mine]", "data=walks"]))
-    assert source.clips.root == Path("made/walks-minutes1.0-seed0-v2")
 
 
 def test_an_executor_of_ones_own(folder: Path):

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from memmlp.common.files import file_digest
 from memmlp.runs import environment as module
-from memmlp.runs.environment import environment, user_packages
+from memmlp.runs.environment import environment, prerequisite_origins, prerequisite_versions, user_packages
+from memmlp.runs.run import Run
 
 
 def test_environment_says_what_ran_without_the_machines_name():
@@ -66,3 +68,75 @@ def test_a_patch_is_of_the_code_that_runs(tmp_path: Path, monkeypatch: pytest.Mo
     finally:
         for one in cached:
             one.cache_clear()
+
+
+CODES, PART, NETWORK = (letter * 16 for letter in "abc")
+
+
+def trained(outputs: Path, name: str, prerequisite: Run | None = None, weights: str = "w", **facts) -> Run:
+    run = Run.of(outputs, name)
+    above = (
+        {"prerequisite_runs": prerequisite_origins(prerequisite.manifest, prerequisite.weights_digest)}
+        if prerequisite
+        else {}
+    )
+    run.begin("vqvae", {}, data="d", prerequisite=prerequisite.id if prerequisite else None, **facts, **above)
+    run.model.write_text(weights)
+    run.finish([run.model.name])
+    return run
+
+
+def test_what_a_run_builds_upon_stays_known_when_that_is_trained_again(tmp_path: Path):
+    """Its id says how it is trained, and not which weights came of it."""
+    codes = trained(tmp_path, CODES, component_versions={"vqvae": 1}, gpu="A card", device="cuda")
+    network = trained(tmp_path, NETWORK, codes)
+    digest, before = file_digest(codes.model), network.manifest["prerequisite_runs"]
+    codes.reset()
+    others = trained(tmp_path, CODES, weights="others")
+    assert prerequisite_origins(others.manifest, others.weights_digest)[0]["weights"] != digest
+    (found,) = network.manifest["prerequisite_runs"]
+    assert [found] == before
+    assert (found["id"], found["kind"], found["weights"]) == (CODES, "vqvae", digest)
+    assert (found["component_versions"], found["gpu"], found["device"]) == ({"vqvae": 1}, "A card", "cuda")
+    assert {"git", "sources", "cpu", "packages"} <= found.keys()
+
+
+def test_prerequisites_of_prerequisites_are_known(tmp_path: Path):
+    codes = trained(tmp_path, CODES, component_versions={"vqvae": 1})
+    part = trained(tmp_path, PART, codes, component_versions={"model.mem_mlp": 2})
+    network = trained(tmp_path, NETWORK, part)
+    assert [one["id"] for one in network.manifest["prerequisite_runs"]] == [PART, CODES]
+    assert prerequisite_versions(network.manifest) == {"vqvae": 1, "model.mem_mlp": 2}
+
+
+def test_a_training_that_is_resumed_upon_other_weights_has_both(tmp_path: Path):
+    network = Run.of(tmp_path, NETWORK)
+    for weights in ("first", "first", "others"):
+        codes = trained(tmp_path, CODES, weights=weights)
+        above = prerequisite_origins(codes.manifest, codes.weights_digest)
+        network.begin("memmlp", {}, data="d", prerequisite=CODES, prerequisite_runs=above)
+        network.checkpoint.touch()
+    found = [one["weights"] for one in network.manifest["prerequisite_runs"]]
+    assert len(found) == 2
+    assert found[0] == codes.weights_digest != found[1]
+
+
+def test_a_training_that_is_resumed_elsewhere_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Its weights come from both machines and both versions of the code."""
+    run = Run.of(tmp_path, "0" * 16)
+
+    def begin(device: str, commit: str, dirty: bool, losses: str) -> dict:
+        made = {"git": {"commit": commit, "dirty": dirty}, "cpu": "A"}
+        monkeypatch.setattr("memmlp.runs.run.environment", lambda: made)
+        files = {"losses.py": losses.encode(), "ik.py": b"i"}
+        monkeypatch.setattr("memmlp.runs.environment.code_files", lambda packages: files)
+        run.begin("memmlp", {}, data="d", prerequisite=None, device=device, threads=2)
+        return run.manifest
+
+    begin("cuda:0", "a" * 40, True, "old")
+    assert begin("cpu", "b" * 40, False, "new")["device"] == "cpu"  # nothing was trained before
+    run.checkpoint.touch()
+    found = begin("cuda:0", "c" * 40, False, "newer")
+    assert (found["device"], found["threads"], found["cpu"]) == ("cpu, cuda:0", 2, "A")
+    assert found["git"] == {"commit": "c" * 40, "dirty": False, "before": "b" * 40}
+    assert run.changed_sources == ["losses.py"]

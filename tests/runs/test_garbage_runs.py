@@ -8,8 +8,8 @@ import pytest
 
 from memmlp.common.files import write_json
 from memmlp.common.lease import current_process
-from memmlp.runs.component_versions import VERSIONS
 from memmlp.runs.garbage_runs import delete, garbage
+from memmlp.runs.identity import VERSIONS
 from memmlp.runs.notes import add_tags, remove_tags
 from memmlp.runs.run import Run
 
@@ -52,7 +52,7 @@ def found(outputs: Path, *kinds: str) -> dict[str, str]:
 
 def test_failed_old_and_orphaned_runs_may_go(outputs: Path):
     assert found(outputs) == {
-        FAILED: "failed", OLD: "old", GONE: "orphaned", CODES: "orphaned", EMPTY: "orphaned",
+        FAILED: "failed", OLD: "old", CODES: "orphaned", EMPTY: "orphaned",
     }  # fmt: skip
     assert found(outputs, "failed") == {FAILED: "failed"}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from begun_runs import CONFIG, identity
 
-import memmlp.runs.component_versions
+import memmlp.runs.identity
 from memmlp.runs.identity import (
     NEUTRAL,
     Identity,
@@ -33,11 +33,11 @@ def test_a_new_component_version_changes_the_runs_that_use_it(monkeypatch: pytes
     codes = Identity("vqvae", {"vqvae": {"codebook": "ema"}}, "d")
     own = Identity("memmlp", gru, "d", codes)
     before = identity(gru), identity(lstm), own.id
-    monkeypatch.setitem(memmlp.runs.component_versions.VERSIONS, "memory.gru", 2)
+    monkeypatch.setitem(memmlp.runs.identity.VERSIONS, "memory.gru", 2)
     assert identity(gru) != before[0]
     assert identity(lstm) == before[1]
     monkeypatch.undo()
-    monkeypatch.setitem(memmlp.runs.component_versions.VERSIONS, "vqvae", 2)
+    monkeypatch.setitem(memmlp.runs.identity.VERSIONS, "vqvae", 2)
     assert own.id != before[2]
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from begun_runs import CONFIG, begun, complete
 
-import memmlp.runs.component_versions
+import memmlp.runs.identity
 from memmlp.cli.runs.listing import shown_number
 from memmlp.cli.runs.show import measured_numbers
 from memmlp.common.errors import InputError
@@ -144,13 +144,13 @@ def test_todays_recipes_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         place.finish({"settings": deployment_settings(config), "int8": {"growth": 0.0, "jitter_growth": 0.0}})
 
     with monkeypatch.context() as today:
-        today.setitem(memmlp.runs.component_versions.VERSIONS, "metrics", 2)
-        today.setitem(memmlp.runs.component_versions.VERSIONS, "graph.naive", 2)
+        today.setitem(memmlp.runs.identity.VERSIONS, "metrics", 2)
+        today.setitem(memmlp.runs.identity.VERSIONS, "graph.naive", 2)
         make(fp32, 2.0, b"new")
     make(config, 1.0, b"old")
     assert run.results["stream"]["rotation"]["MPJPE"] == 1.0
-    monkeypatch.setitem(memmlp.runs.component_versions.VERSIONS, "metrics", 2)
-    monkeypatch.setitem(memmlp.runs.component_versions.VERSIONS, "graph.naive", 2)
+    monkeypatch.setitem(memmlp.runs.identity.VERSIONS, "metrics", 2)
+    monkeypatch.setitem(memmlp.runs.identity.VERSIONS, "graph.naive", 2)
     assert run.results["stream"]["rotation"]["MPJPE"] == 2.0
     assert load(run.folder).means["stream"]["rotation"]["MPJPE"] == 2.0
     assert run.preferred_onnx.read_bytes() == b"new"
@@ -277,15 +277,6 @@ def test_a_run_that_was_killed_before_its_evaluation_is_trained_and_not_done(tmp
     assert run.status == "trained"
     run.want(["window-0", "stream-0"])
     assert run.status == "done"
-
-
-def test_a_config_that_was_read_belongs_to_whoever_read_it(tmp_path: Path):
-    run = begun(tmp_path, kind="vqvae")
-    before = run.config
-    run.config["added"] = {"lr": 1.0}
-    assert run.config == before
-    run.config_path.write_text("optim: {lr: 2.0}\n")
-    assert run.config == {"optim": {"lr": 2.0}}
 
 
 def test_a_damaged_manifest_is_not_replaced(tmp_path: Path):

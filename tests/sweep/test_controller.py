@@ -90,38 +90,6 @@ def test_what_ends_right_after_a_look_is_told(tmp_path: Path, monkeypatch: pytes
     assert told == ["new", "new", "failed"]
 
 
-def test_what_is_done_is_looked_at_again_only_when_nothing_seems_left(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    """So a run that somebody deletes meanwhile is made again."""
-    monkeypatch.setattr(controller, "LOOK", 0)
-    one, two = (RunTask(name * 16, "memmlp", {}) for name in "12")
-    plan = Plan("trial", tmp_path, (), (one, two))
-    done, looks = {one.key}, []
-
-    def complete(self: Plan, task: RunTask) -> bool:
-        looks.append(task.key)
-        return task.key in done
-
-    monkeypatch.setattr(Plan, "complete", complete)
-
-    class Looks(Board):
-        def update(self, plan: Plan, states: Mapping[str, str]) -> None:
-            told.append(sorted(key for key, state in states.items() if state == "done"))
-            if len(told) == 4:
-                done.remove(one.key)
-                done.add(two.key)
-            elif len(told) == 6:
-                done.add(one.key)
-
-    told: list[list[str]] = []
-    controller.oversee(plan, Fleet(Shelf(Living), lambda: None, 1, tmp_path), Looks())
-    both = sorted([one.key, two.key])
-    assert told == [[one.key]] * 4 + [both, [two.key], both]
-    # One is looked at first, when both seem done, until it is done again, and at the end.
-    assert looks == [one.key, two.key, *[two.key] * 4, one.key, two.key, one.key, one.key, one.key, two.key]
-
-
 @pytest.mark.parametrize(("kind", "line"), [(Dead, "the reason"), (Unfit, Unfit.said)])
 def test_workers_that_never_live_end_the_sweep(tmp_path: Path, kind: type[Dead], line: str):
     fleet = Fleet(Shelf(kind), lambda: None, 2, tmp_path)

@@ -1,4 +1,4 @@
-"""The board says on which devices runs are worked on."""
+"""The board of a sweep."""
 
 from __future__ import annotations
 
@@ -12,28 +12,16 @@ from rich.console import Console
 from memmlp.runs.metrics_log import LogRecord
 from memmlp.sweep import progress_table
 from memmlp.sweep.plan import Entry, Plan, RunTask
-from memmlp.sweep.progress_table import QUIET, Board, progress_text, render, time_left
-
-CARD = {"device": "cuda", "gpu": "A card", "gpu_index": "1"}
+from memmlp.sweep.progress_table import QUIET, Board, progress_text, time_left
 
 
 @pytest.fixture
 def plan(tmp_path: Path) -> Plan:
-    """Three runs on a GPU and one on the CPU, of which the last one is done."""
     tasks = tuple(RunTask(str(number) * 16, "memmlp", {"optim": {"steps": 9}}) for number in range(4))
     made = Plan("trial", tmp_path, tuple(Entry("variant", n, t.id) for n, t in enumerate(tasks)), tasks)
-    for task, facts in zip(tasks, (CARD, CARD, {"device": "cpu", "gpu": None}, CARD), strict=True):
+    for task in tasks:
         made.run_of(task).folder.mkdir(parents=True)
-        made.run_of(task).write_manifest(facts)
     return made
-
-
-def test_running_runs_are_counted_by_device(plan: Plan, capsys: pytest.CaptureFixture):
-    states = dict(zip([task.key for task in plan.tasks], ["running"] * 3 + ["done"], strict=True))
-    Console(width=200).print(render(plan, states))
-    assert "running on GPU 1 (A card): 2, cpu: 1" in capsys.readouterr().out
-    Console(width=200).print(render(plan, dict.fromkeys(states, "done")))
-    assert "running on" not in capsys.readouterr().out
 
 
 def test_a_log_is_not_silent_while_runs_go_on(plan: Plan, monkeypatch: pytest.MonkeyPatch):

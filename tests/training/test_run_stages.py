@@ -27,8 +27,8 @@ from memmlp.live.stream import Stream
 from memmlp.motion.dataset import MotionDataset
 from memmlp.report.tables.measured_run import load
 from memmlp.runs import environment
-from memmlp.runs.component_versions import VERSIONS
 from memmlp.runs.evaluation_file import write_report
+from memmlp.runs.identity import VERSIONS
 from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run

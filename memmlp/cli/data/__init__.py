@@ -80,7 +80,7 @@ def prepare(root: Path, overrides: tuple[str, ...], out: Path) -> None:
     """
     from omegaconf import OmegaConf
 
-    from memmlp.config.build_motion import build_motion
+    from memmlp.config.build_request import build_motion
     from memmlp.config.compose import composed
     from memmlp.motion.preparing.cache import prepare as prepare_cache
 

@@ -28,7 +28,7 @@ from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.preparing.find_clips import Folders, Root, find_clips
 from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, PARTS, ClipRecord, Manifest
 from memmlp.motion.preparing.splits import Split
-from memmlp.runs.component_versions import VERSIONS
+from memmlp.runs.identity import VERSIONS
 
 FRAMES_VERSION = 1  # number of a frame's content; a new one changes every digest, and so repeats every run
 CHUNK = 4096  # frames turned into features at a time

@@ -17,9 +17,9 @@ from memmlp.common.files import read_json
 from memmlp.common.processes import MIN_CORE_SHARE
 from memmlp.motion.preparing.groups import Grouping
 from memmlp.runs.deployment_folder import as_deployed, deployed_precision, timed_on
+from memmlp.runs.environment import prerequisite_versions, recorded_prerequisites
 from memmlp.runs.evaluation_file import intact, of_one_solver
 from memmlp.runs.lookup import frames_seen
-from memmlp.runs.origin import prerequisite_versions, recorded_prerequisites
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import TIMES
 

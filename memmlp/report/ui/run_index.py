@@ -14,8 +14,7 @@ from typing import Any
 from memmlp.common.errors import InputError
 from memmlp.common.files import plain, read_json
 from memmlp.runs.deployment_folder import as_deployed
-from memmlp.runs.evaluation_file import with_solvers
-from memmlp.runs.evaluations_as_configured import EvaluationsAsConfigured
+from memmlp.runs.evaluation_file import EvaluationsAsConfigured, with_solvers
 from memmlp.runs.identity import DEPLOYMENT, EVALUATION, ID, INFERENCE, flatten, training_settings
 from memmlp.runs.lookup import run_name
 from memmlp.runs.run import Run, latency_name

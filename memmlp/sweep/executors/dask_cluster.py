@@ -6,7 +6,6 @@ threads, and could not be ended. So each task starts a process and watches it.
 
 from __future__ import annotations
 
-import math
 import os
 import sys
 import tempfile
@@ -71,47 +70,23 @@ class Dask:
             self.client = self.distributed.Client(address, set_as_default=False)
         except (OSError, ValueError) as error:
             raise InputError(f"dask.address={address}: {' '.join(str(error).split())}") from None
-        declared = any(GPU in there for there in self._declared_resources())
+        workers = self.client.scheduler_info(n_workers=-1)["workers"].values()
+        declared = any(GPU in one["resources"] for one in workers)
         self.resources = ({GPU: 1.0} if gpus and declared else {}) | options.get("resources", {})
         self.gpus = self.resources.get(GPU, 0) > 0
-        self.tasks: list[DaskTask] = []
         if gpus and not self.gpus:
-            _warn("no worker declares a GPU (dask worker --resources GPU=1): runs have none")
-        if not self._capacity():
-            asked = ", ".join(f"{amount:g} {name}" for name, amount in self.resources.items())
-            _warn(f"no worker of the cluster has {asked}; runs wait until one comes")
+            line = "no worker declares a GPU (dask worker --resources GPU=1): runs have none"
+            print(f"memmlp: executor=dask: {line}", file=sys.stderr, flush=True)
 
     def submit(self, work: Work, count: int = 1) -> list[DaskTask]:
-        """Start workers, but no more than the cluster has room for at present.
-
-        Dask would assign further ones to busy workers, and leave them there even when other workers become
-        free.
-        """
-        self.tasks = [task for task in self.tasks if task.alive()]
-        free = max(self._capacity() - len(self.tasks), 0)
+        """Start workers; those that the cluster has no resources for wait."""
         started = []
-        for _ in range(int(min(count, free))):
+        for _ in range(count):
             name = f"memmlp-{uuid.uuid4().hex}"
             wanted = {"resources": dict(self.resources)} if self.resources else {}
             future = self.client.submit(_work_apart, work, name, self.gpus, key=name, pure=False, **wanted)
             started.append(DaskTask(future, self.distributed.Event(name, self.client)))
-        self.tasks += started
         return started
-
-    def _capacity(self) -> float:
-        """Return how many of our workers can have their resources at once; infinite if they need none."""
-        asked = {name: amount for name, amount in self.resources.items() if amount}
-        if not asked:
-            return math.inf
-        every = self._declared_resources()
-        return sum(min(there.get(name, 0) // amount for name, amount in asked.items()) for there in every)
-
-    def _declared_resources(self) -> list[Mapping[str, float]]:
-        return [one["resources"] for one in self.client.scheduler_info(n_workers=-1)["workers"].values()]
-
-
-def _warn(line: str) -> None:
-    print(f"memmlp: executor=dask: {line}", file=sys.stderr, flush=True)
 
 
 def _work_apart(work: Work, stop: str, gpus: bool) -> str | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -81,15 +80,6 @@ class Ray:
         least = 1.0 if gpus and there.get("GPU") else 0.0
         self.num_gpus = options.get("num_gpus", least)
         num_cpus = options.get("num_cpus", 1.0)
-        asked = {"GPU": self.num_gpus, "CPU": num_cpus, **options.get("resources", {})}
-        for name, amount in asked.items():
-            if amount > there.get(name, 0):  # a cluster that grows by itself may get it
-                print(
-                    f"memmlp: executor=ray: a worker asks for {amount:g} {name}, of which the cluster has "
-                    f"{there.get(name, 0):g}; workers wait until it has more",
-                    file=sys.stderr,
-                    flush=True,
-                )
         self.gpus = self.num_gpus > 0
         self.task = {key: options[key] for key in ("accelerator_type", "resources") if key in options}
         if "memory_gb" in options:

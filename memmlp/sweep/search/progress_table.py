@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from memmlp.runs.run import Run
-from memmlp.sweep.progress_table import Screen, device_name, devices, progress_text, titled_table
+from memmlp.sweep.progress_table import Screen, progress_text, titled_table
 from memmlp.sweep.search.search_file import Search, Value
 from memmlp.sweep.search.study import Study, deviations, reason
 
@@ -37,7 +37,7 @@ class SearchBoard(Screen):
         ended = [trial for trial in study.trials if trial.state in ENDS]
         numbers = {trial.number for trial in ended}
         printed = numbers if self.printed is None else self.printed
-        changes = [describe_end(one, self.outputs) for one in ended if one.number not in printed]
+        changes = [describe_end(one) for one in ended if one.number not in printed]
 
         def progress() -> list[str]:
             return [
@@ -51,13 +51,11 @@ class SearchBoard(Screen):
         self.printed = numbers
 
 
-def describe_end(trial: FrozenTrial, outputs: Path) -> str:
-    """Say how a trial ended, and on which devices its runs ran."""
+def describe_end(trial: FrozenTrial) -> str:
+    """Describe how a trial ended."""
     result = figures(trial) if trial.state == TrialState.COMPLETE else reason(trial)
     params = ", ".join(f"{key}={_short_value(value)}" for key, value in trial.params.items())
-    names = ", ".join(dict.fromkeys(filter(None, map(device_name, runs_of(trial, outputs)))))
-    where = f" on {names}" if names else ""
-    return f"trial {trial.number} {ENDS[trial.state]}{where}: {result} ({params})"
+    return f"trial {trial.number} {ENDS[trial.state]}: {result} ({params})"
 
 
 def runs_of(trial: FrozenTrial, outputs: Path) -> list[Run]:
@@ -79,16 +77,14 @@ def figures(trial: FrozenTrial) -> str:
 
 
 def render(study: Study, outputs: Path) -> Group:
-    """Draw the running trials, the best ones, the counts, and the devices in use."""
+    """Draw the running trials, the best ones, and the counts."""
     table = trials_table(study.search, f"search {study.search.name}")
-    running = running_trials(study, outputs)
-    for trial, runs in running:
+    for trial, runs in running_trials(study, outputs):
         add_row(table, study.search, trial, _describe_runs(trial, runs))
     ranked = sorted((t for t in study.trials if t.state == TrialState.COMPLETE), key=lambda t: t.values)
     for trial in ranked[:SHOWN]:
         add_row(table, study.search, trial, Text(figures(trial), style="green"))
-    at_work = (run for _, runs in running for run in runs if run.doing)
-    return Group(table, Text(count_trials(study)), *map(Text, devices(at_work)))
+    return Group(table, Text(count_trials(study)))
 
 
 def _describe_runs(trial: FrozenTrial, runs: Sequence[Run]) -> Text:

@@ -23,7 +23,7 @@ from memmlp.motion.preparing import survey as survey_module
 from memmlp.motion.preparing.cache import ClipFolder, prepare
 from memmlp.motion.preparing.manifest import Manifest
 from memmlp.motion.preparing.splits import SeededSplit
-from memmlp.runs.component_versions import VERSIONS
+from memmlp.runs.identity import VERSIONS
 
 
 def motion(length: int, seed: int, fps: float = 60.0) -> Clip:

@@ -14,7 +14,7 @@ import pytest
 from conftest import Memmlp
 
 from memmlp.common.errors import InputError
-from memmlp.config.build_motion import build_motion
+from memmlp.config.build_request import build_motion
 from memmlp.config.compose import composed
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.npz import write_clip

@@ -15,9 +15,8 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
 from memmlp.report.kept_results import Kept, dumps, load_kept
 from memmlp.report.tables.measured_run import Measured, load
-from memmlp.runs.component_versions import VERSIONS, outdated
 from memmlp.runs.evaluation_file import write_report
-from memmlp.runs.identity import deployment_id_of
+from memmlp.runs.identity import VERSIONS, deployment_id_of, outdated
 from memmlp.sweep.definition import Sweep
 
 

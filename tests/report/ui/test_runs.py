@@ -11,9 +11,8 @@ from report.ui.conftest import started_run
 
 from memmlp.evaluation.metric_facts import HIGHER, UNITS
 from memmlp.report.ui.runs import describe_units, differing_keys, outdated_modes, read_curves, thin_out
-from memmlp.runs.component_versions import VERSIONS
 from memmlp.runs.evaluation_file import write_report
-from memmlp.runs.identity import evaluation_id_of, evaluation_settings, evaluation_versions
+from memmlp.runs.identity import VERSIONS, evaluation_id_of, evaluation_settings, evaluation_versions
 from memmlp.runs.run import Run
 
 

@@ -8,7 +8,7 @@ import pytest
 from fake_logger import a_run, an_outdated_evaluation
 
 from memmlp.common.files import write_json
-from memmlp.runs.component_versions import VERSIONS
+from memmlp.runs.identity import VERSIONS
 from memmlp.runs.loggers.facts import Tail, read_run
 from memmlp.runs.notes import add_tags, set_note
 

@@ -42,16 +42,6 @@ def test_a_search_has_the_trials_it_wants_and_the_papers_first(tmp_path: Path):
     assert study.best()[0].value == min(trial.value for trial in study.trials)
 
 
-def test_capacity_is_kept_and_each_plan_holds_what_is_under_way(tmp_path: Path):
-    one = director(open_study(tmp_path), tmp_path)
-    assert len(one.update(3).tasks) == 3
-    assert one.update(3) == one.update(3)
-    finish(one.update(3))
-    plan = one.update(3)
-    assert [entry.label for entry in plan.entries] == ["trial 3", "trial 4", "trial 5"]
-    assert plan.open
-
-
 @pytest.mark.parametrize("moment", range(4))
 def test_a_director_killed_while_it_asks_loses_and_repeats_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int
@@ -229,20 +219,6 @@ def test_pruning_is_by_the_first_seed_alone(tmp_path: Path):
     assert run.id in plan.cancelled
     assert study.trials[-2].state == TrialState.PRUNED
     assert study.trials[-2].user_attrs["runs"] == [run.id]
-
-
-def test_one_failed_seed_fails_the_trial_and_cancels_the_others(tmp_path: Path):
-    study = open_study(tmp_path, seeds=3)
-    one = seeded(study, tmp_path)
-    finish(one.update(1))
-    plan = one.update(1)
-    bad, other = (begun(replace(plan, tasks=(task,))) for task in plan.left())
-    bad.fail("the loss is nan")
-    plan = one.update(1)
-    assert study.trials[0].state == TrialState.FAIL
-    assert study.trials[0].user_attrs["reason"] == "the loss is nan"
-    assert {bad.id, other.id} <= set(plan.cancelled)
-    assert other.id not in {task.id for task in plan.tasks}
 
 
 def test_validations_of_a_network_used_otherwise_are_no_trials(tmp_path: Path):

@@ -7,13 +7,12 @@ from pathlib import Path
 import pytest
 from begun_runs import begun
 
-import memmlp.runs.component_versions
+import memmlp.runs.identity
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.report.tables.measured_run import load
 from memmlp.report.ui.run_index import read_facts
-from memmlp.runs.evaluation_file import write_report
-from memmlp.runs.evaluations_as_configured import EvaluationsAsConfigured
+from memmlp.runs.evaluation_file import EvaluationsAsConfigured, write_report
 from memmlp.runs.identity import evaluation_id_of
 from memmlp.runs.query import record
 from memmlp.runs.run import Run
@@ -69,9 +68,9 @@ def test_a_mode_that_was_measured_by_an_earlier_recipe_says_so(tmp_path: Path, m
         "component_versions": {"mode.stream": 1},
     }
     write_report(tmp_path / f"{evaluation_id_of(settings)}.json", report)
-    monkeypatch.setitem(memmlp.runs.component_versions.VERSIONS, "mode.stream", 1)
+    monkeypatch.setitem(memmlp.runs.identity.VERSIONS, "mode.stream", 1)
     assert EvaluationsAsConfigured(tmp_path, {}).outdated == {}
-    monkeypatch.setitem(memmlp.runs.component_versions.VERSIONS, "mode.stream", 2)
+    monkeypatch.setitem(memmlp.runs.identity.VERSIONS, "mode.stream", 2)
     assert EvaluationsAsConfigured(tmp_path, {}).outdated == {"stream": "mode.stream 1 -> 2"}
 
 

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from memmlp.common.components import declared, find
 from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment
-from memmlp.config.build_motion import build_motion
+from memmlp.config.build_request import build_motion
 from memmlp.config.compose import composed
 from memmlp.config.schema import restored
 from memmlp.motion.preparing.find_clips import Folders
