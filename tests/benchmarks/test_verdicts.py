@@ -1,4 +1,4 @@
-"""Simulated differences have the variances that they are said to have, and broken promises are counted."""
+"""Simulated differences have the documented variances, and broken promises are counted."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from memmlp.report.tables.statistics import error
 
 
 @pytest.mark.parametrize("cell", [SimulationSetting(5, 10, 1), SimulationSetting(5, 11, 2)])
-def test_mixtures_are_those_of_whole_differences(cell: SimulationSetting):
+def test_mixed_effects_equal_simulated_differences(cell: SimulationSetting):
     sample = Simulated(np.random.default_rng(3), cell, 24)
     rng = np.random.default_rng(3)
     of_seeds = np.sqrt(cell.seeds) * rng.normal(size=(24, cell.seeds))
@@ -37,26 +37,17 @@ def test_means_have_a_variance_of_one():
         assert a + b - e == pytest.approx(1, abs=0.06 if shares.groups else 0.2), name
 
 
-def test_the_grid_is_all_that_have_two_groups():
+def test_a_cell_is_reproducible_and_interim_analyses_save_seeds():
     assert len(grid()) == 40
-    assert SimulationSetting(3, 10, 10) not in grid()
-    assert SimulationSetting(10, 536, 10) in grid()
+    small, large = SimulationSetting(3, 4, 2), SimulationSetting(10, 40, 1)
+    assert simulate(small, 20, 1) == simulate(small, 20, 1) != simulate(small, 20, 2)
+    campaign = simulate(large, 20, 0)["campaign"]
+    assert campaign["decided"] > 0.95
+    assert campaign["seeds"] < 9
+    assert campaign["error"] <= 0.05
 
 
-def test_a_cell_is_the_same_again_and_another_with_another_seed():
-    cell = SimulationSetting(3, 4, 2)
-    assert simulate(cell, 20, 1) == simulate(cell, 20, 1)
-    assert simulate(cell, 20, 1) != simulate(cell, 20, 2)
-
-
-def test_looks_spend_fewer_seeds_where_effects_are_plain():
-    told = simulate(SimulationSetting(10, 40, 1), 20, 0)["campaign"]
-    assert told["decided"] > 0.95
-    assert told["seeds"] < 9
-    assert told["error"] <= 0.05
-
-
-def test_a_broken_promise_is_told():
+def test_a_broken_promise_is_listed():
     row = {"tables": 1000, "shares": {"one": {"coverage": 0.95, "error": 0.05, "sequential_error": 0.03}}}
     assert broken(row, True) == []
     row["shares"]["other"] = {"coverage": 0.999, "error": 0.09, "sequential_error": 0.01}

@@ -1,25 +1,19 @@
-"""Simulated tables whose truth is known: how often verdicts are wrong, beside what the statistics promise.
+"""Simulate tables with a known truth, and count how often verdicts are wrong.
 
-Run `python tests/benchmarks/verdicts.py --tables 5000 --seed 20253 --markdown`; docs/results/verdicts.md has
-what it printed. Axes of arrays: K comparisons (T tables of TABLE each), S seeds, C clips, G groups of clips.
+Run `python tests/benchmarks/verdicts.py --tables 5000 --seed 20253`; docs/results/verdicts.md has the output.
+Axes of arrays: K comparisons (T tables of TABLE each), S seeds, C clips, G clip groups.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
 import numpy as np
-from rich import box
-from rich.console import Console
-from rich.table import Table
 from scipy.special import ndtri
 
-from memmlp.common.errors import InputError
-from memmlp.common.files import write_json
 from memmlp.common.progress import progress_bar
 from memmlp.report.tables.statistics import (
     LEVEL,
@@ -43,37 +37,16 @@ class Shares(NamedTuple):
 
 
 SHARES = {
-    "seeds": Shares(seeds=1),
-    "groups": Shares(groups=1),
-    "clips": Shares(clips=1),
-    "noise": Shares(noise=1),
-    "seeds+groups": Shares(seeds=1, groups=1),
-    "seeds+clips": Shares(seeds=1, clips=1),
-    "seeds+noise": Shares(seeds=1, noise=1),
-    "groups+clips": Shares(groups=1, clips=1),
-    "groups+noise": Shares(groups=1, noise=1),
-    "clips+noise": Shares(clips=1, noise=1),
-    "equal": Shares(seeds=1, groups=1, clips=1, noise=1),
-    "skewed": Shares(skewed=1),
-    "seeds+skewed": Shares(seeds=1, skewed=1),
-    "groups+skewed": Shares(groups=1, skewed=1),
-    "skewed+noise": Shares(skewed=1, noise=1),
-    "skewed+noise/20": Shares(skewed=20, noise=1),
+    "seeds": Shares(seeds=1), "groups": Shares(groups=1), "clips": Shares(clips=1), "noise": Shares(noise=1),
+    "seeds+groups": Shares(seeds=1, groups=1), "seeds+clips": Shares(seeds=1, clips=1),
+    "seeds+noise": Shares(seeds=1, noise=1), "groups+clips": Shares(groups=1, clips=1),
+    "groups+noise": Shares(groups=1, noise=1), "clips+noise": Shares(clips=1, noise=1),
+    "equal": Shares(seeds=1, groups=1, clips=1, noise=1), "skewed": Shares(skewed=1),
+    "seeds+skewed": Shares(seeds=1, skewed=1), "groups+skewed": Shares(groups=1, skewed=1),
+    "skewed+noise": Shares(skewed=1, noise=1), "skewed+noise/20": Shares(skewed=20, noise=1),
     "seeds/20+noise": Shares(seeds=1, noise=20),
     "equal, skewed": Shares(seeds=1, groups=1, skewed=1, noise=1),
-}
-
-
-def choices(cell: SimulationSetting) -> dict[str, Shares]:
-    """Return the shares that are simulated in a cell of the grid, by name.
-
-    SHARES divide the variance of the mean. "values" instead gives every source the same variance in a single
-    value d[s, c], so that in the variance of the mean seeds have 1 / S, groups 1 over their number, and so
-    on.
-    """
-    seeds, clips, size = cell
-    values = Shares(seeds=1 / seeds, groups=size / clips, clips=1 / clips, noise=1 / seeds / clips)
-    return SHARES | {"values": values}
+}  # fmt: skip
 
 
 class SimulationSetting(NamedTuple):
@@ -94,10 +67,21 @@ class SimulationSetting(NamedTuple):
         return self.seeds >= 3 and self.groups[-1] >= 4
 
 
-class SimulatedLook(NamedTuple):
-    """What is needed for a look at the first seeds of K comparisons, for effects in any shares.
+def choices(cell: SimulationSetting) -> dict[str, Shares]:
+    """Return the shares that are simulated in a cell of the grid, by name.
 
-    Every kind of effect is scaled so that, with all seeds, it gives the mean a variance of 1.
+    SHARES divide the variance of the mean. "values" instead gives every source the same variance in a single
+    value d[s, c].
+    """
+    seeds, clips, size = cell
+    values = Shares(seeds=1 / seeds, groups=size / clips, clips=1 / clips, noise=1 / seeds / clips)
+    return SHARES | {"values": values}
+
+
+class InterimSample(NamedTuple):
+    """The sufficient statistics of an interim analysis of K comparisons, for effects in any shares.
+
+    Every kind of effect is scaled so that it gives the mean over all seeds a variance of 1.
 
     Attributes:
         noise: the means (K, S) of the noise over clips, by seed.
@@ -114,48 +98,40 @@ class SimulatedLook(NamedTuple):
 class Simulated:
     """Simulated differences of K comparisons without a true effect.
 
-    Drawing is slow and there are many choices of shares. So each kind of effect is drawn once, and enough of
-    it is kept to mix the kinds in any shares later.
+    Drawing is slow, so each kind of effect is drawn once; `mixed` then mixes the kinds in any shares.
     """
 
     def __init__(self, rng: np.random.Generator, cell: SimulationSetting, comparisons: int):
-        """Draw the effects of all seeds, groups and clips, and the noise of all single values."""
         self.seeds = np.sqrt(cell.seeds) * rng.normal(size=(comparisons, cell.seeds))
         fixed, noise, self.weights = draw(rng, cell, comparisons)
         self.means = fixed @ self.weights  # (K, 3)
         variances = noise.var(2, ddof=1)
-        self.looks = {
-            n: self._look(fixed, noise[:, :n], variances[:, :n]) for n in analysis_schedule(cell.seeds)
+        self.interim = {
+            n: self._sample(fixed, noise[:, :n], variances[:, :n]) for n in analysis_schedule(cell.seeds)
         }
 
-    def _look(self, fixed: np.ndarray, noise: np.ndarray, variances: np.ndarray) -> SimulatedLook:
-        """Return what is needed for a look at its seeds.
-
-        Args:
-            fixed: the groups' means of the effects of groups, clips and skewed clips (K, 3, G).
-            noise: the groups' means of the noise (K, S, G), for the look's seeds.
-            variances: the variance of each seed's noise over groups (K, S).
-        """
+    def _sample(self, fixed: np.ndarray, noise: np.ndarray, variances: np.ndarray) -> InterimSample:
+        """Summarise fixed effects (K, 3, G), noise (K, S, G) and its variance over groups (K, S)."""
         effects = np.concatenate([fixed, noise.mean(1, keepdims=True)], 1)
         effects -= effects.mean(2, keepdims=True)
         covariances = effects @ effects.transpose(0, 2, 1) / (len(self.weights) - 1)
-        rest = variances.mean(1) - covariances[:, 3, 3]  # that of all cells less that of their groups
+        rest = variances.mean(1) - covariances[:, 3, 3]  # of all cells, less that of their groups
         e = rest * (self.weights @ self.weights) / (noise.shape[1] - 1)
-        return SimulatedLook(noise @ self.weights, e, covariances)
+        return InterimSample(noise @ self.weights, e, covariances)
 
     def mixed(self, shares: Shares, seeds: int) -> tuple[Error, np.ndarray]:
         """Mix the kinds of effects, and return the estimated error of the mean and the mean (K,).
 
         Args:
             shares: the shares of the kinds in the mean's variance, which is 1 with all seeds.
-            seeds: how many seeds are looked at, from the first one on.
+            seeds: how many seeds are analysed, from the first one on.
         """
         weights = np.sqrt(np.array(shares) / sum(shares))
-        look = self.looks[seeds]
-        by_seed = weights[0] * self.seeds[:, :seeds] + weights[4] * look.noise
+        sample = self.interim[seeds]
+        by_seed = weights[0] * self.seeds[:, :seeds] + weights[4] * sample.noise
         a = by_seed.var(1, ddof=1) / seeds
-        b = (look.covariances @ weights[1:]) @ weights[1:] * (self.weights @ self.weights)
-        known = Error(np.stack([a, b, weights[4] ** 2 * look.variance]), seeds - 1, len(self.weights) - 1)
+        b = (sample.covariances @ weights[1:]) @ weights[1:] * (self.weights @ self.weights)
+        known = Error(np.stack([a, b, weights[4] ** 2 * sample.variance]), seeds - 1, len(self.weights) - 1)
         return known, by_seed.mean(1) + self.means @ weights[1:4]
 
 
@@ -184,22 +160,15 @@ TABLE = VARIANTS * METRICS  # comparisons of a table
 CHUNK = 4_000_000  # numbers that are drawn at once, which bounds the memory
 
 ERROR, LEAST, MOST = 0.06, 0.93, 0.995
-"""The promises that are tested.
-
-A family-wise error of at most ERROR and a coverage of at least LEAST everywhere; from 3 seeds and 5 groups on
-also a coverage of at most MOST, so that intervals are not too wide.
-"""
+"""The largest family-wise error, and the least coverage; from 3 seeds and 5 groups on, the most coverage."""
 
 MARGIN, EFFECT = 8.0, 16.0
-"""The smallest effect of interest, and the effect that half of the variants have in simulated campaigns.
-
-Both are in standard errors.
-"""
+"""The smallest effect of interest, and the effect of half the variants in campaigns, in standard errors."""
 CAMPAIGNS = 200  # tables with effects for each cell of the grid
 
 
 def grid() -> list[SimulationSetting]:
-    """Return all cells of the grid that have at least two groups."""
+    """Return the cells that have at least two groups."""
     cells = itertools.starmap(SimulationSetting, itertools.product(SEEDS, CLIPS, SIZES))
     return [cell for cell in cells if cell.groups[-1] > 0]
 
@@ -209,15 +178,15 @@ class SimulatedOutcomes(NamedTuple):
 
     Attributes:
         covered: whether the 95 % interval covers the truth (K,).
-        starred: whether a table has any star (T,), which is then a false one, with all seeds at once.
-        in_looks: the same if seeds are added in looks (T,).
+        starred: whether a table has a (false) star, with all seeds at once (T,).
+        sequential: the same with interim analyses (T,).
         found: the smallest true effect that would have been found (K,): half the interval's width at Holm's
             first step, minus the simulated mean.
     """
 
     covered: np.ndarray
     starred: np.ndarray
-    in_looks: np.ndarray
+    sequential: np.ndarray
     found: np.ndarray
 
 
@@ -226,18 +195,18 @@ def count(sample: Simulated, shares: Shares) -> SimulatedOutcomes:
 
     All nulls are true, so Holm gives a table a star exactly if its first step does.
     """
-    in_looks = np.zeros(len(sample.seeds), bool)
-    for seeds, level in spent(sample):
+    sequential = np.zeros(len(sample.seeds), bool)
+    for seeds, level in levels(sample):
         known, mean = sample.mixed(shares, seeds)
-        in_looks |= np.abs(mean) > known.half(level / TABLE)
+        sequential |= np.abs(mean) > known.half(level / TABLE)
     half = known.half(LEVEL / TABLE)
     covered = np.abs(mean) <= known.half(LEVEL)
-    return SimulatedOutcomes(covered, _any(np.abs(mean) > half), _any(in_looks), half - mean)
+    return SimulatedOutcomes(covered, _any(np.abs(mean) > half), _any(sequential), half - mean)
 
 
-def spent(sample: Simulated) -> Iterator[tuple[int, float]]:
-    """Return the number of seeds of each look, with the level that it may spend."""
-    return zip(sample.looks, spending(len(sample.looks)), strict=True)
+def levels(sample: Simulated) -> Iterator[tuple[int, float]]:
+    """Return the number of seeds of each interim analysis, and the level that it may spend."""
+    return zip(sample.interim, spending(len(sample.interim)), strict=True)
 
 
 def _any(claims: np.ndarray) -> np.ndarray:
@@ -251,12 +220,12 @@ def summary(counts: Sequence[SimulatedOutcomes]) -> dict[str, float]:
     Power is the share of comparisons that find the effect which an oracle, who knows the variances, finds in
     80 % of tables. `effect_ratio` is the effect found in 80 % of tables, divided by the oracle's.
     """
-    covered, starred, in_looks, found = map(np.concatenate, zip(*counts, strict=True))
+    covered, starred, sequential, found = map(np.concatenate, zip(*counts, strict=True))
     oracle = ndtri(1 - LEVEL / TABLE / 2) + ndtri(0.8)
     return {
         "coverage": float(covered.mean()),
         "error": float(starred.mean()),
-        "sequential_error": float(in_looks.mean()),
+        "sequential_error": float(sequential.mean()),
         "power": float((found < oracle).mean()),
         "effect_ratio": float(np.quantile(found, 0.8) / oracle),
     }
@@ -267,9 +236,9 @@ class Campaign(NamedTuple):
 
     Attributes:
         seeds: the number of seeds that each variant spent (T, VARIANTS).
-        decided: whether each comparison was decided in looks (T, TABLE).
+        decided: whether each comparison was decided in an interim analysis (T, TABLE).
         at_once: whether each is decided with all seeds at once (T, TABLE).
-        false: whether a table made any false claim in looks (T,).
+        false: whether a table made any false claim in an interim analysis (T,).
     """
 
     seeds: np.ndarray
@@ -279,7 +248,7 @@ class Campaign(NamedTuple):
 
 
 def campaign(sample: Simulated, shares: Shares) -> Campaign:
-    """Simulate tables that are looked at with more and more seeds; half of the variants differ by EFFECT.
+    """Simulate tables with interim analyses; half of the variants differ by EFFECT.
 
     A variant stops when all of its comparisons are decided.
     """
@@ -287,7 +256,7 @@ def campaign(sample: Simulated, shares: Shares) -> Campaign:
     truth = np.repeat(np.arange(VARIANTS) % 2 * EFFECT, METRICS)
     differ, same = np.zeros((2, tables, TABLE), bool)
     seeds = np.zeros((tables, VARIANTS), int)
-    for number, level in spent(sample):
+    for number, level in levels(sample):
         seeds[~(differ | same).reshape(tables, VARIANTS, METRICS).all(2)] = number
         known, mean = sample.mixed(shares, number)
         means = mean.reshape(tables, TABLE) + truth
@@ -301,20 +270,20 @@ def campaign(sample: Simulated, shares: Shares) -> Campaign:
 
 
 def _claimed(p: np.ndarray, before: np.ndarray, closed: np.ndarray, level: float) -> np.ndarray:
-    """Return what a family of claims has claimed after a look (T, TABLE).
+    """Return all claims of a family after an interim analysis (T, TABLE).
 
     Args:
-        p: p-values at the look (T, TABLE).
-        before: what the family claimed at earlier looks (T, TABLE).
-        closed: what the other family has claimed (T, TABLE).
-        level: what the look may spend.
+        p: p-values of this analysis (T, TABLE).
+        before: the family's claims of earlier analyses (T, TABLE).
+        closed: the other family's claims (T, TABLE).
+        level: the level that this analysis may spend.
     """
     rows = zip(p, before, closed & ~before, strict=True)
     return np.array([sequential(*row) <= level for row in rows])
 
 
 def simulate(cell: SimulationSetting, tables: int, seed: int) -> dict[str, Any]:
-    """Simulate a cell of the grid, and return everything that is reported about it."""
+    """Simulate a cell of the grid, and return its report."""
     rng = np.random.default_rng([seed, *cell])
     size = max(1, CHUNK // (TABLE * cell.seeds * cell.clips))
     every = choices(cell)
@@ -331,17 +300,15 @@ def simulate(cell: SimulationSetting, tables: int, seed: int) -> dict[str, Any]:
         "groups": int(cell.groups[-1]) + 1,
         "tables": tables,
         "shares": {name: summary(parts) for name, parts in counts.items()},
-        "campaign": told(campaigns),
+        "campaign": averages(campaigns),
     }
 
 
-def told(campaigns: Sequence[Campaign]) -> dict[str, float]:
+def averages(campaigns: Sequence[Campaign]) -> dict[str, float]:
     """Return means over simulated tables that spend seeds until everything is decided."""
     names = ("seeds", "decided", "decided_at_once", "error")
-    return {
-        name: float(np.concatenate(part).mean())
-        for name, part in zip(names, zip(*campaigns, strict=True), strict=True)
-    }
+    parts = zip(*campaigns, strict=True)
+    return {name: float(np.concatenate(part).mean()) for name, part in zip(names, parts, strict=True)}
 
 
 def extreme(row: dict[str, Any], what: str, pick: Any) -> tuple[float, str]:
@@ -366,15 +333,12 @@ def broken(row: dict[str, Any], capped: bool) -> list[str]:
     ]
 
 
-QUICK = 40  # the largest number of clips with --quick
-
 HEADER = (
-    "design", "coverage", "star", "of", "looks", "power", "effect", "seeds", "decided",
+    "design", "coverage", "star", "of", "interim", "power", "effect", "seeds", "decided",
 )  # fmt: skip
 
 
 def columns(row: dict[str, Any]) -> list[str]:
-    """Return the words of a row of the printed table."""
     least, most = (100 * extreme(row, "coverage", pick)[0] for pick in (min, max))
     error, worst = extreme(row, "error", max)
     equal, spent = row["shares"]["equal"], row["campaign"]
@@ -391,77 +355,30 @@ def columns(row: dict[str, Any]) -> list[str]:
     ]
 
 
-def remarks(rows: Sequence[dict[str, Any]], seed: int) -> list[str]:
-    """Return the lines that explain the columns."""
-    tables = rows[0]["tables"]
-    star, covered = (100 * np.sqrt(LEVEL * (1 - LEVEL) / number) for number in (tables, tables * TABLE))
-    return [
-        f"design: seeds x clips / clips of a group; {tables} tables of {TABLE} true nulls for each, and for "
-        f"each of {len(rows[0]['shares'])} choices of shares of variance; seed {seed}",
-        f"coverage: of the 95 % interval, least and most over shares, in % (standard error {covered:.2f})",
-        f"star: tables with any after Holm, in % (standard error {star:.2f}), and the shares with the most; "
-        "looks: the same, where seeds are added in looks; the worst of many cells is above its true rate",
-        "power: in %, of an effect that an oracle, who knows the variances, finds in 80 %; effect: found in "
-        "80 %, over the oracle's; both with equal shares, at Holm's first step",
-        f"seeds: of a variant, in looks, with equal shares; every other variant differs by {EFFECT:.0f} "
-        f"standard errors and {MARGIN:.0f} are of interest; decided: comparisons, in %, so / at once",
-    ]
-
-
-def table(rows: Sequence[dict[str, Any]]) -> Table:
-    """Return the rows as a table for a terminal."""
-    shown = Table(box=box.SIMPLE_HEAD, padding=0)
-    for name in HEADER:
-        shown.add_column(name, justify="left" if name == "of" else "right", no_wrap=True)
-    for row, after in itertools.zip_longest(rows, rows[1:]):
-        shown.add_row(*columns(row), end_section=bool(after) and after["seeds"] != row["seeds"])
-    return shown
-
-
-def markdown(rows: Sequence[dict[str, Any]], seed: int) -> str:
-    """Return the rows and remarks as Markdown, for docs/results/verdicts.md."""
+def markdown(rows: Sequence[dict[str, Any]]) -> str:
     lines = [HEADER, ["---" if name == "of" else "---:" for name in HEADER], *map(columns, rows)]
-    text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-    return "\n".join([text, "", *(f"- {line}" for line in remarks(rows, seed))]) + "\n"
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-@click.command("verdicts")
-@click.option(
-    "--tables",
-    default=5000,
-    show_default=True,
-    type=click.IntRange(1),
-    help="How many tables are simulated for each cell of the grid.",
-)
-@click.option("--quick", is_flag=True, help=f"Simulate the cells of at most {QUICK} clips alone.")
+@click.command()
+@click.option("--tables", default=5000, show_default=True, help="Simulated tables of each cell of the grid.")
 @click.option("--seed", default=0, show_default=True, help="Seed of the random numbers.")
-@click.option(
-    "--json", "file", type=click.Path(path_type=Path), help="File to write all rates into, as JSON."
-)
-@click.option("--markdown", "as_markdown", is_flag=True, help="Print the table as Markdown.")
-def verdicts(tables: int, quick: bool, seed: int, file: Path | None, as_markdown: bool) -> None:
-    """Simulate how often verdicts are wrong.
+def main(tables: int, seed: int) -> None:
+    """Print the table of docs/results/verdicts.md for a grid of seeds, clips, groups and variance shares.
 
-    The simulation covers a grid of seeds, clips, groups and shares of variance. Exits with 1 where a cell
-    breaks a promise by more than two standard errors of the simulation.
+    Exits with 1 where a cell breaks a promise by more than two standard errors of the simulation.
     """
-    if file and not file.absolute().parent.is_dir():
-        raise InputError(f"--json {file}: there is no folder {file.parent}")
-    cells = [cell for cell in grid() if not quick or cell.clips <= QUICK]
+    cells = grid()
     rows = [simulate(cell, tables, seed) for cell in progress_bar(cells, "simulating")]
-    if file:
-        write_json(file, {"seed": seed, "level": LEVEL, "comparisons": TABLE, "cells": rows})
-    if as_markdown:
-        click.echo(markdown(rows, seed))
-    else:
-        Console().print(table(rows), *remarks(rows, seed), sep="\n")
-    failures = {cell: broken(row, cell.capped) for cell, row in zip(cells, rows, strict=True)}
-    for cell, problems in failures.items():
-        for problem in problems:
-            click.echo(f"broken at {cell.seeds} seeds x {cell.clips} clips, {cell.size} a group: {problem}")
-    if any(failures.values()):
-        raise SystemExit(1)
+    click.echo(markdown(rows))
+    failures = [
+        f"broken at {cell.seeds} seeds x {cell.clips} clips, {cell.size} a group: {problem}"
+        for cell, row in zip(cells, rows, strict=True)
+        for problem in broken(row, cell.capped)
+    ]
+    click.echo("\n".join(failures))
+    raise SystemExit(bool(failures))
 
 
 if __name__ == "__main__":
-    verdicts()
+    main()
