@@ -24,16 +24,9 @@ from memmlp.runs.lookup import list_runs
 
 ROOT = Path(memmlp.__file__).parents[1]
 NAMES = [
-    "InputError",
-    "Offsets",
-    "Pose",
-    "Prediction",
-    "Runs",
-    "SampleWarning",
-    "Stream",
-    "TrainedRun",
+    "InputError", "Offsets", "Pose", "Prediction", "Runs", "SampleWarning", "Stream", "TrainedRun",
     "load_run",
-]
+]  # fmt: skip
 UPRIGHT = ((0.0, 1.6, 0.0), np.eye(3))
 
 
@@ -78,29 +71,29 @@ def three(run: memmlp.TrainedRun, tmp_path: Path) -> memmlp.Runs:
 
 
 def refused(*words: str) -> contextlib.AbstractContextManager[object]:
-    """An InputError of one line that begins with the first of these words and has the others after it."""
-    pattern = r"^(?![\s\S]*\n)" + ".*".join(map(re.escape, words))
-    return pytest.raises(memmlp.InputError, match=pattern)
+    """An InputError of one line that begins with the first word and contains the others."""
+    return pytest.raises(memmlp.InputError, match=r"^(?![\s\S]*\n)" + ".*".join(map(re.escape, words)))
 
 
-def test_a_run_is_found_by_its_id_its_beginning_and_its_folder(run: memmlp.TrainedRun):
+def test_load_run_takes_ids_prefixes_and_folders(
+    run: memmlp.TrainedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     for name in (run.id, run.id[:6], run.folder, f"outputs/runs/{run.id}", run):
         found = memmlp.load_run(name, "outputs")
         assert (found.id, found.folder) == (run.id, run.folder)
-
-
-def test_outputs_are_those_of_the_command_line(
-    run: memmlp.TrainedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
     assert memmlp.load_run(run.id).id == memmlp.Runs()[0].id == run.id
     monkeypatch.setenv("MEMMLP_OUTPUTS", str(tmp_path))
     with refused(f"run '{run.id}'", str(tmp_path)):
         memmlp.load_run(run.id)
     with refused("outputs", str(tmp_path)):
         memmlp.Runs()
+    (tmp_path / "runs").mkdir()
+    assert len(memmlp.Runs()) == 0
 
 
-def test_what_is_no_finished_network_is_refused(run: memmlp.TrainedRun, three: memmlp.Runs, tmp_path: Path):
+def test_load_run_refuses_unfinished_and_other_runs(
+    run: memmlp.TrainedRun, three: memmlp.Runs, tmp_path: Path
+):
     (codes,) = [found for found in list_runs("outputs") if found.id != run.id]
     for name, word in (("nobody", "nobody"), ("", "''"), (codes.id, "a finished run of a motion network")):
         with refused("run", word):
@@ -111,49 +104,13 @@ def test_what_is_no_finished_network_is_refused(run: memmlp.TrainedRun, three: m
         memmlp.load_run(run.id, tmp_path)
 
 
-def test_runs_are_a_sequence_the_newest_first(three: memmlp.Runs):
+def test_runs_are_a_sequence_with_the_newest_first(three: memmlp.Runs):
     assert [run.seed for run in three] == [1, 0, 2]
     assert (len(three), three[-1].seed) == (3, 2)
     rest = three[1:]
     assert isinstance(rest, memmlp.Runs)
     assert [run.seed for run in rest] == [0, 2]
     assert repr(rest) == f"Runs([{three[1]!r}, TrainedRun('{'2' * 16}')])"
-
-
-def test_an_outputs_folder_without_runs_is_refused(tmp_path: Path):
-    with refused(f"outputs {tmp_path / 'no'}", "outputs"):
-        memmlp.Runs(tmp_path / "no")
-    (tmp_path / "runs").mkdir()
-    assert len(memmlp.Runs(tmp_path)) == 0
-
-
-def test_config_and_results_are_those_of_the_folder(run: memmlp.TrainedRun):
-    config = yaml.safe_load((run.folder / "config.yaml").read_text())
-    assert (run.config, run.seed) == (config, 0)
-    assert list(run.results) == ["stream", "window"]
-    for mode, branches in run.results.items():
-        (file,) = run.folder.glob(f"evaluations/{mode}-*.json")
-        assert branches == read_json(file)["mean"]
-
-
-def test_per_clip_results_are_a_frame(run: memmlp.TrainedRun):
-    frame = run.per_clip()
-    facts = ["run", "seed", "mode", "branch", "combined_by", "clip", "group", "frames"]
-    assert list(frame.columns) == [*facts, *UNITS]
-    assert frame.attrs["units"]["MPJPE"] == "cm"
-    assert frame["combined_by"].isna().all()
-    assert run.combined_by == {}
-    pairs = [(mode, branch) for mode in ("stream", "window") for branch in ("rotation", "position")]
-    assert list(frame[["mode", "branch"]].itertuples(index=False, name=None)) == pairs  # one test clip
-    for row, (mode, branch) in zip(frame.to_dict("records"), pairs, strict=True):
-        (file,) = run.folder.glob(f"evaluations/{mode}-*.json")
-        (clip,) = read_json(file)["clips"]
-        assert (row["clip"], row["group"], row["frames"]) == (clip["name"], clip["group"], clip["frames"])
-        assert {name: row[name] for name in clip[branch]} == clip[branch]
-        assert np.isnan(row["MPJRE"]) == (branch == "position")
-
-
-def test_the_rows_of_all_runs_are_one_frame(three: memmlp.Runs):
     whole = three.per_clip()
     pd.testing.assert_frame_equal(whole, pd.concat([run.per_clip() for run in three], ignore_index=True))
     assert whole["seed"].unique().tolist() == [1, 0, 2]
@@ -161,7 +118,30 @@ def test_the_rows_of_all_runs_are_one_frame(three: memmlp.Runs):
     assert list(three[:0].per_clip().columns) == list(whole.columns)
 
 
-def test_a_metric_that_is_no_number_is_nan_and_a_damaged_file_is_named(three: memmlp.Runs):
+def test_config_and_results_are_those_of_the_folder(run: memmlp.TrainedRun, monkeypatch: pytest.MonkeyPatch):
+    config = yaml.safe_load((run.folder / "config.yaml").read_text())
+    assert (run.config, run.seed, run.combined_by) == (config, 0, {})
+    frame = run.per_clip()
+    facts = ["run", "seed", "mode", "branch", "combined_by", "clip", "group", "frames"]
+    assert list(frame.columns) == [*facts, *UNITS]
+    assert frame.attrs["units"]["MPJPE"] == "cm"
+    assert frame["combined_by"].isna().all()
+    pairs = [(mode, branch) for mode in ("stream", "window") for branch in ("rotation", "position")]
+    assert list(frame[["mode", "branch"]].itertuples(index=False, name=None)) == pairs  # one test clip
+    assert list(run.results) == ["stream", "window"]
+    for row, (mode, branch) in zip(frame.to_dict("records"), pairs, strict=True):
+        (file,) = run.folder.glob(f"evaluations/{mode}-*.json")
+        (clip,) = read_json(file)["clips"]
+        assert run.results[mode] == read_json(file)["mean"]
+        assert (row["clip"], row["group"], row["frames"]) == (clip["name"], clip["group"], clip["frames"])
+        assert {name: row[name] for name in clip[branch]} == clip[branch]
+        assert np.isnan(row["MPJRE"]) == (branch == "position")
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with refused("per_clip: needs pandas", "memmlp[notebook]"):
+        run.per_clip()
+
+
+def test_nan_metrics_are_nan_and_damaged_files_are_named(three: memmlp.Runs):
     (file,) = three[0].folder.glob("evaluations/stream-*.json")
     report = {key: value for key, value in read_json(file).items() if key != "digest"}
     report["clips"][0]["rotation"]["Jitter"] = "nan"  # as of a clip too short for it
@@ -173,13 +153,9 @@ def test_a_metric_that_is_no_number_is_nan_and_a_damaged_file_is_named(three: me
             read()
 
 
-def test_without_pandas_one_line_says_so(run: memmlp.TrainedRun, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with refused("per_clip: needs pandas", "memmlp[notebook]"):
-        run.per_clip()
-
-
-def test_a_prediction_is_what_was_measured(run: memmlp.TrainedRun, prediction: memmlp.Prediction):
+def test_a_prediction_has_the_evaluated_errors(
+    run: memmlp.TrainedRun, prediction: memmlp.Prediction, monkeypatch: pytest.MonkeyPatch
+):
     assert (prediction.run, prediction.clip, prediction.mode) == (run.id, run.clips[0], "stream")
     n = len(prediction)
     frame = run.per_clip().set_index(["mode", "branch"])
@@ -189,10 +165,6 @@ def test_a_prediction_is_what_was_measured(run: memmlp.TrainedRun, prediction: m
             errors = found.errors(branch)
             assert errors.shape == (n, 22)
             assert errors.mean() == pytest.approx(frame.loc[(mode, branch), "MPJPE"], rel=1e-4)
-
-
-def test_a_predictions_arrays(prediction: memmlp.Prediction):
-    n = len(prediction)
     assert prediction.true_positions.shape == prediction.positions.shape == (n, 22, 3)
     assert prediction.position_branch is not None
     assert prediction.position_branch.shape == (n, 22, 3)
@@ -202,20 +174,12 @@ def test_a_predictions_arrays(prediction: memmlp.Prediction):
     head = prediction.positions[:, 15] - prediction.true_positions[:, 15]
     np.testing.assert_allclose(head, 0, atol=1e-5)  # on its tracker
 
-
-def test_a_network_without_a_position_branch_has_no_joints(
-    run: memmlp.TrainedRun, monkeypatch: pytest.MonkeyPatch
-):
-    alone = memmlp.load_run(run)
-    monkeypatch.setattr(alone.model, "branches", frozenset({"rotation"}))
-    found = alone.predict(alone.clips[0], "window")
+    rotation_only = memmlp.load_run(run)
+    monkeypatch.setattr(rotation_only.model, "branches", frozenset({"rotation"}))
+    found = rotation_only.predict(run.clips[0], "window")
     assert found.position_branch is None
-    assert found.errors().shape == (len(found), 22)
     with refused("branch position", "rotation"):
         found.errors("position")
-
-
-def test_unknown_clips_and_modes_are_one_line(run: memmlp.TrainedRun):
     with refused("clip nobody", run.clips[0]):
         run.predict("nobody")
     with refused("mode live", "stream, window"):
@@ -235,10 +199,10 @@ class Still(Term): pass
 """
 
 
-def test_code_of_ones_own_runs_only_where_the_script_names_its_package(
+def test_user_code_runs_only_if_the_script_names_its_package(
     three: memmlp.Runs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Whatever a run's record names, and be it a module that lies here."""
+    """A run's record cannot import anything, not even a module in the current folder."""
     (tmp_path / "mine.py").write_text(STILL)
     monkeypatch.syspath_prepend(tmp_path)
     folder = three[0].folder
@@ -259,7 +223,7 @@ def test_code_of_ones_own_runs_only_where_the_script_names_its_package(
         memmlp.load_run(folder, plugins=["nowhere"])
 
 
-def test_a_picture_and_a_film_are_drawn(prediction: memmlp.Prediction, tmp_path: Path):
+def test_pictures_and_films(prediction: memmlp.Prediction, tmp_path: Path):
     one, two = (prediction.draw(tmp_path / f"{n}.png", poses=n) for n in (1, 2))
     assert one == tmp_path / "1.png"
     with Image.open(one) as narrow, Image.open(two) as wide:
@@ -269,7 +233,7 @@ def test_a_picture_and_a_film_are_drawn(prediction: memmlp.Prediction, tmp_path:
         assert film.n_frames == 3
 
 
-def test_bad_input_to_pictures_and_files_is_one_line(prediction: memmlp.Prediction, tmp_path: Path):
+def test_bad_input_to_pictures_and_files_is_refused(prediction: memmlp.Prediction, tmp_path: Path):
     for name, options, words in (
         ("a.avi", {}, ("path ", "a.avi", ".png, .gif, .mp4")),
         ("no/a.png", {}, ("path ", "no")),
@@ -288,8 +252,7 @@ def test_bad_input_to_pictures_and_files_is_one_line(prediction: memmlp.Predicti
     assert list(tmp_path.iterdir()) == []
 
 
-def test_motion_is_saved_for_other_programs(prediction: memmlp.Prediction, tmp_path: Path):
-    """As BVH, glTF and npz by the suffix; the root is where the prediction, or the truth, has it."""
+def test_motion_is_saved_as_bvh_gltf_and_npz(prediction: memmlp.Prediction, tmp_path: Path):
     for name in ("a.bvh", "deep/a.glb", "a.npz"):
         assert prediction.save(tmp_path / name) == tmp_path / name
     assert (tmp_path / "a.bvh").read_text().startswith("HIERARCHY\nROOT pelvis\n")
@@ -315,16 +278,12 @@ def test_a_run_streams(run: memmlp.TrainedRun, three: memmlp.Runs):
         three[0].stream()
 
 
-def test_dir_is_the_api():
+def test_the_api_is_listed_and_imported_lazily():
     assert dir(memmlp) == sorted(memmlp.__all__) == NAMES
     for name in NAMES:
         assert getattr(memmlp, name).__name__ == name
     with pytest.raises(AttributeError, match="Strem"):
         memmlp.Strem  # noqa: B018
-
-
-def test_importing_it_is_quick():
-    """The names come when they are asked for; runs and results do without torch."""
     loaded = "print(sorted({'hydra', 'numpy', 'onnxruntime', 'pandas', 'torch'} & set(sys.modules)));"
     later = "memmlp.load_run; print(sorted({'hydra', 'torch'} & set(sys.modules)))"
     code = f"import sys, memmlp; {loaded} {later}"
