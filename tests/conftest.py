@@ -1,8 +1,8 @@
-"""What every test shares."""
+"""Settings and fixtures that all tests share."""
 
 from __future__ import annotations
 
-import gc
+import functools
 import math
 import os
 import re
@@ -10,74 +10,45 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import omegaconf.base
 import processes
 import pytest
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
-from remembered import keep_exports, remember
-from scratch_in_memory import remove_at_exit, scratch_in_memory
-from small_pictures import draw_large, draw_small
 
 from memmlp.common.processes import collect_garbage_rarely
 
 if Path("/dev/nvidiactl").exists():
-    os.environ["CUDA_VISIBLE_DEVICES"] = ""  # what the tests compare with was computed on a CPU
+    os.environ["CUDA_VISIBLE_DEVICES"] = ""  # expected numbers were computed on a CPU
 
-
-scratch = scratch_in_memory()
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_make_collect_report(collector: pytest.Collector) -> Iterator[None]:
-    """Each test process begins elsewhere, so that what one rewrites and compiles, the others find."""
-    report = yield
-    if isinstance(collector, pytest.Dir) and (worker := os.environ.get("PYTEST_XDIST_WORKER")):
-        share = len(report.result) / int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
-        first = round(share * int(worker.removeprefix("gw")))
-        report.result = report.result[first:] + report.result[:first]
-    return report
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """By files, some of which stay together (work_units.py)."""
-    if config.getvalue("dist") != "loadfile":
-        return None
-    from work_units import WorkUnits  # here, since it needs xdist
-
-    return WorkUnits(config, log)
+# Networks are tiny and test processes many: more threads only wait for each other.
+THREADS = int(os.environ.setdefault("OMP_NUM_THREADS", "1"))
+SLOW_TIMEOUT = 3600  # seconds, on a machine with much other work
+INT8 = "export.precision=int8"
+# The same examples each time, and no complaint that a busy machine is slow.
+settings.register_profile(
+    "memmlp", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("memmlp")
+processes.mark()
+collect_garbage_rarely()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest files first, the others by their names; what needs a trained run is slow."""
-    here = Path(__file__).parent
-    ranks = {here / f"{name}.py": rank for rank, name in enumerate(LONGEST)}
-    if gone := [path for path in ranks if not path.is_file()]:
-        raise pytest.UsageError(f"LONGEST names files that are not there: {', '.join(map(str, gone))}")
-    items.sort(key=lambda item: (ranks.get(item.path, len(ranks)), item.path))
+    """Tests that need a trained run are slow."""
     for item in items:
-        if "home" in item.fixturenames or "tiny_home" in item.fixturenames:
+        if {"home", "tiny_home"} & set(item.fixturenames):
             item.add_marker(pytest.mark.slow)
         if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(SLOW_TIMEOUT))
 
 
-collect_garbage_rarely()
-
-
-def pytest_collection_finish() -> None:
-    """What is imported by now stays: the garbage collector need not go through it."""
-    gc.freeze()
-
-
 @pytest.hookimpl(trylast=True)
-def pytest_sessionfinish(session: pytest.Session) -> None:
-    """What a test process left that died itself, and, unless a test failed, what all wrote."""
+def pytest_sessionfinish() -> None:
+    """End the processes that a killed test process has left."""
     processes.end_all()
-    if scratch is not None and not session.testsfailed:
-        remove_at_exit(scratch)
 
 
 class Ran(NamedTuple):
@@ -88,72 +59,39 @@ class Ran(NamedTuple):
     err: str
 
 
-# The same examples each time, and no complaint that a busy machine is slow.
-settings.register_profile(
-    "memmlp", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
-)
-settings.load_profile("memmlp")
-
-# Networks are tiny and test processes many: more threads only wait for each other.
-THREADS = int(os.environ.setdefault("OMP_NUM_THREADS", "1"))
-
-processes.mark()
-
-# Begun first, so that no process is left alone with one of them at the end. Those that mostly wait for other
-# processes stand among those that compute.
-LONGEST = (
-    "cli/test_sweep", "deploy/test_deployment", "config/test_build", "training/test_run_stages",
-    "kills/test_search", "training/test_experiment", "live/test_trackers_to_body_graph",
-    "training/test_baselines", "networks/test_streaming", "training/test_loop", "config/test_baselines",
-    "live/web/test_page", "test_example_package",
-    "kills/test_rounds", "config/test_compose", "cli/test_main", "live/test_stream",
-    "kills/test_sweep", "report/tables/test_seed_rounds", "networks/test_baselines", "deploy/test_export",
-    "cli/test_tune", "report/ui/test_page", "kills/test_command", "kills/test_training",
-    "runs/loggers/test_mlflow", "live/session/test_live_page", "common/test_distributed",
-    "cli/test_look",
-)  # fmt: skip
-
-SLOW_TIMEOUT = 3600  # seconds: ends what hangs, but not what is slow on a machine with much other work
-
-INT8 = "export.precision=int8"
 Memmlp = Callable[..., Ran]
 
 
 def clean(monkeypatch: pytest.MonkeyPatch) -> None:
     """No test depends on the caller's settings, or writes to its outputs."""
     for name in (
-        "MEMMLP_OUTPUTS",
-        "MEMMLP_TRACEBACK",
-        "MEMMLP_PLUGINS",
-        "MLFLOW_TRACKING_URI",
-        "HYDRA_FULL_ERROR",
+        "MEMMLP_OUTPUTS", "MEMMLP_TRACEBACK", "MEMMLP_PLUGINS", "MLFLOW_TRACKING_URI", "HYDRA_FULL_ERROR",
         "COMP_LINE",
-    ):
+    ):  # fmt: skip
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("COLUMNS", "80")
-    # How far work is, is said every so many seconds: never, however slow the machine is.
-    monkeypatch.setattr("memmlp.common.progress.INTERVAL", math.inf)
+    monkeypatch.setattr("memmlp.common.progress.INTERVAL", math.inf)  # however slow the machine is
+    monkeypatch.setattr("os.fsync", lambda file: None)  # no test outlives a power cut
 
 
 @pytest.fixture(autouse=True)
-def _own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+def _own_environment(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     clean(monkeypatch)
-    remember()
-
-
-@pytest.fixture(autouse=True)
-def _threads_stay_as_they_were() -> Iterator[None]:
-    """A command that sets torch's threads sets them for its process, which here goes on with other tests."""
     yield
-    if (torch := sys.modules.get("torch")) and torch.get_num_threads() != THREADS:
+    if (torch := sys.modules.get("torch")) and torch.get_num_threads() != THREADS:  # set by a command
         torch.set_num_threads(THREADS)
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def _no_process_is_left() -> Iterator[None]:
-    """What a test started ends with it, whether it passes, fails, or takes too long."""
     yield
     processes.end_all()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _parse_interpolations_once() -> None:
+    """OmegaConf parses each `${seed}` anew, which is a third of a composition."""
+    omegaconf.base.parse = functools.lru_cache(maxsize=1000)(omegaconf.base.parse)
 
 
 def shared(factory: pytest.TempPathFactory, name: str) -> Path:
@@ -164,32 +102,20 @@ def shared(factory: pytest.TempPathFactory, name: str) -> Path:
     return folder
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _pictures_are_small() -> None:
-    draw_small()
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _exports_are_kept(tmp_path_factory: pytest.TempPathFactory) -> None:
-    keep_exports(shared(tmp_path_factory, "exports"))
-
-
 @pytest.fixture(scope="session")
 def tiny_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with one finished run, int8 included, and what it printed; made once for all processes.
+    """A folder with one finished run, int8 included, and its output; made once for all processes.
 
-    It is only read: what writes takes a copy (`home`).
+    Tests only read it, or copy it (`home`).
     """
     folder = shared(tmp_path_factory, "tiny")
     said = folder / "out.txt"
     with FileLock(f"{folder}.lock"), pytest.MonkeyPatch.context() as monkeypatch:
         clean(monkeypatch)
         if not said.exists():
-            import command_line  # with torch, which the process that only distributes the tests does without
+            import command_line  # with torch, which xdist's controller need not import
 
-            draw_large()
-            said.write_text(command_line.run(folder, "train", *command_line.TINY, INT8))
-            draw_small()
+            said.write_text(command_line.run(folder, "train", *command_line.TINY, INT8, picture=True))
     return folder
 
 
@@ -219,14 +145,6 @@ def on_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setenv("PYTHONPATH", str(EXAMPLE), prepend=":")
     with registers_kept():
         yield EXAMPLE
-
-
-@pytest.fixture
-def large_pictures() -> Iterator[None]:
-    """Runs in this process have the picture that they have for users."""
-    draw_large()
-    yield
-    draw_small()
 
 
 @pytest.fixture

@@ -1,0 +1,116 @@
+"""Processes killed at arbitrary moments: a training, a sweep and a search end as undisturbed ones do."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+import signal
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from benchmarks import chaos
+from command_line import SMALL, TINY, in_folder, run
+from processes import Forked, forked, until
+
+from memmlp.common.lease import current_process
+from memmlp.networks import checkpoint
+from memmlp.runs.lookup import list_runs
+from memmlp.runs.run import Run
+
+
+def last_step(outputs: Path, kind: str) -> int:
+    """The step of the newest checkpoint of a run of a kind."""
+    runs = [run for run in list_runs(outputs) if run.manifest.get("kind") == kind and run.checkpoint.exists()]
+    return max((int(checkpoint.read(run.checkpoint)[1]["step"]) for run in runs), default=0)
+
+
+MOMENTS = {
+    "the data has a first clip": lambda outputs: list(outputs.glob("data/**/*.npz")),
+    "the VQ-VAE is being trained": lambda outputs: last_step(outputs, "vqvae"),
+    "the network is being trained": lambda outputs: last_step(outputs, "memmlp"),
+    "it is trained further": lambda outputs: last_step(outputs, "memmlp") >= 30,
+    "it is evaluated in one of two modes": lambda outputs: list(outputs.glob("runs/*/evaluations/*.json")),
+    "it is exported, but not timed": lambda outputs: list(outputs.glob("runs/*/deployments/*/step.onnx")),
+}
+
+
+@pytest.mark.slow
+def test_a_killed_training_resumes_to_the_same_model(tmp_path: Path):
+    """The command is killed at each moment in turn, and then runs to its end."""
+    words = ["train", *TINY, "optim.steps=40", "optim.checkpoint_every=5"]
+    disturbed, whole = tmp_path / "disturbed", tmp_path / "whole"
+    for folder in (disturbed, whole):
+        folder.mkdir()
+    for name, reached in MOMENTS.items():
+        with forked(in_folder, disturbed, *words) as process:
+            until(lambda reached=reached: reached(disturbed / "outputs"), name, process)
+            process.kill()
+            assert process.wait() == -signal.SIGKILL
+    for folder in (disturbed, whole):
+        run(folder, *words)
+    (expected,) = (made for made in list_runs(whole / "outputs") if "window" in made.results)
+    killed = Run.of(disturbed / "outputs", expected.id)
+    assert killed.done
+    assert killed.model.read_bytes() == expected.model.read_bytes()
+    rotation = killed.results["stream"]["rotation"]
+    assert rotation == pytest.approx(expected.results["stream"]["rotation"], rel=1e-6)
+
+
+def fork_controllers(folder: Path, monkeypatch: pytest.MonkeyPatch, *workers: str) -> None:
+    """Controllers are forked, which saves the import of torch."""
+
+    def start(words: Sequence[str], outputs: Path, **_: int) -> Forked:
+        return Forked(in_folder, folder, *words, *workers, "--outputs", str(outputs))
+
+    monkeypatch.setattr(chaos, "start", start)
+
+
+@pytest.mark.slow
+def test_a_sweep_under_kills_ends_as_an_undisturbed_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Controllers do the work of their workers."""
+    fork_controllers(tmp_path, monkeypatch, "executor=debug")
+    assert chaos.sweep_storm(2, 3, 2, random.Random(0), [*SMALL, "export.graph=off"]) == []
+
+
+@pytest.mark.slow
+def test_a_search_under_kills_has_every_trial_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    fork_controllers(tmp_path, monkeypatch, "--workers", "1")
+    assert chaos.search_storm(2, 2, 1, random.Random(0), SMALL) == []
+
+
+def finished(outputs: Path, name: str, weights: bytes = b"w") -> Run:
+    run = Run.of(outputs, name * 16)
+    run.begin("memmlp", {}, data="d", upstream=None)
+    run.want([])  # no evaluation and no export
+    run.model.write_bytes(weights)
+    run.finish(["model.safetensors"])
+    return run
+
+
+def test_every_kind_of_difference_is_found(tmp_path: Path):
+    calm, stormy = tmp_path / "calm", tmp_path / "stormy"
+    for name in "abcdeg":
+        finished(calm, name)
+    shutil.copytree(calm, stormy)
+    assert chaos.compare(calm, stormy) == []
+    shutil.rmtree(Run.of(stormy, "a" * 16).folder)
+    finished(stormy, "f")
+    finished(stormy, "b", b"other")
+    Run.of(stormy, "c" * 16).marker.unlink()
+    claim = {**current_process(), "since": "now"}
+    (Run.of(stormy, "d" * 16).folder / ".lease-1").write_text(json.dumps(claim))
+    Run.of(stormy, "e" * 16).model.write_bytes(b"damaged")
+    again = {"started": "2999-01-01T00:00:00+00:00", "stage": "training"}
+    Run.of(stormy, "g" * 16).write_manifest({"attempts": [again]})
+    assert sorted(chaos.compare(calm, stormy)) == [
+        f"run {'a' * 16} is missing",
+        f"run {'b' * 16}: other weights",
+        f"run {'c' * 16}: stopped, not done",
+        f"run {'d' * 16}: is still held",
+        f"run {'e' * 16}: artifact model.safetensors is missing or changed",
+        f"run {'e' * 16}: other weights",
+        f"run {'f' * 16} should not be",
+        f"run {'g' * 16}: trained again after it was finished",
+    ]
