@@ -17,15 +17,15 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP)
 	$(BIN)/memmlp demo
 
-# One process more than small machines have cores: some tests wait for others' processes. The fast ones don't.
-# What they compile is kept, whatever the environment says: dozens of interpreters are started.
-PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder -n 3
+# One process more than cores, since some tests wait for other processes.
+CORES := $(shell $(PYTHON) -c 'import os; print(os.cpu_count())')
+PYTEST := $(BIN)/python -m pytest --dist worksteal -n $$(($(CORES) + 1))
 
 test: $(STAMP)
 	$(PYTEST)
 
 test-fast: $(STAMP)
-	$(PYTEST) -n 2 -m "not slow"
+	$(PYTEST) -m "not slow"
 
 coverage: $(STAMP)
 	$(PYTEST) --cov --cov-report=term:skip-covered

@@ -1,4 +1,4 @@
-"""Chromium without a window, driven over a pipe by its DevTools protocol: clicks, values, pictures."""
+"""Headless Chromium, driven over a pipe by its DevTools protocol: clicks, values, pictures."""
 
 from __future__ import annotations
 
@@ -20,27 +20,29 @@ from processes import MARK, PATIENCE, until
 
 SETPRIV = shutil.which("setpriv")
 MODEST = [SETPRIV, "--bounding-set=-sys_nice"] if SETPRIV and os.geteuid() == 0 else []
-"""What keeps a root's browser from a priority above all others', which its drawing by software takes."""
-DRAWN = """{
+"""Keeps a root's browser from raising its priority, which starves other processes."""
+SLOW_DRAWING = """{
   const display = window.requestAnimationFrame.bind(window);
   window.seldom = 150;
   window.requestAnimationFrame = callback => setTimeout(() => display(callback), window.seldom);
 }"""
-"""What lets a page draw so seldom (ms) that everything else has its turn, too: software draws slowly."""
-STALL = "GPU stall due to ReadPixels"
-"""What a driver warns of where software puts a page together: no fault of the page."""
-UNSEEN = [f"WebUIOmnibox{which}Popup" for which in ("", "Full", "Aim")] + ["SpareRendererForSitePerProcess"]
-"""Features that load a page of the browser's own beside each of a test's: a second of CPU time."""
+"""Lets a page draw every `window.seldom` milliseconds only: software draws slowly."""
+STALL = "GPU stall due to ReadPixels"  # a warning of drivers in software
+UNUSED = [f"WebUIOmnibox{which}Popup" for which in ("", "Full", "Aim")] + ["SpareRendererForSitePerProcess"]
+"""Features that load internal pages beside each of a test's: a second of CPU time."""
 NAMES = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
-"""The first has the same engine without what draws windows, and takes a third less time."""
 CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
+CLICK = """(element => {
+  const box = element.getBoundingClientRect();
+  const at = { clientX: box.x + box.width / 2, clientY: box.y + box.height / 2 };
+  element.dispatchEvent(new MouseEvent('click', { bubbles: true, cancelable: true, ...at }));
+})"""
 
 
 class Chromium:
-    """A browser without a window, drawn by software, with nothing but this machine to reach.
+    """A browser that reaches this machine only, and lives as long as the test process.
 
-    It lives as long as the test process, whose end closes the pipe that it is driven by. So it lacks the mark
-    of what ends with a test.
+    It lacks the mark of processes that end with a test file.
     """
 
     def __init__(self) -> None:
@@ -49,8 +51,8 @@ class Chromium:
         self.litter = tempfile.TemporaryDirectory(prefix="chromium-", ignore_cleanup_errors=True)
         command = [
             CHROMIUM, "--headless", "--no-sandbox", "--disable-dev-shm-usage", "--no-first-run",
-            "--disable-gpu-compositing",  # a tenth of its time, where there is no GPU
-            f"--disable-features={','.join(UNSEEN)}",
+            "--disable-gpu-compositing",  # a tenth of its time without a GPU
+            f"--disable-features={','.join(UNUSED)}",
             "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
             "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
             "--remote-debugging-pipe", f"--user-data-dir={self.litter.name}/profile", "about:blank",
@@ -69,7 +71,7 @@ class Chromium:
     def call(
         self, method: str, session: str | None, errors: list[str], parameters: dict[str, Any]
     ) -> dict[str, Any]:
-        """The result of a method; what goes wrong in the session meanwhile is added to `errors`."""
+        """The result of a method; errors in the session meanwhile are added to `errors`."""
         self.count += 1
         message = {"id": self.count, "method": method, "params": parameters}
         if session:
@@ -93,8 +95,7 @@ class Chromium:
         return json.loads(line)
 
     def end(self) -> None:
-        """End it: it goes when its pipe is closed, whatever starts it."""
-        os.close(self.write), os.close(self.read)
+        os.close(self.write), os.close(self.read)  # at which it ends
         try:
             self.process.wait(60)
         except subprocess.TimeoutExpired:
@@ -105,12 +106,12 @@ class Chromium:
 
 @functools.cache
 def chromium() -> Chromium:
-    """The browser of this process, whose start takes seconds of CPU time."""
+    """The browser of this process, started once."""
     return Chromium()
 
 
 class Browser:
-    """One page in a profile of its own, which knows nothing of others."""
+    """One page in its own profile."""
 
     def __init__(self, width: int = 1100, height: int = 720, dark: bool = False):
         self.chromium, self.session, self.errors = chromium(), None, []
@@ -124,30 +125,29 @@ class Browser:
         self.size(width, height)
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", features=[scheme])
-        self.before(DRAWN)
+        self.before(SLOW_DRAWING)
 
     def size(self, width: int, height: int) -> None:
-        """The page's size in pixels."""
         settings = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
         self.call("Emulation.setDeviceMetricsOverride", **settings)
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """The result of a method."""
+        """The result of a DevTools method."""
         return self.chromium.call(method, self.session, self.errors, parameters)
 
-    def value(self, expression: str) -> Any:
-        """What an expression is on the page."""
-        result = self.call("Runtime.evaluate", expression=expression, returnByValue=True)
+    def value(self, expression: str, **options: Any) -> Any:
+        """The value of an expression on the page."""
+        given = {"expression": expression, "returnByValue": True, "userGesture": True, **options}
+        result = self.call("Runtime.evaluate", **given)
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 
     def resolved(self, expression: str) -> Any:
-        """What a promise on the page resolves to."""
+        """The value of a promise on the page."""
         late = f"setTimeout(() => fail(new Error('not within {PATIENCE:.0f} s')), {1000 * PATIENCE:.0f})"
-        bounded = f"Promise.race([{expression}, new Promise((_, fail) => {late})])"
-        result = self.call("Runtime.evaluate", expression=bounded, returnByValue=True, awaitPromise=True)
-        assert "exceptionDetails" not in result, result
-        return result["result"].get("value")
+        return self.value(
+            f"Promise.race([{expression}, new Promise((_, fail) => {late})])", awaitPromise=True
+        )
 
     def before(self, script: str) -> None:
         """Run a script on every page before its own."""
@@ -163,25 +163,9 @@ class Browser:
         self.wait(f"location.href.startsWith({url!r}) && document.readyState == 'complete'")
 
     def click(self, selector: str) -> None:
-        """Press the mouse in the middle of an element, and again where the page moved it away meanwhile."""
-        until(lambda: self._pressed(selector), f"a click on {selector}; {self.errors}", self.process)
-
-    def _pressed(self, selector: str) -> bool:
-        """Whether a press of the mouse came to the element that it was meant for."""
-        meant = f"event => {{ window.pressed = Boolean(event.target.closest({selector!r})); }}"
-        # There is no click at all where the page replaced the element between press and release.
-        missed = "() => setTimeout(() => { window.pressed ??= false; })"
-        heard = {"click": meant, "mouseup": missed}
-        listen = [
-            f"addEventListener('{kind}', {do}, {{ once: true, capture: true }})" for kind, do in heard.items()
-        ]
-        self.value(f"window.pressed = null; {'; '.join(listen)}")
-        box = f"document.querySelector({selector!r}).getBoundingClientRect()"
-        x, y = self.value(f"(b => [b.x + b.width / 2, b.y + b.height / 2])({box})")
-        for kind in ("mousePressed", "mouseReleased"):
-            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
-        self.wait("window.pressed !== null")
-        return self.value("window.pressed !== false")  # another page knows nothing of it
+        """Click on the middle of an element, once it is there."""
+        self.wait(f"document.querySelector({selector!r})")
+        self.value(f"{CLICK}(document.querySelector({selector!r}))")
 
     def picture(self) -> np.ndarray:
         """The page (H, W, 3), uint8."""

@@ -1,4 +1,4 @@
-"""Machines of a test: threads that count as machines, which share a folder, but no clock and no locks."""
+"""Threads that count as machines, which share a folder, but neither clocks nor locks."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import contextlib
 import os
 import random
 import threading
-from collections.abc import Callable, Iterator, MutableMapping
+from collections import UserDict
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,7 +20,7 @@ from memmlp.common.lease import Changes
 
 
 class Clock:
-    """A clock that a test turns."""
+    """A clock that a test sets."""
 
     def __init__(self) -> None:
         self.now = 1000.0
@@ -28,36 +30,18 @@ class Clock:
 
 
 class OwnChanges(threading.local):
-    """What each machine has seen, by a clock that all of them read."""
+    """The changes that each machine has seen, by a common clock."""
 
     def __init__(self, clock: Clock):
         self.seconds_unchanged = Changes(clock).seconds_unchanged
 
 
-class OwnLeases(threading.local, MutableMapping):
+class OwnLeases(threading.local, UserDict):
     """The leases of each machine."""
-
-    def __init__(self) -> None:
-        self.leases: dict[Path, Any] = {}
-
-    def __getitem__(self, key: Path) -> Any:
-        return self.leases[key]
-
-    def __setitem__(self, key: Path, value: Any) -> None:
-        self.leases[key] = value
-
-    def __delitem__(self, key: Path) -> None:
-        del self.leases[key]
-
-    def __iter__(self) -> Iterator[Path]:
-        return iter(self.leases)
-
-    def __len__(self) -> int:
-        return len(self.leases)
 
 
 def apart(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    """Let every thread be a machine. Nothing beats by itself; the clock stands until it is turned."""
+    """Let every thread be a machine. No lease is renewed by itself, and the clock stands until it is set."""
     clock = Clock()
     monkeypatch.setattr(lease, "process_space", lambda: threading.current_thread().name)
     monkeypatch.setattr(lease, "_changes", OwnChanges(clock))
@@ -67,37 +51,18 @@ def apart(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 class Machine:
-    """A thread that does one thing after another, each when it is told to."""
+    """A thread that does one thing after another."""
 
     def __init__(self, name: str):
-        self.wanted: Callable[[], object] | None = None
-        self.result: object = None
-        self.go, self.done = threading.Semaphore(0), threading.Semaphore(0)
-        self.thread = threading.Thread(target=self._serve, name=name, daemon=True)
-        self.thread.start()
+        self.thread = ThreadPoolExecutor(1, thread_name_prefix=name)
 
     def __call__(self, action: Callable[..., Any], *arguments: Any) -> Any:
-        """Do it there, and return what it returns, or raise what it raises."""
-        self.wanted = lambda: action(*arguments)
-        self.go.release()
-        self.done.acquire()
-        if isinstance(self.result, BaseException):
-            raise self.result
-        return self.result
-
-    def _serve(self) -> None:
-        while True:
-            self.go.acquire()
-            assert self.wanted is not None
-            try:
-                self.result = self.wanted()
-            except BaseException as error:
-                self.result = error
-            self.done.release()
+        """Do it there, and return the result."""
+        return self.thread.submit(action, *arguments).result()
 
 
 class Scheduler:
-    """Lets one of several threads go at a time, from system call to system call, in an order drawn by lot."""
+    """Lets one of several threads run at a time, from system call to system call, in a random order."""
 
     CALLS = ("listdir", "open", "write", "utime", "replace")
 
@@ -152,7 +117,7 @@ class Scheduler:
 
 @contextlib.contextmanager
 def taken(lock: lease.Lock) -> Iterator[lease.Lease]:
-    """The lock held, which nobody else has."""
+    """Hold a lock that nobody else holds."""
     with lock.hold(wait=False) as found:
         assert found is not None
         yield found
@@ -160,7 +125,7 @@ def taken(lock: lease.Lock) -> Iterator[lease.Lease]:
 
 @contextlib.contextmanager
 def fenced(folder: Path, fence: Any) -> Iterator[None]:
-    """Let an object with `number` and `check` stand for this process' lease on a folder."""
+    """Use an object with `number` and `check` as this process' lease on a folder."""
     key = lease._resolved(folder)
     lease._leases[key] = fence
     try:

@@ -1,4 +1,4 @@
-"""Trainings that tests have done by processes of their own."""
+"""Trainings that processes of tests share."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
-import torch
-from tiny_tasks import OPTIM, TASKS, motion_task
+from tiny_tasks import OPTIM, TASKS
 
 from memmlp.common import distributed
 from memmlp.runs.run import Run
@@ -27,12 +26,12 @@ DEATH = 14  # the step at which the second process dies
 
 
 def optim_of(name: str) -> Optim:
-    """How a task is optimised."""
+    """The optimiser of a task."""
     return OPTIMS.get(name, STEPS)
 
 
 def precise(name: str) -> TrainingTask:
-    """A task in float64: in float32 the order of sums alone sets two trainings apart within tens of steps."""
+    """A task in float64: in float32 two trainings differ within tens of steps, by the order of sums."""
     task = TASKS[name](optim=optim_of(name))
     task.module.double()
     task.dataset.frames = task.dataset.frames.double()
@@ -43,10 +42,9 @@ def precise(name: str) -> TrainingTask:
 
 
 def together(folder: Path, *names: str) -> None:
-    """Train tasks in this process, one of several.
+    """Train tasks in this process, one of several, each in FOLDER/TASK from its checkpoint.
 
-    Each task is trained in FOLDER/TASK, from the checkpoint that is there. In the one that is named last as
-    die=TASK the second process is killed on the way.
+    In a task named die=TASK the second process is killed on the way.
     """
     distributed.connect("cpu")
     for word in names:
@@ -58,7 +56,7 @@ def together(folder: Path, *names: str) -> None:
 
 
 def dying(step: Callable, die: Callable[[], object]) -> Callable:
-    """A step that dies at its time."""
+    """A step that dies at number DEATH."""
 
     def last(number: int) -> object:
         if number == DEATH:
@@ -66,13 +64,3 @@ def dying(step: Callable, die: Callable[[], object]) -> Callable:
         return step(number)
 
     return last
-
-
-def alone(folder: Path) -> Run:
-    """Bring a run of 200 steps to its end."""
-    torch.set_num_threads(1)
-    optim = replace(OPTIM, steps=200, checkpoint_every=7)
-    task, run = motion_task(optim=optim), Run(folder)
-    run.folder.mkdir(exist_ok=True)
-    train(task, optim, run, 0, "whole")
-    return run

@@ -7,18 +7,13 @@ import os
 import shutil
 import subprocess
 import tarfile
-import urllib.request
 import venv
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 from command_line import TINY
 from own_package import EXAMPLE, KILLED, PACKAGE
-from processes import started, until
 
 import memmlp
 
@@ -31,29 +26,13 @@ pytestmark = [
 ]
 
 
-def outside() -> dict[str, str]:
-    """The environment variables of a process without this checkout on its path."""
-    return {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-
-
-def ran(*words: str | Path, folder: Path, code: int = 0) -> subprocess.CompletedProcess[str]:
-    """What a command printed, run in a folder without this checkout on its path."""
-    done = subprocess.run(
-        [*map(str, words)],
-        cwd=folder,
-        env=outside(),
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=1500,
-    )
-    assert done.returncode == code, done.stdout + done.stderr
-    return done
-
-
-def run(*words: str | Path, folder: Path) -> str:
-    """What a command says on its standard output."""
-    return ran(*words, folder=folder).stdout
+def run(*words: str | Path, folder: Path, code: int = 0) -> str:
+    """The output of a command in a folder, without this checkout on its path."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "timeout": 1500}
+    done = subprocess.run([*map(str, words)], cwd=folder, env=environment, check=False, **options)
+    assert done.returncode == code, done.stdout
+    return done.stdout
 
 
 @pytest.fixture(scope="module")
@@ -75,21 +54,6 @@ def bin_folder(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "bin"
 
 
-@pytest.fixture(scope="module")
-def feet_bin(bin_folder: Path, wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The commands of another environment: the wheel and the example, with the first one's dependencies."""
-    folder = tmp_path_factory.mktemp("feet")
-    venv.create(folder, with_pip=False)
-    python = bin_folder / "python"
-    where = "import sysconfig; print(sysconfig.get_path('purelib'))"
-    theirs, ours = (run(one, "-c", where, folder=folder).strip() for one in (python, folder / "bin/python"))
-    Path(ours, "dependencies.pth").write_text(f"{theirs}\n")
-    pip = [python, "-m", "pip", "--disable-pip-version-check", "--quiet", "--python", folder / "bin/python"]
-    copy = shutil.copytree(EXAMPLE, folder / "source")  # a build leaves files beside its source
-    run(*pip, "install", "--no-deps", "--ignore-installed", wheel, copy, folder=folder)
-    return folder / "bin"
-
-
 def test_the_wheel_has_what_the_commands_need(wheel: Path):
     names = set(zipfile.ZipFile(wheel).namelist())
     for folder in ("conf", "sweeps"):
@@ -99,13 +63,7 @@ def test_the_wheel_has_what_the_commands_need(wheel: Path):
         assert ours
         assert ours <= names
     package = {path.relative_to(ROOT) for path in (ROOT / "memmlp").rglob("*") if path.is_file()}
-    kept = {path.as_posix() for path in package if "__pycache__" not in path.parts}
-    assert {
-        "memmlp/live/session/page/index.html",
-        "memmlp/report/ui/page/index.html",
-        "memmlp/py.typed",
-    } <= kept
-    assert kept <= names
+    assert {path.as_posix() for path in package if "__pycache__" not in path.parts} <= names
     assert not {name for name in names if name.startswith(("tests/", "docs/"))}
 
 
@@ -136,67 +94,20 @@ def test_it_works_outside_the_checkout(bin_folder: Path, tmp_path: Path):
     assert set(memmlp.__all__) <= set(shown)
 
 
-@contextmanager
-def page(command: Path, folder: Path) -> Iterator[str]:
-    """The address of `memmlp ui`, which ends with the block."""
-    line = [str(command), "ui", "--port", "0", "--no-browser"]
-    out = folder / "ui.txt"
-    with open(out, "w") as file, started(line, cwd=folder, env=outside(), stdout=file) as process:
-        said = until(lambda: out.read_text().split(), "the page's address", process)
-        yield said[0]
-
-
-def answer(address: str, question: str) -> dict[str, Any]:
-    """What the page's server answers."""
-    with urllib.request.urlopen(f"{address.rstrip('/')}/api/{question}", timeout=60) as response:
-        return json.loads(response.read())
-
-
-def test_a_package_of_ones_own_goes_through_every_command(feet_bin: Path, bin_folder: Path, tmp_path: Path):
-    """Its memory, term and metric, which only its entry point names; and a line where it isn't installed."""
-    command, home = feet_bin / "memmlp", tmp_path
-    where = run(feet_bin / "python", "-c", f"import memmlp, {PACKAGE} as p; print(p.__file__)", folder=home)
-    assert str(feet_bin.parent) in where
-
-    words = ["train", "experiment=feet", *KILLED]
-    with started([str(command), *words], cwd=home, env=outside()) as process:
-        until(lambda: [*home.glob("outputs/runs/*/checkpoint.safetensors")], "a checkpoint", process)
-        process.kill()
-    assert "FootSkate" in run(command, *words, folder=home)
+def test_a_custom_package_is_found_by_its_entry_point(bin_folder: Path, tmp_path: Path):
+    """Its memory, term and metric; and one line names the package where it is not installed."""
+    pip = [bin_folder / "python", "-m", "pip", "--disable-pip-version-check", "--quiet"]
+    copy = shutil.copytree(EXAMPLE, tmp_path / "source")  # a build leaves files beside its source
+    run(*pip, "install", "--no-deps", copy, folder=tmp_path)
+    command, home = bin_folder / "memmlp", tmp_path / "home"
+    home.mkdir()
+    assert "FootSkate" in run(command, "train", "experiment=feet", *KILLED, folder=home)
     (manifest,) = (json.loads(path.read_text()) for path in home.glob("outputs/runs/*/manifest.json"))
-    name = manifest["id"]
-    assert [one["stage"] for one in manifest["attempts"]][:2] == ["training", "training"]
     assert manifest["plugins"][PACKAGE]["version"] == "0.1.0"
-
-    assert "measured before" in run(command, "eval", name, folder=home)
-    run(command, "export", name, "--out", "step.onnx", folder=home)
-    assert (home / "step.onnx").exists()
-
-    sweep = shutil.copy(EXAMPLE / "feet.yaml", home)
-    quick = [sweep, *KILLED, "export.graph=off"]
-    assert "2 of 2 runs done" in run(command, "sweep", *quick, "--workers", "1", folder=home)
-    table = json.loads(run(command, "table", *quick, "--format", "json", folder=home))
+    sweep = [shutil.copy(EXAMPLE / "feet.yaml", home), *KILLED, "export.graph=off"]
+    assert "2 of 2 runs done" in run(command, "sweep", *sweep, "--workers", "1", folder=home)
+    table = json.loads(run(command, "table", *sweep, "--format", "json", folder=home))
     assert table["rows"][0]["cells"]["stream"]["FootSkate"]["mean"] > 0
-
-    space = "+search.space.term.weight={low: 0.01, high: 1.0, log: true}"
-    search = ["search.objectives=[FootSkate]", space, "search.n_trials=1"]
-    tuned = run(command, "tune", "experiment=feet", *KILLED, *search, "--workers", "1", folder=home)
-    assert "1 of 1 trials: 1 complete" in tuned
-
-    with page(command, home) as address:
-        runs = answer(address, "runs")
-        assert runs["units"]["FootSkate"] == {"unit": "cm/s", "better": "lower"}
-        row = next(row for row in runs["rows"] if row["id"] == name)
-        assert row["metrics"][runs["metrics"].index("stream.rotation.FootSkate")] > 0
-        assert answer(address, f"run/{name}")["config"]["term.name"] == "skate"
-        (swept,) = answer(address, "sweeps")["sweeps"]
-        table = answer(address, f"sweeps/{swept['name']}")["table"]
-        assert (table["better"]["FootSkate"], table["rows"][0]["found"]) == ("lower", [0])
-        (found,) = answer(address, "searches")["searches"]
-        assert found["objectives"] == ["FootSkate"]
-
-    failed = ran(bin_folder / "memmlp", "eval", name, folder=home, code=2)
-    assert failed.stderr == (
-        f"memmlp: run {name}: made with the package {PACKAGE} 0.1.0, which is not here; install it, or "
-        "put its folder on PYTHONPATH\n"
-    )
+    run(*pip, "uninstall", "--yes", PACKAGE, folder=home)
+    said = run(command, "eval", manifest["id"], folder=home, code=2)
+    assert said.startswith(f"memmlp: run {manifest['id']}: made with the package {PACKAGE} 0.1.0")

@@ -1,18 +1,19 @@
-"""A receiver of the VMC protocol, from its specification and that of OSC 1.0, without any library.
+"""A receiver of the VMC protocol (protocol.vmc.info/english) in Unity's axes: left-handed, Y up, +Z forward.
 
-protocol.vmc.info/english: OSC over UDP, `/VMC/Ext/OK` (int){loaded} (int){calibration state} (int){mode},
-`/VMC/Ext/T` (float), `/VMC/Ext/Root/Pos` and `/VMC/Ext/Bone/Pos` (string){name} and seven floats: position
-and quaternion xyzw in the parent's frame, of Unity: left-handed, Y up, +Z forward. Names are HumanBodyBones'.
+It reads OSC as docs/examples/vmc/receive.py does, which is independent of python-osc.
 """
 
 from __future__ import annotations
 
+import runpy
 import socket
-import struct
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+EXAMPLE = runpy.run_path(str(Path(__file__).parent.parent / "docs/examples/vmc/receive.py"))
 TREE = {
     "Hips": None, "LeftUpperLeg": "Hips", "RightUpperLeg": "Hips", "LeftLowerLeg": "LeftUpperLeg",
     "RightLowerLeg": "RightUpperLeg", "LeftFoot": "LeftLowerLeg", "RightFoot": "RightLowerLeg",
@@ -27,52 +28,11 @@ TREE = {
 
 class Message(NamedTuple):
     address: str
-    types: str
     values: list
 
 
-def messages(datagram: bytes) -> list[Message]:
-    """The messages of an OSC packet: one, or those of a bundle."""
-    assert len(datagram) % 4 == 0
-    if not datagram.startswith(b"#bundle\0"):
-        return [message(datagram)]
-    found, at = [], 16  # after the name and the time tag
-    while at < len(datagram):
-        (size,) = struct.unpack_from(">i", datagram, at)
-        found += messages(datagram[at + 4 : at + 4 + size])
-        at += 4 + size
-    assert at == len(datagram)
-    return found
-
-
-def message(data: bytes) -> Message:
-    """One message: address, type tags, arguments, each padded to four bytes."""
-    address, at = text(data, 0)
-    types, at = text(data, at)
-    assert address.startswith("/")
-    assert types.startswith(",")
-    values: list = []
-    for kind in types[1:]:
-        if kind == "s":
-            value, at = text(data, at)
-        else:
-            (value,) = struct.unpack_from({"i": ">i", "f": ">f"}[kind], data, at)
-            at += 4
-        values.append(value)
-    assert at == len(data)
-    return Message(address, types, values)
-
-
-def text(data: bytes, at: int) -> tuple[str, int]:
-    """The text at a place, and the place after it."""
-    end = data.index(b"\0", at)
-    after = end + 4 - end % 4
-    assert data[end:after] == bytes(after - end)
-    return data[at:end].decode(), after
-
-
 class Marionette:
-    """Listens at a UDP port of this machine, and poses a body by what comes."""
+    """Listens at a UDP port of this machine, and poses a body by the messages."""
 
     def __init__(self) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -84,52 +44,38 @@ class Marionette:
         self.time, self.loaded = 0.0, False
 
     def receive(self) -> list[Message]:
-        """Wait for one datagram, and take what is in it."""
-        found = messages(self.socket.recv(65_536))
-        for each in found:
-            self.take(each)
+        """Wait for one datagram, and apply its messages."""
+        found = [Message(*each) for each in EXAMPLE["messages"](self.socket.recv(65_536))]
+        for address, values in found:
+            if address == "/VMC/Ext/OK":
+                self.loaded = values[0] == 1
+            elif address == "/VMC/Ext/T":
+                (self.time,) = values
+            elif address == "/VMC/Ext/Root/Pos":
+                assert values[0] == "root"
+                self.root = np.array(values[1:])
+            elif address == "/VMC/Ext/Bone/Pos":
+                assert values[0] in TREE
+                self.bones[values[0]] = np.array(values[1:])
         return found
 
-    def take(self, each: Message) -> None:
-        if each.address == "/VMC/Ext/OK":
-            assert each.types == ",iii"
-            self.loaded = each.values[0] == 1
-        elif each.address == "/VMC/Ext/T":
-            assert each.types == ",f"
-            self.time = each.values[0]
-        elif each.address == "/VMC/Ext/Root/Pos":
-            assert (each.types, each.values[0]) == (",sfffffff", "root")
-            self.root = np.array(each.values[1:])
-        elif each.address == "/VMC/Ext/Bone/Pos":
-            assert each.types == ",sfffffff"
-            assert each.values[0] in TREE
-            self.bones[each.values[0]] = np.array(each.values[1:])
-
     def positions(self) -> dict[str, np.ndarray]:
-        """Where the bones are, in Unity's world."""
-        return posed(self.root, self.bones)
+        """The bones' positions in Unity's world."""
+        return {name: at[0] for name, at in posed(self.root, self.bones).items()}
 
     def close(self) -> None:
         self.socket.close()
 
 
 def posed(root: np.ndarray, bones: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Where bones (..., 7) are in Unity's world (..., 3), below a root (..., 7)."""
-    place = {None: (root[..., :3], root[..., 3:])}
-    for name, above in TREE.items():
-        (at, turned), bone = place[above], bones[name]
-        place[name] = at + rotated(turned, bone[..., :3]), multiplied(turned, bone[..., 3:])
+    """The positions (N, 3) in Unity's world, given root and bones (N, 7) relative to parents."""
+
+    def split(values: np.ndarray) -> tuple[np.ndarray, Rotation]:
+        values = np.atleast_2d(values)
+        return values[:, :3], Rotation.from_quat(values[:, 3:])
+
+    place = {None: split(root)}
+    for name, parent in TREE.items():
+        (at, turned), (offset, turn) = place[parent], split(bones[name])
+        place[name] = at + turned.apply(offset), turned * turn
     return {name: at for name, (at, _) in place.items() if name}
-
-
-def multiplied(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The products of quaternions xyzw (..., 4), as Unity's `a * b`."""
-    v, w = a[..., :3], a[..., 3:]
-    vector = w * b[..., :3] + b[..., 3:] * v + np.cross(v, b[..., :3])
-    return np.concatenate([vector, w * b[..., 3:] - (v * b[..., :3]).sum(-1, keepdims=True)], -1)
-
-
-def rotated(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) turned by unit quaternions xyzw (..., 4), as Unity's `q * v`."""
-    axis = q[..., :3]
-    return v + 2 * np.cross(axis, np.cross(axis, v) + q[..., 3:] * v)

@@ -1,13 +1,45 @@
-"""What the examples of engines share."""
+"""A clip of trackers through a tiny network in a space, as the examples of docs/examples read it."""
 
 from __future__ import annotations
 
+import runpy
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
+import exported
+import numpy as np
 import pytest
+import wearer
 from conftest import shared
-from engine_clips import Played, play
+from filelock import FileLock
+
+from memmlp.live.rotations import matrix_to_quaternion
+from memmlp.live.spaces import SPACES
+from memmlp.live.stream import Pose, Stream
+
+EXAMPLES = Path(__file__).parents[2] / "docs/examples"
+PERSON = wearer.person(np.arange(61) / 60)
+
+
+class Played(NamedTuple):
+    """The files of a clip and of a network in a space, and the poses of `memmlp.Stream` for them."""
+
+    network: Path
+    trackers: Path
+    poses: list[Pose]
+
+    @property
+    def joints(self) -> np.ndarray:
+        """Positions (N, 22, 3), metres."""
+        return wearer.joints(self.poses)
+
+
+def trackers(space: str) -> np.ndarray:
+    """Head, left and right of the clip (N, 3, 7), x y z qx qy qz qw."""
+    rotations = SPACES[space].rotations_out(PERSON.rotations)
+    quaternions = matrix_to_quaternion(rotations.reshape(-1, 3, 3)).reshape(-1, 3, 4)
+    return np.concatenate([SPACES[space].positions_out(PERSON.positions), quaternions], -1)
 
 
 @pytest.fixture(scope="session")
@@ -16,4 +48,23 @@ def played(
 ) -> Callable[[str], Played]:
     """A clip of trackers through a tiny network, by the name of the space."""
     folder = shared(tmp_path_factory, "engines")
-    return lambda space: play(folder, step_files("mem_mlp"), space)
+
+    def play(space: str) -> Played:
+        network, path = folder / f"{space}.onnx", folder / f"{space}.csv"
+        with FileLock(f"{network}.lock"):
+            if not network.exists():
+                export(network, space)
+                runpy.run_path(str(EXAMPLES / "trackers.py"))["write"](path, trackers(space))
+        there = SPACES[space]
+        given = there.positions_out(PERSON.positions), there.rotations_out(PERSON.rotations)
+        return Played(network, path, wearer.play(Stream(step_files("mem_mlp"), space=space), *given))
+
+    return play
+
+
+def export(path: Path, space: str) -> None:
+    """Export the full graph from trackers to joints."""
+    from memmlp.live.trackers_to_body_graph import export_full  # it takes seconds to import
+    from memmlp.networks.streaming import streaming
+
+    export_full(streaming(exported.NETWORKS["mem_mlp"]()), path, "0123456789abcdef", space)

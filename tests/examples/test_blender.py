@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from engine_clips import EXAMPLES, Played
+from examples.conftest import EXAMPLES, Played
 
 from memmlp.motion.body import JOINTS
 
@@ -57,45 +57,29 @@ def ran(script: Path, *words: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
 
 
-@pytest.fixture(scope="module")
-def motion(played: Callable[[str], Played], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the example in Python saves."""
+def test_bones_stand_at_the_joints_of_the_stream(played: Callable[[str], Played], tmp_path: Path):
     blender()
-    path = tmp_path_factory.mktemp("motion") / "motion.npz"
-    clip = played("amass")
-    script = EXAMPLES / "python/full_body.py"
-    subprocess.run(
-        [sys.executable, script, clip.network, clip.trackers, "--save", path], check=True, timeout=300
-    )
-    return path
+    clip, motion = played("amass"), tmp_path / "motion.npz"
+    script = [sys.executable, EXAMPLES / "python/full_body.py", clip.network, clip.trackers, "--save", motion]
+    subprocess.run(script, check=True, timeout=300)
+    animate, read = EXAMPLES / "blender/animate.py", tmp_path / "read.py"
+    read.write_text(READ.replace("COUNT", str(len(clip.joints))).replace("NAMES", str(JOINTS)))
+    for out in (tmp_path / "body.blend", tmp_path / "body.glb"):
+        done = ran(animate, motion, "--out", out, "--check")
+        assert done.returncode == 0, done.stderr
+        assert f"{len(clip.joints)} frames: a bone is at most 0.00" in done.stdout
+        (line,) = [line for line in ran(read, out).stdout.splitlines() if line.startswith("READ ")]
+        np.testing.assert_allclose(json.loads(line.removeprefix("READ ")), clip.joints, atol=1e-3)
 
-
-@pytest.mark.parametrize("suffix", [".blend", ".glb"])
-def test_bones_stand_at_the_joints_of_the_stream(
-    suffix: str, motion: Path, played: Callable[[str], Played], tmp_path: Path
-):
-    out, joints = tmp_path / f"body{suffix}", played("amass").joints
-    done = ran(EXAMPLES / "blender/animate.py", motion, "--out", out, "--check")
-    assert done.returncode == 0, done.stderr
-    assert f"{len(joints)} frames: a bone is at most 0.00" in done.stdout
-    script = tmp_path / "read.py"
-    script.write_text(READ.replace("COUNT", str(len(joints))).replace("NAMES", str(JOINTS)))
-    (line,) = [line for line in ran(script, out).stdout.splitlines() if line.startswith("READ ")]
-    np.testing.assert_allclose(json.loads(line.removeprefix("READ ")), joints, atol=1e-3)
-
-
-def test_the_check_sees_a_bone_that_is_elsewhere(motion: Path, tmp_path: Path):
     with np.load(motion) as saved:
         arrays = {name: saved[name].copy() for name in saved.files}
     arrays["positions"][-1, 20] += [0, 2e-3, 0]
     np.savez(tmp_path / "other.npz", **arrays)
-    done = ran(
-        EXAMPLES / "blender/animate.py", tmp_path / "other.npz", "--out", tmp_path / "a.blend", "--check"
-    )
+    done = ran(animate, tmp_path / "other.npz", "--out", tmp_path / "a.blend", "--check")
     assert done.returncode == 1
     assert re.search(r"at most (2\.00|1\.99)", done.stdout)
-    assert not (tmp_path / "a.blend").exists()
     np.savez(tmp_path / "unity.npz", **arrays | {"space": np.array("unity")})
-    done = ran(EXAMPLES / "blender/animate.py", tmp_path / "unity.npz", "--out", tmp_path / "a.blend")
+    done = ran(animate, tmp_path / "unity.npz", "--out", tmp_path / "a.blend")
     assert done.returncode == 1
     assert "in the space unity; Blender's is amass" in done.stderr
+    assert not (tmp_path / "a.blend").exists()

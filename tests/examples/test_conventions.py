@@ -8,7 +8,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from engine_clips import EXAMPLES
+from examples.conftest import EXAMPLES
 from scipy.spatial.transform import Rotation
 
 DOCS = EXAMPLES.parent

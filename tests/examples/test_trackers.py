@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import wearer
-from engine_clips import EXAMPLES
+from examples.conftest import EXAMPLES
 from scipy.spatial.transform import Rotation
 
 from memmlp.live.spaces import SPACES

@@ -9,7 +9,7 @@ import sys
 
 import numpy as np
 import pytest
-from engine_clips import EXAMPLES
+from examples.conftest import EXAMPLES
 from scipy.spatial.transform import Rotation
 
 from memmlp.live.session.sources import from_json

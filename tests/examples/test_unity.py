@@ -16,7 +16,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import wearer
-from engine_clips import EXAMPLES, PERSON, Played, trackers
+from examples.conftest import EXAMPLES, PERSON, Played, trackers
 from processes import started
 from scipy.spatial.transform import Rotation
 
@@ -101,14 +101,11 @@ def play(program: Path, played: Callable[[str], Played], tmp_path: Path) -> Play
 
 
 def described(end: onnxruntime.NodeArg) -> str:
-    """The name and shape of an input or output."""
     return " ".join(map(str, (end.name, *end.shape)))
 
 
 def written(time: float, frame: np.ndarray, word: str) -> list[str]:
-    """The words of a row."""
-    places = ["" if np.isnan(value) else repr(float(value)) for value in frame.ravel()]
-    return [repr(time), *places, word]
+    return [repr(time), *("" if np.isnan(value) else repr(float(value)) for value in frame.ravel()), word]
 
 
 def rows(frames: np.ndarray, fps: float = 60) -> Rows:
@@ -145,17 +142,13 @@ def test_bones_are_where_the_stream_has_the_joints(
     np.testing.assert_allclose(play.turned, turns, atol=1e-4)
 
 
-def test_other_rates_and_gaps(play: Player, stream: Stream):
-    """At 90 Hz some samples bring no frame, at 37 some bring two; after a gap all begins anew."""
+def test_other_rates_gaps_and_samples_that_come_together(play: Player, stream: Stream):
+    """At 90 Hz some samples bring no frame, at 37 some bring two; the stream restarts after a gap."""
     fast, slow = rows(trackers("unity")[:40], 90), rows(trackers("unity")[:20], 37)
     samples = fast + [(time + fast[-1][0] + GAP + 0.1, *rest) for time, *rest in slow]
-    np.testing.assert_allclose(play(samples), poses(stream, samples), atol=1e-4)
-
-
-def test_samples_that_come_together(play: Player, stream: Stream):
-    """A frame ahead of the second goes a tenth further; on the line through both it would be far away."""
-    samples = [(max(time - 4e-4, 0.0), *rest) for time, *rest in rows(trackers("unity")[:40])]
-    samples[9] = (samples[10][0] - 2e-5, *samples[9][1:])
+    together = [(max(time - 4e-4, 0.0) + 9, *rest) for time, *rest in rows(trackers("unity")[:40])]
+    together[9] = (together[10][0] - 2e-5, *together[9][1:])
+    samples += together
     np.testing.assert_allclose(play(samples), poses(stream, samples), atol=1e-4)
 
 

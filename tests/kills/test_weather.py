@@ -1,18 +1,17 @@
-"""Hard weather: full and read-only disks, and files that are cut anywhere.
-
-Nothing is lost, nothing is half there, and a person reads one line.
-"""
+"""Full or read-only disks, and files cut anywhere: nothing is lost, and one line names the fault."""
 
 from __future__ import annotations
 
+import builtins
 import errno
+import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from begun_runs import complete
 from conftest import Memmlp, one_line
-from disks import Disk
 from fake_runs import fake_run
 from processes import until
 
@@ -31,8 +30,71 @@ TASK = RunTask("a" * 16, "memmlp", {}, None, ("stream-0", "fp32-0"))
 STEPS = 2
 
 
-def whole(plan: Plan, task: RunTask) -> None:
-    """A run of a few steps, done as the pipeline does one: from its checkpoint, and only what is missing."""
+class Disk:
+    """The disk below a folder: it counts writes, and refuses them with an error from number `full` on."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path, code: int, full: int):
+        self.folder, self.code, self.full, self.writes = str(folder), code, full, 0
+        for name in ("open", "mkdir"):
+            monkeypatch.setattr(os, name, self._os(getattr(os, name)))
+        real = builtins.open
+
+        def opened(path: Any, mode: str = "r", *arguments: Any, **options: Any) -> Any:
+            if not set(mode) & set("wax+") or not self._has(path):
+                return real(path, mode, *arguments, **options)
+            self.write(path)
+            return Written(self, path, real(path, mode, *arguments, **options))
+
+        monkeypatch.setattr(builtins, "open", opened)
+
+    def _has(self, path: Any) -> bool:
+        return isinstance(path, str | os.PathLike) and os.path.abspath(path).startswith(self.folder)
+
+    def _os(self, call: Callable[..., Any]) -> Callable[..., Any]:
+        """Return os.mkdir or os.open, which writes if it creates."""
+
+        def called(path: Any, flags: int = os.O_CREAT, *arguments: Any, **options: Any) -> Any:
+            if flags & os.O_CREAT and self._has(path) and not os.path.exists(path):
+                self.write(path)
+            return call(path, flags, *arguments, **options)
+
+        return called
+
+    def write(self, path: Any) -> None:
+        if self.writes >= self.full:
+            raise OSError(self.code, os.strerror(self.code), str(path))
+        self.writes += 1
+
+
+class Written:
+    """A file being written to a disk, which writes half of refused content."""
+
+    def __init__(self, disk: Disk, path: Any, file: Any):
+        self.disk, self.path, self.file = disk, path, file
+
+    def write(self, content: Any) -> int:
+        """Write, or write half and raise; an unbuffered file returns the length of its half."""
+        try:
+            self.disk.write(self.path)
+        except OSError:
+            half = self.file.write(content[: len(content) // 2])
+            if hasattr(self.file, "raw") or not half:
+                raise
+            return half
+        return self.file.write(content)
+
+    def __enter__(self) -> Written:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.file.close()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.file, name)
+
+
+def finish(plan: Plan, task: RunTask) -> None:
+    """Finish a run of a few steps as the pipeline does: from its checkpoint, and only missing stages."""
     run = plan.run_of(task)
     if not run.done:
         run.begin(task.kind, {"optim": {"steps": STEPS}}, data="d", prerequisite=None)
@@ -56,7 +118,7 @@ def whole(plan: Plan, task: RunTask) -> None:
 
 
 def sound(run: Run) -> bool:
-    """Whether all that is there of a run is whole, so that it can be gone on with."""
+    """Whether all files of a run are whole, so that it can be resumed."""
     assert [entry.values for entry in run.metrics()] == [{"loss": 1 / (n + 1)} for n in range(run.step)]
     assert not run.done or run.verify() == []
     assert all(map(intact, run.evaluations.glob("*.json")))
@@ -64,7 +126,6 @@ def sound(run: Run) -> bool:
 
 
 def error_of(action: Callable[[], object]) -> Exception | None:
-    """What an action raises."""
     try:
         action()
     except Exception as error:
@@ -74,12 +135,11 @@ def error_of(action: Callable[[], object]) -> Exception | None:
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Small records, written quickly."""
+    """Records are small."""
     monkeypatch.setattr("memmlp.runs.environment.code_files", lambda packages: {"a.py": b"0"})
     monkeypatch.setattr("memmlp.runs.run.changes", lambda: "")
     for module in ("run", "evaluation_file", "deployment_folder"):
         monkeypatch.setattr(f"memmlp.runs.{module}.environment", lambda: {"host": "h"})
-    monkeypatch.setattr("os.fsync", lambda handle: None)
 
 
 @pytest.fixture
@@ -89,13 +149,13 @@ def plan(tmp_path: Path) -> Plan:
 
 @pytest.mark.slow
 def test_a_disk_that_is_full_at_any_write(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(lease, "LEASE", 0.0)  # a claim that could not be let go, as by a process that ended
+    monkeypatch.setattr(lease, "LEASE", 0.0)  # leases of processes that ended expire at once
     run = plan.run_of(TASK)
     full, refused = 0, True
     while refused:
         with monkeypatch.context() as context:
             disk = Disk(context, tmp_path, errno.ENOSPC, full)
-            error = error_of(lambda: attempt(plan, TASK, whole))
+            error = error_of(lambda: attempt(plan, TASK, finish))
         refused = error is not None
         if refused:
             assert isinstance(error, OSError)
@@ -103,7 +163,7 @@ def test_a_disk_that_is_full_at_any_write(plan: Plan, tmp_path: Path, monkeypatc
             assert not plan.complete(TASK)
         assert sound(run), full
         assert run.failure is None
-        until(lambda: attempt(plan, TASK, whole), "the run can be taken")
+        until(lambda: attempt(plan, TASK, finish), "the run can be taken")
         assert plan.complete(TASK), full
         assert sound(run)
         assert run.step == STEPS
@@ -114,7 +174,7 @@ def test_a_disk_that_is_full_at_any_write(plan: Plan, tmp_path: Path, monkeypatc
 
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [["train"], ["sweep", "14", "executor=debug"], ["tune"]])
-def test_outputs_that_are_read_only(memmlp: Memmlp, tmp_path: Path, monkeypatch, words: list[str]):
+def test_read_only_outputs_are_one_line(memmlp: Memmlp, tmp_path: Path, monkeypatch, words: list[str]):
     Disk(monkeypatch, tmp_path, errno.EROFS, 0)
     ran = memmlp(*words, "profile=tiny", "loggers=none")
     assert one_line(ran, "Read-only file system", "outputs"), ran.err
@@ -122,9 +182,9 @@ def test_outputs_that_are_read_only(memmlp: Memmlp, tmp_path: Path, monkeypatch,
 
 
 def at_every_byte(path: Path, look: Callable[[], object], whole_from: int = 1) -> int:
-    """Cut a file at every byte, and look; return how often a line said that something is wrong with it.
+    """Cut a file at every byte, and look; return how often one line refused it.
 
-    A look at a file that lacks up to `whole_from` bytes, such as the last line feed, may find it whole.
+    A file that lacks up to `whole_from` bytes, such as the last line feed, may pass for whole.
     """
     content, refused = path.read_bytes(), 0
     expected = look()
@@ -144,7 +204,7 @@ def at_every_byte(path: Path, look: Callable[[], object], whole_from: int = 1) -
 
 
 @pytest.mark.slow
-def test_the_marker_the_manifest_and_the_config_cut_at_every_byte(tmp_path: Path):
+def test_records_of_a_run_cut_at_every_byte(tmp_path: Path):
     run = complete(tmp_path)
     assert at_every_byte(run.marker, lambda: run.status) == 0  # then it is not done
     for path in (run.evaluation("stream-0"), run.deployment("int8-0").latency):
@@ -170,8 +230,8 @@ def test_a_plan_cut_at_every_byte_is_refused(plan: Plan, tmp_path: Path):
     assert at_every_byte(path, lambda: Plan.load(path)) >= size - 1
 
 
-def test_a_search_refuses_a_log_that_lacks_its_last_validation(tmp_path: Path):
-    """Whose earlier validations would pass for the run's result."""
+def test_a_search_refuses_a_log_without_its_last_validation(tmp_path: Path):
+    """Its earlier validations would pass for the run's result."""
     run = complete(tmp_path, {"optim": {"steps": 20}})
     wanted = [Objective("MPJPE", ((1.0, "rotation MPJPE"),))]
     for step in (10, 20):

@@ -157,7 +157,6 @@ def test_a_mode_a_solver_or_a_precision_is_that_stages_work_alone(home):
     ik = ("evaluation.ik=lbfgs", "evaluation.ik_iterations=1")
     assert "evaluation done" in command(home, "eval", run.id, *ik)
     assert "finished already" in command(home, "train", *TINY, INT8, *seed_of(run), *ik)
-    # The graph of the run itself is kept (tests/kept_exports.py); that of another m is made anew.
     said = command(home, "eval", run.id, "export.precision=fp32")
     assert "deployment done" in said
     assert "evaluation" not in said
