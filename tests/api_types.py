@@ -32,7 +32,7 @@ memmlp.Runs(folder="outputs")  # type: ignore[call-arg]
 memmlp.Runs()[0].per_clips()  # type: ignore[attr-defined]
 run.predict("clip", mod="window")  # type: ignore[call-arg]
 run.predict("clip", "windows")  # type: ignore[arg-type]
-run.seed = "0"  # type: ignore[misc]
+run.seed = "0"  # type: ignore
 run.stream(spcae="unity")  # type: ignore[call-arg]
 prediction.draw("a.png", frames=3)  # type: ignore[call-arg]
 prediction.error()  # type: ignore[attr-defined]

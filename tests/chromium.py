@@ -32,11 +32,6 @@ UNUSED = [f"WebUIOmnibox{which}Popup" for which in ("", "Full", "Aim")] + ["Spar
 """Features that load internal pages beside each of a test's: a second of CPU time."""
 NAMES = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
 CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
-CLICK = """(element => {
-  const box = element.getBoundingClientRect();
-  const at = { clientX: box.x + box.width / 2, clientY: box.y + box.height / 2 };
-  element.dispatchEvent(new MouseEvent('click', { bubbles: true, cancelable: true, ...at }));
-})"""
 
 
 class Chromium:
@@ -163,9 +158,25 @@ class Browser:
         self.wait(f"location.href.startsWith({url!r}) && document.readyState == 'complete'")
 
     def click(self, selector: str) -> None:
-        """Click on the middle of an element, once it is there."""
-        self.wait(f"document.querySelector({selector!r})")
-        self.value(f"{CLICK}(document.querySelector({selector!r}))")
+        """Press the mouse in the middle of an element, and again if the page has moved it meanwhile."""
+        until(lambda: self._pressed(selector), f"a click on {selector}; {self.errors}", self.process)
+
+    def _pressed(self, selector: str) -> bool:
+        """Whether a press of the mouse reached its element."""
+        meant = f"event => {{ window.pressed = Boolean(event.target.closest({selector!r})); }}"
+        # There is no click if the page replaced the element between press and release.
+        missed = "() => setTimeout(() => { window.pressed ??= false; })"
+        heard = {"click": meant, "mouseup": missed}
+        listen = [
+            f"addEventListener('{kind}', {do}, {{ once: true, capture: true }})" for kind, do in heard.items()
+        ]
+        self.value(f"window.pressed = null; {'; '.join(listen)}")
+        box = f"document.querySelector({selector!r}).getBoundingClientRect()"
+        x, y = self.value(f"(b => [b.x + b.width / 2, b.y + b.height / 2])({box})")
+        for kind in ("mousePressed", "mouseReleased"):
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+        self.wait("window.pressed !== null")
+        return self.value("window.pressed !== false")  # another page knows nothing of it
 
     def picture(self) -> np.ndarray:
         """The page (H, W, 3), uint8."""
