@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 from command_line import MAIN
 from conftest import Memmlp, one_line
-from engine_clips import EXAMPLES
+from examples.conftest import EXAMPLES
 from PIL import Image
 from processes import PATIENCE, started
 
