@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING
 import tiny
 
 from memmlp.motion.network_coordinates import Heading
-from memmlp.networks.memory import NoMemory
+from memmlp.networks.memory import LSTMMemory, NoMemory
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.own_past_memory import CodeMemory
 from memmlp.networks.predictor import RotationOnlySettings
-from memmlp.networks.recurrent_memory import LSTMMemory
 
 if TYPE_CHECKING:
     from onnx import GraphProto

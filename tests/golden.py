@@ -23,7 +23,8 @@ from torch import Tensor
 
 from memmlp.evaluation import metrics
 from memmlp.evaluation import modes as evaluation
-from memmlp.evaluation.ik import IK, LBFGS, Arms
+from memmlp.evaluation.evaluation import Evaluation
+from memmlp.evaluation.ik import IK, LBFGS, Arms, NoIK
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.clip import Clip
 from memmlp.motion.dataset import MirroredDataset, WindowSampler
@@ -32,7 +33,7 @@ from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.motion.synthetic import ACTIVITIES, synthesize, synthesize_clip
 from memmlp.networks.constant_pose import ConstantPose, ConstantPoseSettings
-from memmlp.networks.memory import NoMemory
+from memmlp.networks.memory import GRUMemory, LSTMMemory, NoMemory
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, NoCodesMemory
 from memmlp.networks.predictor import (
@@ -41,7 +42,6 @@ from memmlp.networks.predictor import (
     TwoBranchMemorySettings,
     TwoBranchSettings,
 )
-from memmlp.networks.recurrent_memory import GRUMemory, LSTMMemory
 from memmlp.networks.recurrent_poser import CELLS
 from memmlp.runs.identity import version_of
 from memmlp.training.loop import seed_step
@@ -218,7 +218,7 @@ def mode(name: str) -> Numbers:
     found = {}
     for i, motion in enumerate(evaluation.MODE_FUNCTIONS[name](model, split.clips())):
         found |= summary(f"clip {i}", motion)
-    mean = evaluation.evaluate(model, split, [name], 2)["mean"][name]["rotation"]
+    mean = Evaluation([name], 2, NoIK(), 0).report(model, split, name)["mean"]["rotation"]
     return found | {key: mean[key] for key in ("MPJPE", "Jitter")}
 
 

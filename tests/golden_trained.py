@@ -21,10 +21,9 @@ from memmlp.training.loop import seed_step, train_step
 from memmlp.training.losses import Fixed, Loss, Terms
 from memmlp.training.optim import Optim, vqvae_optim
 from memmlp.training.rollout import TeacherForcing
-from memmlp.training.train_network import MotionTask
+from memmlp.training.train_network import MotionTask, VQVAETask
 from memmlp.training.train_refiner import LOSSES, RefinerTask, RefinerTraining
 from memmlp.training.train_sage import PARTS, DroppingOptim, PartTask
-from memmlp.training.train_vqvae import VQVAETask
 
 ROUNDED = ("quantiser.vectors", "key.bias")
 """Parameters that processors' rounding moves: the nearest of almost equal codes, and the biases of keys of

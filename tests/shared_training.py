@@ -15,7 +15,7 @@ from memmlp.common import distributed
 from memmlp.runs.run import Run
 from memmlp.training.loop import TrainingTask, train
 from memmlp.training.optim import Muon, Optim, ScheduleFree
-from memmlp.training.train_vqvae import VQVAETask
+from memmlp.training.train_network import VQVAETask
 
 STEPS = replace(OPTIM, steps=24, checkpoint_every=10, validate_every=12)
 OPTIMS = {

@@ -16,9 +16,8 @@ from memmlp.runs.run import Run
 from memmlp.training.losses import HandPosition, MotionLoss, TermsLoss, Uncertainty
 from memmlp.training.optim import Optim
 from memmlp.training.rollout import OwnPredictions, PersistentStreams, TeacherForcing
-from memmlp.training.train_network import MotionTask, NetworkTraining
+from memmlp.training.train_network import MotionTask, NetworkTraining, VQVAETask
 from memmlp.training.train_sage import PARTS, PartTask, make_objective
-from memmlp.training.train_vqvae import VQVAETask
 
 OPTIM = Optim(steps=12, batch=4, lr=1e-3, final_lr=1e-4, schedule="cosine", checkpoint_every=5, log_every=4)
 ROLLOUTS = {

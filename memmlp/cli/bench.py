@@ -16,7 +16,7 @@ from memmlp.cli.options import Finite, config_dir_option, plugins_option
 
 if TYPE_CHECKING:
     from memmlp.deploy.latency import InTurn
-    from memmlp.training.experiment import Experiment
+    from memmlp.training.run_stages import Experiment
 
 BASE = "avatar_poser"
 """The network whose times are the unit of all ratios, in the size of its option."""
@@ -280,8 +280,8 @@ def measure_seed(experiments: dict[str, Experiment], seed: int, every: int) -> d
     """
     from memmlp.common.errors import InputError
     from memmlp.common.progress import progress_bar
+    from memmlp.training.loop import Learner, find_first, train_in_turn
     from memmlp.training.run_stages import make_prerequisites
-    from memmlp.training.time_to_error import Learner, find_first, train_in_turn
     from memmlp.training.train_network import NetworkTraining
 
     data = {name: experiment.motion.prepare() for name, experiment in experiments.items()}

@@ -36,12 +36,11 @@ from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.lookup import check_trained
 from memmlp.runs.run import Run
 from memmlp.training.devices import device
-from memmlp.training.experiment import Experiment, PrerequisiteTraining
 from memmlp.training.losses import Loss, MotionLoss, Term
 from memmlp.training.optim import Optim, vqvae_optim
-from memmlp.training.train_network import NetworkTraining
+from memmlp.training.run_stages import Experiment
+from memmlp.training.train_network import NetworkTraining, Training, VQVAETraining
 from memmlp.training.train_refiner import RefinerTraining
-from memmlp.training.train_vqvae import VQVAETraining
 
 
 def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
@@ -83,7 +82,7 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
     )
 
 
-def build_prerequisites(cfg: DictConfig, config: dict[str, Any]) -> tuple[PrerequisiteTraining, ...]:
+def build_prerequisites(cfg: DictConfig, config: dict[str, Any]) -> tuple[Training, ...]:
     """Build the trainings of the prerequisite runs of a checked config's network, in order.
 
     The only prerequisite of a refiner is its network's run.

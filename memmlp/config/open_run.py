@@ -22,7 +22,7 @@ from memmlp.runs.identity import DEPLOYMENT, EVALUATION, INFERENCE, training_con
 from memmlp.runs.lookup import find_run
 from memmlp.runs.run import Run
 from memmlp.training.devices import device
-from memmlp.training.experiment import Experiment
+from memmlp.training.run_stages import Experiment
 
 ACTING = (*EVALUATION, *DEPLOYMENT, "data", "paths", "plugins", "loggers")
 """The groups whose keys have an effect on a finished run; so have the keys of INFERENCE."""

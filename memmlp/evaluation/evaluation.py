@@ -45,11 +45,16 @@ class Evaluation:
             "offline" for a network that can't run as a stream.
         """
         torch.manual_seed(self.seed)  # a mode's result does not depend on which modes came before it
-        found = modes.evaluate(model, test, [mode], self.batch, self.ik, self.metrics)
-        facts = ("name", "group", "source", "frames")
-        rows = [{key: row[key] for key in facts if key in row} | row[mode] for row in found["clips"]]
+        clips = test.clips()
+        rows: list[dict[str, Any]] = []
+        for index, motion in enumerate(modes.predict(model, clips, mode, self.batch)):
+            facts = {"name": test.names[index], "group": test.groups[index]}
+            facts |= {"source": test.sources[index]} if test.sources else {}
+            errors = modes.clip_report(model.normalizer, motion, clips[index], self.ik, self.metrics)
+            rows.append({**facts, "frames": len(clips[index]), **errors})
+        branches = [{key: row[key] for key in errors} for row in rows]
         label = {} if model.is_stream else {"offline": True}
-        return {"mean": found["mean"][mode], "clips": rows, **label}
+        return {"mean": modes.mean_of_clips(branches), "clips": rows, **label}
 
 
 def predict_first_clip(model: MotionModel, test: MotionDataset) -> tuple[np.ndarray, np.ndarray]:

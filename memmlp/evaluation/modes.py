@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -106,42 +105,6 @@ MODE_FUNCTIONS: dict[str, Callable[[MotionModel, Sequence[Tensor]], list[Tensor]
 }
 
 
-def evaluate(
-    network: MotionModel,
-    dataset: MotionDataset,
-    modes: Sequence[str],
-    batch: int,
-    ik: IK | None = None,
-    custom: metrics.UserMetrics | None = None,
-) -> dict[str, Any]:
-    """Compute the metrics of a dataset: `{"mean": {mode: {branch: {metric: value}}}, "clips": [...]}`.
-
-    Each clip's metrics are means over its frames; the mean is the mean over clips.
-
-    Args:
-        network: the network to evaluate.
-        dataset: the clips.
-        modes: the evaluation modes.
-        batch: the largest number of clips that are evaluated side by side.
-        ik: inverse kinematics, whose result is one more branch.
-        custom: custom metrics.
-    """
-    clips = dataset.clips()
-    rows: list[dict[str, Any]] = [
-        {"name": name, "group": group, "frames": len(clip)}
-        for name, group, clip in zip(dataset.names, dataset.groups, clips, strict=True)
-    ]
-    for row, source in zip(rows, dataset.sources or (), strict=False):
-        row["source"] = source
-    for mode in modes:
-        motions = predict(network, clips, mode, batch)
-        for row, clip, motion in zip(
-            progress_bar(rows, "measuring", unit="clips"), clips, motions, strict=True
-        ):
-            row[mode] = clip_report(network.normalizer, motion, clip, ik, custom)
-    return {"mean": {mode: _mean([row[mode] for row in rows]) for mode in modes}, "clips": rows}
-
-
 def predict(network: MotionModel, clips: Sequence[Tensor], mode: str, batch: int) -> list[Tensor]:
     """Predict the motion (N, 198) of each clip (N, 252), with at most `batch` clips side by side."""
     groups = [clips[i : i + batch] for i in range(0, len(clips), batch)]
@@ -208,7 +171,9 @@ def quick_stream(
     """Return the stream-mode metrics, averaged over pieces of clips, for validation during training."""
     motions = stream(network, pieces)
     pairs = zip(motions, pieces, strict=True)
-    mean = _mean([clip_report(network.normalizer, motion, piece, custom=custom) for motion, piece in pairs])
+    mean = mean_of_clips(
+        [clip_report(network.normalizer, motion, piece, custom=custom) for motion, piece in pairs]
+    )
     return {f"{branch} {name}": value for branch, values in mean.items() for name, value in values.items()}
 
 
@@ -219,7 +184,7 @@ def _side_by_side(clips: Sequence[Tensor]) -> tuple[list[int], list[int], Tensor
     return order, [len(clips[i]) for i in order], inputs
 
 
-def _mean(rows: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
+def mean_of_clips(rows: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
     """Return each branch's metrics, mean over clips; clips that are too short for a metric are left out.
 
     A clip for which the network returned NaN is not left out: all means of that branch are then NaN.

@@ -40,10 +40,9 @@ class AGRoLMLPGraph(StemGraph):
         self.blocks = cast(list[MLPBlock], list(model.blocks))
 
     def embed_frame(self, encoded: Tensor) -> Tensor:
-        """Return the stem's output (1, d) for a frame's inputs (1, 54)."""
         return self.model.stem(encoded)
 
-    def predict_rotation(self, window: Tensor) -> Tensor:
+    def predict_rotation(self, window: Tensor, encoded: Tensor) -> Tensor:
         """Apply the blocks to (T, d), the last block for the newest frame alone, then the head: (1, 132)."""
         *earlier, last = self.blocks
         for block in earlier:
@@ -133,7 +132,7 @@ class AGRoLDiffusionGraph(StemGraph):
         """
         return F.linear(encoded, self.model.stem.weight[:, ROTATION.stop :], self.model.stem.bias)
 
-    def predict_rotation(self, window: Tensor) -> Tensor:
+    def predict_rotation(self, window: Tensor, encoded: Tensor) -> Tensor:
         """Sample by DDIM; the denoiser's last call computes the newest frame (1, 132) alone."""
         diffusion, noisy = self.model.diffusion, self.model.noise
         for index in range(len(diffusion.times) - 1):

@@ -25,15 +25,10 @@ from memmlp.motion.body import (
 )
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer, in_float32
-from memmlp.networks.motion_model import (
-    State,
-    StreamingGraph,
-    TrainingOutputs,
-    WindowModel,
-    fill_past,
-)
+from memmlp.networks.motion_model import State, TrainingOutputs, WindowModel
 from memmlp.networks.settings import NetworkSettings
-from memmlp.networks.transformer import EncoderLayer, draw_weights
+from memmlp.networks.streaming import StemGraph
+from memmlp.networks.transformer import EncoderLayer, draw_weights, make_encoder
 
 JOINT_DIM = 18  # features of a joint: rotation, angular velocity, position, velocity
 UNSEEN = 0.01  # stands in all features of joints without a tracker
@@ -73,8 +68,8 @@ def attended(layer: EncoderLayer, h: Tensor, seen: Tensor) -> Tensor:
     return layer.finish(flat, attention.attend(query, key, value).flatten(0, 1)).view(h.shape)
 
 
-class AvatarJLMGraph(StreamingGraph):
-    """AvatarJLM's streaming graph, which carries the tokens of each frame, in order of time.
+class AvatarJLMGraph(StemGraph):
+    """AvatarJLM's streaming graph, which carries the tokens of each frame, without position embeddings.
 
     The tokens' position embeddings change at every step and attention looks both ways in time, so all layers
     are recomputed; the last one, over time, is only computed for the newest frame.
@@ -86,15 +81,12 @@ class AvatarJLMGraph(StreamingGraph):
 
     def build(self, model: Any) -> None:
         self.model, self.layers = model, cast(list[EncoderLayer], list(model.layers))
+        self.width = model.joint_places.numel()
 
-    def windows(self) -> State:
-        """Return zeros (T - 1, 45 d): each earlier frame's tokens, without position embeddings."""
-        return {"tokens": torch.zeros(self.frames - 1, self.model.joint_places.numel())}
+    def embed_frame(self, encoded: Tensor) -> Tensor:
+        return self.model.make_tokens(encoded).flatten(1)
 
-    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
-        entering = self.model.make_tokens(encoded).flatten(1)
-        window = torch.cat([fill_past(state["tokens"], entering, fresh), entering])
+    def predict_rotation(self, window: Tensor, encoded: Tensor) -> Tensor:
         h = self.model.add_places(window.unflatten(-1, (TOKENS, -1)))
         first = h[:, -1:]
         for index, layer in enumerate(self.layers[:-1]):
@@ -104,11 +96,11 @@ class AvatarJLMGraph(StreamingGraph):
         by_token = h.transpose(0, 1)
         newest = attended(self.layers[-1], by_token[:, -1:], by_token).transpose(0, 1)
         features = self.model.reset_input_token(newest, first[-1:]).flatten(1)
-        return self.normalizer.posed(self.predict_rotation(features, encoded), sparse), {"tokens": window[1:]}
+        return self.read(self.model.regressor(features), encoded)
 
-    def predict_rotation(self, features: Tensor, encoded: Tensor) -> Tensor:
-        """Map the newest frame's tokens (1, 45 d) and inputs (1, 54) to its rotations (1, 132)."""
-        return self.model.regressor(features)
+    def read(self, made: Tensor, encoded: Tensor) -> Tensor:
+        """Map the newest frame's outputs and inputs (1, 54) to its rotations (1, 132)."""
+        return made
 
 
 @component("model", "avatar_jlm", version=2, builds="AvatarJLM")
@@ -168,10 +160,7 @@ class AvatarJLM(WindowModel):
         self.time_places = nn.Parameter(torch.empty(max(LONGEST, settings.frames), 1, settings.width))
         for places in (self.joint_places, self.time_places):
             nn.init.trunc_normal_(places, std=0.02)
-        self.layers = nn.ModuleList(
-            EncoderLayer(settings.width, settings.heads, settings.feedforward, settings.dropout)
-            for _ in range(2 * settings.depth)
-        )
+        self.layers = make_encoder(settings, 2 * settings.depth)
         self.regressor = nn.Sequential(
             nn.Linear(TOKENS * settings.width, hidden),
             nn.GroupNorm(GROUPS, hidden),

@@ -1,23 +1,29 @@
-"""AvatarPoser (Jiang et al., ECCV 2022): a transformer encoder whose feature of the newest frame is read.
+"""AvatarPoser (Jiang et al., ECCV 2022) and EgoPoser (Jiang et al., ECCV 2024).
 
-Its final step, inverse kinematics of the arms, is not part of the network and is left out here.
+A transformer encoder makes a feature of the newest frame, from which its pose is read. EgoPoser sees a fast
+and a slow view of a longer window. AvatarPoser's inverse kinematics of the arms and EgoPoser's mask of hands
+out of sight are left out, as is EgoPoser's head for the body's shape, since all bodies here have the mean.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common.components import component
 from memmlp.common.settings import at_least, fraction, setting
-from memmlp.motion.body import N_JOINTS, SPARSE_DIM
+from memmlp.motion.body import N_JOINTS, SPARSE_DIM, SPARSE_POSITION, TRACKED
+from memmlp.motion.network_coordinates import HeadRelative
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.motion_model import NewestFrameModel, State, StreamingGraph, slide_window
+from memmlp.networks.motion_model import NewestFrameModel, StreamingGraph
 from memmlp.networks.settings import NetworkSettings
-from memmlp.networks.transformer import EncoderLayer, draw_weights
+from memmlp.networks.streaming import StemGraph
+from memmlp.networks.transformer import EncoderLayer, draw_weights, encode_newest_frame, make_encoder
 
 ROOT = 6  # components of the root's orientation, the first of the rotations
 
@@ -27,8 +33,8 @@ def head(width: int, size: int) -> nn.Module:
     return nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, size))
 
 
-class AvatarPoserGraph(StreamingGraph):
-    """AvatarPoser's streaming graph."""
+class AvatarPoserGraph(StemGraph):
+    """AvatarPoser's streaming graph, which carries each frame's embedding, first query, key and value."""
 
     float32_modules: tuple[str, ...] = ("model.embedding", "model.orientation", "model.rotation")
     model: AvatarPoser
@@ -36,30 +42,24 @@ class AvatarPoserGraph(StreamingGraph):
 
     def build(self, model: Any) -> None:
         self.model, self.layers = model, cast(list[EncoderLayer], list(model.layers))
+        self.width = 4 * model.embedding.out_features
 
-    def windows(self) -> State:
-        """Return zeros (T, 4 d): each frame's embedding and first query, key and value, side by side."""
-        return {"first": torch.zeros(self.frames, 4 * self.model.embedding.out_features)}
+    def embed_frame(self, encoded: Tensor) -> Tensor:
+        embedded, attention = self.model.embedding(encoded), self.layers[0].attention
+        parts = attention.query(embedded), attention.key(embedded), attention.value(embedded)
+        return torch.cat([embedded, *parts], -1)
 
-    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
-        embedded = self.model.embedding(encoded)
+    def predict_rotation(self, window: Tensor, encoded: Tensor) -> Tensor:
         *earlier, last = self.layers
-        attention = self.layers[0].attention
-        entering = torch.cat(
-            [embedded, attention.query(embedded), attention.key(embedded), attention.value(embedded)], -1
-        )
-        first = slide_window(state["first"], entering, entering, fresh)
-        h, query, key, value = first.chunk(4, -1)
+        h, query, key, value = window.chunk(4, -1)
         for layer, following in zip(earlier, self.layers[1:], strict=True):
             h = layer.finish(h, layer.attention.attend(query[None], key[None], value[None])[0])
             attention = following.attention
             query, key, value = attention.query(h), attention.key(h), attention.value(h)
         attended = last.attention.attend(query[-1:][None], key[None], value[None])[0]
-        features = last.finish(h[-1:], attended)
-        return self.normalizer.posed(self.predict_rotation(features, encoded), sparse), {"first": first}
+        return self.read(last.finish(h[-1:], attended), encoded)
 
-    def predict_rotation(self, newest: Tensor, encoded: Tensor) -> Tensor:
+    def read(self, newest: Tensor, encoded: Tensor) -> Tensor:
         """Map the newest frame's feature (1, d) and inputs (1, 54) to its rotations (1, 132)."""
         return self.model.read(newest)
 
@@ -105,10 +105,7 @@ class AvatarPoser(NewestFrameModel):
     def __init__(self, normalizer: Normalizer, settings: AvatarPoserSettings):
         super().__init__(normalizer, settings.frames)
         self.embedding = nn.Linear(self.inputs, settings.width)
-        self.layers = nn.ModuleList(
-            EncoderLayer(settings.width, settings.heads, settings.feedforward, settings.dropout)
-            for _ in range(settings.depth)
-        )
+        self.layers = make_encoder(settings, settings.depth)
         self.orientation = head(settings.width, ROOT)
         self.rotation = head(settings.width, 6 * self.rotated)
         draw_weights(self)
@@ -125,3 +122,96 @@ class AvatarPoser(NewestFrameModel):
     def read(self, newest: Tensor) -> Tensor:
         """Map the newest frame's feature (..., d) to rotations (..., 132)."""
         return torch.cat([self.orientation(newest), self.rotation(newest)], -1)
+
+
+PLACES = 2 * len(TRACKED)  # components of the trackers' places on the floor
+
+
+def center_on_head(sparse: Tensor) -> Tensor:
+    """Return inputs (..., 54) with positions on the floor relative to the head in the same frame."""
+    space = HeadRelative()
+    return space.sparse_in(sparse, space.origin(sparse))
+
+
+def select_places(sparse: Tensor) -> Tensor:
+    """Return the trackers' positions on the floor (..., 6), from inputs (..., 54)."""
+    return sparse[..., SPARSE_POSITION].unflatten(-1, (len(TRACKED), 3))[..., :2].flatten(-2)
+
+
+class EgoPoserGraph(StemGraph):
+    """EgoPoser's streaming graph, which carries each frame's embedding and places on the floor.
+
+    At every step the slow view pairs other frames, so nothing after the embedding can be carried. The
+    movement since the window's first frame enters linearly, so the first frame's contribution is subtracted
+    from the sum.
+    """
+
+    float32_modules = ("model.embedding", "model.orientation", "model.rotation")
+    model: EgoPoser
+
+    def build(self, model: Any) -> None:
+        self.model, self.layers = model, cast(list[EncoderLayer], list(model.layers))
+        self.width = model.embedding.out_features + PLACES
+
+    def embed_frame(self, encoded: Tensor) -> Tensor:
+        local = center_on_head(encoded)
+        place = select_places(local)
+        return torch.cat([self.model.embedding(torch.cat([local, place], -1)), place], -1)
+
+    def predict_rotation(self, window: Tensor, encoded: Tensor) -> Tensor:
+        embedded, places = window.split([self.width - PLACES, PLACES], -1)
+        slow, fast = self.model.make_views(embedded)
+        first = F.linear(places[:1], self.model.embedding.weight[:, SPARSE_DIM:])
+        return self.model.read(encode_newest_frame(self.layers, slow + fast - 2 * first))
+
+
+@component("model", "ego_poser", version=2, builds="EgoPoser")
+@dataclass
+class EgoPoserSettings(AvatarPoserSettings):
+    """EgoPoser (Jiang et al. 2024): AvatarPoser's encoder over a fast and a slow view of a longer window.
+
+    Loss and features are those of its released code, except for the hands' positions, which are its paper's
+    (docs/readings.md). Training is this project's, as AvatarPoser's is.
+    """
+
+    # T, the frames of a window; the encoder sees half as many
+    frames: int = setting(at_least(2), tiny=20, small=80, paper=80)
+
+    defaults: ClassVar = {"loss": "ego_poser"}
+
+    @classmethod
+    def problems(cls, config: Any) -> Iterator[str]:
+        """Yield why the network cannot be used; see Settings."""
+        yield from super().problems(config)
+        normalizer = config["normalizer"]
+        if normalizer["z_scores"] and normalizer["coordinates"] == "world":
+            yield (
+                "normalizer.z_scores=true: must be false with normalizer.coordinates=world, since "
+                "model=ego_poser subtracts the head position"
+            )
+
+
+class EgoPoser(AvatarPoser):
+    """AvatarPoser's encoder over the sum of two views: the window's newer half, and its every second frame.
+
+    It has 4,126,340 parameters at the paper's sizes (T = 80, otherwise AvatarPoser's); the released code has
+    a further layer of 7,808 that nothing uses. Positions are relative to the point of the floor below the
+    head in the same frame, and how far these moved since the window's first frame is appended to each frame's
+    inputs: the head's not at all. In the released code the hands' positions and movements are the world's
+    (docs/readings.md).
+    """
+
+    graph = EgoPoserGraph
+    inputs: ClassVar[int] = SPARSE_DIM + PLACES
+
+    def predict_rotations(self, encoded: Tensor) -> Tensor:
+        local = center_on_head(encoded)
+        moved = select_places(local) - select_places(local[:, :1])
+        slow, fast = self.make_views(torch.cat([local, moved], -1))
+        return self.encode(self.embedding(slow) + self.embedding(fast))
+
+    @staticmethod
+    def make_views(window: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the slow and the fast view of a window (..., T, n): half of its frames each."""
+        slow = window[..., ::2, :]
+        return slow, window[..., -slow.shape[-2] :, :]

@@ -65,7 +65,7 @@ class BoDiffusionGraph(StemGraph):
         """
         return self.sparse(encoded)
 
-    def predict_rotation(self, window: Tensor) -> Tensor:
+    def predict_rotation(self, window: Tensor, encoded: Tensor) -> Tensor:
         """Sample step by step; the last step makes the newest frame (1, 132) alone."""
         diffusion, limits = self.model.diffusion, self.model.compute_limits()
         last = len(diffusion.times) - 1

@@ -30,7 +30,7 @@ from memmlp.motion.geometry import matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer, in_float32
 from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel
 from memmlp.networks.settings import NetworkSettings
-from memmlp.networks.transformer import EncoderLayer
+from memmlp.networks.transformer import make_encoder
 
 HANDS, OTHERS = 2, 3  # tokens of hands in the head's frame, and of the sensors that there are none of
 TOKENS = len(TRACKED) + HANDS + OTHERS
@@ -111,11 +111,7 @@ class NormedLSTM(nn.Module):
         self.biases = nn.ParameterList([plain.bias_ih_l0, plain.bias_hh_l0])
 
     def forward(self, x: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Run over inputs (B, n, d) from states (B, d).
-
-        Returns:
-            Outputs (B, n, d), and the states after the last input.
-        """
+        """Run over inputs (B, n, d) from states (B, d); return outputs (B, n, d) and the states after."""
         pairs = zip(self.directions, self.gains, strict=True)
         weights = [F.normalize(direction, dim=1) * gain for direction, gain in pairs]
         states = [state.contiguous()[None] for state in (hidden, cell)]
@@ -131,17 +127,13 @@ class TimeAndTokenBlock(nn.Module):
     """An LSTM over time for each token, then encoder layers over the tokens of each frame.
 
     Args:
-        width: d, the width of a token.
-        layers: number of encoder layers.
-        heads: number of attention heads; it divides d.
-        feedforward: width of the encoder's hidden layers.
-        dropout: dropout rate of the encoder.
+        settings: the network's settings.
     """
 
-    def __init__(self, width: int, layers: int, heads: int, feedforward: int, dropout: float):
+    def __init__(self, settings: HMDPoserSettings):
         super().__init__()
-        self.over_time = nn.ModuleList(NormedLSTM(width) for _ in range(TOKENS))
-        self.layers = nn.ModuleList(EncoderLayer(width, heads, feedforward, dropout) for _ in range(layers))
+        self.over_time = nn.ModuleList(NormedLSTM(settings.width) for _ in range(TOKENS))
+        self.layers = make_encoder(settings, settings.encoder_layers)
 
     def forward(self, tokens: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Map tokens (B, n, 8, d) and states (B, 8, d) to tokens and the states after the last frame."""
@@ -214,16 +206,7 @@ class HMDPoser(WindowlessModel):
         unseen = (6, 6, 3), (turns, turns, settings.width - 2 * turns)
         self.others = nn.ModuleList(TokenEmbedding(*unseen) for _ in range(OTHERS))
         self.norm = nn.LayerNorm(settings.width, eps=1e-6)
-        self.blocks = nn.ModuleList(
-            TimeAndTokenBlock(
-                settings.width,
-                settings.encoder_layers,
-                settings.heads,
-                settings.feedforward,
-                settings.dropout,
-            )
-            for _ in range(settings.depth)
-        )
+        self.blocks = nn.ModuleList(TimeAndTokenBlock(settings) for _ in range(settings.depth))
         self.pose = self._head(ROTATION.stop)
         self.shape = self._head(SHAPE) if settings.shape_weight else None
 

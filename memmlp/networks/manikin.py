@@ -1,7 +1,7 @@
 """MANIKIN (Jiang et al., ECCV 2024): networks predict the trunk and where limbs end; the limbs are solved.
 
 MANIKIN-S has AvatarPoser's encoder, MANIKIN-L AvatarJLM's network. What they predict of a frame
-(`PredictedParts`) is turned into a pose in closed form (memmlp.networks.baselines.limb_solver). Readings: all
+(`PredictedParts`) is turned into a pose in closed form (memmlp.networks.limb_solver). Readings: all
 heights are the world's, since a stream does not know the lowest foot of its clip; the head has its tracker's
 rotation; and a straight limb does not keep the swivel of the frame before.
 """
@@ -217,10 +217,10 @@ class Manikin(MotionModel):
 class ManikinSGraph(AvatarPoserGraph):
     """MANIKIN-S' streaming graph: AvatarPoser's graph, then the solver of the newest frame's limbs."""
 
-    float32_modules = (*AvatarPoserGraph.float32_modules, "model.swivel", "model.places")
+    float32_modules: tuple[str, ...] = (*AvatarPoserGraph.float32_modules, "model.swivel", "model.places")
     model: ManikinS
 
-    def predict_rotation(self, newest: Tensor, encoded: Tensor) -> Tensor:
+    def read(self, newest: Tensor, encoded: Tensor) -> Tensor:
         return self.model.solve_pose(self.model.read(newest), encoded)
 
 
@@ -299,8 +299,8 @@ class ManikinLGraph(AvatarJLMGraph):
 
     model: ManikinL
 
-    def predict_rotation(self, features: Tensor, encoded: Tensor) -> Tensor:
-        return self.model.solve_pose(self.model.regressor(features), encoded)
+    def read(self, made: Tensor, encoded: Tensor) -> Tensor:
+        return self.model.solve_pose(made, encoded)
 
 
 @component("model", "manikin_l", version=2, builds="ManikinL")

@@ -21,7 +21,7 @@ from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import FrameGraph, State, TrainingOutputs, WindowlessModel
 from memmlp.networks.settings import NetworkSettings
-from memmlp.networks.transformer import Attention, EncoderLayer
+from memmlp.networks.transformer import Attention, make_encoder
 
 FRESH = 0.25  # of the training windows begin as a live stream does, without a past
 
@@ -91,10 +91,7 @@ class RPM(WindowlessModel):
         self.sparse = nn.Linear(SPARSE_DIM, settings.width)
         self.attention = Attention(settings.width, settings.heads)
         self.norm = nn.LayerNorm(settings.width)
-        self.layers = nn.ModuleList(
-            EncoderLayer(settings.width, settings.heads, settings.feedforward, settings.dropout, F.gelu)
-            for _ in range(settings.depth)
-        )
+        self.layers = make_encoder(settings, settings.depth, F.gelu)
         self.head = nn.Linear(settings.width, ROTATION.stop)
         # Sines and cosines as position embeddings (context + W, d) (Vaswani et al. 2017, Sec. 3.5).
         rates = torch.exp(-math.log(10_000) * torch.arange(0, settings.width, 2) / settings.width)

@@ -18,16 +18,10 @@ from memmlp.common.settings import at_least, fraction, setting, sized
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.diffusion import Diffusion
-from memmlp.networks.motion_model import (
-    NewestFrameModel,
-    State,
-    StreamingGraph,
-    TrainingOutputs,
-    slide_window,
-)
+from memmlp.networks.motion_model import NewestFrameModel, State, TrainingOutputs
 from memmlp.networks.sage_parts import LATENT, Decoder, HalfVQVAE, LowerDenoiser, UpperDenoiser, make_places
 from memmlp.networks.settings import NetworkSettings
-from memmlp.networks.streaming import linear
+from memmlp.networks.streaming import StemGraph, linear
 from memmlp.networks.transformer import DiTBlock
 
 
@@ -63,7 +57,7 @@ class DenoiserAtSamplingTimes(nn.Module):
         return self.denoiser.head(h)
 
 
-class SAGENetGraph(StreamingGraph):
+class SAGENetGraph(StemGraph):
     """SAGE-Net's streaming graph, which carries what each of the three parts computes from single frames.
 
     What the blocks compute from the diffusion times is the same at every step of a stream, so it is computed
@@ -81,6 +75,7 @@ class SAGENetGraph(StreamingGraph):
         self.beside = model.lower.beside
         conditions = model.upper.condition, model.lower.condition, model.decoder.condition
         self.widths = [one.linear.out_features for one in conditions]
+        self.width = sum(self.widths)
 
         def entering(encoded: Tensor) -> Tensor:
             return torch.cat([one.linear(one.mixture(encoded).flatten(-2)) for one in conditions], -1)
@@ -92,19 +87,11 @@ class SAGENetGraph(StreamingGraph):
             "places", make_places(nothing.new_zeros(self.frames // 2, model.decoder.stem.out_features))
         )
 
-    def windows(self) -> State:
-        """Return zeros (T, d + d + 384): what the denoisers and the decoder compute from each frame alone."""
-        return {"seen": torch.zeros(self.frames, sum(self.widths))}
+    def embed_frame(self, encoded: Tensor) -> Tensor:
+        return self.sparse(encoded)
 
-    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
-        entering = self.sparse(encoded)
-        seen = slide_window(state["seen"], entering, entering, fresh)
-        rotation = self.decode(*seen.split(self.widths, -1))
-        return self.normalizer.posed(rotation, sparse), {"seen": seen}
-
-    def decode(self, for_upper: Tensor, for_lower: Tensor, for_decoder: Tensor) -> Tensor:
-        """Return the newest frame's rotations (1, 132), from what each part has of the window (T, ...)."""
+    def predict_rotation(self, window: Tensor, encoded: Tensor) -> Tensor:
+        for_upper, for_lower, for_decoder = window.split(self.widths, -1)
         upper = self.sample(self.upper, for_upper, self.noises[0], lambda noisy: noisy)
         lower = self.sample(
             self.lower, for_lower, self.noises[1], lambda noisy: self.beside(torch.cat([upper, noisy], -1))

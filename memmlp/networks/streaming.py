@@ -169,24 +169,29 @@ class OneFrame(nn.Module):
 
 
 class StemGraph(StreamingGraph):
-    """The base of the streaming graphs of AGRoL's networks; it carries the stem's outputs."""
+    """The base of the streaming graphs of windowed networks; it carries what a stem makes of each frame.
+
+    Attributes:
+        width: d, how many numbers are carried of a frame.
+    """
 
     float32_modules: tuple[str, ...] = ("model.stem", "model.head")
     width: int
 
     def windows(self) -> State:
-        """Return zeros (T - 1, d): the stem's output for each earlier frame's inputs."""
+        """Return zeros (T - 1, d): what is carried of each earlier frame, in order of time."""
         return {"stem": torch.zeros(self.frames - 1, self.width)}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
-        entering = self.embed_frame(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
+        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
+        entering = self.embed_frame(encoded)
         window = torch.cat([fill_past(state["stem"], entering, fresh), entering])
-        return self.normalizer.posed(self.predict_rotation(window), sparse), {"stem": window[1:]}
+        return self.normalizer.posed(self.predict_rotation(window, encoded), sparse), {"stem": window[1:]}
 
     def embed_frame(self, encoded: Tensor) -> Tensor:
-        """Return the stem's output (1, d) for one frame's inputs (1, 54), as it is carried."""
+        """Map one frame's inputs (1, 54) in network space to what is carried of it (1, d)."""
         raise NotImplementedError
 
-    def predict_rotation(self, window: Tensor) -> Tensor:
-        """Map a window of the stem's carried outputs (T, d) to the rotations (1, 132) of its newest frame."""
+    def predict_rotation(self, window: Tensor, encoded: Tensor) -> Tensor:
+        """Map a window (T, d), and its newest frame's inputs (1, 54), to that frame's rotations (1, 132)."""
         raise NotImplementedError

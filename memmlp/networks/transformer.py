@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -80,6 +81,12 @@ class EncoderLayer(nn.Module):
         h = self.attention_norm(h + self.dropout(attended))
         wide = self.dropout(self.activation(self.widen(h)))
         return self.norm(h + self.dropout(self.narrow(wide)))
+
+
+def make_encoder(settings: Any, depth: int, activation: Callable[[Tensor], Tensor] = F.relu) -> nn.ModuleList:
+    """Make `depth` encoder layers by a network's settings: width, heads, feedforward and dropout."""
+    sizes = settings.width, settings.heads, settings.feedforward, settings.dropout
+    return nn.ModuleList(EncoderLayer(*sizes, activation) for _ in range(depth))
 
 
 @torch.no_grad()

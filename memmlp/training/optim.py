@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import Any, Self
@@ -16,12 +16,12 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 from torch.overrides import TorchFunctionMode
 
 from memmlp.common.components import component
 from memmlp.common.errors import InputError
 from memmlp.common.settings import Settings, at_least, fraction, one_of, positive, setting, within
-from memmlp.training.averaging import EMA, Average, ScheduleFreeAverage
 
 SCHEDULES: dict[str, Callable[[float, float, float], float]] = {
     # Each maps the progress in [0, 1), final rate / first rate and `drop_at` to the factor on the first rate.
@@ -149,12 +149,16 @@ class Optim:
     def check_installed(self) -> None:
         """Raise InputError if the optimiser's library is not installed."""
 
-    def build(self, groups: list[dict]) -> torch.optim.Optimizer:
+    def build(self, groups: list[dict]) -> Optimizer:
         """Make the optimiser over parameter groups; a group's own `lr` and `weight_decay` take precedence."""
+        return self.build_adam(groups)
+
+    def build_adam(self, groups: list[dict]) -> Optimizer:
+        """Make Adam or AdamW over parameter groups."""
         kind = torch.optim.AdamW if self.decoupled else torch.optim.Adam
         return kind(groups, lr=self.lr, weight_decay=self.weight_decay, betas=self.betas, fused=True)
 
-    def make_average(self, module: nn.Module, optimiser: torch.optim.Optimizer) -> Average:
+    def make_average(self, module: nn.Module, optimiser: Optimizer) -> Average:
         """Make the object that says which weights of the module count."""
         return EMA(module, self.ema) if self.ema else Average(module)
 
@@ -185,22 +189,16 @@ class Muon(Optim):
         if not hasattr(torch.optim, "Muon"):
             raise InputError(f"optim=muon: torch {torch.__version__} does not have Muon; needs 2.9 or newer")
 
-    def build(self, groups: list[dict]) -> torch.optim.Optimizer:
-        """Make both optimisers as one; a parameter group's own `lr` and `weight_decay` take precedence."""
+    def build(self, groups: list[dict]) -> Optimizer:
+        """Make both optimisers as one; see Optim."""
         self.check_installed()
         matrices, rest = _split(groups, least=1 if self.vectors == "muon" else 2)
-        parts: list[torch.optim.Optimizer] = []
+        parts: list[Optimizer] = []
         if matrices:
-            parts.append(
-                torch.optim.Muon(
-                    matrices, self.lr, self.weight_decay, self.momentum, adjust_lr_fn="match_rms_adamw"
-                )
-            )
+            keys = self.lr, self.weight_decay, self.momentum
+            parts.append(torch.optim.Muon(matrices, *keys, adjust_lr_fn="match_rms_adamw"))
         if rest:
-            lr = self.other_lr or self.lr
-            parts.append(
-                torch.optim.AdamW(rest, lr, weight_decay=self.weight_decay, betas=self.betas, fused=True)
-            )
+            parts.append(replace(self, lr=self.other_lr or self.lr, decoupled=True).build_adam(rest))
         return ComposedOptimiser(parts)
 
 
@@ -223,8 +221,8 @@ class ScheduleFree(Optim):
                 "optim=schedule_free: needs the package schedulefree; pip install 'memmlp[schedulefree]'"
             )
 
-    def build(self, groups: list[dict]) -> torch.optim.Optimizer:
-        """Make the optimiser, ready to train; a group's own `lr` and `weight_decay` take precedence."""
+    def build(self, groups: list[dict]) -> Optimizer:
+        """Make the optimiser, ready to train; see Optim."""
         self.check_installed()
         from schedulefree import AdamWScheduleFree
 
@@ -232,7 +230,7 @@ class ScheduleFree(Optim):
         optimiser.train()
         return optimiser
 
-    def make_average(self, module: nn.Module, optimiser: torch.optim.Optimizer) -> Average:
+    def make_average(self, module: nn.Module, optimiser: Optimizer) -> Average:
         """Make the object that says which weights count: the optimiser's own average."""
         return ScheduleFreeAverage(module, optimiser)
 
@@ -324,3 +322,113 @@ def has_bfloat16_products() -> bool:
 
 def _is_narrow(tensor: Any) -> bool:
     return isinstance(tensor, Tensor) and tensor.dtype == torch.bfloat16 and tensor.device.type == "cpu"
+
+
+class Average:
+    """The weights of a module that count: they are validated, and kept at the end.
+
+    In this base class they are the weights of the last step; a subclass may average over the steps. A
+    checkpoint has both, so that a resumed training continues as if it had never stopped. Only parameters are
+    averaged; buffers, such as a codebook's statistics, are the last step's.
+
+    Args:
+        module: the module that is trained.
+    """
+
+    def __init__(self, module: nn.Module):
+        self.parameters = dict(module.named_parameters())
+
+    def update(self, steps: int) -> None:
+        """Update the average with the module's weights after `steps` steps."""
+
+    def put_in_place(self) -> None:
+        """Put the weights that count into the module, for good."""
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the tensors that a checkpoint must hold, their names preceded by "average."."""
+        return {}
+
+    def load(self, tensors: dict[str, Tensor]) -> None:
+        """Load from a checkpoint's tensors those that `tensors` returned."""
+
+    @contextmanager
+    def in_place(self) -> Iterator[None]:
+        """Give the module the weights that count within the context, then the last step's, bit for bit."""
+        before = {name: one.detach().clone() for name, one in self.parameters.items()}
+        self.put_in_place()
+        try:
+            yield
+        finally:
+            self._put(before)
+
+    @torch.no_grad()
+    def _put(self, values: dict[str, Tensor]) -> None:
+        for name, one in self.parameters.items():
+            one.copy_(values[name])
+
+
+class EMA(Average):
+    """An exponential moving average of the weights.
+
+    The decay grows to its value as (1 + steps) / (10 + steps), so that the random first weights are soon
+    forgotten.
+
+    Args:
+        module: the module that is trained.
+        decay: the share of the old average that is kept at each step, in (0, 1).
+    """
+
+    def __init__(self, module: nn.Module, decay: float):
+        super().__init__(module)
+        self.decay = decay
+        self.averages = {name: one.detach().clone() for name, one in self.parameters.items()}
+
+    def update(self, steps: int) -> None:
+        decay = min(self.decay, (1 + steps) / (10 + steps))
+        weights = [one.detach() for one in self.parameters.values()]
+        get_ema_multi_avg_fn(decay)(list(self.averages.values()), weights, steps)
+
+    def put_in_place(self) -> None:
+        self._put(self.averages)
+
+    def tensors(self) -> dict[str, Tensor]:
+        return {f"average.{name}": value for name, value in self.averages.items()}
+
+    def load(self, tensors: dict[str, Tensor]) -> None:
+        for name, value in self.averages.items():
+            value.copy_(tensors[f"average.{name}"])
+
+
+class ScheduleFreeAverage(Average):
+    """The average that a schedule-free optimiser maintains itself, and shows in its evaluation mode.
+
+    Args:
+        module: the module that is trained.
+        optimiser: an optimiser of the package schedulefree, in its training mode.
+    """
+
+    COUNTERS = ("k", "weight_sum", "lr_max")
+    """What its groups count besides their settings: steps, sum of the average's weights, largest rate."""
+
+    def __init__(self, module: nn.Module, optimiser: Optimizer):
+        super().__init__(module)
+        self.optimiser = optimiser
+
+    def put_in_place(self) -> None:
+        self.optimiser.eval()  # type: ignore[attr-defined]
+
+    @contextmanager
+    def in_place(self) -> Iterator[None]:
+        # The optimiser can restore the last step's weights by itself, but not bit for bit.
+        with super().in_place():
+            yield
+            self.optimiser.train()  # type: ignore[attr-defined]
+
+    def tensors(self) -> dict[str, Tensor]:
+        counted = [[group[name] for name in self.COUNTERS] for group in self.optimiser.param_groups]
+        return {"average.counters": torch.tensor(counted, dtype=torch.float64)}
+
+    def load(self, tensors: dict[str, Tensor]) -> None:
+        counted = tensors["average.counters"].tolist()
+        for group, (steps, weight_sum, lr_max) in zip(self.optimiser.param_groups, counted, strict=True):
+            group.update(zip(self.COUNTERS, (int(steps), weight_sum, lr_max), strict=True))

@@ -9,7 +9,8 @@ import contextlib
 import getpass
 import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -20,11 +21,13 @@ from memmlp.common import distributed
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged, is_disk_error
 from memmlp.common.files import write_json
 from memmlp.common.progress import announce, notify
-from memmlp.evaluation.evaluation import predict_first_clip
+from memmlp.deploy.deployment import Deployment
+from memmlp.evaluation.evaluation import Evaluation, predict_first_clip
 from memmlp.evaluation.predictions import save_predictions
 from memmlp.live.pose_latency import measure_pose
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.motion_source import Prepared
+from memmlp.networks.architectures import Architecture
 from memmlp.networks.motion_model import MotionModel
 from memmlp.runs.environment import PREREQUISITES, prerequisite_origins
 from memmlp.runs.evaluation_file import write_report
@@ -39,9 +42,37 @@ from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.run import Run
 from memmlp.training.data_remarks import data_warnings, partial_words
 from memmlp.training.devices import described, overlooked_gpu
-from memmlp.training.experiment import Experiment, PrerequisiteTraining
 from memmlp.training.loop import ValidationCallback
-from memmlp.training.request import Outcome, announce_data, own_code, results_of, unmeasured
+from memmlp.training.request import Outcome, RunRequest, announce_data, own_code, results_of, unmeasured
+from memmlp.training.train_network import NetworkTraining, Training
+from memmlp.training.train_refiner import RefinerTraining
+
+
+@dataclass(frozen=True)
+class Experiment(RunRequest):
+    """A request with all that its runs need, as built objects.
+
+    Attributes:
+        device: device of training and evaluation.
+        architecture: builds the networks.
+        prerequisites: how to train the runs that the network builds upon; each builds upon the one before.
+        training: how the network is trained.
+        evaluation: how the network is evaluated.
+        deployment: how the network is exported and timed; None where it is not deployed.
+        loggers: show the runs elsewhere, such as in MLflow.
+        make_name: makes a readable name for a run from its kind and its config.
+        unrefined: the experiment of the network that is refined; None without a refiner.
+    """
+
+    device: torch.device
+    architecture: Architecture
+    prerequisites: tuple[Training, ...]
+    training: NetworkTraining | RefinerTraining
+    evaluation: Evaluation
+    deployment: Deployment | None
+    loggers: Loggers
+    make_name: Callable[[str, Mapping[str, Any]], str] = lambda kind, config: kind
+    unrefined: Experiment | None = None
 
 
 def run_in_processes(experiment: Experiment) -> Outcome | None:
@@ -174,7 +205,7 @@ def make_prerequisites(experiment: Experiment, data: Prepared, last: str | None 
 
 def find_or_train(
     experiment: Experiment,
-    training: PrerequisiteTraining,
+    training: Training,
     identity: Identity,
     data: Prepared,
     before: Run | None,

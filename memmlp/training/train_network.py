@@ -1,4 +1,4 @@
-"""The stage that trains a motion network."""
+"""The trainings of a motion network, and of the VQ-VAE that its memory may use (App. A)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from memmlp.common import distributed
 from memmlp.evaluation import modes
@@ -15,9 +15,11 @@ from memmlp.evaluation.metrics import UserMetrics
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MirroredDataset, MotionDataset, WindowSampler
 from memmlp.motion.motion_source import Prepared
+from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import checkpoint
 from memmlp.networks.architectures import Architecture
 from memmlp.networks.motion_model import MotionModel
+from memmlp.networks.vqvae import VQVAE, measure_rotation_error
 from memmlp.runs.run import Run
 from memmlp.training.loop import StepResult, TrainingTask, ValidationCallback, train
 from memmlp.training.losses import Loss
@@ -27,8 +29,53 @@ from memmlp.training.rollout import Rollout
 VALIDATION_PIECE = 240  # frames, 4 s: validation streams through pieces of clips of this length
 
 
+class Training:
+    """How the weights of a run are trained; the interface of all trainings.
+
+    Attributes:
+        kind: the kind of the run (see `Identity`).
+    """
+
+    kind: str
+
+    @property
+    def description(self) -> str:
+        """What the training does, in words."""
+        return self.kind
+
+    def train(
+        self,
+        architecture: Architecture,
+        data: Prepared,
+        prerequisite: Path | None,
+        run: Run,
+        device: torch.device,
+        on_validation: ValidationCallback | None = None,
+    ) -> dict[str, float]:
+        """Train, from the run's checkpoint if there is one, and write the weights.
+
+        Args:
+            architecture: builds the network.
+            data: the prepared motion.
+            prerequisite: file of the weights of the run before, such as a frozen VQ-VAE's, or None.
+            run: the run whose folder takes checkpoints, log and weights.
+            device: the device to train on.
+            on_validation: called after each validation; see `memmlp.training.loop.train`.
+
+        Returns:
+            The errors of the last validation; empty in a process that does not validate.
+        """
+        raise NotImplementedError
+
+
+def last_errors(run: Run) -> dict[str, float]:
+    """Return the errors of a run's last validation; empty in a process that does not validate."""
+    found = [entry.values for entry in run.metrics() if entry.phase == "val"]
+    return dict(found[-1]) if found else {}
+
+
 @dataclass(frozen=True)
-class NetworkTraining:
+class NetworkTraining(Training):
     """How a motion network is trained.
 
     Attributes:
@@ -59,25 +106,13 @@ class NetworkTraining:
         run: Run,
         device: torch.device,
         on_validation: ValidationCallback | None = None,
-    ) -> MotionModel:
-        """Train a network, from the run's checkpoint if there is one, and write the network's weights.
-
-        Args:
-            architecture: builds the network.
-            data: the prepared motion.
-            prerequisite: file of the prerequisite run's weights, such as a frozen VQ-VAE's, or None.
-            run: the run whose folder takes checkpoints, log and weights.
-            device: the device to train on.
-            on_validation: called after each validation; see `memmlp.training.loop.train`.
-
-        Returns:
-            The trained network in evaluation mode.
-        """
+    ) -> dict[str, float]:
+        """Train a network; see Training."""
         task = self.task(architecture, data, prerequisite, device)
         train(task, self.optim, run, self.seed, "network", on_validation)
         if distributed.is_first():
             checkpoint.write(run.model, checkpoint.module_tensors("model", task.model), {})
-        return task.model.eval()
+        return last_errors(run)
 
     def task(
         self, architecture: Architecture, data: Prepared, prerequisite: Path | None, device: torch.device
@@ -148,3 +183,94 @@ class MotionTask(TrainingTask):
     def validate(self) -> dict[str, float]:
         """Compute the stream-mode metrics on the validation part."""
         return self._validate(self.model)
+
+
+@dataclass(frozen=True)
+class VQVAETraining(Training):
+    """How a VQ-VAE is trained.
+
+    All frames of the training part are equally likely, whatever `data.drawn_by` and the sources' weights are,
+    since an epoch has each once (reading 5). So networks that draw windows in other ways share their VQ-VAE.
+
+    Attributes:
+        seed: seed of the weights and batches.
+        optim: makes the optimisation, given the number of training frames.
+        mirror: whether half of the training frames are mirrored (see MirroredDataset).
+    """
+
+    seed: int
+    optim: Callable[[int], Optim]
+    mirror: bool = False
+    kind = "vqvae"
+
+    @property
+    def description(self) -> str:
+        """What the training does, in words."""
+        return "VQ-VAE: train it, since the network's memory uses its code-vectors"
+
+    def train(
+        self,
+        architecture: Architecture,
+        data: Prepared,
+        prerequisite: Path | None,
+        run: Run,
+        device: torch.device,
+        on_validation: ValidationCallback | None = None,
+    ) -> dict[str, float]:
+        """Train the architecture's VQ-VAE, which builds upon no other run; see Training."""
+        dataset, validation = (data.open(split).to(device) for split in ("train", "val"))
+        torch.manual_seed(self.seed)
+        normalizer = architecture.make_normalizer(data.manifest, dataset.frames).to(device)
+        model = architecture.vqvae().to(device)
+        optim = self.optim(len(dataset.frames))
+        training = MirroredDataset(dataset) if self.mirror else dataset
+        task = VQVAETask(model, normalizer, training, validation, optim, self.seed)
+        train(task, optim, run, self.seed, "VQ-VAE", on_validation)
+        if distributed.is_first():
+            checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
+        return task.validate()
+
+
+class VQVAETask(TrainingTask):
+    """The training task of a VQ-VAE: Eq. 1 on the reconstructed rotations, and the codebook loss (App. A)."""
+
+    def __init__(
+        self,
+        model: VQVAE,
+        normalizer: Normalizer,
+        dataset: MotionDataset,
+        validation: MotionDataset,
+        optim: Optim,
+        seed: int,
+    ):
+        self.model, self.normalizer, self.dataset, self.validation = model, normalizer, dataset, validation
+        self.module = model
+        self.sampler = WindowSampler(dataset, batch=optim.batch, window=1, seed=seed)
+        self.used = torch.zeros(len(model.codebook.vectors))
+
+    def step(self, step: int) -> StepResult:
+        """Compute the loss on a batch of single frames."""
+        clips, end = map(distributed.local_rows, self.sampler.draw(step))
+        frames = self.normalizer.encode(self.dataset.stretches(clips, end, 1))[:, 0]
+        terms, indices = self.model.compute_losses(frames, self.normalizer)
+        self.used = torch.bincount(distributed.gather_rows(indices), minlength=len(self.used)).float()
+        return StepResult(torch.stack(list(terms.values())).sum(), terms, clips)
+
+    def report(self) -> dict[str, float]:
+        """Return the perplexity of the step's codes, the exponential of the entropy of their counts."""
+        return {"perplexity": perplexity(self.used)}
+
+    @torch.no_grad()
+    def validate(self) -> dict[str, float]:
+        """Compute Eq. 1 and the perplexity on the validation frames."""
+        frames = self.normalizer.encode(self.validation.frames)
+        vectors, index = self.model.codebook(self.model.encode(frames))
+        used = torch.bincount(index, minlength=len(self.used)).float()
+        error = measure_rotation_error(self.model.decoder(vectors), frames, self.normalizer)
+        return {"rotation": float(error), "perplexity": perplexity(used)}
+
+
+def perplexity(counts: Tensor) -> float:
+    """Return the exponential of the entropy of counts (K,): K if all are equal, 1 if just one is not 0."""
+    share = counts / counts.sum().clamp_min(1)
+    return float(torch.special.entr(share).sum().exp())

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -18,14 +20,13 @@ from memmlp.motion.motion_source import Prepared
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import checkpoint
 from memmlp.networks.architectures import Architecture
-from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.refiner import HIDDEN, Refined, SAGERefinerSettings
 from memmlp.runs.run import Run
 from memmlp.training.loop import StepResult, TrainingTask, ValidationCallback, train
 from memmlp.training.losses import Fixed, Loss, Terms, TermsLoss
 from memmlp.training.losses.terms import Comparison, measure_jerk
 from memmlp.training.optim import Optim
-from memmlp.training.train_network import VALIDATION_PIECE
+from memmlp.training.train_network import VALIDATION_PIECE, Training, last_errors
 
 TOGETHER = 64  # pieces that the network streams through side by side
 
@@ -60,26 +61,19 @@ def _smooth_l1(error: Tensor) -> Tensor:
     return F.smooth_l1_loss(error, error.new_zeros(()).expand_as(error))
 
 
-def make_joints_loss() -> Loss:
-    """Return the loss that compares the movement of joints, with the weights of SAGE-Net's loss."""
-    return TermsLoss(
-        "smooth",
-        orientation=0.01,
-        rotation=0.01,
-        world_position=0.01,
-        hand=0.01,
-        velocity=60.0,
-        velocity_3=20.0,
-        jerk=0.03,
-    )
+JOINTS: dict[str, Any] = {"orientation": 0.01, "rotation": 0.01, "world_position": 0.01, "hand": 0.01}
+JOINTS |= {"velocity": 60.0, "velocity_3": 20.0, "jerk": 0.03}
+"""The weights of the loss that compares the movement of joints, those of SAGE-Net's loss."""
 
-
-LOSSES: dict[str, Callable[[], Loss]] = {"rotations": SAGERefinerLoss, "joints": make_joints_loss}
+LOSSES: dict[str, Callable[[], Loss]] = {
+    "rotations": SAGERefinerLoss,
+    "joints": partial(TermsLoss, "smooth", **JOINTS),
+}
 """The losses of a refiner, by what they compare the movement of."""
 
 
 @dataclass(frozen=True)
-class RefinerTraining:
+class RefinerTraining(Training):
     """How a refiner is trained.
 
     Attributes:
@@ -108,20 +102,8 @@ class RefinerTraining:
         run: Run,
         device: torch.device,
         on_validation: ValidationCallback | None = None,
-    ) -> MotionModel:
-        """Train a refiner, from the run's checkpoint if there is one, and write it together with its network.
-
-        Args:
-            architecture: builds the network with its refiner.
-            data: the prepared motion.
-            prerequisite: file of the weights of the finished network.
-            run: the run whose folder takes checkpoints, log and weights.
-            device: the device to train on.
-            on_validation: called after each validation; see `memmlp.training.loop.train`.
-
-        Returns:
-            The refined network in evaluation mode.
-        """
+    ) -> dict[str, float]:
+        """Train a refiner and write it together with its finished network; see Training."""
         assert prerequisite is not None
         plain = data.open("train").to(device)
         dataset = MirroredDataset(plain) if self.mirror else plain
@@ -140,7 +122,7 @@ class RefinerTraining:
         train(task, self.optim, run, self.seed, "refiner", on_validation)
         finished.requires_grad_(True)
         checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
-        return model.eval()
+        return last_errors(run)
 
     def draw_pieces(self, dataset: MotionDataset) -> tuple[Tensor, Tensor]:
         """Draw the pieces: frames (P, n, 252), and the indices (P,) of the clips that they come from."""

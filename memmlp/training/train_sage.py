@@ -30,10 +30,10 @@ from memmlp.networks.architectures import Architecture
 from memmlp.networks.sage_net import SAGENet
 from memmlp.networks.sage_parts import HIDDEN, LOWER, UPPER, HalfVQVAE
 from memmlp.runs.run import Run
-from memmlp.training.loop import StepResult, TrainingTask, train
+from memmlp.training.loop import StepResult, TrainingTask, ValidationCallback, train
 from memmlp.training.losses.terms import Body
 from memmlp.training.optim import Optim
-from memmlp.training.train_network import NetworkTraining
+from memmlp.training.train_network import NetworkTraining, Training, last_errors
 
 PARTS = ("upper_codes", "lower_codes", "upper_diffusion", "lower_diffusion", "decoder")
 """In the order of their training; each builds upon the one before."""
@@ -149,7 +149,7 @@ class SAGEPrerequisiteSettings(Settings):
 
 
 @dataclass(frozen=True)
-class PartTraining:
+class PartTraining(Training):
     """How a part is trained, as a run of its own.
 
     Attributes:
@@ -172,18 +172,11 @@ class PartTraining:
         prerequisite: Path | None,
         run: Run,
         device: torch.device,
+        on_validation: ValidationCallback | None = None,
     ) -> dict[str, float]:
-        """Train the part and write it with the parts before it, whose file is `prerequisite`.
-
-        For the other arguments see `NetworkTraining.train`.
-
-        Returns:
-            The part's errors on windows of the validation part.
-        """
-        before, dataset = (
-            checkpoint.read(prerequisite)[0] if prerequisite else {},
-            data.open("train").to(device),
-        )
+        """Train the part and write it with the parts before it; see Training."""
+        before = checkpoint.read(prerequisite)[0] if prerequisite else {}
+        dataset = data.open("train").to(device)
         torch.manual_seed(self.network.seed)
         net = architecture.build(architecture.make_normalizer(data.manifest, dataset.frames), None)
         assert isinstance(net, SAGENet)
@@ -199,7 +192,7 @@ class PartTraining:
         halves.eval().requires_grad_(False).to(device)
         objective, validation = make_objective(self.kind, halves), data.open("val").to(device)
         task = PartTask(part.requires_grad_(True), objective, self.network, dataset, validation, net.frames)
-        train(task, self.network.optim, run, self.network.seed, self.kind.replace("_", " "))
+        train(task, self.network.optim, run, self.network.seed, self.kind.replace("_", " "), on_validation)
         if distributed.is_first():
             checkpoint.write(run.model, before | checkpoint.module_tensors(name, part), {})
         return last_errors(run)
@@ -216,17 +209,11 @@ class DecoderTraining(PartTraining):
         prerequisite: Path | None,
         run: Run,
         device: torch.device,
+        on_validation: ValidationCallback | None = None,
     ) -> dict[str, float]:
-        """Train the decoder and write it together with the diffusion models; see PartTraining."""
+        """Train the decoder and write it together with the diffusion models; see Training."""
         fixed = replace(architecture, trained_parts=("upper", "lower"))
-        self.network.train(fixed, data, prerequisite, run, device)
-        return last_errors(run)
-
-
-def last_errors(run: Run) -> dict[str, float]:
-    """Return the errors of a run's last validation; empty in a process that does not validate."""
-    found = [entry.values for entry in run.metrics() if entry.phase == "val"]
-    return dict(found[-1]) if found else {}
+        return self.network.train(fixed, data, prerequisite, run, device, on_validation)
 
 
 class PartTask(TrainingTask):

@@ -11,7 +11,7 @@ from own_package import registers_kept
 
 from memmlp.common.components import SLOTS, add_package, collected, declared, find, names
 from memmlp.common.errors import InputError
-from memmlp.networks.ego_poser import EgoPoser, EgoPoserSettings
+from memmlp.networks.avatar_poser import EgoPoser, EgoPoserSettings
 
 TORCH_FREE = """
 import sys
@@ -79,7 +79,7 @@ def test_declared_settings_and_those_of_the_module_are_the_same():
     assert found.kind is EgoPoser
     assert found.settings is not EgoPoserSettings  # it was read without an import
     assert [spec for spec in found.settings.__dataclass_fields__] == [*EgoPoserSettings.__dataclass_fields__]
-    assert (found.version, found.package, found.module) == (2, "memmlp", "memmlp.networks.ego_poser")
+    assert (found.version, found.package, found.module) == (2, "memmlp", "memmlp.networks.avatar_poser")
     assert collected(found.settings, "defaults") == {
         "memory": None, "predictor": None, "hand": None, "loss": "ego_poser",
     }  # fmt: skip

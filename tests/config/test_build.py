@@ -20,8 +20,7 @@ from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.runs.run import Run
-from memmlp.training.experiment import Experiment
-from memmlp.training.run_stages import make_prerequisites
+from memmlp.training.run_stages import Experiment, make_prerequisites
 
 TINY = [
     "profile=tiny", "data.synth.minutes=0.1", "loggers=none", "threads=1", "optim.steps=2", "vqvae.steps=2",
@@ -87,14 +86,15 @@ def train_and_stream(cfg: DictConfig) -> Arm:
     above = make_prerequisites(experiment, data)
     run = Run(Path(mkdtemp(dir=".", prefix="arm-")))
     weights = above.model if above else None
-    model = experiment.training.train(experiment.architecture, data, weights, run, experiment.device)
+    experiment.training.train(experiment.architecture, data, weights, run, experiment.device)
+    model = experiment.architecture.load(run.model)
     test = data.open("test")
     short = MotionDataset(test.frames[:12], torch.tensor([0]), torch.tensor([12]), test.names[:1])
-    torch.manual_seed(0)
-    results = evaluation.evaluate(model, short, experiment.evaluation.modes, 4, experiment.evaluation.ik)
+    settings = experiment.evaluation
+    results = {mode: settings.report(model, short, mode)["mean"] for mode in settings.modes}
     torch.manual_seed(0)
     motion = evaluation.stream(model, [short.frames])[0]
-    return Arm(model, [entry.values for entry in run.metrics()], motion, results["mean"])
+    return Arm(model, [entry.values for entry in run.metrics()], motion, results)
 
 
 def variants(axis: str) -> list[list[str]]:

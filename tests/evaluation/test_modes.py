@@ -5,7 +5,7 @@ import tiny
 import torch
 
 from memmlp.evaluation.modes import frame_by_frame, stream, window
-from memmlp.networks.recurrent_memory import GRUMemory, LSTMMemory
+from memmlp.networks.memory import GRUMemory, LSTMMemory
 
 CLIPS = [tiny.clip(n, seed=n).double() for n in (25, 5, 20, 16)]  # windows of 7 or 8
 

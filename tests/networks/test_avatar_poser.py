@@ -1,10 +1,11 @@
-"""AvatarPoser, part by part."""
+"""AvatarPoser and EgoPoser, part by part."""
 
+import numpy as np
 import tiny
 import torch
 
 from memmlp.evaluation import modes as evaluation
-from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.body import SPARSE_DIM, SPARSE_POSITION
 
 CLIP = tiny.clip(40)
 SPARSE = CLIP[None, :, :SPARSE_DIM]
@@ -32,3 +33,35 @@ def test_dropout_drops_in_training_alone():
     assert torch.equal(model.training_call(*call)[0], model.training_call(*call)[0])
     model.train()
     assert not torch.equal(model.training_call(*call)[0], model.training_call(*call)[0])
+
+
+@torch.no_grad()
+def test_tokens_are_an_independent_computation():
+    """Frame by frame, in NumPy: relative to the head, movement appended, every second frame added."""
+    model, window = tiny.baseline("ego_poser", frames=8).double(), CLIP[None, :8, :SPARSE_DIM].double()
+    seen = []
+    model.encode = lambda h: (seen.append(h), torch.zeros(1, 132).double())[1]
+    model.predict_rotations(window)
+    rows = []
+    for frame in window[0].numpy():
+        row = frame.copy()
+        for tracker in range(3):
+            at = SPARSE_POSITION.start + 3 * tracker
+            row[at : at + 2] -= frame[SPARSE_POSITION.start : SPARSE_POSITION.start + 2]
+        rows.append(row)
+    corners = [36, 37, 39, 40, 42, 43]
+    rows = np.array([np.concatenate([row, (row - rows[0])[corners]]) for row in rows])
+    weight, bias = (part.numpy() for part in (model.embedding.weight, model.embedding.bias))
+    pairs = zip(range(0, 8, 2), range(4, 8), strict=True)
+    expected = np.array([(rows[slow] + rows[fast]) @ weight.T + 2 * bias for slow, fast in pairs])
+    np.testing.assert_allclose(seen[0][0].numpy(), expected, atol=1e-12)
+
+
+@torch.no_grad()
+def test_where_on_the_floor_the_person_is_does_not_matter():
+    model, window = tiny.baseline("ego_poser").double(), CLIP[None, :7, :SPARSE_DIM].double()
+    elsewhere = window.clone()
+    elsewhere[..., SPARSE_POSITION] += torch.tensor([3.0, -2.0, 0.0] * 3)
+    torch.testing.assert_close(model.predict_rotations(elsewhere), model.predict_rotations(window))
+    elsewhere[..., SPARSE_POSITION] += torch.tensor([0.0, 0.0, 0.1] * 3)
+    assert not torch.allclose(model.predict_rotations(elsewhere), model.predict_rotations(window), atol=1e-3)

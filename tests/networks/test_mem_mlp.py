@@ -11,7 +11,7 @@ from memmlp.motion.dataset import WindowSampler
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
-from memmlp.networks.memory import NoMemory
+from memmlp.networks.memory import GRUMemory, LSTMMemory, NoMemory
 from memmlp.networks.own_past_memory import CodeMemory, CodeMemorySettings, JointCodeMemory, NoCodesMemory
 from memmlp.networks.predictor import (
     RotationOnlyMemorySettings,
@@ -20,7 +20,6 @@ from memmlp.networks.predictor import (
     TwoBranchMemorySettings,
     TwoBranchSettings,
 )
-from memmlp.networks.recurrent_memory import GRUMemory, LSTMMemory
 from memmlp.networks.vqvae import VQVAE
 from memmlp.training.rollout import TeacherForcing
 

@@ -11,10 +11,9 @@ from memmlp.deploy import latency
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import WindowSampler
 from memmlp.networks.mem_mlp import MemMLP
-from memmlp.networks.memory import NoMemory
+from memmlp.networks.memory import GRUMemory, LSTMMemory, NoMemory
 from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, NoCodesMemory
 from memmlp.networks.predictor import RotationOnlyMemorySettings, TwoBranchMemorySettings
-from memmlp.networks.recurrent_memory import GRUMemory, LSTMMemory
 from memmlp.networks.vqvae import VQVAE
 from memmlp.runs.run import Run
 from memmlp.training.loop import train

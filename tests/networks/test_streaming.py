@@ -18,11 +18,10 @@ from memmlp.deploy.parity import parity
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.networks.mem_mlp import MemMLP
-from memmlp.networks.memory import NoMemory
+from memmlp.networks.memory import GRUMemory, LSTMMemory, NoMemory
 from memmlp.networks.motion_model import StreamingGraph
 from memmlp.networks.own_past_memory import CodeMemory, JointCodeMemory, NoCodesMemory
 from memmlp.networks.predictor import RotationOnlySettings, TwoBranchMemorySettings, TwoBranchSettings
-from memmlp.networks.recurrent_memory import GRUMemory, LSTMMemory
 from memmlp.networks.streaming import has_stream, streaming
 
 MEMORIES = [

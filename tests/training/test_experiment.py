@@ -17,13 +17,11 @@ from omegaconf import OmegaConf
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.deploy.deployment import GRAPHS
-from memmlp.evaluation import modes as evaluation
 from memmlp.motion.dataset import MotionDataset
 from memmlp.runs.identity import NEUTRAL, flatten
 from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.run import Run
-from memmlp.training.experiment import Experiment
-from memmlp.training.run_stages import make_prerequisites
+from memmlp.training.run_stages import Experiment, make_prerequisites
 
 BASE = [
     "profile=tiny", "data=mocap", "data.root=clips", "data.split.groups=[]", "memory.shift=frame",
@@ -144,16 +142,14 @@ def outcome(folder: Path, overrides: list[str]) -> Outcome:
     codes = make_prerequisites(replace(experiment, loggers=Loggers((), folder)), data).model
     run = Run(folder / "run")
     run.folder.mkdir(parents=True)
-    model = experiment.training.train(experiment.architecture, data, codes, run, experiment.device)
+    experiment.training.train(experiment.architecture, data, codes, run, experiment.device)
+    model = experiment.architecture.load(run.model)
     found = data.open("test")
     short = MotionDataset(
         found.frames[:11], torch.tensor([0]), torch.tensor([11]), found.names[:1], found.groups[:1]
     )
-    settings = experiment.evaluation
-    reports = {
-        mode: evaluation.evaluate(model, short, [mode], settings.batch, settings.ik)["clips"]
-        for mode in settings.modes
-    }
+    evaluation = experiment.evaluation
+    reports = {mode: evaluation.report(model, short, mode)["clips"] for mode in evaluation.modes}
     return Outcome(
         {"training": identity.id, **experiment.evaluations, "deployment": experiment.deployment_id},
         {
@@ -221,21 +217,3 @@ def test_neutral_keys_are_those_that_move_nothing():
     own = {key for key in CHANGES if not key.startswith(("data.", "evaluation."))}
     neutral = {key for key in own if any(key == name or key.startswith(f"{name}.") for name in NEUTRAL)}
     assert neutral == own & (NOWHERE | {"threads", "device"})
-
-
-def test_other_synthetic_motion_is_another_identity():
-    def identity(*overrides: str) -> str:
-        synthetic = [word for word in BASE if not word.startswith("data")]
-        experiment = build_experiment(composed([*synthetic, "data.synth.minutes=0.1", *overrides]))
-        return experiment.identity(experiment.motion.prepare().digest).id
-
-    assert len({identity(), identity("data.synth.seed=1"), identity("data.synth.minutes=0.25")}) == 3
-
-
-def test_a_compiled_training_is_another():
-    """No result is made here, since compiling takes half a minute."""
-
-    def identity(*overrides: str) -> str:
-        return build_experiment(composed([*BASE, *overrides])).identity("data").id
-
-    assert identity("optim.compile=true") != identity()

@@ -10,7 +10,7 @@ from memmlp.common.errors import InputError
 from memmlp.motion.body import PARENTS, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.network_coordinates import World
 from memmlp.training.losses import TermsLoss
-from memmlp.training.losses.terms import ERRORS, TERM_FRAMES, TERMS
+from memmlp.training.losses.terms import ERRORS, TERMS
 
 TRUE = torch.stack([tiny.clip(9, 3), tiny.clip(9, 4)])
 MADE = torch.stack([tiny.clip(9, 1), tiny.clip(9, 2)])[..., SPARSE_DIM:]
@@ -128,16 +128,6 @@ def test_a_weight_of_none_leaves_a_term_out_and_the_others_are_summed():
         TermsLoss(rotation=None)
 
 
-def test_a_term_of_too_few_frames_is_refused_and_of_enough_it_is_a_number():
-    """Of a single frame the mean of velocities would be NaN."""
-    for name in TERMS:
-        needed = TERM_FRAMES.get(name, 1)
-        assert np.isfinite(terms(MADE[:, :needed], TRUE[:, :needed], **{name: 1.0})[name])
-        if needed > 1:
-            with pytest.raises(InputError, match=rf"loss\.{name}: .*{needed} frames"):
-                terms(MADE[:, : needed - 1], TRUE[:, : needed - 1], **{name: 1.0})
-
-
 def test_every_term_reaches_the_rotations():
     truth = TRUE.clone()
     feet = SPARSE_DIM + ROTATION.stop
@@ -152,7 +142,7 @@ def test_every_term_reaches_the_rotations():
 
 def test_learned_weights_begin_as_given_and_find_the_reciprocals_of_their_terms():
     """At the minimum of e^-s L + s, e^-s is 1 / L, whatever the weight that it begins at."""
-    loss = TermsLoss(weighting="learned", lr=0.05, rotation=3.0, world_position=50.0)
+    loss = TermsLoss(weighting="learned", lr=0.1, rotation=3.0, world_position=50.0)
     assert loss.weighting.weights() == pytest.approx({"rotation": 3.0, "world_position": 50.0})
     given = MADE, TRUE[..., SPARSE_DIM:], TRUE[..., :SPARSE_DIM], NORMALIZER
     total, parts = loss(*given)
@@ -162,9 +152,9 @@ def test_learned_weights_begin_as_given_and_find_the_reciprocals_of_their_terms(
     )
     assert float(total.detach()) == pytest.approx(expected, rel=1e-5)
     (group,) = loss.weighting.parameter_groups()
-    assert (group["lr"], group["weight_decay"], len(group["params"])) == (0.05, 0.0, 2)
+    assert (group["lr"], group["weight_decay"], len(group["params"])) == (0.1, 0.0, 2)
     optimiser = torch.optim.Adam([group])
-    for _ in range(400):
+    for _ in range(200):
         optimiser.zero_grad()
         loss(*given)[0].backward()
         optimiser.step()

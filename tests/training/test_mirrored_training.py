@@ -14,7 +14,7 @@ from memmlp.config.compose import composed
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.networks import checkpoint
 from memmlp.runs.run import Run
-from memmlp.training.experiment import Experiment
+from memmlp.training.run_stages import Experiment
 
 DATA = SimpleNamespace(manifest=SimpleNamespace(rest=builtin_rest_joints()), open=lambda split: tiny.frames())
 SHORT = [
@@ -47,18 +47,3 @@ def test_a_vqvae_learns_mirrored_frames_and_is_another_run(tmp_path: Path):
     assert differ(made["plain"], made["mirrored"])
     (one, _), (other, _) = (found.identities("d") for found in (plain, mirrored))
     assert one.id != other.id
-
-
-@pytest.mark.slow
-def test_a_refiner_learns_mirrored_pieces(tmp_path: Path):
-    words = ["model=vae_hmd", "refiner=sage"]
-    plain, mirrored = experiment(False, *words), experiment(True, *words)
-    assert plain.unrefined is not None
-    bare = tmp_path / "bare"
-    trained(plain.unrefined.training, plain.unrefined.architecture, None, bare)
-    made = {
-        name: trained(one.training, one.architecture, Run(bare).model, tmp_path / name)
-        for name, one in (("plain", plain), ("again", plain), ("mirrored", mirrored))
-    }
-    assert not differ(made["plain"], made["again"])
-    assert differ(made["plain"], made["mirrored"])

@@ -10,8 +10,6 @@ from memmlp.common import distributed
 from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment, config_of
 from memmlp.config.compose import composed
-from memmlp.config.compose_plan import tasks_of
-from memmlp.config.worker_process import check_identity
 from memmlp.networks.refiner import Refined
 from memmlp.runs.lookup import list_runs
 from memmlp.training.run_stages import run_in_processes
@@ -56,28 +54,6 @@ def test_its_identity_is_of_all_that_its_pieces_follow_from():
     sampled = [experiment(*words, f"model.sampling_steps={steps}").identity("d") for steps in (2, 3)]
     assert sampled[0].prerequisite.id == sampled[1].prerequisite.id
     assert sampled[0].id != sampled[1].id
-
-
-@pytest.mark.slow
-def test_a_sweep_trains_prerequisites_first():
-    """VQ-VAE, network, refiner; each task's config is one that makes its run."""
-    refined = build_experiment(composed(["profile=tiny", "refiner=sage"]))
-    tasks = tasks_of(refined, "d")
-    assert [task.kind for task in tasks] == ["vqvae", "memmlp", "memmlp"]
-    assert [task.prerequisite for task in tasks] == [None, tasks[0].id, tasks[1].id]
-    assert [bool(task.stages) for task in tasks] == [False, False, True]
-    assert tasks[1].id == build_experiment(composed(["profile=tiny"])).identity("d").id
-    assert [task.config["refiner"] is None for task in tasks] == [True, True, False]
-
-    class Data:
-        groups_digest = None
-
-        def prepare(self):
-            return type("Prepared", (), {"digest": "d"})
-
-    for task, own in zip(tasks[1:], (refined.unrefined, refined), strict=True):
-        object.__setattr__(own, "motion", Data())
-        check_identity(own, task)
 
 
 def test_several_processes_are_refused(monkeypatch):

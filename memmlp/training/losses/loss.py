@@ -113,12 +113,19 @@ class Uncertainty(nn.Module):
 
     Args:
         lr: learning rate of the s; with the model's learning rate they would settle too slowly.
+        values: the weights to begin with, by the terms' names; after `build` they are 1.
+
+    Raises:
+        InputError: for a weight of 0, which e^-s never is.
     """
 
-    def __init__(self, lr: float = 1e-2):
+    def __init__(self, lr: float = 1e-2, values: Mapping[str, float] | None = None):
         super().__init__()
         self.lr = lr
-        self.s = nn.ParameterDict()
+        if none := [name for name, value in (values or {}).items() if not value]:
+            raise InputError(f"loss.{none[0]}=0: must be above 0, or null, with loss.weighting=learned")
+        begin = {name: -torch.tensor(float(value)).log() for name, value in (values or {}).items()}
+        self.s = nn.ParameterDict({name: nn.Parameter(s) for name, s in begin.items()})
 
     def build(self, names: list[str], own: Mapping[str, float] | None = None) -> None:
         """Make a parameter s, starting at 0, for each term; `own` has fixed weights and is not used."""
@@ -137,26 +144,6 @@ class Uncertainty(nn.Module):
     def weights(self) -> Mapping[str, float]:
         """Return the present weight e^-s of each term."""
         return {name: float((-s.detach()).exp()) for name, s in self.s.items()}
-
-
-class LearnedWeights(Uncertainty):
-    """Weights by uncertainty that begin at given values instead of 1.
-
-    Args:
-        values: the weights to begin with, by the terms' names.
-        lr: learning rate of the s; see Uncertainty.
-
-    Raises:
-        InputError: for a weight of 0, which e^-s never is.
-    """
-
-    def __init__(self, values: Mapping[str, float], lr: float = 1e-2):
-        super().__init__(lr)
-        if none := [name for name, value in values.items() if not value]:
-            raise InputError(f"loss.{none[0]}=0: must be above 0, or null, with loss.weighting=learned")
-        self.s = nn.ParameterDict(
-            {name: nn.Parameter(-torch.tensor(float(value)).log()) for name, value in values.items()}
-        )
 
 
 Weighting = Fixed | Uncertainty

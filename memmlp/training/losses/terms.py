@@ -24,9 +24,9 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.training.losses.loss import (
     CompleteLossSettings,
     Fixed,
-    LearnedWeights,
     Loss,
     Terms,
+    Uncertainty,
     Weighting,
     joints,
 )
@@ -189,11 +189,6 @@ TERM_FRAMES = {
 }  # fmt: skip
 """How many frames the terms need that need several."""
 
-WEIGHTINGS: dict[str, Callable[[dict[str, float], float], Weighting]] = {
-    "fixed": lambda weights, lr: Fixed(weights),
-    "learned": LearnedWeights,
-}
-
 
 @component("loss", "terms", builds="TermsLoss")
 @dataclass
@@ -275,21 +270,8 @@ class TermsLoss(Loss):
         if not chosen:
             raise InputError(f"loss=terms: needs a weight for at least one of {', '.join(TERMS)}")
         self.error = ERRORS[error]
-        self.weighting = WEIGHTINGS[weighting](chosen, lr)
+        self.weighting: Weighting = Uncertainty(lr, chosen) if weighting == "learned" else Fixed(chosen)
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Return each term by name, from motion and truth (B, T, 198) and inputs (B, T, 54) in the world.
-
-        Raises:
-            InputError: if a term needs more frames than the motion has, as with networks that learn one frame
-                per window.
-        """
-        pair, frames = Comparison(motion, truth, sparse, normalizer), motion.shape[1]
-        found = {}
-        for name in self.weighting.weights():
-            if frames < (needed := TERM_FRAMES.get(name, 1)):
-                raise InputError(
-                    f"loss.{name}: must be null, since it needs {needed} frames; the network learns {frames}"
-                )
-            found[name] = getattr(pair, name)(self.error)
-        return found
+        pair = Comparison(motion, truth, sparse, normalizer)
+        return {name: getattr(pair, name)(self.error) for name in self.weighting.weights()}
