@@ -80,8 +80,8 @@ def resample(clip: Clip, fps: float = FPS, interpolation: str = SPLINES) -> tupl
     ratio = clip.fps / fps
     stride = round(ratio)
     if stride >= 1 and abs(ratio - stride) <= RATE_TOLERANCE * stride:
-        how = "kept" if stride == 1 else f"every {stride}. frame"
-        return replace(clip, poses=clip.poses[::stride], trans=clip.trans[::stride], fps=float(fps)), how
+        method = "kept" if stride == 1 else f"every {stride}. frame"
+        return replace(clip, poses=clip.poses[::stride], trans=clip.trans[::stride], fps=float(fps)), method
     if len(clip) < 2:
         raise InputError(f"{clip.name}: one frame at {clip.fps:g} Hz cannot be brought to {fps:g} Hz")
     from scipy.spatial.transform import Rotation, RotationSpline, Slerp  # 0.4 s to import
@@ -108,7 +108,7 @@ CLOSE = 2e-3  # relative: 29.97, 59.94 and 119.88 Hz are rates of video
 
 def nearest_rate(rate: float) -> float:
     """Return the usual or rare rate that is nearest to a rate, relatively, Hz."""
-    return float(min(USUAL_RATES + RARE_RATES, key=lambda known: max(known / rate, rate / known)))
+    return float(min(USUAL_RATES + RARE_RATES, key=lambda usual: max(usual / rate, rate / usual)))
 
 
 def is_known_rate(rate: float) -> bool:

@@ -131,21 +131,21 @@ def plan_export(source: Path, out: Path, name: str | None = None) -> ExportPlan:
     """
     if not source.exists():
         raise InputError(f"{source}: no such file or folder; expected an npz file, or a folder of npz files")
-    chosen = choose_format(out, name, folder=source.is_dir())
+    target_format = choose_format(out, name, folder=source.is_dir())
     if not source.is_dir():
         if out.resolve() == source.resolve():
             raise InputError(f"--out {out}: must not be the source itself")
-        return ExportPlan((Target(source.stem, source, out),), chosen)
+        return ExportPlan((Target(source.stem, source, out),), target_format)
     above, below = source.resolve(), out.resolve()
     if below.is_relative_to(above) or above.is_relative_to(below):
         raise InputError(f"--out {out}: must not be in {source}, or around it; expected a folder beside it")
-    found = find_clips(source)
-    names = {file: clip_name(file) for file in found.files}
+    content = find_clips(source)
+    names = {file: clip_name(file) for file in content.files}
     first, count = Counter(names.values()).most_common(1)[0]
     if count > 1:
         raise InputError(f"{source / first}: {count} npz files with this name; expected one")
-    targets = tuple(Target(n, source / file, out / (n + chosen.suffix)) for file, n in names.items())
-    return ExportPlan(targets, chosen, tuple(Skipped(*each) for each in found.unreadable.items()))
+    targets = tuple(Target(n, source / file, out / (n + target_format.suffix)) for file, n in names.items())
+    return ExportPlan(targets, target_format, tuple(Skipped(*each) for each in content.unreadable.items()))
 
 
 def choose_format(out: Path, name: str | None, folder: bool) -> Format:
@@ -163,10 +163,10 @@ def choose_format(out: Path, name: str | None, folder: bool) -> Format:
         raise InputError(f"--out {out}: must be a file for one clip, not a folder")
     if folder:
         return FORMATS[str(name)]
-    chosen = format_of(out, "--out")
-    if name is not None and FORMATS[name] is not chosen:
+    suffix_format = format_of(out, "--out")
+    if name is not None and FORMATS[name] is not suffix_format:
         raise InputError(f"--out {out}: the suffix must be {FORMATS[name].suffix} for --format {name}")
-    return chosen
+    return suffix_format
 
 
 def export(
@@ -224,7 +224,7 @@ def export_converted(
         for target in progress_bar(plan.targets, "export"):
             try:
                 clip = read_clip(target.source, target.name)
-                found = check_plausible(target.source, clip)
+                clip_faults = check_plausible(target.source, clip)
                 content = prepare(target, clip)
             except InputError as error:
                 no_motion = isinstance(error, NoMotion)  # AMASS has files of shapes beside its clips
@@ -233,7 +233,7 @@ def export_converted(
                 reason = str(error).removeprefix(one_line(f"{target.source}: "))
                 skipped.extend([] if no_motion else [Skipped(target.name + target.source.suffix, reason)])
                 continue
-            faults.update({target.name: found} if found else {})
+            faults.update({target.name: clip_faults} if clip_faults else {})
             yield target, content
 
     contents = read()

@@ -95,10 +95,10 @@ class MotionSource:
         if not self.partial and split.listed:
             names = [clip_name(file) for file in find_clips(root).files]
             Coverage.of(split.listed, split.missing(names)).check(root)
-        found = Prepared(self.cache, prepare(self.clips, self.cache))
+        prepared = Prepared(self.cache, prepare(self.clips, self.cache))
         if not self.partial:
-            found.manifest.coverage.check(root)
-        return found
+            prepared.manifest.coverage.check(root)
+        return prepared
 
     def digest(self) -> str | None:
         """Return the digest of the prepared data; None if the cache is missing or out of date."""

@@ -84,8 +84,8 @@ def prepare(root: Path, overrides: tuple[str, ...], out: Path) -> None:
     from memmlp.config.compose import composed
     from memmlp.motion.preparing.cache import prepare as prepare_cache
 
-    chosen = any(override.startswith("data=") for override in overrides)
-    cfg = composed([*([] if chosen else ["data=mocap"]), *overrides, "data.root=."])
+    has_protocol = any(override.startswith("data=") for override in overrides)
+    cfg = composed([*([] if has_protocol else ["data=mocap"]), *overrides, "data.root=."])
     OmegaConf.update(cfg, "data.root", str(root))
     show_manifest(prepare_cache(build_motion(cfg).clips, out))
 
@@ -103,13 +103,13 @@ def inspect(path: Path) -> None:
     if (path / MANIFEST).is_file():
         show_manifest(Manifest.load(path))
         return
-    found = survey(path)
-    show_skipped(found.skipped)
-    show_pairs("unusual", found.unusual, ": ")
-    show_pairs("the same frames, or some of them", found.duplicates)
-    show_rates(found.clips)
-    hours = Total(len(found.clips), sum(clip.length for clip in found.clips)).hours
-    click.echo(f"{len(found.clips)} clips, {hours:.2f} h, {len(found.skipped)} bad files")
+    content = survey(path)
+    show_skipped(content.skipped)
+    show_pairs("unusual", content.unusual, ": ")
+    show_pairs("the same frames, or some of them", content.duplicates)
+    show_rates(content.clips)
+    hours = Total(len(content.clips), sum(clip.length for clip in content.clips)).hours
+    click.echo(f"{len(content.clips)} clips, {hours:.2f} h, {len(content.skipped)} bad files")
 
 
 @data.command("export")

@@ -70,8 +70,8 @@ def import_(
     maps = ", ".join(sorted({clip.skeleton for clip in report.clips}))
     click.echo(f"{amount(len(report.clips), seconds)}, skeleton {maps}, in {out}")
     grouping = grouping_to_choose([Path(clip.clip).with_suffix("").as_posix() for clip in report.clips])
-    chosen = [f"data/grouping@data.split={grouping}"] if grouping else []
-    click.echo("next: " + shlex.join(["memmlp", "train", "data=mocap", f"data.root={out}", *chosen]))
+    group_overrides = [f"data/grouping@data.split={grouping}"] if grouping else []
+    click.echo("next: " + shlex.join(["memmlp", "train", "data=mocap", f"data.root={out}", *group_overrides]))
 
 
 def _rates(texts: Sequence[str]) -> dict[str, float]:
@@ -104,8 +104,8 @@ def _floor(text: str) -> str | float:
 @skeleton_option
 @body_option
 @up_option
-@click.option("--all", "every", is_flag=True, help="Show every file and not only those with faults.")
-def verify(source: Path, skeleton: str | None, body: str, up: str | None, every: bool) -> None:
+@click.option("--all", "show_all", is_flag=True, help="Show every file and not only those with faults.")
+def verify(source: Path, skeleton: str | None, body: str, up: str | None, show_all: bool) -> None:
     """Check imports against the files themselves.
 
     Each file is imported, and the result is compared with the file's own joints: "worst mm" is the largest
@@ -130,7 +130,7 @@ def verify(source: Path, skeleton: str | None, body: str, up: str | None, every:
         errors.append((row.mm.value, row.degrees.value))
         sound += not row.faults
         bad += [f"{row.name}: {fault}" for fault in row.faults]
-        if every or row.faults:
+        if show_all or row.faults:
             numbers = (str(row.frames), f"{row.mm.value:.4f}", f"{row.degrees.value:.4f}")
             table.add_row(row.name, row.skeleton, *numbers, f"{row.mm}\n{row.degrees}")
     if table.row_count:
@@ -169,14 +169,14 @@ def guess(file: Path, out: Path | None) -> None:
     if out is not None:
         write_map(out, text)
     try:
-        done = check(recording, proposed)
+        converted = check(recording, proposed)
     except InputError as error:
         raise click.ClickException(f"the file cannot be imported with this map: {error}") from None
-    for fault in done.fidelity.faults:
+    for fault in converted.fidelity.faults:
         click.echo(f"warning: {fault}", err=True)
-    faults = len(done.fidelity.faults)
+    faults = len(converted.fidelity.faults)
     click.echo(
-        f"imports from {done.fitted.stance.source}, with {faults} fault{'s' * (faults != 1)}", err=True
+        f"imports from {converted.fitted.stance.source}, with {faults} fault{'s' * (faults != 1)}", err=True
     )
     click.echo(f"next: memmlp data skeleton show {file} --skeleton {out or 'MAP'} --out PNG", err=True)
 
@@ -184,10 +184,10 @@ def guess(file: Path, out: Path | None) -> None:
 @skeleton.command("show")
 @click.argument("file", type=PATH)
 @click.option(
-    "--skeleton", "which", help="A shipped map or the path of one.  [default: by the joints' names]"
+    "--skeleton", "map_name", help="A shipped map or the path of one.  [default: by the joints' names]"
 )
 @click.option("--out", required=True, type=PATH, help="The picture, a .png.")
-def show(file: Path, which: str | None, out: Path) -> None:
+def show(file: Path, map_name: str | None, out: Path) -> None:
     """Draw the stance that a file's skeleton is read from, with the nodes that a map picks.
 
     The built-in body stands beside it in the same stance: if the two differ, the map is wrong.
@@ -201,7 +201,7 @@ def show(file: Path, which: str | None, out: Path) -> None:
 
     check_picture(out, "--out", (".png",))
     recording = read_recording(file)
-    chosen = find_skeleton(recording, None if which is None else load_skeleton(which))
-    stance = view_stance(recording, chosen, load_rest_joints("builtin"))
-    write_skeleton_picture(out, stance, f"{file.name}: {chosen.name}")
-    click.echo(f"{chosen.name}, read from {stance.source}: {out}")
+    skeleton_map = find_skeleton(recording, None if map_name is None else load_skeleton(map_name))
+    stance = view_stance(recording, skeleton_map, load_rest_joints("builtin"))
+    write_skeleton_picture(out, stance, f"{file.name}: {skeleton_map.name}")
+    click.echo(f"{skeleton_map.name}, read from {stance.source}: {out}")

@@ -35,8 +35,8 @@ def show_manifest(manifest: Manifest) -> None:
         table.add_row(part, str(total.clips), str(total.frames), f"{total.hours:.3f}")
     Console(highlight=False).print(table)
     for source in manifest.sources:
-        own = tuple(clip for clip in manifest.clips if source_of(clip.name) == source)
-        totals = replace(manifest, clips=own).totals.items()
+        clips = tuple(clip for clip in manifest.clips if source_of(clip.name) == source)
+        totals = replace(manifest, clips=clips).totals.items()
         parts = [f"{part} {total.clips} clips, {total.hours:.3f} h" for part, total in totals]
         click.echo(f"{source}: {'; '.join(parts)}")
     if manifest.split["kind"] == "persons":
@@ -73,9 +73,9 @@ def show_persons(manifest: Manifest) -> None:
 
 def show_rates(clips: tuple[ClipRecord, ...], interpolation: str = "") -> None:
     """Print the frame rates of clips, and how each was brought to 60 Hz; with the interpolation, if given."""
-    for (fps, how), count in sorted(Counter((clip.fps, clip.resampling) for clip in clips).items()):
-        by = f" by {interpolation}" if interpolation and how == INTERPOLATED else ""
-        click.echo(f"{count} clips at {fps:g} Hz: {how}{by}")
+    for (fps, method), count in sorted(Counter((clip.fps, clip.resampling) for clip in clips).items()):
+        detail = f" by {interpolation}" if interpolation and method == INTERPOLATED else ""
+        click.echo(f"{count} clips at {fps:g} Hz: {method}{detail}")
 
 
 def show_pairs(label: str, pairs: Mapping[str, str], sign: str = " = ") -> None:

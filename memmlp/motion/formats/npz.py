@@ -112,8 +112,8 @@ def _find_keys(file: _Npz) -> tuple[dict[str, tuple[int, ...]], str, str]:
     trans = next((key for key in TRANSLATIONS if key in file.names), None)
     rate = next((key for key in FRAME_RATES if key in file.names), None)
     if layout is None or trans is None or rate is None:
-        found = {"poses": layout, "trans": trans, "mocap_framerate": rate}
-        missing = ", ".join(key for key, value in found.items() if value is None)
+        keys = {"poses": layout, "trans": trans, "mocap_framerate": rate}
+        missing = ", ".join(key for key, value in keys.items() if value is None)
         raise InputError(f"{file.path}: no {missing} in it, so it is not AMASS motion")
     return layout, trans, rate
 

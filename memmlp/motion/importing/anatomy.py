@@ -223,5 +223,5 @@ def hinge(upper: np.ndarray, positions: np.ndarray, joint: int) -> np.ndarray | 
     bones = unit(positions[:, middle] - positions[:, joint]), unit(positions[:, end] - positions[:, middle])
     bends = np.einsum("nij,ni->nj", upper, np.cross(*bones))
     total, sizes = bends.sum(0), np.linalg.norm(bends, axis=-1)
-    known = sizes.mean() > HINGE_BEND and np.linalg.norm(total) > HINGE_AGREEMENT * sizes.sum()
-    return unit(total) if known else None
+    is_clear = sizes.mean() > HINGE_BEND and np.linalg.norm(total) > HINGE_AGREEMENT * sizes.sum()
+    return unit(total) if is_clear else None

@@ -70,7 +70,7 @@ JUMPED = 0.05  # a smaller step, in multiples of the skeleton's size, does not c
 
 
 @dataclass(frozen=True)
-class Converted:
+class Conversion:
     """A recording converted to the body.
 
     Attributes:
@@ -82,7 +82,7 @@ class Converted:
     """
 
     clip: Clip
-    fitted: Fitted
+    fitted: Retargeting
     fidelity: Fidelity
     floor: float | None
 
@@ -95,7 +95,7 @@ def convert(
     name: str,
     fps: float,
     floor: str | float = AUTO,
-) -> Converted:
+) -> Conversion:
     """Convert a recording to a body.
 
     Args:
@@ -116,7 +116,7 @@ def convert(
     else:
         height = None if floor == NONE else float(floor) * fitted.scale
     clip = replace(clip, trans=clip.trans - [0.0, 0.0, height or 0.0])
-    return Converted(clip, fitted, compare(clip, fitted.motion, rest, skeleton.name), height)
+    return Conversion(clip, fitted, compare(clip, fitted.motion, rest, skeleton.name), height)
 
 
 # Stance and conversion
@@ -142,7 +142,7 @@ class Stance:
 
 
 @dataclass(frozen=True)
-class Fitted:
+class Retargeting:
     """The motion of a recording's mapped joints, and the constants that convert it to a body.
 
     Attributes:
@@ -204,7 +204,7 @@ def find_stance(recording: Recording, skeleton: SkeletonMap, motion: MappedMotio
     return stance(motion.rotations[frame], positions[frame], nodes, f"{STRAIGHTEST} {frame}")
 
 
-def fit(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -> Fitted:
+def fit(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -> Retargeting:
     """Fit a recording's skeleton to a body's rest joints (22, 3), metres.
 
     Raises:
@@ -219,10 +219,10 @@ def fit(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -> Fitted
         _turn_to_hinges(turned, stance, motion, rest)
     corrections = stance.rotations.swapaxes(-1, -2) @ turned
     scale = float(_leg_length(rest) / np.median(_leg_length(motion.positions)))
-    return Fitted(skeleton, motion, stance, corrections, scale)
+    return Retargeting(skeleton, motion, stance, corrections, scale)
 
 
-def to_body(fitted: Fitted, rest: np.ndarray, name: str, fps: float) -> Clip:
+def to_body(fitted: Retargeting, rest: np.ndarray, name: str, fps: float) -> Clip:
     """Return mapped motion as a clip on the body that it was fitted to, in the world (Z up).
 
     The middle of the hips is at its place in the recording, scaled by the ratio of leg lengths.

@@ -18,7 +18,7 @@ from memmlp.common.errors import InputError
 from memmlp.motion.body import JOINTS, builtin_rest_joints
 from memmlp.motion.formats.recording import END, Recording
 from memmlp.motion.importing.anatomy import CHAINS
-from memmlp.motion.importing.convert import JUMP, Converted, convert, first_step
+from memmlp.motion.importing.convert import JUMP, Conversion, convert, first_step
 from memmlp.motion.importing.skeleton_map import REQUIRED, SkeletonMap, without_namespace
 
 LEG = {  # joint of a leg -> words for it, the clearest first
@@ -89,24 +89,24 @@ def split_words(name: str) -> NodeWords:
 def guess(recording: Recording, name: str) -> Guess:
     """Propose a map with the given name for a file."""
     tree = _Tree(recording)
-    found: dict[str, int] = {}
+    node_of: dict[str, int] = {}
     for side in ("left", "right"):
         leg, arm = tree.limb(side, LEG), tree.limb(side, ARM)
-        found |= {f"{side}_{part}": node for part, node in (leg | arm).items()}
+        node_of |= {f"{side}_{part}": node for part, node in (leg | arm).items()}
         if "shoulder" in arm:
             above = tree.line(arm["shoulder"])[:-1]
             collars = [n for n in above if tree.words[n].word in COLLAR and tree.words[n].side == side]
-            found |= {f"{side}_collar": collars[-1]} if collars else {}
-    by_name = set(found)
-    found |= tree.trunk(found)
+            node_of |= {f"{side}_collar": collars[-1]} if collars else {}
+    by_name = set(node_of)
+    node_of |= tree.trunk(node_of)
     by_name |= {
-        joint for joint in ("neck", "head") if joint in found and joint in tree.words[found[joint]].word
+        joint for joint in ("neck", "head") if joint in node_of and joint in tree.words[node_of[joint]].word
     }
     for side in ("left", "right"):
-        ankle = found.get(f"{side}_ankle")
-        tips = [] if ankle is None or f"{side}_foot" in found else tree.children(ankle)
-        found |= {f"{side}_foot": tips[0]} if len(tips) == 1 else {}
-    joints = {joint: recording.nodes[found[joint]] for joint in JOINTS if joint in found}
+        ankle = node_of.get(f"{side}_ankle")
+        tips = [] if ankle is None or f"{side}_foot" in node_of else tree.children(ankle)
+        node_of |= {f"{side}_foot": tips[0]} if len(tips) == 1 else {}
+    joints = {joint: recording.nodes[node_of[joint]] for joint in JOINTS if joint in node_of}
     skeleton = SkeletonMap(name, joints, calibration_frame=first_step(recording) > JUMP)
     return Guess(skeleton, tuple(joint for joint in joints if joint not in by_name))
 
@@ -133,18 +133,18 @@ class _Tree:
 
     def limb(self, side: str, parts: dict[str, tuple[str, ...]]) -> dict[str, int]:
         """Return the joints of a limb that names identify, each below the one before it."""
-        found: dict[str, int] = {}
+        node_of: dict[str, int] = {}
         for part, spellings in parts.items():
-            above = next(reversed(found.values()), None)
+            above = next(reversed(node_of.values()), None)
             below = [
                 node
                 for node in range(len(self.nodes))
                 if not self.is_end(node) and (above is None or above in self.line(node)[:-1])
             ]
-            named = [n for word in spellings for n in below if self.words[n] == (side, word)]
-            if named:
-                found[part] = named[0]
-        return found
+            matches = [n for word in spellings for n in below if self.words[n] == (side, word)]
+            if matches:
+                node_of[part] = matches[0]
+        return node_of
 
     def trunk(self, limbs: dict[str, int]) -> dict[str, int]:
         """Return pelvis, spine, neck and head, given the joints of the limbs."""
@@ -155,25 +155,25 @@ class _Tree:
         hips, shoulders = ([n for n in left if n in right] for left, right in (lines[:2], lines[2:]))
         shared = [node for node in hips if node in shoulders]  # down to where legs and arms part
         spine = shoulders[len(shared) :]
-        found = {"pelvis": shared[-1]}
+        node_of = {"pelvis": shared[-1]}
         if spine:
-            picked = np.linspace(0, len(spine) - 1, min(3, len(spine))).astype(int)
-            found |= {f"spine{step}": spine[index] for step, index in enumerate(picked, start=1)}
+            indices = np.linspace(0, len(spine) - 1, min(3, len(spine))).astype(int)
+            node_of |= {f"spine{step}": spine[index] for step, index in enumerate(indices, start=1)}
         heads = [n for n, words in enumerate(self.words) if words.word == "head" and not self.is_end(n)]
         if heads:
             line = self.line(heads[0])
         else:  # the longest line of nodes above the shoulders that is not an arm
             arms = {node for arm in lines[2:] for node in arm} - set(shoulders)
-            every = [self.line(n) for n in range(len(self.nodes))]
-            line = max((x for x in every if shoulders[-1] in x and not arms & set(x)), key=len)
+            lines_to_all = [self.line(n) for n in range(len(self.nodes))]
+            line = max((x for x in lines_to_all if shoulders[-1] in x and not arms & set(x)), key=len)
         above = [node for node in line if node not in shoulders and not self.is_end(node)]
         if above:
             necks = [node for node in above[:-1] if "neck" in self.words[node].word] or above[:-1]
-            found |= {"head": above[-1]} | ({"neck": necks[0]} if necks else {})
-        return found
+            node_of |= {"head": above[-1]} | ({"neck": necks[0]} if necks else {})
+        return node_of
 
 
-def check(recording: Recording, proposed: Guess) -> Converted:
+def check(recording: Recording, proposed: Guess) -> Conversion:
     """Convert a file to the built-in body with a proposed map.
 
     Raises:

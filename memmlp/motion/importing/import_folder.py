@@ -20,14 +20,14 @@ from memmlp.motion.clip import FRAME_RATE_RANGE, Skipped
 from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.formats.recording import Recording
 from memmlp.motion.geometry import one_thread
-from memmlp.motion.importing.convert import AUTO, JUMP, STRAIGHTEST, Converted, convert, first_step
+from memmlp.motion.importing.convert import AUTO, JUMP, STRAIGHTEST, Conversion, convert, first_step
 from memmlp.motion.importing.fidelity import Fidelity, compare
 from memmlp.motion.importing.recordings import Rate, find_rate, find_recordings, folder_key, read_recording
 from memmlp.motion.importing.skeleton_map import SkeletonMap, find_skeleton, is_number, load_skeleton
 
 
 @dataclass(frozen=True)
-class Imported:
+class ImportedClip:
     """One imported clip.
 
     Attributes:
@@ -77,7 +77,7 @@ class ImportReport:
         skipped: the files that were skipped.
     """
 
-    clips: tuple[Imported, ...]
+    clips: tuple[ImportedClip, ...]
     notes: tuple[str, ...]
     skipped: tuple[Skipped, ...]
 
@@ -108,27 +108,27 @@ class ImportSettings:
     up: str | None = None
 
 
-def import_folder(source: Path, out: Path, how: ImportSettings | None = None) -> ImportReport:
+def import_folder(source: Path, out: Path, settings: ImportSettings | None = None) -> ImportReport:
     """Write each file of a folder, or a single file, as out/<its path>.npz, and a record as out/import.json.
 
     Args:
         source: folder or file.
         out: folder; it must not hold other clips than this import's.
-        how: the settings.
+        settings: the settings.
 
     Raises:
         InputError: with nothing written, if there are no files, several of the same name, a rate that fits no
             folder, clips of another import in `out`, or no file that could be imported; also if `out` cannot
             be written.
     """
-    how, files = how or ImportSettings(), find_recordings(source)
-    _check_import(files, out, how)
-    how = replace(how, strict=how.strict or len(files) == 1)
-    rest, clips, skipped = load_rest_joints(how.body), [], list[Skipped]()
+    settings, files = settings or ImportSettings(), find_recordings(source)
+    _check_import(files, out, settings)
+    settings = replace(settings, strict=settings.strict or len(files) == 1)
+    rest, clips, skipped = load_rest_joints(settings.body), [], list[Skipped]()
     with _make_staging(out) as staging:
         folder = Path(staging) / "clips"
         folder.mkdir()
-        for relative, result in _convert_all(files, how, rest):
+        for relative, result in _convert_all(files, settings, rest):
             if isinstance(result, Skipped):
                 skipped.append(result)
                 continue
@@ -137,17 +137,17 @@ def import_folder(source: Path, out: Path, how: ImportSettings | None = None) ->
         if not clips:
             first = f"the first: {skipped[0].file}: {skipped[0].reason}"
             raise InputError(f"{source}: no usable file of {len(files)}; {first}")
-        report = ImportReport(tuple(clips), tuple(_notes(clips, how)), tuple(skipped))
-        _publish(folder, out, report, body_record(how.body, rest))
+        report = ImportReport(tuple(clips), tuple(_notes(clips, settings)), tuple(skipped))
+        _publish(folder, out, report, body_record(settings.body, rest))
     return report
 
 
-def verify_folder(source: Path, how: ImportSettings | None = None) -> Iterator[Fidelity | Skipped]:
+def verify_folder(source: Path, settings: ImportSettings | None = None) -> Iterator[Fidelity | Skipped]:
     """Import each file of a folder, or a single one, on trial, and compare the npz with the file.
 
     Args:
         source: folder or file.
-        how: the settings.
+        settings: the settings.
 
     Yields:
         The comparison, or the reason why a file cannot be imported.
@@ -155,9 +155,9 @@ def verify_folder(source: Path, how: ImportSettings | None = None) -> Iterator[F
     Raises:
         InputError: if there is no file, or no such skeleton or body.
     """
-    how = how or ImportSettings()
-    rest = load_rest_joints(how.body)
-    for relative, result in _convert_all(find_recordings(source), how, rest):
+    settings = settings or ImportSettings()
+    rest = load_rest_joints(settings.body)
+    for relative, result in _convert_all(find_recordings(source), settings, rest):
         if isinstance(result, Skipped):
             yield result
             continue
@@ -175,47 +175,49 @@ class _Result:
     recording: Recording
     skeleton: SkeletonMap
     rate: Rate
-    converted: Converted
+    converted: Conversion
 
 
 def _convert_all(
-    files: Mapping[Path, Path], how: ImportSettings, rest: np.ndarray
+    files: Mapping[Path, Path], settings: ImportSettings, rest: np.ndarray
 ) -> Iterator[tuple[Path, _Result | Skipped]]:
     """Yield each file's path below the folder with the clip made of it, or with why it is skipped."""
-    chosen = None if how.skeleton is None else load_skeleton(how.skeleton)
+    user_map = None if settings.skeleton is None else load_skeleton(settings.skeleton)
     for relative, path in progress_bar(files.items(), "import", len(files)):
         try:
             recording = read_recording(path)
-            skeleton = find_skeleton(recording, chosen).with_up(how.up)
-            rate, name = find_rate(recording, relative, how.fps), relative.with_suffix("").as_posix()
+            skeleton = find_skeleton(recording, user_map).with_up(settings.up)
+            rate, name = find_rate(recording, relative, settings.fps), relative.with_suffix("").as_posix()
             with one_thread():
-                converted = convert(recording, skeleton, rest, name=name, fps=rate.fps, floor=how.floor)
-            if how.sound and converted.fidelity.faults:
+                converted = convert(recording, skeleton, rest, name=name, fps=rate.fps, floor=settings.floor)
+            if settings.sound and converted.fidelity.faults:
                 faults = "; ".join(converted.fidelity.faults)
                 raise InputError(f"{path}: {faults}; --sound expects clips without faults")
         except InputError as error:
-            if how.strict:
+            if settings.strict:
                 raise
             yield relative, Skipped(relative.as_posix(), str(error).replace(f"{path}: ", ""))
         else:
             yield relative, _Result(recording, skeleton, rate, converted)
 
 
-def _check_import(files: Mapping[Path, Path], out: Path, how: ImportSettings) -> None:
+def _check_import(files: Mapping[Path, Path], out: Path, settings: ImportSettings) -> None:
     """Raise InputError for two sources of one clip, foreign clips in `out`, or wrong rates."""
     npz, count = Counter(relative.with_suffix(".npz") for relative in files).most_common(1)[0]
     if count > 1:
         raise InputError(f"{npz.with_suffix('').as_posix()}: {count} recordings of this name; expected one")
-    own = {path.with_suffix(".npz") for path in files}
-    foreign = sorted({path.relative_to(out) for path in out.rglob("*.npz")} - own)
+    expected = {path.with_suffix(".npz") for path in files}
+    foreign = sorted({path.relative_to(out) for path in out.rglob("*.npz")} - expected)
     if foreign or (out.exists() and not out.is_dir()):
         problem = f"has other clips, such as {foreign[0].as_posix()}" if foreign else "is a file"
         raise InputError(f"{out}: {problem}; must be a new folder, or that of the same import")
     folders = sorted({folder_key(folder) for relative in files for folder in relative.parents})
-    for folder, rate in how.fps.items():
+    for folder, rate in settings.fps.items():
         if folder not in folders or not is_number(rate, *FRAME_RATE_RANGE):
-            known = ", ".join(map(repr, folders))
-            raise InputError(f"--fps {folder}={rate!r}: must be 1 to 1000 Hz for one of {known} ('' is all)")
+            choices = ", ".join(map(repr, folders))
+            raise InputError(
+                f"--fps {folder}={rate!r}: must be 1 to 1000 Hz for one of {choices} ('' is all)"
+            )
 
 
 def _make_staging(out: Path) -> tempfile.TemporaryDirectory:
@@ -226,9 +228,9 @@ def _make_staging(out: Path) -> tempfile.TemporaryDirectory:
         raise InputError(f"{out}: cannot be written ({error.strerror})") from error
 
 
-def _describe_clip(relative: Path, result: _Result) -> Imported:
+def _describe_clip(relative: Path, result: _Result) -> ImportedClip:
     converted, recording = result.converted, result.recording
-    return Imported(
+    return ImportedClip(
         source=relative.as_posix(),
         sha256=hashlib.sha256(recording.path.read_bytes()).hexdigest(),
         clip=relative.with_suffix(".npz").as_posix(),
@@ -269,7 +271,7 @@ def _publish(staging: Path, out: Path, report: ImportReport, body: Mapping[str, 
         raise InputError(f"{out}: cannot be written ({error.strerror})") from error
 
 
-def _notes(clips: Sequence[Imported], how: ImportSettings) -> Iterator[str]:
+def _notes(clips: Sequence[ImportedClip], settings: ImportSettings) -> Iterator[str]:
     """Yield notes for the user, one line each."""
     corrected: dict[str, list[str]] = {}
     for clip in clips:
@@ -280,13 +282,13 @@ def _notes(clips: Sequence[Imported], how: ImportSettings) -> Iterator[str]:
     for correction, names in corrected.items():
         yield f"{correction} ({_name_first(names, 3)})"
     for name in sorted({clip.skeleton for clip in clips}):
-        own = [clip for clip in clips if clip.skeleton == name]
+        clips_of_map = [clip for clip in clips if clip.skeleton == name]
         for key in ("up", "unit"):
-            found = Counter(getattr(clip, key) for clip in own)
-            if len(found) > 1:
-                several = ", ".join(f"{value} in {count} clips" for value, count in found.most_common())
+            counts = Counter(getattr(clip, key) for clip in clips_of_map)
+            if len(counts) > 1:
+                several = ", ".join(f"{value} in {count} clips" for value, count in counts.most_common())
                 yield f"{name}: {key} is found as {several}; set it in the map if that is wrong"
-        count = sum(clip.stance.startswith(STRAIGHTEST) for clip in own)
+        count = sum(clip.stance.startswith(STRAIGHTEST) for clip in clips_of_map)
         if count > 1:
             yield (
                 f"{name}: the zero pose of {count} clips is not a stance, so each is read from its own "
@@ -298,7 +300,7 @@ def _notes(clips: Sequence[Imported], how: ImportSettings) -> Iterator[str]:
             "calibration_frame: true in a custom map leaves it out"
         )
     floorless = [clip.source for clip in clips if clip.floor is None]
-    if how.floor == AUTO and floorless:
+    if settings.floor == AUTO and floorless:
         yield f"{_name_first(floorless, 1)}: no foot stands still, so the floor is as in the file"
 
 

@@ -74,8 +74,8 @@ def load_skeleton(which: str) -> SkeletonMap:
     """
     path = SKELETONS / f"{which}.yaml" if which in shipped_skeletons() else Path(which)
     if not path.is_file():
-        known = ", ".join(shipped_skeletons())
-        raise InputError(f"--skeleton {which}: must be one of {known}, or the path of a YAML map")
+        names = ", ".join(shipped_skeletons())
+        raise InputError(f"--skeleton {which}: must be one of {names}, or the path of a YAML map")
     try:
         content = yaml.load(path.read_text("utf-8"), _StrictLoader)
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
@@ -83,7 +83,7 @@ def load_skeleton(which: str) -> SkeletonMap:
     return _parse(path, content)
 
 
-def find_skeleton(recording: Recording, chosen: SkeletonMap | None = None) -> SkeletonMap:
+def find_skeleton(recording: Recording, user_map: SkeletonMap | None = None) -> SkeletonMap:
     """Find the shipped map all of whose nodes the file has; of several maps, the one with the most nodes.
 
     Of maps with equally many nodes, the one that finds unit and up axis in the file is preferred. Spellings
@@ -93,8 +93,8 @@ def find_skeleton(recording: Recording, chosen: SkeletonMap | None = None) -> Sk
     Raises:
         InputError: if no map fits, or several fit equally well.
     """
-    if chosen is not None:
-        return _respell(chosen, recording) or chosen
+    if user_map is not None:
+        return _respell(user_map, recording) or user_map
     maps = _load_shipped(SKELETONS)
     fitting = [fitted for skeleton in maps if (fitted := _respell(skeleton, recording)) is not None]
 
@@ -106,11 +106,11 @@ def find_skeleton(recording: Recording, chosen: SkeletonMap | None = None) -> Sk
     if len(fitting) == 1:
         return fitting[0]
     problem = "fits more than one skeleton" if fitting else "has an unknown skeleton"
-    known = ", ".join(skeleton.name for skeleton in fitting or maps)
-    names = [name for name in recording.nodes if not name.endswith(END)]
-    listed = ", ".join(names[:60]) + (", ..." if len(names) > 60 else "")
+    names = ", ".join(skeleton.name for skeleton in fitting or maps)
+    joint_names = [name for name in recording.nodes if not name.endswith(END)]
+    listed = ", ".join(joint_names[:60]) + (", ..." if len(joint_names) > 60 else "")
     raise InputError(
-        f"{recording.path}: {problem} with the joints {listed}; expected {known}, or a map by --skeleton"
+        f"{recording.path}: {problem} with the joints {listed}; expected {names}, or a map by --skeleton"
     )
 
 
@@ -158,10 +158,10 @@ def find_nodes(nodes: Sequence[str], names: Sequence[str]) -> dict[str, str] | N
     keys = [_key(name) for name in without_namespace(nodes)]
     count = Counter(keys)
     unique = {key: node for key, node in zip(keys, nodes, strict=True) if count[key] == 1}
-    found = {name: name if name in nodes else unique.get(_key(name)) for name in names}
-    if None in found.values() or len(set(found.values())) < len(found):
+    node_of = {name: name if name in nodes else unique.get(_key(name)) for name in names}
+    if None in node_of.values() or len(set(node_of.values())) < len(node_of):
         return None
-    return {name: str(node) for name, node in found.items()}
+    return {name: str(node) for name, node in node_of.items()}
 
 
 def _key(name: str) -> str:

@@ -74,9 +74,9 @@ def prepare(source: ClipFolder, out: Path) -> Manifest:
         out.mkdir(parents=True, exist_ok=True)
         with Lock(out).hold():
             request = _request_digest(source, rest)
-            found = _load_finished(out, request)
-            if found and not (source.strict and found.skipped):
-                return found
+            manifest = _load_finished(out, request)
+            if manifest and not (source.strict and manifest.skipped):
+                return manifest
             manifest = _plan(source, rest, request)
             _write(source, rest, manifest, out)
             return manifest
@@ -97,26 +97,28 @@ def _plan(source: ClipFolder, rest: np.ndarray, request: str) -> Manifest:
     from memmlp.motion.preparing.duplicates import assign_parts  # scipy takes 0.4 s to import
     from memmlp.motion.preparing.survey import survey
 
-    found, split = survey(source.root, source.min_frames, source.strict), source.split
-    if not found.clips:
-        first = f"; the first: {found.skipped[0].file}: {found.skipped[0].reason}" if found.skipped else ""
+    summary, split = survey(source.root, source.min_frames, source.strict), source.split
+    if not summary.clips:
+        first = (
+            f"; the first: {summary.skipped[0].file}: {summary.skipped[0].reason}" if summary.skipped else ""
+        )
         raise InputError(
-            f"data.root={source.root}: no usable clip ({len(found.skipped)} bad files{first}); "
+            f"data.root={source.root}: no usable clip ({len(summary.skipped)} bad files{first}); "
             "expected AMASS npz files"
         )
-    names = [clip.name for clip in found.clips]
-    parts, groups, duplicates = assign_parts(split, found.clips)
-    every = [*names, *found.short, *found.damaged]
-    split.check_groups([name for name, part in parts.items() if part], every)
-    clips = _place(found.clips, parts, groups)
+    names = [clip.name for clip in summary.clips]
+    parts, groups, duplicates = assign_parts(split, summary.clips)
+    files = [*names, *summary.short, *summary.damaged]
+    split.check_groups([name for name, part in parts.items() if part], files)
+    clips = _place(summary.clips, parts, groups)
     if not any(clip.split == "train" for clip in clips):
         raise InputError(f"data.root={source.root}: no clip for training; check data.split")
     left_out = [n for n, part in sorted(parts.items()) if part is None and n not in duplicates]
     interpolated = source.interpolation != LINES and any(clip.resampling == INTERPOLATED for clip in clips)
     frames = [(clip.name, clip.split, clip.sha256) for clip in clips]
-    content = [FRAMES_VERSION, source.min_frames, rest.tolist(), frames]
+    ingredients = [FRAMES_VERSION, source.min_frames, rest.tolist(), frames]
     return Manifest(
-        digest=_hash([*content, *([source.interpolation] if interpolated else [])]),
+        digest=_hash([*ingredients, *([source.interpolation] if interpolated else [])]),
         request=request,
         body=body_name(source.body, rest),
         rest_joints=tuple(map(tuple, rest.tolist())),
@@ -124,12 +126,12 @@ def _plan(source: ClipFolder, rest: np.ndarray, request: str) -> Manifest:
         min_frames=source.min_frames,
         interpolation=source.interpolation,
         clips=clips,
-        skipped=found.skipped,
+        skipped=summary.skipped,
         left_out=dict(Counter(name.split("/")[0] for name in left_out)),
         listed=dict(split.listed),
-        missing=split.missing([*names, *found.short]),
+        missing=split.missing([*names, *summary.short]),
         duplicates=duplicates,
-        unusual=found.unusual,
+        unusual=summary.unusual,
         sources=tuple(source.root.sources) if isinstance(source.root, Folders) else (),
     )
 

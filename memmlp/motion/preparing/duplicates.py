@@ -51,10 +51,10 @@ def assign_parts(
     Raises:
         InputError: if the split is impossible.
     """
-    found = split.assign([clip.name for clip in clips])
-    groups = merge_groups(clips, found.groups)
-    if split.listed or groups == found.groups:
-        parts, gave_way = keep_one_part(clips, found.parts)
+    assignment = split.assign([clip.name for clip in clips])
+    groups = merge_groups(clips, assignment.groups)
+    if split.listed or groups == assignment.groups:
+        parts, gave_way = keep_one_part(clips, assignment.parts)
         return parts, groups, gave_way
     firsts: dict[str, str] = {}
     for name in sorted(groups):

@@ -78,9 +78,9 @@ def find_clips(root: Root) -> FoundFiles:
         return _find_in_folder(root)
     result = FoundFiles()
     for source, folder in root.sources.items():
-        found = _find_in_folder(folder)
-        result.files += [f"{source}/{file}" for file in found.files]
-        result.unreadable |= {f"{source}/{path}": why for path, why in found.unreadable.items()}
+        content = _find_in_folder(folder)
+        result.files += [f"{source}/{file}" for file in content.files]
+        result.unreadable |= {f"{source}/{path}": why for path, why in content.unreadable.items()}
     result.files.sort()
     return result
 
@@ -98,11 +98,11 @@ def source_of(clip: str) -> str:
 def _find_in_folder(root: Path) -> FoundFiles:
     if not root.is_dir():
         raise InputError(f"data.root={root}: no such folder; expected the folder with your npz clips")
-    found, files = FoundFiles(), dict[object, str]()
+    content, files = FoundFiles(), dict[object, str]()
     folders = {_identity(root)}
     level = [""]
     while level:  # one depth after the other, so that of two paths the shorter one counts
-        entries = [entry for folder in level for entry in _list_folder(root, folder, found)]
+        entries = [entry for folder in level for entry in _list_folder(root, folder, content)]
         level = []
         for path, is_folder in entries:
             identity = _identity(root / path)
@@ -111,19 +111,19 @@ def _find_in_folder(root: Path) -> FoundFiles:
                 level.append(path)
             elif not is_folder and path.lower().endswith(SUFFIX):
                 files.setdefault(identity, path)
-    found.files = sorted(files.values())
-    if not found.files:
+    content.files = sorted(files.values())
+    if not content.files:
         raise InputError(f"data.root={root}: no npz in it; make some with memmlp data synth or data import")
-    return found
+    return content
 
 
-def _list_folder(root: Path, folder: str, found: FoundFiles) -> list[tuple[str, bool]]:
+def _list_folder(root: Path, folder: str, content: FoundFiles) -> list[tuple[str, bool]]:
     """Return the visible paths in a folder, real ones before links, and whether each is a folder itself."""
     try:
         with os.scandir(root / folder) as listing:
             shown = [entry for entry in listing if not entry.name.startswith(".")]
     except OSError as error:
-        found.unreadable[folder] = f"cannot be listed ({error.strerror})"
+        content.unreadable[folder] = f"cannot be listed ({error.strerror})"
         return []
     entries = sorted(shown, key=lambda entry: (entry.is_symlink(), entry.name))
     return [((Path(folder) / entry.name).as_posix(), _is_folder(entry)) for entry in entries]

@@ -76,11 +76,11 @@ class Grouping:
                 more = f" and {len(clips) - 1} more" if len(clips) > 1 else ""
                 raise InputError(f"{KEY}={self.file}: {problem} {min(clips)}{more}")
 
-    def tie(self, seen: Mapping[str, str]) -> list[list[str]]:
+    def tie(self, aliases: Mapping[str, str]) -> list[list[str]]:
         """Return clips in groups; ties are transitive.
 
         Args:
-            seen: clip name -> the name that patterns, and the order within a group, use.
+            aliases: clip name -> the name that patterns, and the order within a group, use.
 
         Raises:
             InputError: if a pattern is not a regular expression.
@@ -91,11 +91,11 @@ class Grouping:
             raise InputError(
                 f"data.split.groups={error.pattern!r}: not a regular expression ({error})"
             ) from error
-        order = sorted(seen, key=lambda name: seen[name])
+        order = sorted(aliases, key=lambda name: aliases[name])
         parents: dict[Any, Any] = {}
         for name in order:
             for index, pattern in enumerate(compiled):
-                if match := pattern.search(seen[name]):
+                if match := pattern.search(aliases[name]):
                     parents[find_root(parents, name)] = find_root(parents, (index, match.groups()))
             if self.rows and name in self.rows:
                 parents[find_root(parents, name)] = find_root(parents, (KEY, self.rows[name]))
@@ -104,10 +104,10 @@ class Grouping:
             groups.setdefault(find_root(parents, name), []).append(name)
         return list(groups.values())
 
-    def names(self, seen: Mapping[str, str]) -> dict[str, str]:
+    def names(self, aliases: Mapping[str, str]) -> dict[str, str]:
         """Map each clip to its group's name: the column file's, else the name of the group's first clip."""
         rows = self.rows or {}
-        return {name: rows.get(group[0], group[0]) for group in self.tie(seen) for name in group}
+        return {name: rows.get(group[0], group[0]) for group in self.tie(aliases) for name in group}
 
 
 def read_groups(file: Path) -> dict[str, str]:

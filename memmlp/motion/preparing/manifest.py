@@ -91,19 +91,21 @@ class Coverage:
     @property
     def counts(self) -> tuple[int, int]:
         """The number of entries that have a clip, and the number of all entries."""
-        every = sum(self.listed.values())
-        return every - sum(self.absent.values()), every
+        total = sum(self.listed.values())
+        return total - sum(self.absent.values()), total
 
     def __str__(self) -> str:
-        present, every = self.counts
-        return f"{100 * present // max(every, 1)} % of the list ({present} of {every} entries)"
+        present, total = self.counts
+        return f"{100 * present // max(total, 1)} % of the list ({present} of {total} entries)"
 
     @property
     def gaps(self) -> str:
         """A description of the missing entries: the number of all, and of those of each subset."""
-        present, every = self.counts
-        each = [f"{name} {count} of {self.listed[name]}" for name, count in self.absent.items()]
-        return f"{every - present} of {every} entries of the split's list have no clip ({', '.join(each)})"
+        present, total = self.counts
+        by_subset = [f"{name} {count} of {self.listed[name]}" for name, count in self.absent.items()]
+        return (
+            f"{total - present} of {total} entries of the split's list have no clip ({', '.join(by_subset)})"
+        )
 
     def check(self, root: Root) -> None:
         """Raise InputError unless every entry has a clip below the data's root."""
@@ -199,7 +201,7 @@ class Manifest:
     def totals(self) -> dict[str, Total]:
         """part -> the number of its clips and frames."""
         lengths = {part: [clip.length for clip in self.clips if clip.split == part] for part in PARTS}
-        return {part: Total(len(own), sum(own)) for part, own in lengths.items()}
+        return {part: Total(len(frames), sum(frames)) for part, frames in lengths.items()}
 
     def part(self, part: str) -> list[ClipRecord]:
         """Return the clips of a part, in the order of its array."""

@@ -122,20 +122,20 @@ class GroupedSplit(Split):
         fewer = {"train_fraction": self.train_fraction} if self.train_fraction < 1 else {}
         return {"val": self.val, "seed": self.seed, "groups": list(self.groups), **file, **fewer}
 
-    def _divide(self, seen: Mapping[str, str], fractions: Mapping[str, float]) -> dict[str, str | None]:
+    def _divide(self, aliases: Mapping[str, str], fractions: Mapping[str, float]) -> dict[str, str | None]:
         """Map clips to parts: the first groups in seeded order fill those of `fractions`, the others train.
 
         The last groups of train are left out (None), as `train_fraction` says.
 
         Args:
-            seen: each clip's name -> the name that patterns and the seeded order use.
+            aliases: each clip's name -> the name that patterns and the seeded order use.
             fractions: part -> its fraction of the groups.
 
         Raises:
             InputError: if there are fewer groups than parts.
         """
-        ranked = sorted(self.grouping.tie(seen), key=lambda group: rank(seen[group[0]], self.seed))
-        parts: dict[str, str | None] = dict.fromkeys(seen, "train")
+        ranked = sorted(self.grouping.tie(aliases), key=lambda group: rank(aliases[group[0]], self.seed))
+        parts: dict[str, str | None] = dict.fromkeys(aliases, "train")
         start = 0
         for part, count in _counts(len(ranked), fractions).items():
             for group in ranked[start : start + count]:
@@ -188,8 +188,11 @@ class SeededSplit(GroupedSplit):
         self._check_fractions(test=self.test, val=self.val)
 
     def assign(self, names: Sequence[str]) -> Assignment:
-        seen = {name: strip_archives(name) for name in names}
-        parts, groups = self._divide(seen, {"test": self.test, "val": self.val}), self.grouping.names(seen)
+        aliases = {name: strip_archives(name) for name in names}
+        parts, groups = (
+            self._divide(aliases, {"test": self.test, "val": self.val}),
+            self.grouping.names(aliases),
+        )
         return Assignment(self.limit(parts, groups), groups)
 
     def limit(self, parts: Mapping[str, str | None], groups: Mapping[str, str]) -> dict[str, str | None]:
@@ -263,13 +266,13 @@ class MixedSplit(Split):
 class PublishedSplit(GroupedSplit):
     """A split with published training and test parts; a seeded part of training becomes validation."""
 
-    def _carve_validation(self, parts: Mapping[str, str | None], seen: Mapping[str, str]) -> Assignment:
+    def _carve_validation(self, parts: Mapping[str, str | None], aliases: Mapping[str, str]) -> Assignment:
         """Return the assignment with some of train's groups moved to "val"."""
-        train = {name: seen[name] for name, part in parts.items() if part == "train"}
+        train = {name: aliases[name] for name, part in parts.items() if part == "train"}
         if not train:
             raise InputError("data.split: data.root has no clip of its training part; is it the right root?")
         carved = {**parts, **self._divide(train, {"val": self.val})}
-        return Assignment(carved, self.grouping.names(seen))
+        return Assignment(carved, self.grouping.names(aliases))
 
 
 @dataclass(frozen=True)
@@ -294,9 +297,9 @@ class ListSplit(PublishedSplit):
 
     def assign(self, names: Sequence[str]) -> Assignment:
         entries = _match_entries(self.entries, names)
-        seen = {name: entries.get(name, name) for name in names}
-        parts = {name: self.entries.get(seen[name]) for name in names}
-        return self._carve_validation(parts, seen)
+        aliases = {name: entries.get(name, name) for name in names}
+        parts = {name: self.entries.get(aliases[name]) for name in names}
+        return self._carve_validation(parts, aliases)
 
     def missing(self, names: Collection[str]) -> tuple[str, ...]:
         return tuple(sorted(set(self.entries) - set(_match_entries(self.entries, names).values())))
@@ -335,13 +338,13 @@ class SubsetSplit(PublishedSplit):
 
     def assign(self, names: Sequence[str]) -> Assignment:
         part_of = {subset(name): part for part in LISTED for name in getattr(self, part)}
-        seen = {name: strip_archives(name) for name in names}
-        parts = {name: part_of.get(subset(name), part_of.get(subset(own))) for name, own in seen.items()}
+        aliases = {name: strip_archives(name) for name in names}
+        parts = {name: part_of.get(subset(name), part_of.get(subset(own))) for name, own in aliases.items()}
         clips = defaultdict(list)
         for name in sorted(name for name, part in parts.items() if part):
             clips[clip_key(name)].append(name)
         _check_one_release(clips.values())
-        return self._carve_validation(parts, seen)
+        return self._carve_validation(parts, aliases)
 
     def missing(self, names: Collection[str]) -> tuple[str, ...]:
         present = present_subsets(names)
@@ -365,12 +368,12 @@ def _match_entries(entries: Collection[str], names: Collection[str]) -> dict[str
     """Map clips to their entries in a list: by name, else by the name in another release of AMASS."""
     same = {name: name for name in names if name in entries}
     others = {clip_key(entry).lower(): entry for entry in sorted(set(entries) - set(same), reverse=True)}
-    found = defaultdict(list)
+    files_of = defaultdict(list)
     for name in sorted(set(names) - set(same)):
         if (entry := others.get(clip_key(name).lower())) is not None:
-            found[entry].append(name)
-    _check_one_release(found.values())
-    return same | {clips[0]: entry for entry, clips in found.items()}
+            files_of[entry].append(name)
+    _check_one_release(files_of.values())
+    return same | {clips[0]: entry for entry, clips in files_of.items()}
 
 
 def _check_one_release(matches: Iterable[Sequence[str]]) -> None:
@@ -413,5 +416,5 @@ def _read_list(file: Path) -> Iterator[str]:
         raise InputError(f"{file}: not a readable list ({error})") from error
     for line in filter(None, map(str.strip, lines)):
         steps = [step for step in line.removesuffix(".npz").split("/") if step not in ("", ".")]
-        own = next((i for i, step in enumerate(steps[:-1]) if subset(step) == subset(file.parent.name)), 0)
-        yield "/".join(steps[own:])
+        start = next((i for i, step in enumerate(steps[:-1]) if subset(step) == subset(file.parent.name)), 0)
+        yield "/".join(steps[start:])

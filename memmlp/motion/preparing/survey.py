@@ -71,15 +71,15 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
     firsts: dict[str, np.ndarray] = {}
     marks: dict[str, tuple[Marks, Marks]] = {}
     odd: dict[str, str] = {}
-    short, found = [], find_clips(root)
-    skipped = [Skipped(folder, reason) for folder, reason in found.unreadable.items()]
-    for file in progress_bar(found.files, "reading"):
+    short, content = [], find_clips(root)
+    skipped = [Skipped(folder, reason) for folder, reason in content.unreadable.items()]
+    for file in progress_bar(content.files, "reading"):
         path, name = root / file, clip_name(file)
         try:
             _check_name(path, file, clips)
             clip = read_clip(path, name)
             faults = check_plausible(path, clip)
-            resampled, how = resample(clip, interpolation=LINES)  # the survey is the same with either
+            resampled, method = resample(clip, interpolation=LINES)  # the survey is the same with either
             if len(resampled) < min_frames:
                 few = f"{len(resampled)} frames at {FPS} Hz"
                 raise TooShort(f"{path}: {few}, fewer than data.min_frames={min_frames}")
@@ -92,7 +92,7 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
             short += [name] if isinstance(error, TooShort) else []
         else:
             digests = file_digest(path), _content_digest(clip)
-            clips[name] = ClipRecord(name, file, "", "", 0, len(resampled) - 1, *digests, clip.fps, how)
+            clips[name] = ClipRecord(name, file, "", "", 0, len(resampled) - 1, *digests, clip.fps, method)
             firsts[name], marks[name] = first_frames(clip), mark_frames(resampled)
             odd |= {name: faults} if faults else {}
     records = list(clips.values())

@@ -9,12 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from asf_samples import DOFS, amc_text, asf_text, movement, plain_positions, write_take
-from plain_kinematics import npz_kinematics, to_world, worst_direction, worst_distance
 
 from memmlp.common.errors import InputError
+from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.formats.asf_amc import read_amc
-from memmlp.motion.importing.import_folder import import_folder
-from memmlp.motion.importing.skeleton_map import load_skeleton
+from memmlp.motion.formats.npz import read_clip
+from memmlp.motion.geometry import clip_kinematics
+from memmlp.motion.importing.fidelity import Fidelity
+from memmlp.motion.importing.import_folder import import_folder, verify_folder
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
 CUTS = {
@@ -34,17 +36,12 @@ def assert_posed(take: Path, asf: Path) -> None:
 
 def assert_imported(source: Path, out: Path) -> None:
     """The clips of a folder have every segment and joint within the limits of an import."""
-    report, joints = import_folder(source, out), load_skeleton("asf_amc").joints
+    report = import_folder(source, out)
     assert not report.skipped
-    for clip in report.clips:
-        take = source / clip.source
-        (asf,) = take.parent.glob("*.asf")
-        file = {name: to_world(at, "y") for name, at in plain_positions(asf, take).items()}
-        angle, where = worst_direction(out / clip.clip, file, joints)
-        assert angle < 3, (clip.source, where)
-        distance, where = worst_distance(out / clip.clip, file, joints, 1.0)
-        assert distance < 1, (clip.source, where)
-        assert (clip.fps, clip.header_fps) == (120, None)
+    assert {(clip.fps, clip.header_fps) for clip in report.clips} == {(120, None)}
+    for fidelity in verify_folder(source):
+        assert isinstance(fidelity, Fidelity)
+        assert (fidelity.mm.value < 1, fidelity.degrees.value < 3) == (True, True), fidelity
 
 
 def test_an_import_has_the_files_segments(tmp_path: Path):
@@ -61,7 +58,8 @@ def test_a_head_that_looks_ahead_is_level(tmp_path: Path):
     values[:, columns.index("head")] = 16.0
     write_take(tmp_path / "05", values)
     import_folder(tmp_path / "05", tmp_path / "out")
-    rotations, _ = npz_kinematics(tmp_path / "out" / "05_01.npz")
+    clip = read_clip(tmp_path / "out" / "05_01.npz", "05_01")
+    rotations, _ = clip_kinematics(clip, builtin_rest_joints())
     assert np.degrees(np.arcsin(rotations[0, 15, 2, 2])) == pytest.approx(0, abs=0.1)
 
 

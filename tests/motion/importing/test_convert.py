@@ -36,7 +36,7 @@ from memmlp.motion.importing.convert import (
     NONE,
     STRAIGHTEST,
     UNITS,
-    Converted,
+    Conversion,
     Stance,
     convert,
     find_floor,
@@ -57,7 +57,7 @@ BANDAI_CLIPS = DATA / "bandai-namco" / "bandai-1.tar.xz"
 MM, DEGREES = 1.0, 3.0  # the largest errors that an import may have
 
 
-def check(path: Path, chosen: SkeletonMap) -> Converted:
+def check(path: Path, chosen: SkeletonMap) -> Conversion:
     """Import a file; the clip must be as in the file."""
     converted = convert(read_bvh(path), chosen, REST, name=path.stem, fps=120.0)
     assert converted.fidelity.mm.value < MM

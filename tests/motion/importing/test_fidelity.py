@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from memmlp.motion.body import JOINTS, builtin_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.bvh import read_bvh
-from memmlp.motion.importing.convert import Converted, convert
+from memmlp.motion.importing.convert import Conversion, convert
 from memmlp.motion.importing.fidelity import compare
 from memmlp.motion.importing.skeleton_map import SkeletonMap, load_skeleton
 from memmlp.motion.synthetic import synthesize_clip
@@ -23,7 +23,7 @@ REST = builtin_rest_joints()
 JOINT = {name: index for index, name in enumerate(JOINTS)}
 
 
-def converted(path: Path, chosen: SkeletonMap) -> Converted:
+def converted(path: Path, chosen: SkeletonMap) -> Conversion:
     return convert(read_bvh(path), chosen, REST, name="clip", fps=120.0)
 
 
@@ -37,13 +37,13 @@ def test_imports_keep_joints_and_limbs(tmp_path: Path, skeleton: str) -> None:
 
 
 @pytest.fixture
-def walk(tmp_path: Path) -> Converted:
+def walk(tmp_path: Path) -> Conversion:
     chosen = load_skeleton("cmu_daz")
     file = performed(chosen, synthesize_clip("walking", 1, seconds=2.0), sample=tree("cmu_daz"))
     return converted(write(tmp_path, file.text()), chosen)
 
 
-def test_a_right_import_has_no_fault(walk: Converted) -> None:
+def test_a_right_import_has_no_fault(walk: Conversion) -> None:
     assert walk.fidelity.faults == ()
     again = compare(walk.clip, walk.fitted.motion, REST, "cmu_daz")
     assert again == walk.fidelity
@@ -63,7 +63,7 @@ def bent(clip: Clip, joint: str, frame: int | slice, vector: list[float]) -> Cli
         ("right_hip", "right_hip to right_knee"),
     ],
 )
-def test_a_joint_that_is_off_in_one_frame_is_named(walk: Converted, joint: str, segment: str) -> None:
+def test_a_joint_that_is_off_in_one_frame_is_named(walk: Conversion, joint: str, segment: str) -> None:
     clip = bent(walk.clip, joint, 31, [0.0, 0.1, 0.25])
     fidelity = compare(clip, walk.fitted.motion, REST, "cmu_daz")
     assert fidelity.degrees.value > 3
@@ -82,12 +82,12 @@ def test_a_joint_that_is_off_in_one_frame_is_named(walk: Converted, joint: str, 
         (lambda c: bent(c, "spine1", slice(None), [2.8, 0.0, 0.0]), "the head is never above the pelvis"),
     ],
 )
-def test_what_no_person_does_is_said(walk: Converted, change: Callable[[Clip], Clip], said: str) -> None:
+def test_what_no_person_does_is_said(walk: Conversion, change: Callable[[Clip], Clip], said: str) -> None:
     faults = compare(change(walk.clip), walk.fitted.motion, REST, "cmu_daz").faults
     assert any(said in fault for fault in faults)
 
 
-def test_a_head_that_flips_for_a_while_is_said(walk: Converted) -> None:
+def test_a_head_that_flips_for_a_while_is_said(walk: Conversion) -> None:
     """As in CMU's salsa/07, where the head's markers change places; 1 % of the frames is enough."""
     flipped = bent(walk.clip, "head", slice(40, 46), [0.0, 0.0, np.pi])
     said = compare(flipped, walk.fitted.motion, REST, "cmu_daz").faults
