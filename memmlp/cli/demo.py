@@ -35,19 +35,17 @@ def demo(overrides: tuple[str, ...]) -> None:
     from memmlp.runs.lookup import frames_seen, hardly_trained
 
     started = time.monotonic()
-    both = fit_recurrent_poser(overrides)  # before the minutes of the first network
-    outcomes = train_demo(overrides)
-    if both:
-        outcomes += train_demo([*overrides, RECURRENT_POSER])
+    both = fits_recurrent_poser(overrides)  # before the minutes of the first network
+    outcomes = train_demo(overrides) + (train_demo([*overrides, RECURRENT_POSER]) if both else [])
     if len(outcomes) == len(NETWORKS):
         show_side_by_side(dict(zip(NETWORKS, outcomes, strict=True)))
-        for said in dict.fromkeys(filter(None, (hardly_trained(frames_seen(one.run)) for one in outcomes))):
-            click.echo(said)
+        for remark in dict.fromkeys(filter(None, (hardly_trained(frames_seen(one.run)) for one in outcomes))):
+            click.echo(remark)
     click.echo(f"the demo took {(time.monotonic() - started) / 60:.1f} minutes")
     click.echo(next_steps(overrides, inactive_environment(), [one.run.id for one in outcomes]))
 
 
-def fit_recurrent_poser(overrides: Sequence[str]) -> bool:
+def fits_recurrent_poser(overrides: Sequence[str]) -> bool:
     """Return whether a demo's overrides leave the network open, and are valid for RecurrentPoser, too."""
     from memmlp.common.errors import InputError
     from memmlp.config.compose import parse, preflight

@@ -7,7 +7,6 @@ from pathlib import Path
 import click
 
 from memmlp.cli.options import check_runs, device_option, outputs_option, plugins_option
-from memmlp.cli.run_remarks import remark_on
 from memmlp.common.errors import InputError
 
 
@@ -50,7 +49,7 @@ def evaluate(
         raise InputError(f"--save-predictions {save_predictions}: must be a folder, not a file")
     from rich.console import Console
 
-    from memmlp.cli.train_summary import metrics_table, older_code, source_tables
+    from memmlp.cli.train_summary import metrics_table, run_warnings, source_tables
     from memmlp.common.files import write_json
     from memmlp.config.open_run import open_run
     from memmlp.evaluation.predictions import save_predictions as write_predictions
@@ -62,14 +61,9 @@ def evaluate(
     results, made = complete_stages(experiment, found.run, found.data, again=again)
     outcome = f"{' and '.join(made)} done" if made else "measured before"
     click.echo(f"run {found.run.id}: {outcome}")
-    if partial := found.run.manifest.get("partial"):
-        click.echo(f"on a part of the data: {partial}")
-    for fact in ("resampled", "unusual"):
-        if warning := found.run.manifest.get(fact):
-            click.echo(warning)
-    remark_on([found.run])
-    if changed := found.run.changed_sources:
-        click.echo(older_code(found.run, changed))
+    facts = [found.run.manifest.get(fact) for fact in ("resampled", "unusual")]
+    for line in (*filter(None, facts), *run_warnings(found.run)):
+        click.echo(line)
     for table in (metrics_table(results), *source_tables(found.run, experiment.stage_ids)):
         Console(highlight=False).print(table)
     if json_path is not None:

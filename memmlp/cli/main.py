@@ -30,22 +30,22 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
-    "demo": Command("demo", "demo", "The whole way on embedded data, in minutes.", True),
+    "demo": Command("demo", "demo", "The whole pipeline on synthetic data, in minutes.", True),
     "train": Command("train", "command", "Train, evaluate, export and time one configuration (Hydra).", True),
     "data": Command("data", "data", "Make, import, prepare, inspect and export motion data."),
-    "sweep": Command("sweep", "sweep", "Run what is missing of a table or of a sweep of your own.", True),
+    "sweep": Command("sweep", "sweep", "Run the missing runs of a table or of your own sweep.", True),
     "tune": Command("tune", "tune", "Search loss weights, or other keys, by the errors on validation.", True),
     "table": Command("table", "table", "The paper's tables beside measured numbers."),
     "results": Command("results", "results", "Keep runs' results with the code; make pages of them."),
     "report": Command("report", "report", "The page of some sweeps, tables and figures, in one file."),
     "runs": Command("runs", "runs", "List, show, compare, tag, clean up and move runs."),
     "loggers": Command("loggers", "loggers", "Add runs to MLflow, TensorBoard or W&B."),
-    "mlflow": Command("loggers", "mlflow", "MLflow's page on the runs it shows."),
+    "mlflow": Command("loggers", "mlflow", "MLflow's page of the runs."),
     "ui": Command("ui", "ui", "Runs, sweeps and searches on a page of this machine, live."),
     "eval": Command("evaluate", "evaluate", "Metrics and predictions of a finished run."),
-    "predict": Command("predict", "predict", "What a network makes of clips, as BVH, glTF or npz."),
+    "predict": Command("predict", "predict", "A network's predictions for clips, as BVH, glTF or npz."),
     "render": Command("render", "render", "Figures and films of runs beside the truth, coloured by error."),
-    "live": Command("live", "live", "A network live on a local page: a clip, or trackers by UDP or OSC."),
+    "live": Command("live", "live", "A network live on a local page, fed by a clip or by trackers."),
     "web": Command("web", "web", "A site that times and plays networks in any browser, and on a headset."),
     "export": Command("export", "export", "ONNX file of a finished run."),
     "bench": Command("bench", "bench", "Measure speed on this machine."),
@@ -53,11 +53,6 @@ COMMANDS = {
 
 
 INTERRUPTED = 130  # exit code after a Ctrl-C
-REFUSED = {
-    errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR, errno.ENOENT, errno.ENAMETOOLONG,
-    errno.ENOSPC, errno.EDQUOT,
-}  # fmt: skip
-"""Errors of the operating system that are about a path given by the user, or about its disk."""
 
 
 class Commands(click.Group):
@@ -69,9 +64,8 @@ class Commands(click.Group):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import and return the command with that name; None for an unknown name."""
-        if cmd_name not in COMMANDS:
+        if (command := COMMANDS.get(cmd_name)) is None:
             return None
-        command = COMMANDS[cmd_name]
         return getattr(importlib.import_module(f"memmlp.cli.{command.module}"), command.attribute)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -142,7 +136,7 @@ def _exit_code(error: Exception) -> int | None:
     if isinstance(error, click.ClickException):
         return error.exit_code
     if isinstance(error, OSError) and error.strerror:
-        return 2 if error.errno in REFUSED else 1
+        return 2 if error.filename else 1  # about a path that the user gave, or its disk
     if type(error) in (InputError, TrainingDiverged, LeaseLost):
         return 2 if type(error) is InputError else 1
     cause: BaseException | None = error  # an error after a Ctrl-C, such as one that cut an import short

@@ -6,9 +6,12 @@ import math
 from collections.abc import Callable
 from ipaddress import IPv4Network
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
+
+if TYPE_CHECKING:
+    from memmlp.runs.run import Run
 
 Command = Callable[..., Any]
 PORT = click.IntRange(1, 65535)
@@ -170,3 +173,12 @@ def check_runs(outputs: Path, *names: str) -> None:
 
     for name in names:
         find_run(outputs, name)
+
+
+def remark_on(*runs: Run) -> None:
+    """Print on standard error which of the runs' networks hardly saw motion in training."""
+    from memmlp.runs.lookup import frames_seen, hardly_trained
+
+    for run in runs:
+        if remark := hardly_trained(frames_seen(run)):
+            click.echo(f"run {run.id}: {remark}", err=True)

@@ -14,9 +14,9 @@ from memmlp.cli.options import (
     format_option,
     outputs_option,
     plugins_option,
+    remark_on,
     strict_option,
 )
-from memmlp.cli.run_remarks import remark_on
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
@@ -86,7 +86,7 @@ def predict(
         report = predict_test_clip(predictor, opened, source, out, format_)
     click.echo(f"run {found.id}: {chosen}, {mode} mode")
     show_exported(report, out)
-    remark_on([found])
+    remark_on(found)
 
 
 def choose_branch(evaluation: Evaluation, branch: str | None) -> str:

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import Finite, check_runs, outputs_option, plugins_option
-from memmlp.cli.run_remarks import remark_on
+from memmlp.cli.options import Finite, check_runs, outputs_option, plugins_option, remark_on
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
@@ -91,7 +90,7 @@ def render(
     write_picture(out, piece, poses, "--out")
     errors = ", ".join(f"{label} {error.mean():.1f} cm" for label, error in piece.errors.items())
     click.echo(f"{out}: {piece.title}, {errors}")
-    remark_on(one.run for one in opened)
+    remark_on(*(one.run for one in opened))
 
 
 def _predict_piece(

@@ -8,7 +8,8 @@ from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
+from rich.text import Text
 
 from memmlp.common.processes import MIN_CORE_SHARE
 from memmlp.evaluation.metric_facts import UNITS
@@ -32,23 +33,36 @@ COLUMNS = [(mode, branch) for mode in ("stream", "window") for branch in BRANCHE
 
 def show(outcome: Outcome) -> None:
     """Print a run's metrics in both modes, its latency and sizes if it has any, and where its files are."""
-    console = Console(highlight=False, markup=False)  # a folder's name may have brackets
     run, results = outcome.run, outcome.results
-    console.print(said(outcome), soft_wrap=True)
-    if partial := run.manifest.get("partial"):
-        console.print(f"on a part of the data: {partial}", style="yellow", soft_wrap=True)
-    if changed := run.changed_sources:
-        console.print(older_code(run, changed), style="yellow", soft_wrap=True)
-    if hardly := hardly_trained(frames_seen(run)):
-        console.print(hardly, style="yellow", soft_wrap=True)
-    console.print(metrics_table(results))
-    for table in source_tables(run, outcome.stage_ids):
-        console.print(table)
+    lines: list[Any] = [describe_stages(outcome), *map(warn, run_warnings(run))]
+    lines += [metrics_table(results), *source_tables(run, outcome.stage_ids)]
     if "latency" in results:
-        show_latency(console, results["latency"])
-    console.print(f"run      {run.folder}", soft_wrap=True)
+        lines += describe_latency(results["latency"])
+    lines.append(f"run      {run.folder}")
     if run.picture.exists():  # it needs matplotlib
-        console.print(f"picture  {run.picture}", soft_wrap=True)
+        lines.append(f"picture  {run.picture}")
+    console = Console(highlight=False, markup=False)  # a folder's name may have brackets
+    for line in lines:
+        console.print(line, soft_wrap=not isinstance(line, Table))
+
+
+def warn(line: str) -> Text:
+    """Return a line in the colour of warnings."""
+    return Text(line, style="yellow")
+
+
+def run_warnings(run: Run) -> Iterator[str]:
+    """Yield warnings about a run: of a part of the data, of changed code, or hardly trained."""
+    if partial := run.manifest.get("partial"):
+        yield f"on a part of the data: {partial}"
+    if changed := run.changed_sources:
+        names = ", ".join(changed[:5]) + (f" and {len(changed) - 5} more" if len(changed) > 5 else "")
+        yield (
+            f"run {run.id} was made before the code of {names} changed, under the same component versions: "
+            "force=true makes it again"
+        )
+    if remark := hardly_trained(frames_seen(run)):
+        yield remark
 
 
 def show_side_by_side(outcomes: Mapping[str, Outcome]) -> None:
@@ -81,70 +95,47 @@ def _differing(branches: Mapping[str, Mapping[str, Any]]) -> list[str]:
     return found
 
 
-def show_latency(console: Console, record: Mapping[str, Any]) -> None:
-    """Print the time of a frame in the exported file that was asked for, and the file's size."""
+def describe_latency(record: Mapping[str, Any]) -> Iterator[str | Text]:
+    """Yield lines about the time of a frame in the requested exported file, and the network's size."""
     measured, precision = as_deployed(record), deployed_precision(record)
-    file = "" if precision == "fp32" else f" in {precision}"
-    plain = "" if precision == "fp32" else f", fp32 {record['median_ms']:.2f} ms"
-    console.print(
+    lower = precision != "fp32"
+    file = f" in {precision}" if lower else ""
+    yield (
         f"a frame on one CPU core{file}: {measured['median_ms']:.2f} ms median, "
-        f"{measured['p95_ms']:.2f} ms p95 "
-        f"({measured['ratio_to_yardstick']:.2f} x the yardstick{plain})",
-        soft_wrap=True,
+        f"{measured['p95_ms']:.2f} ms p95 ({measured['ratio_to_yardstick']:.2f} x the yardstick"
+        + (f", fp32 {record['median_ms']:.2f} ms)" if lower else ")")
     )
-    if said := less_precise_words(record):
-        console.print(said, style="yellow", soft_wrap=True)
-    if (share := min(measured.get(key, 1.0) for key in CORE_SHARES.values())) < MIN_CORE_SHARE:
-        busy = f"the machine was busy: it had a core for {share:.0%} of the time, and its times are too long"
-        console.print(busy, style="yellow", soft_wrap=True)
-    if "pose_median_ms" in measured:  # runs of earlier versions lack it
-        console.print(
-            f"an end-to-end pose, trackers to joints: {measured['pose_median_ms']:.2f} ms median, "
-            f"{measured['pose_p95_ms']:.2f} ms p95 (timed with the network in the caches)",
-            soft_wrap=True,
-        )
-    console.print(size(measured), soft_wrap=True)
-
-
-def less_precise_words(record: Mapping[str, Any]) -> str:
-    """Say that an int8 file is not used live, since its errors grow too much; empty if it is used."""
-    precision = deployed_precision(record)
     cost = record.get(precision) or {}
-    if precision not in INT8_PRECISIONS or accurate_enough(cost) or "jitter_growth" not in cost:
-        return ""
-    growth, of_jitter = cost["growth"], cost["jitter_growth"]
-    limits = f"more than {MAX_GROWTH:.0%} and {MAX_JITTER_GROWTH:.0%} allow"
-    return f"{precision}: MPJPE {growth:+.1%}, Jitter {of_jitter:+.1%}, {limits}: live use takes float32"
-
-
-def size(measured: Mapping[str, Any]) -> str:
-    """Describe the network's size, with a frozen VQ-VAE and parts for training alone if it has any."""
+    if precision in INT8_PRECISIONS and "jitter_growth" in cost and not accurate_enough(cost):
+        yield warn(
+            f"{precision}: MPJPE {cost['growth']:+.1%}, Jitter {cost['jitter_growth']:+.1%}, more than "
+            f"{MAX_GROWTH:.0%} and {MAX_JITTER_GROWTH:.0%}: live use takes float32"
+        )
+    if (share := min(measured.get(key, 1.0) for key in CORE_SHARES.values())) < MIN_CORE_SHARE:
+        yield warn(f"the machine was busy: it had a core for {share:.0%} of the time; its times are too long")
+    if "pose_median_ms" in measured:
+        yield (
+            f"an end-to-end pose, trackers to joints: {measured['pose_median_ms']:.2f} ms median, "
+            f"{measured['pose_p95_ms']:.2f} ms p95 (timed with the network in the caches)"
+        )
     own, whole = measured["parameters"], measured["parameters_with_vqvae"]
-    others = "parts that are frozen or for training alone"
-    beside = f" ({whole / 1e6:.2f} M with {others})" if whole != own else ""
-    return (
-        f"{own / 1e6:.2f} M parameters{beside}, {measured['macs'] / 1e6:.3g} MMAC a frame, "
+    others = (
+        f" ({whole / 1e6:.2f} M with parts that are frozen or for training alone)" if whole != own else ""
+    )
+    yield (
+        f"{own / 1e6:.2f} M parameters{others}, {measured['macs'] / 1e6:.3g} MMAC a frame, "
         f"ONNX file {measured['onnx_bytes'] / 1e6:.1f} MB, graph included"
     )
 
 
-def said(outcome: Outcome) -> str:
-    """Say which stages were made now, and which existed already."""
+def describe_stages(outcome: Outcome) -> str:
+    """Return a line about which stages were made now, and which existed already."""
     if not outcome.made:
         return f"run {outcome.run.id} is finished already; nothing was done (force=true does it again)"
-    wanted = [stage for stage in STAGES if stage != "deployment" or "latency" in outcome.results]
-    found = [stage for stage in wanted if stage not in outcome.made]
-    before = f"; {' and '.join(found)} found done" if found else ""
-    return f"run {outcome.run.id}: {', '.join(outcome.made)} done{before}"
-
-
-def older_code(run: Run, changed: Sequence[str]) -> str:
-    """Return a warning that code has changed since the run was made, under the same component versions."""
-    names = ", ".join(changed[:5]) + (f" and {len(changed) - 5} more" if len(changed) > 5 else "")
-    return (
-        f"run {run.id} was made before the code of {names} changed, under the same component versions: "
-        "force=true makes it again"
-    )
+    stages = [stage for stage in STAGES if stage != "deployment" or "latency" in outcome.results]
+    before = [stage for stage in stages if stage not in outcome.made]
+    ending = f"; {' and '.join(before)} done before" if before else ""
+    return f"run {outcome.run.id}: {', '.join(outcome.made)} done{ending}"
 
 
 def source_tables(run: Run, stages: Sequence[str]) -> Iterator[Table]:
@@ -169,15 +160,11 @@ def metrics_table(results: Errors, title: str = "test clips") -> Table:
 def _error_table(
     title: str, headers: Sequence[str], errors: Sequence[Mapping[str, Any]], **style: Any
 ) -> Table:
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, **style)
-    table.add_column("metric")
-    table.add_column("unit")
-    for header in headers:
-        table.add_column(header, justify="right")
+    columns = [Column("metric"), Column("unit"), *(Column(header, justify="right") for header in headers)]
+    table = Table(*columns, title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, **style)
     for metric, unit in UNITS.items():
         values = [column.get(metric) for column in errors]
         if any(value is not None for value in values):  # a custom metric may not have been asked for
-            table.add_row(
-                metric, unit, *("-" if value is None else f"{float(value):.2f}" for value in values)
-            )
+            numbers = ("-" if value is None else f"{float(value):.2f}" for value in values)
+            table.add_row(metric, unit, *numbers)
     return table

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import PATH, Finite, check_runs, outputs_option, plugins_option
-from memmlp.cli.run_remarks import remark_on
+from memmlp.cli.options import PATH, Finite, check_runs, outputs_option, plugins_option, remark_on
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
@@ -67,7 +66,7 @@ def web(
     )
     size = site.make(out)
     click.echo(f"{out}: {size / 1e6:.1f} MB; serve it with: python -m http.server --directory {out}")
-    remark_on(one.run for one in opened)
+    remark_on(*(one.run for one in opened))
 
 
 def pack_clips(opened: OpenedRun, count: int, seconds: float) -> list[SiteClip]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from command_line import TINY
 
-from memmlp.cli.demo import fit_recurrent_poser, inactive_environment, next_steps
+from memmlp.cli.demo import fits_recurrent_poser, inactive_environment, next_steps
 
 
 @pytest.mark.slow
@@ -35,7 +35,7 @@ def test_an_override_of_mem_mlps_slots_shows_it_alone(memmlp):
 
 def test_overrides_that_recurrent_poser_cannot_take_are_known_before_training():
     for words in (["profile=tiny", "threads=1"], ["vqvae.steps=7", "optim.steps=500"]):
-        assert fit_recurrent_poser(words)
+        assert fits_recurrent_poser(words)
     for words in (
         ["optim.steps=50"],  # shorter than its warm-up
         ["memory=none"],
@@ -44,7 +44,7 @@ def test_overrides_that_recurrent_poser_cannot_take_are_known_before_training():
         ["model=avatar_poser"],
         ["experiment=no_memory"],
     ):
-        assert not fit_recurrent_poser(words), words
+        assert not fits_recurrent_poser(words), words
 
 
 def test_next_steps_enter_the_environment_and_repeat_the_overrides(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,9 +9,8 @@ from typing import cast
 
 import pytest
 from fake_runs import fake_run
-from rich.console import Console
 
-from memmlp.cli.train_summary import show, show_latency, show_side_by_side, source_tables
+from memmlp.cli.train_summary import describe_latency, show, show_side_by_side, source_tables
 from memmlp.runs.evaluation_file import write_report
 from memmlp.training.request import Outcome
 
@@ -55,9 +53,7 @@ TIMES = {"median_ms": 3.39, "p95_ms": 3.5, "ratio_to_yardstick": 1.2}
 
 
 def latency(record: dict) -> str:
-    said = io.StringIO()
-    show_latency(Console(file=said, width=200), MEASURED | TIMES | record)
-    return said.getvalue()
+    return "\n".join(map(str, describe_latency(MEASURED | TIMES | record)))
 
 
 def test_times_and_size_are_those_of_the_file_that_was_asked_for():
