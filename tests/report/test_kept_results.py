@@ -71,22 +71,6 @@ def test_kept_results_have_the_same_bytes(kept: Kept, tmp_path: Path):
     assert max(map(len, dumps(kept).splitlines())) < 1000  # a line a list, so that changes can be read
 
 
-def test_texts_of_kept_results_keep_their_spaces(kept: Kept, tmp_path: Path):
-    """Spaces and brackets in the names of clips, and in flags, are no layout."""
-    word = "Subject 1  take [ 2 ]\u2028"
-    runs = {
-        label: {seed: replace(run, clips={f"{clip}{word}": rows for clip, rows in run.clips.items()})
-                for seed, run in of_variant.items()}
-        for label, of_variant in kept.runs.items()
-    }  # fmt: skip
-    save(tmp_path / "kept.json", replace(kept, runs=runs, flags=(word, "two  spaces")))
-    read = load_kept(tmp_path / "kept.json")
-    assert read.flags == (word, "two  spaces")
-    assert [set(run.clips) for run in read.every] == [
-        {f"{clip}{word}" for clip in run.clips} for run in kept.every
-    ]
-
-
 def test_two_deployments_of_one_run_are_kept_apart(sweep: Sweep, kept: Kept, tmp_path: Path):
     """Variants may show what two graphs of one training cost, and one of them two evaluations, too."""
     one, two, three = list(kept.runs)[:3]

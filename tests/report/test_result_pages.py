@@ -17,7 +17,7 @@ from report.conftest import GROUPS
 from memmlp.cli.results import make_tables
 from memmlp.common.errors import InputError
 from memmlp.report.kept_results import Kept, list_overrides
-from memmlp.report.result_pages import KeptTable, Placeholders, describe_origin, make_pages
+from memmlp.report.result_pages import KeptTable, Placeholders, make_pages
 from memmlp.report.tables.build_table import make_table, together
 from memmlp.report.tables.statistics import Verdict, error
 from memmlp.report.tables.table_text import MINUS
@@ -84,13 +84,6 @@ def test_significant_differences_are_counted_with_coarser_groups_too(sweep: Swee
     assert text == f"{significant} of {len(effects)}, 0 of {len(effects)}"
 
 
-def test_each_commit_is_named_once(kept: Kept):
-    runs = kept.runs["2"]
-    for seed, code in zip(runs, ("e2f8fc0", "92ecce3, e2f8fc0", "e2f8fc0, 92ecce3"), strict=False):
-        runs[seed] = replace(runs[seed], origin=replace(runs[seed].origin, code=code))
-    assert ", commit 0123456, 92ecce3 and e2f8fc0, torch" in describe_origin(kept)
-
-
 @pytest.mark.parametrize(
     ("template", "words"),
     [
@@ -108,11 +101,6 @@ def test_bad_templates_are_one_line(sweep: Sweep, kept: Kept, template: str, wor
         make_pages({"t": source(sweep, kept)}, {"README.md": template})
     assert str(raised.value).startswith("README.md")
     assert "\n" not in str(raised.value)
-
-
-def test_a_template_cannot_stand_for_a_tables_page(sweep: Sweep, kept: Kept):
-    with pytest.raises(InputError, match=r"t\.md"):
-        make_pages({"t": source(sweep, kept)}, {"t.md": "words"})
 
 
 @functools.cache

@@ -2,34 +2,17 @@
 
 from __future__ import annotations
 
-import functools
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from fake_runs import CLIPS, fake_sweep, runs_of
-from fake_table import SHIPPED, printed
 from processes import finished
 
 from memmlp.common.errors import InputError
-from memmlp.report.tables.build_table import make_table, on_source, together, without_runs
-from memmlp.report.tables.measured_run import load
-from memmlp.sweep.definition import Sweep
-from memmlp.sweep.sweep_file import load_sweep, parse_sweep
-
-
-def test_collect_reads_each_run_once(sweep: Sweep, tmp_path: Path):
-    """The work is linear in the runs: each is read once, though it is in many comparisons."""
-    many = parse_sweep("many", {"axes": {"optim.lr": list(range(1, 41))}, "seeds": [0, 1]})
-    find, opened = fake_sweep(tmp_path, many), []
-
-    def counted(folder: Path):
-        opened.append(folder)
-        return load(folder)
-
-    runs_of(many, find, functools.cache(counted))
-    assert len(opened) == len(set(opened)) == 80
+from memmlp.report.tables.build_table import make_table, on_source, together
+from memmlp.sweep.sweep_file import parse_sweep
 
 
 def test_tables_need_no_torch():
@@ -38,16 +21,6 @@ def test_tables_need_no_torch():
     ran = finished([sys.executable, "-c", code])
     assert ran.returncode == 0, ran.stderr
     assert not {"torch", "scipy.stats", "matplotlib", "hydra"} & set(ran.stdout.split())
-
-
-def test_without_runs_the_papers_values_and_the_reason_are_shown():
-    table = without_runs(
-        load_sweep(SHIPPED / "table01.yaml"), ("stream", "window"), "nothing measured: data.root"
-    )
-    text = printed(table, 100)
-    assert "nothing measured: data.root" in text
-    assert "14.27" in text
-    assert "missing" not in text
 
 
 def test_variants_without_a_sources_clips_are_left_out_and_named(tmp_path: Path):

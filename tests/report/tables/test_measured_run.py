@@ -20,12 +20,6 @@ from memmlp.runs.identity import VERSIONS, deployment_id_of, outdated
 from memmlp.sweep.definition import Sweep
 
 
-def test_costs_have_the_tables_units(tmp_path: Path):
-    costs = load(fake_run(tmp_path, "run").folder).costs
-    sizes = {"FLOPs": 0.026, "MACs": 0.013, "parameters": 0.356798, "size": 1.9}
-    assert costs == pytest.approx({**sizes, "ms": 0.8, "ratio": 0.6, "FPS": 1250})
-
-
 def test_size_and_times_are_of_the_precision_that_was_asked_for(sweep: Sweep, tmp_path: Path):
     run = fake_run(tmp_path, "run")
     path = run.deployment("fp32-0").latency
@@ -96,15 +90,6 @@ def test_damaged_results_are_one_line(tmp_path: Path, sweep: Sweep):
             table_of(sweep, find)
 
 
-def test_costs_that_are_no_numbers_are_left_out(tmp_path: Path):
-    run = fake_run(tmp_path, "a")
-    path = run.deployment("fp32-0").latency
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"flops": "nan"}))
-    costs = load(run.folder).costs
-    assert "FLOPs" not in costs
-    assert "parameters" in costs
-
-
 def test_the_evaluations_of_a_table_are_its_own(tmp_path: Path):
     """Where a run has two evaluations of one mode, each table reads the one that it asks for."""
     run = fake_run(tmp_path, "a")
@@ -141,11 +126,6 @@ def test_means_of_one_sources_clips(tmp_path):
         assert part.value("stream", "rotation", "MPJPE") == pytest.approx(expected)
     whole = measured.value("stream", "rotation", "MPJPE")
     assert found["salsa"].value("stream", "rotation", "MPJPE") != whole
-
-
-def test_one_source_has_no_parts(tmp_path):
-    measured = load(fake_run(tmp_path, "a").folder)
-    assert measured.by_source() == {}
 
 
 def test_sources_are_kept(tmp_path):

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import functools
-import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -203,11 +201,6 @@ def test_a_control_that_failed_stops_what_needs_it():
     world = World()
     world.failing = {("full", 5)}
     assert world.to_the_end(new_rounds(SWEEP)).analyses == ()
-
-
-def test_a_file_holds_all_of_it():
-    rounds = World().to_the_end(new_rounds(SWEEP))
-    assert Rounds.of_json(json.loads(json.dumps(asdict(rounds)))) == rounds
 
 
 def test_corrections_are_over_all_that_nobody_has_claimed():

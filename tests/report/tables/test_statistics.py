@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-
 import numpy as np
 import pytest
 from drawn import SHARES, TABLE, differences, groups, starred
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
-from scipy.special import stdtrit
 
 from memmlp.report.tables.statistics import (
     EffectEstimates,
@@ -94,13 +90,6 @@ def test_one_seed_or_one_group_has_an_interval_of_the_other_alone(shape, labels,
         assert effects.high[0] == pytest.approx(stats.ttest_1samp(sample, 0).confidence_interval().high)
 
 
-def test_no_interval_from_one_value():
-    effects = paired_effects(np.full((1, 1, 1), 0.3))
-    assert effects.mean[0] == 0.3
-    assert effects.conditional == "seeds and clips"
-    assert np.isnan([effects.low[0], effects.high[0], effects.p[0]]).all()
-
-
 def test_differences_that_are_all_the_same():
     effects = paired_effects(np.stack([np.zeros((3, 4)), np.full((3, 4), 2.0)]))
     np.testing.assert_array_equal(effects.low, [0, 2])
@@ -139,12 +128,6 @@ def test_promises(name: str):
         assert covered >= 0.93
         assert covered <= 0.995 or shape[1] / shape[2] < 5
         assert starred(effects.p) <= 0.08  # of a family-wise error of 5 %, the standard error is 1.3 %
-
-
-def test_clips_for_their_own_replicates_would_break_them():
-    d = differences(5, 40, 10, SHARES["groups"], tables=300)
-    assert starred(paired_effects(d).p) > 0.1
-    assert starred(paired_effects(d, groups(40, 10)).p) < 0.06
 
 
 def test_unequal_groups_keep_the_promises():
@@ -216,7 +199,7 @@ def test_noise_is_counted_once():
     assert known.half(0.001)[0] == pytest.approx(stats.t.isf(0.0005, 0.9 * 7**0.6), rel=0.01)
 
 
-@pytest.mark.parametrize("count", [2, 3, 5, 10, 40])
+@pytest.mark.parametrize("count", [2, 10, 40])
 def test_means_of_few_skewed_values_have_the_tails_they_are_given(count: int):
     x = np.random.default_rng(count).exponential(size=(200_000, count)) - 1
     t = np.abs(x.mean(1)) / (x.std(1, ddof=1) / np.sqrt(count))
@@ -224,35 +207,6 @@ def test_means_of_few_skewed_values_have_the_tails_they_are_given(count: int):
         missed = np.mean(t > stats.t.isf(level / 2, skewed(count - 1)))
         assert 0.45 * level < missed < 1.45 * level
         assert np.mean(t > stats.t.isf(level / 2, count - 1)) > 1.3 * level
-
-
-def test_the_example_of_the_documentation():
-    """Each of its numbers follows from its table."""
-    page = (Path(__file__).parents[3] / "docs/statistics.md").read_text()
-    example = page[page.index("**Example**") : page.index("### The interval")]
-    rows = [[float(cell) for cell in row.split("|")[2:8]] for row in re.findall(r"\| seed .*", example)]
-    table = np.array(rows)
-    differences = table[:, :5]
-    assert table[:, 5] == pytest.approx(differences.mean(1))
-    known = error(differences[None])
-    a, b, _ = np.sqrt(known.variances[:, 0])
-    t_seeds, t_groups = (-stdtrit(df, 0.025) for df in (2, skewed(4)))
-    (p,) = known.level(np.abs(differences.mean(keepdims=True)[0]))
-    seeds, groups = a * t_seeds, b * t_groups
-    mean, half = differences.mean(), known.half(0.05)[0]
-    columns = " | ".join(f"{x:.2f}" for x in (*differences.mean(0), mean))
-    for number in (
-        f"standard deviation of {differences.mean(1).std(ddof=1):.2f},",
-        f"= {a:.3f}. With t = {t_seeds:.1f} that side is ± {seeds:.2f}.",
-        f"standard deviation of {differences.mean(0).std(ddof=1):.2f},",
-        f"= {b:.3f}. With t = {t_groups:.1f} instead of {-stdtrit(4, 0.025):.1f},",
-        f"± {groups:.2f}.",
-        f"√({seeds:.2f}² + {groups:.2f}²)",
-        f"**{mean:.2f} ± {half:.2f} cm**, p = {p:.3f}",
-        f"| mean | {columns} |",
-    ):
-        assert number in " ".join(example.split())
-    assert 0.05 / 10 < p < 0.05
 
 
 @pytest.mark.parametrize("comparisons", [1, 24])

@@ -1,17 +1,25 @@
-"""The words of a table."""
+"""Tables as text: words, the screen, Markdown, LaTeX and JSON."""
 
 from __future__ import annotations
 
+import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from fake_runs import fake_sweep, table_of
+from fake_runs import CLIPS, fake_sweep, table_of
 from fake_table import SHIPPED, cell, printed
 
 from memmlp.report.tables.table import Cell, Effect, Table
-from memmlp.report.tables.table_text import MINUS, effect_words, heading, legend, number_words, value_words
+from memmlp.report.tables.table_text import (
+    FORMATS,
+    MINUS,
+    effect_words,
+    legend,
+    value_words,
+)
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import load_sweep
 
@@ -24,10 +32,6 @@ def test_costs_show_how_many_times_the_controls_they_are(tmp_path: Path):
     ms = [row.cells[table.modes[0]]["ms"].mean for row in table.rows]
     assert f"(x {ms[1] / ms[0]:.3g})" in text
     assert f"(x {30.1 / 6.0:.3g})" in text
-
-
-def test_heads_tell_unit_and_direction():
-    assert [heading(name) for name in ("Jitter", "ms", "FPS")] == ["Jitter [10² m/s³] ↓", "ms ↓", "FPS ↑"]
 
 
 def test_an_error_below_a_tenth_has_two_digits_as_its_difference_has():
@@ -76,13 +80,6 @@ def test_power_is_that_of_the_table_where_a_run_diverged(table: Table):
     assert [line for line in legend(replace(table, rows=tuple(rows))) if "power" in line] == before
 
 
-@pytest.mark.parametrize(
-    ("value", "said"), [(99.6, "100"), (5.04, "5"), (0.123, "0.12"), (123.4, "123"), (2.5e6, "2500000")]
-)
-def test_two_digits_of_a_number_have_no_exponent(value: float, said: str):
-    assert number_words(value) == said
-
-
 def test_a_star_has_a_digit_beside_it():
     small = Effect(0.0004, low=0.0001, high=0.0007, holm=0.01)
     assert effect_words(Cell({0: 8.0}, effect=small), "MPJPE") == ("+0.0004*", "[0.0001, 0.0007]")
@@ -97,3 +94,62 @@ def test_large_costs_and_their_differences_have_no_exponent():
     assert effect_words(Cell({0: 2500.0}, effect=Effect(1500.0)), "FPS") == ("+1500", "(x 2.5)")
     assert effect_words(Cell({0: 2500.0}, effect=Effect(-1500.0)), "FPS") == (f"{MINUS}1500", "(x 0.625)")
     assert effect_words(Cell({0: 2.0}, effect=Effect(0.0)), "FPS")[0] == "0"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["table04", "table17", "recurrent_poser", "scaling"])
+def test_shipped_tables_fit_the_screen(tmp_path: Path, name: str):
+    sweep = load_sweep(SHIPPED / f"{name}.yaml")
+    table = table_of(sweep, fake_sweep(tmp_path, sweep, clips=CLIPS[:2]))
+    for width in (80, 100):
+        text = printed(table, width)
+        assert max(map(len, text.splitlines())) <= width
+        for variant in sweep.variants:
+            assert variant.label.split()[0] in text
+            for value in (variant.paper or {}).values():
+                assert f"{value:.1f}" in text or f"{value:.2f}" in text
+        assert text.count(f"{len(sweep.seeds)}/{len(sweep.seeds)}") >= len(sweep.runnable())
+
+
+def test_screen_shows_everything_of_an_variant(table: Table):
+    lines = [line.split("  ") for line in printed(table, 100).splitlines()]
+    words = [[word.strip() for word in line if word.strip()] for line in lines]
+    start = next(i for i, line in enumerate(words) if line[:1] == ["no | memory"])
+    assert words[start][1] == "3/3"
+    assert re.fullmatch(r"\d\.\d\d ± \d\.\d\d", words[start][2])
+    assert re.fullmatch(r"\+\d\.\d+\*", words[start + 1][1])
+    assert re.fullmatch(r"\[\d\.\d+, \d\.\d+\]", words[start + 2][0])
+    assert words[start + 3][:3] == ["holds", "opposite", "higher"]
+    assert words[start + 4][:3] == ["paper", "2.76 (+0.19 ✓)", "3.00 (−0.08 ✗)"]  # noqa: RUF001
+    assert ["a system", "paper", "-", "4.00", "-", "-", "-"] in words
+
+
+def test_markdown_escapes(table: Table):
+    text = FORMATS["md"](table)
+    rows = [re.split(r"(?<!\\)\|", line) for line in text.splitlines() if line.startswith("|")]
+    assert {len(row) for row in rows} == {2 + 2 + 5}
+    assert r"no \| memory" in text
+    assert r"full\_model" in text
+    assert r"\<parts\>" in text
+    assert "a note of the file" in text
+    assert r"by position: as \<printed\>" in text
+
+
+def test_latex_escapes(table: Table):
+    text = FORMATS["tex"](table)
+    assert r"Memory \& its $<$parts$>$" in text
+    assert r"full\_model" in text
+    assert text.count(r"\toprule") == text.count(r"\bottomrule") == 1
+    assert not re.search(r"[±−↓↑✓✗²³]", text)  # noqa: RUF001
+    rows = [line for line in text.splitlines() if line.endswith(r"\\") and "multicolumn" not in line]
+    assert {len(re.split(r"(?<!\\)&", row)) for row in rows} == {7}
+
+
+def test_json_has_the_values_of_each_seed(table: Table):
+    content = json.loads(FORMATS["json"](table))
+    found = content["rows"][1]["cells"]["stream"]["MPJPE"]
+    expected = cell(table, "no | memory", "MPJPE")
+    assert found["values"] == {str(seed): value for seed, value in expected.values.items()}
+    assert found["effect"]["holm"] == expected.effect.holm
+    assert (found["agrees"], found["paper"]) == (False, 3.0)
+    assert content["rows"][0]["wanted"] == []

@@ -31,11 +31,6 @@ def test_nan_errors_come_first_and_are_shown():
     assert js("[f.metricNumber('MPJPE', 'nan'), f.metricNumber('MPJPE', 3)]") == ["nan", "3.00"]
 
 
-def test_a_significant_difference_has_a_digit():
-    effects = "[{mean: 4e-4, holm: .01, level: .05}, {mean: 4e-4, holm: .3, level: .05}, {mean: 2e3}]"
-    assert js(f"{effects}.map(f.effectDigits)") == [4, 2, 0]
-
-
 def test_an_error_below_a_tenth_has_two_digits_as_its_difference_has():
     """Such as one in metres, of a metric of one's own; as in tables."""
     assert js("[0.0034, 0.05, 3.1e-5, 0, 0.25].map(value => f.metricNumber('slide', value))") == [
