@@ -36,7 +36,7 @@ def test_every_command_takes_custom_components(
     assert "2 of 2 runs done" in run(tmp_path, "sweep", *sweep, "executor=debug")
     assert len(list_runs(tmp_path / "outputs")) == 2
     assert "FootSkate" in json.dumps(json.loads(run(tmp_path, "table", *sweep, "--format", "json")))
-    run(tmp_path, "report", *sweep, "--out", "page.html")
+    run(tmp_path, "report", "--out", "page.html")
     assert "FootSkate" in (tmp_path / "page.html").read_text()
 
     # workers import the package, too

@@ -37,7 +37,7 @@ COMMANDS = {
     "tune": Command("tune", "tune", "Search loss weights, or other keys, by the errors on validation.", True),
     "table": Command("table", "table", "The paper's tables beside measured numbers."),
     "results": Command("results", "results", "Keep runs' results with the code; make pages of them."),
-    "report": Command("report", "report", "The page of some sweeps, tables and figures, in one file."),
+    "report": Command("report", "report", "The page of `memmlp ui` as one HTML file."),
     "runs": Command("runs", "runs", "List, show, compare, tag, clean up and move runs."),
     "loggers": Command("loggers", "loggers", "Add runs to MLflow, TensorBoard or W&B."),
     "mlflow": Command("loggers", "mlflow", "MLflow's page of the runs."),

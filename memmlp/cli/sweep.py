@@ -217,7 +217,7 @@ def show_outcome(shown: ShownSweep, given: Sequence[str], chosen: Sweep, labels:
     if failed:
         click.echo("again with: --retry", err=True)
         raise SystemExit(1)
-    click.echo(f"next: memmlp report {command}")
+    click.echo("next: memmlp report")
 
 
 def check_rounds_options(overrides: Sequence[str], wanted: bool, most: int | None) -> None:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 import urllib.parse
-from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Collection, Iterable, Mapping
+from pathlib import Path
+from typing import Any
 
-from memmlp.report.tables.effects import RunsBySeed
-from memmlp.report.tables.table import Table
+from memmlp.common.errors import InputError
 from memmlp.report.ui.page_files import one_file
 from memmlp.report.ui.runs import read_curves, thin_out
 from memmlp.report.ui.server import Answers
-from memmlp.report.ui.sweeps import describe_results, name_sweep
+from memmlp.report.ui.sweeps import KnownSweep
 from memmlp.runs.run import Run
-from memmlp.sweep.definition import MODES, Sweep
+from memmlp.sweep.definition import MODES
 
 MAX_POINTS = 120  # of a curve, about
 MAX_CLIPS = 60  # of a run, its worst
@@ -25,75 +25,53 @@ CURVES = ("train loss", "val rotation ", "val position MPJPE", "val loss")  # be
 LONG_FACTS = ("source", "attempts", "prerequisite_runs")  # of a manifest, left out
 
 
-class ReportedSweep(NamedTuple):
-    """A sweep in the file.
-
-    Attributes:
-        name: the name of its folder below outputs/sweeps, which need not exist.
-        sweep: its definition.
-        runs: the finished runs by the variant's label and the seed.
-        table: their table.
-    """
-
-    name: str
-    sweep: Sweep
-    runs: Mapping[str, RunsBySeed]
-    table: Table
-
-    @property
-    def missing(self) -> float:
-        """The fraction of variants without a run."""
-        variants = self.sweep.runnable()
-        return sum(not self.runs.get(variant.label) for variant in variants) / max(len(variants), 1)
-
-
-def write_page(answers: Answers, sweeps: Iterable[ReportedSweep], about: str, replays: bool = True) -> str:
-    """Return the page as one file; sweeps with the most runs come first.
+def write_page(answers: Answers, names: Collection[str], about: str, replays: bool = True) -> str:
+    """Return the page as one file.
 
     Args:
         answers: answers about the outputs folder.
-        sweeps: the sweeps to show, with all of their runs that have started.
+        names: the sweeps to show, with their runs: files, numbers of the paper's tables, or names of folders
+            below outputs/sweeps; all sweeps if there are none.
         about: when and by which code the file is made.
         replays: whether the worst seconds of the best runs are computed and shown.
+
+    Raises:
+        InputError: if there is no sweep with a given name, or no sweep at all.
     """
     answers.refresh()
-    sweeps = sorted(sweeps, key=lambda one: one.missing)
-    pages = {one.name: _describe_sweep(answers, one) for one in sweeps}
-    planned = [answers.sweeps.known[name].plan for name in pages if name in answers.sweeps.known]
-    ids = {task.id for plan in planned for task in plan.tasks if task.id in answers.index.runs}
-    rows = answers.answer("runs", {})
-    progress = set(next(iter(answers.sweeps.list_rows()["sweeps"]), _progress_of_unplanned(sweeps[0])))
+    shown = _select_sweeps(answers, names)
+    ids = {task.id for known in shown.values() for task in known.plan.tasks if task.id in answers.index.runs}
+    rows, sweeps = answers.answer("runs", {}), answers.sweeps.list_rows()["sweeps"]
     found: dict[str, Any] = {
         "about": about,
         "runs": {**rows, "rows": [row for row in rows["rows"] if row["id"] in ids], "outputs": ""},
         "body": answers.answer("body", {}),
         "curves": {run_id: _read_curves(Run.of(answers.outputs, run_id)) for run_id in sorted(ids)},
-        "sweeps": {
-            "sweeps": [{key: page[key] for key in progress} for page in pages.values()], "damaged": {},
-        },
+        "sweeps": {"sweeps": [row for row in sweeps if row["name"] in shown], "damaged": {}},
         "searches": answers.searches.list_rows(),
-        **{f"sweeps/{name}": page for name, page in pages.items()},
+        **{f"sweeps/{name}": answers.sweeps.describe(name) for name in shown},
         **{f"searches/{name}": answers.searches.describe(name) for name in answers.searches.names()},
         **{f"run/{run_id}": _shorten(answers.answer(f"run/{run_id}", {})) for run_id in sorted(ids)},
-    }  # fmt: skip
+    }
     if replays:
-        found |= _replay_best_runs(answers, [[e.id for e in plan.entries] for plan in planned], found)
+        planned = [[entry.id for entry in known.plan.entries] for known in shown.values()]
+        found |= _replay_best_runs(answers, planned, found)
     return one_file(round_numbers(found))
 
 
-def _describe_sweep(answers: Answers, one: ReportedSweep) -> dict[str, Any]:
-    results = describe_results(one.sweep, one.table)
-    if one.name in answers.sweeps.known:
-        return answers.sweeps.describe(one.name) | results
-    return {**_progress_of_unplanned(one), "cells": [], "prerequisites": [], "rounds": None, **results}
-
-
-def _progress_of_unplanned(one: ReportedSweep) -> dict[str, Any]:
-    count = len(one.sweep.runnable()) * len(one.sweep.seeds)
-    return {
-        **name_sweep(one.name, one.sweep), "variants": len(one.sweep.variants), "seeds": len(one.sweep.seeds),
-        "tasks": count, "counts": {"new": count}, "prerequisite_counts": {}, "share": 0.0, "remaining": None,
-    }  # fmt: skip
+def _select_sweeps(answers: Answers, names: Collection[str]) -> dict[str, KnownSweep]:
+    known = answers.sweeps.known
+    folder, expected = answers.outputs / "sweeps", ", ".join(known) or "none; memmlp sweep makes them"
+    if not known:
+        raise InputError(f"{folder}: has {expected}")
+    shown: dict[str, KnownSweep] = {}
+    for name in names:
+        stem = f"table{int(name):02}" if name.isdigit() else Path(name).stem
+        found = {one: known[one] for one in known if one == stem or one.startswith(f"{stem}-")}
+        if not found:
+            raise InputError(f"{name}: not found in {folder}, which has {expected}")
+        shown |= found
+    return shown or known
 
 
 def _read_curves(run: Run) -> dict[str, Any]:

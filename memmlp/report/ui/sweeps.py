@@ -20,7 +20,6 @@ from memmlp.report.tables.build_table import finished_runs, make_table
 from memmlp.report.tables.measured_run import Measured, load
 from memmlp.report.tables.seed_rounds import ROUNDS_FILE, Rounds, check_same_runs, progress, subject
 from memmlp.report.tables.statistics import Verdict
-from memmlp.report.tables.table import Table
 from memmlp.report.tables.table_text import as_json, better, caption, heading, legend
 from memmlp.report.ui.run_index import RunIndex
 from memmlp.runs.identity import NETWORK, training_settings
@@ -107,7 +106,7 @@ class Sweeps:
 
     def describe_progress(self, known: KnownSweep, states: Mapping[str, str]) -> dict[str, Any]:
         """Return a sweep's progress, given its tasks' states."""
-        plan = known.plan
+        plan, sweep = known.plan, known.sweep
         counts = {True: Counter[str](), False: Counter[str]()}
         for task in plan.tasks:
             counts[task.kind == NETWORK][states[task.key]] += 1
@@ -116,7 +115,8 @@ class Sweeps:
         # An unfinished run has at least one step left: its evaluation may be missing.
         left = sum(max(remaining, states[key] != "done") for key, (_, remaining) in steps.items())
         return {
-            **name_sweep(plan.name, known.sweep),
+            "name": plan.name,
+            "title": f"Table {sweep.table}: {sweep.title}" if sweep.table else sweep.title,
             "variants": len({entry.label for entry in plan.entries}),
             "seeds": len({entry.seed for entry in plan.entries}),
             "tasks": counts[True].total(),
@@ -197,7 +197,7 @@ class Sweeps:
         rounds, flag = find_rounds(known.sweep, plan)
         sweep = rounds.spent(known.sweep) if rounds else known.sweep
         entries = {(entry.label, entry.seed): entry for entry in plan.entries}
-        metric = _cell_metric(sweep)
+        metric = next((metric for metric in sweep.metrics if metric in UNITS), "MPJPE")
         values: dict[tuple[str, int], float] = {}
 
         def find(variant: Variant, seed: int) -> Measured | None:
@@ -219,28 +219,20 @@ class Sweeps:
         table = make_table(sweep, runs, rounds=rounds)
         table = replace(table, flags=(*table.flags, *flag, *flags))
         described = describe_rounds(rounds, sweep) if rounds else None
-        return describe_results(sweep, table) | {"rounds": described, "values": values}
-
-
-def name_sweep(name: str, sweep: Sweep) -> dict[str, Any]:
-    """Return a sweep's name and title, with its table's number in the paper."""
-    return {"name": name, "title": f"Table {sweep.table}: {sweep.title}" if sweep.table else sweep.title}
-
-
-def describe_results(sweep: Sweep, table: Table) -> dict[str, Any]:
-    """Return a sweep's results for a page: the table, and the metric of its cells."""
-    branches = {variant.branch for variant in sweep.variants}
-    return {
-        "metric": _cell_metric(sweep),
-        "branch": branches.pop() if len(branches) == 1 else "",
-        "table": {
-            **json.loads(as_json(table)),
-            "caption": caption(table),
-            "headings": {metric: heading(metric) for metric in table.metrics},
-            "better": {metric: better(metric) for metric in table.metrics},
-            "legend": legend(table),
-        },
-    }
+        branches = {variant.branch for variant in sweep.variants}
+        return {
+            "metric": metric,
+            "branch": branches.pop() if len(branches) == 1 else "",
+            "table": {
+                **json.loads(as_json(table)),
+                "caption": caption(table),
+                "headings": {metric: heading(metric) for metric in table.metrics},
+                "better": {metric: better(metric) for metric in table.metrics},
+                "legend": legend(table),
+            },
+            "rounds": described,
+            "values": values,
+        }
 
 
 def find_rounds(sweep: Sweep, plan: Plan) -> tuple[Rounds | None, list[str]]:
@@ -267,10 +259,6 @@ def describe_rounds(rounds: Rounds, sweep: Sweep) -> dict[str, Any]:
         analyses.append({"seeds": seeds, "level": level, "compared": len(found), "decided": decided})
     variants = [asdict(variant) for variant in progress(rounds, sweep)]
     return {"comparisons": len(rounds.comparisons(sweep)), "analyses": analyses, "variants": variants}
-
-
-def _cell_metric(sweep: Sweep) -> str:
-    return next((metric for metric in sweep.metrics if metric in UNITS), "MPJPE")
 
 
 def _changed(path: Path) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,14 +12,12 @@ from chromium import Browser
 from report.ui.conftest import SEEDS, make_outputs, predict, run_of, started_run
 
 from memmlp.cli.sweep import analyse
+from memmlp.common.errors import InputError
 from memmlp.evaluation.metric_facts import UNITS
-from memmlp.report.tables.build_table import finished_runs, make_table, run_finder
-from memmlp.report.tables.measured_run import load
 from memmlp.report.tables.seed_rounds import new_rounds
-from memmlp.report.ui.report_file import ReportedSweep, write_page
+from memmlp.report.ui.report_file import write_page
 from memmlp.report.ui.server import Answers, RunsServer
 from memmlp.runs.run import Run
-from memmlp.sweep.definition import kept_sweep
 from memmlp.sweep.plan import Plan
 
 EVIL = "<img src=x onerror=owned=1>"
@@ -243,24 +240,17 @@ def test_a_phone_s_page_is_not_wider_than_the_phone(browser: Browser, server: Ru
 
 
 def test_a_file_without_a_server(browser: Browser, home: Path, tmp_path: Path):
-    folder = home / "sweeps" / "mine"
-    sweep, plan = kept_sweep(folder), Plan.load(folder / "plan.json")
-    assert sweep is not None
-    runs = finished_runs(sweep, run_finder(plan, load))
-    other = replace(sweep, name="other", title="Other")
-    nothing = {variant.label: {} for variant in other.runnable()}
-    sweeps = [
-        ReportedSweep("other", other, nothing, make_table(other, nothing)),
-        ReportedSweep("mine", sweep, runs, make_table(sweep, runs)),
-    ]
-    text = write_page(Answers(home, predict), sweeps, "Generated today")
+    answers = Answers(home, predict)
+    text = write_page(answers, ["mine.yaml"], "Generated today")
+    with pytest.raises(InputError, match=r"other: .* has mine"):
+        write_page(answers, ["other"], "")
     assert EVIL not in text
     assert not re.search(r"<link[^>]*href=\"(?!data:)|<(script|img)[^>]*src=", text)
     file = tmp_path / "report.html"
     file.write_text(text)
-    go(browser, file.as_uri(), "", "document.querySelectorAll('main h2').length >= 2")
+    go(browser, file.as_uri(), "", "document.querySelectorAll('main h2').length >= 1")
     heads = "[...document.querySelectorAll('main h2')].map(one => one.textContent)"
-    assert browser.value(heads) == ["Mine", "Other"]  # one without runs comes last
+    assert browser.value(heads) == ["Mine"]
     assert browser.value("document.body.textContent.includes('Generated today')")
     assert browser.value("document.querySelectorAll('.verdict').length") == 2
     go(browser, file.as_uri(), "runs", f"{NAMES}.length == 6")
@@ -270,4 +260,3 @@ def test_a_file_without_a_server(browser: Browser, home: Path, tmp_path: Path):
     )
     go(browser, file.as_uri(), f"run/{best.id}", "document.documentElement.dataset.replayed?.endsWith(' 3')")
     go(browser, file.as_uri(), "sweep/mine", "document.querySelectorAll('.plot svg').length >= 2")
-    go(browser, file.as_uri(), "sweep/other", "document.querySelector('.effects')")
