@@ -18,8 +18,6 @@ from memmlp.common.lease import Lock
 from memmlp.common.overrides import Override
 
 if TYPE_CHECKING:
-    from optuna.trial import FrozenTrial
-
     from memmlp.sweep.plan import RunTask
     from memmlp.sweep.search.search_file import Search, Value
     from memmlp.sweep.search.study import Study
@@ -245,6 +243,7 @@ def summary(setup: Setup, study: Study) -> None:
 
     from memmlp.sweep.search.progress_table import add_row, count_trials, figures, trials_table
     from memmlp.sweep.search.results import IMPORTANCE, boundary_warnings, importances, too_few_trials
+    from memmlp.sweep.search.study import trial_values
     from memmlp.training.data_remarks import partial_words
 
     console = Console(highlight=False)
@@ -267,30 +266,9 @@ def summary(setup: Setup, study: Study) -> None:
         click.echo(f"on a part of the data: {part}")
     click.echo(f"in {setup.folder}")
     if best:
-        click.echo(f"next: memmlp train {shlex.join(training(setup, best[0]))}")
+        words = setup.overrides(trial_values(best[0], setup.search))[1:]
+        click.echo(f"next: memmlp train {shlex.join([*setup.config_options, *words])}")
     else:
         reasons = [trial.user_attrs["reason"] for trial in study.trials if "reason" in trial.user_attrs]
         click.echo(f"no trial is complete; the last failure: {(reasons or ['NaN errors'])[-1]}")
         raise SystemExit(1)
-
-
-def training(setup: Setup, trial: FrozenTrial) -> list[str]:
-    """Return the overrides with which `memmlp train` makes a trial's run.
-
-    These choose the experiment that was written of it, if that makes the same run. An experiment of the base
-    or the command line may set something else; then they are all of the trial's settings.
-    """
-    from memmlp.config.build_request import build_request
-    from memmlp.config.compose import composed
-    from memmlp.sweep.search.study import trial_values
-
-    short = ["--config-dir", str(setup.folder), "experiment=best", *setup.command_line]
-    try:
-        cfg = composed(short)
-        cfg.paths.outputs = str(setup.outputs)
-        request = build_request(cfg)
-        if request.identity(request.motion.prepare().digest).id == trial.user_attrs["runs"][0]:
-            return short
-    except InputError:
-        pass
-    return [*setup.config_options, *setup.overrides(trial_values(trial, setup.search))[1:]]

@@ -225,7 +225,7 @@ def start_fleet(folder: Path, plan: Plan, workers: Workers, devices: Iterable[st
     Raises:
         InputError: if workers can't have the GPUs that are asked for.
     """
-    from memmlp.config.worker_process import work_alone, work_under_controller
+    from memmlp.config.worker_process import work
     from memmlp.sweep.controller import Fleet
     from memmlp.sweep.worker import Presence
 
@@ -239,9 +239,7 @@ def start_fleet(folder: Path, plan: Plan, workers: Workers, devices: Iterable[st
     plan.save(path)
     presence = Presence(own.with_suffix(".process"))
     gpu = executor.gpus and may_use_gpu
-    if workers.executor == "local":
-        threads = max((os.cpu_count() or 1) // count, 1)
-        work = partial(work_under_controller, str(path), threads, str(presence.path), gpu)
-    else:
-        work = partial(work_alone, str(path), gpu)
-    return path, Fleet(executor, work, count, folder / "workers", presence)
+    local = workers.executor == "local"
+    threads = max((os.cpu_count() or 1) // count, 1) if local else 0
+    job = partial(work, str(path), threads, str(presence.path) if local else None, gpu)
+    return path, Fleet(executor, job, count, folder / "workers", presence)

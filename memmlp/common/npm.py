@@ -1,17 +1,14 @@
 """Pinned packages from the npm registry, whose files are parts of pages: fetched once, checked, and kept.
 
-The registry is `NPM_CONFIG_REGISTRY`, else npm's own (`npm config get registry`), else registry.npmjs.org.
+The registry is `NPM_CONFIG_REGISTRY`, or else registry.npmjs.org.
 Tarballs are kept below the user's cache folder. They are read member by member, and never unpacked.
 """
 
 from __future__ import annotations
 
 import base64
-import contextlib
 import hashlib
 import os
-import shutil
-import subprocess
 import tarfile
 import urllib.request
 from collections.abc import Collection
@@ -125,16 +122,10 @@ def cache() -> Path:
 
 
 def registry() -> str:
-    """Return the address of the registry with which npm is configured."""
+    """Return the address of the registry."""
     given = (value for name, value in os.environ.items() if name.upper() == "NPM_CONFIG_REGISTRY")
     if address := next(given, ""):
         return address
-    if npm := shutil.which("npm"):
-        command = [npm, "config", "get", "registry"]
-        with contextlib.suppress(OSError, subprocess.TimeoutExpired):
-            ran = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, check=False)
-            if ran.stdout.startswith("http"):
-                return ran.stdout.strip()
     return DEFAULT_REGISTRY
 
 

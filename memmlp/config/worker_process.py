@@ -14,13 +14,15 @@ from memmlp.sweep.worker import Cancelled, Presence, has_controller, work_off
 from memmlp.training.request import RunRequest
 
 
-def work_under_controller(path: str, threads: int, controller: str, gpu: bool) -> str | None:
-    """Work on the tasks of the plan in a file for as long as its controller's process is alive.
+def work(path: str, threads: int, controller: str | None, gpu: bool) -> str | None:
+    """Work on the tasks of the plan in a file.
 
     Args:
         path: the plan's file.
         threads: torch's threads if the config leaves them open; 0 leaves the choice to torch.
-        controller: the file that identifies the controller's process (`Presence`).
+        controller: the file that identifies the controller's process (`Presence`), with which the worker
+            ends. None for a worker on another machine: it works on a closed plan (a sweep's) to its end, and
+            on an open one (a search's) while its controller shows signs of life.
         gpu: whether this worker should have a GPU.
 
     Returns:
@@ -28,26 +30,8 @@ def work_under_controller(path: str, threads: int, controller: str, gpu: bool) -
     """
     if gpu and (line := missing_gpu()):
         return line
-    work_off(Path(path), partial(perform, Path(path), threads), lambda: Presence.of(Path(controller)))
-    return None
-
-
-def work_alone(path: str, gpu: bool) -> str | None:
-    """Work on the tasks of the plan in a file until none is left, on another machine than the controller.
-
-    A worker on a cluster outlives the process that started it: it works on a closed plan (a sweep's) to its
-    end, and on an open one (a search's) while its controller shows signs of life.
-
-    Args:
-        path: the plan's file.
-        gpu: whether this worker should have a GPU.
-
-    Returns:
-        A line if there is no such GPU, in which case nothing was done; else None.
-    """
-    if gpu and (line := missing_gpu()):
-        return line
-    work_off(Path(path), partial(perform, Path(path), 0), lambda: has_controller(Path(path)))
+    wanted = partial(Presence.of, Path(controller)) if controller else partial(has_controller, Path(path))
+    work_off(Path(path), partial(perform, Path(path), threads), wanted)
     return None
 
 

@@ -7,7 +7,7 @@ A plan holds only the runs' identities; their progress is read from the run fold
 from __future__ import annotations
 
 import json
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -209,8 +209,3 @@ def run_seconds(run: Run) -> float | None:
     """Return how long a finished run took, all stages together; None if it has not finished."""
     found = run.manifest.get("seconds") if run.done else None
     return sum(found.values()) if isinstance(found, dict) else found
-
-
-def count_states(plan: Plan) -> Counter[str]:
-    """Count a plan's tasks in each state."""
-    return Counter(plan.states().values())

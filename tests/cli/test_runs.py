@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from pathlib import Path
 
 import pytest
@@ -44,18 +43,6 @@ def lines_up(ran: Ran, width: int) -> bool:
     return ran.code == 0 and max(widths) <= width
 
 
-@pytest.mark.parametrize("width", [80, 120])
-def test_list_lines_up(memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch, width: int):
-    monkeypatch.setenv("COLUMNS", str(width))
-    ran = memmlp("runs", "list")
-    assert lines_up(ran, width)
-    rows = {line.split()[0]: line.split() for line in ran.out.splitlines() if line.strip()[:1] in set("abc")}
-    assert rows[A][1] == "done"
-    assert rows[A][-4:] == (["6.51", "7.00", "-", "1.50"] if width == 120 else ["0", "0", "6.51", "7.00"])
-    assert rows[C][1] == "stopped"
-    assert rows[C][-2:] == ["-"] * 2
-
-
 def test_list_names_the_older_ones(memmlp: Memmlp, outputs: Path):
     for i in range(25):
         Run.of(outputs, f"{i:016x}").begin("vqvae", {}, data="d", prerequisite=None)
@@ -74,37 +61,6 @@ def test_finished_vqvaes_are_counted_and_listed_where_asked_for(memmlp: Memmlp, 
     assert "1 finished VQ-VAE: memmlp runs list --all\n" in said
     assert run.id in memmlp("runs", "list", "--all").out
     assert run.id in memmlp("runs", "list", "--where", "kind=vqvae").out
-
-
-def test_runs_of_two_data_sets_fit_a_terminal(
-    memmlp: Memmlp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    groups = [f"subject{i}/.*" for i in range(15)]
-    for letter, name, memory in (("a", "synth", "vq"), ("b", "synth", "none"), ("c", "mocap", "vq")):
-        data = {"name": name, "split": {"groups": groups if name == "mocap" else []}}
-        config = {"data": data, "memory": {"name": memory}, "seed": 0}
-        digest = "e" * 64 if name == "mocap" else "f" * 64
-        run = Run.of(tmp_path / "outputs", letter * 16)
-        words = " · ".join(["profile=tiny", f"memory={memory}", "seed 0"])
-        run.begin("memmlp", config, data=digest, prerequisite=None, name=words)
-    monkeypatch.setenv("COLUMNS", "80")
-    ran = memmlp("runs", "list")
-    assert lines_up(ran, 80)
-    assert heads(ran.out) >= {"run", "name", "data", "memory"}
-    rows = {line[0]: line.split() for line in ran.out.splitlines() if line[:1] in set("abc")}
-    assert rows["b"][2:9] == ["profile=tiny", "·", "memory=none", "·", "seed", "0", "synth"]
-    assert rows["c"][8:10] == ["mocap", "vq"]
-    assert "--columns" not in ran.out
-    assert "subject14" in memmlp("runs", "list", "--columns", "data.split.groups").out
-
-
-def test_a_long_value_that_nobody_asked_for_is_cut(
-    memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch
-):
-    Run.of(outputs, A).begin("memmlp", {"seed": "x," * 40}, data="d" * 64, prerequisite=None)
-    monkeypatch.setenv("COLUMNS", "120")
-    assert "…" in memmlp("runs", "list").out
-    assert "…" not in memmlp("runs", "list", "--columns", "seed").out
 
 
 def test_an_empty_list_says_where_it_looked(memmlp: Memmlp):
@@ -158,17 +114,6 @@ def test_list_names_the_networks_that_hardly_saw_motion(memmlp: Memmlp, outputs:
     for name in (A, B):
         Run.of(outputs, name).config_path.write_text(json.dumps(little))
     assert f"{said} all finished runs\n" in memmlp("runs", "list").out
-
-
-def test_diff_cuts_no_number(memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch):
-    """Half a number is another number: keys get narrow first."""
-    numbers = ["1.7190123e+05", "3.9876543e+05", "+2.2686e+05", "10^2 m/s^3"]
-    rows = [("deployment.onnx.parameters_with_vq_and_more", *numbers)]
-    module = sys.modules["memmlp.cli.runs.show"]  # in its package the name is the command's
-    monkeypatch.setattr(module, "result_differences", lambda first, second: rows)
-    said = memmlp("runs", "diff", A, B).out
-    assert all(number in said for number in [*numbers, A[:8], B[:8]])
-    assert "".join(word for word in said.split() if word in rows[0][0]) == rows[0][0]
 
 
 def test_diff_leaves_out_what_changes_no_result(memmlp: Memmlp, outputs: Path):
@@ -244,54 +189,6 @@ def test_list_shows_what_differs_as_far_as_there_is_room(
     assert heads(seen["85"]) == {"run", "status", "name", "seed", "memory.", "layers", "MPJPE", "stream"}
     assert heads(seen["140"]) == heads(seen["85"]) | {"window", "Jitter", "age", "ms"}
     assert "differ in" not in seen["140"]
-
-
-def test_of_many_keys_a_few_have_columns_and_results_have_theirs(
-    memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch
-):
-    for digit in ("d", "e"):
-        config = {f"key{letter}": digit for letter in "abcdefghij"}
-        Run.of(outputs, digit * 16).begin(
-            "memmlp", config, data="d" * 64, prerequisite=None, name=f"of {digit}"
-        )
-    for width, there in (("80", {"name", "stream"}), ("140", {"name", "stream", "window", "Jitter", "keya"})):
-        monkeypatch.setenv("COLUMNS", width)
-        ran = memmlp("runs", "list")
-        assert heads(ran.out) >= there
-        assert lines_up(ran._replace(out=ran.out.partition("they also")[0]), int(width))
-        option = ran.out.rpartition(": --columns ")[2].split()[0]
-        assert option.startswith("name,")
-        assert memmlp("runs", "list", "--columns", option).code == 0
-        assert "more keys: --columns" in ran.out
-
-
-def test_names_have_the_room_that_there_is(memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch):
-    long = "model=avatar_poser · optim.lr=0.004 · optim.warmup=100"
-    for digit in ("d", "e"):
-        config = {"seed": int(digit, 16), "memory": {"layers": [2]}}
-        Run.of(outputs, digit * 16).begin("memmlp", config, data="d" * 64, prerequisite=None, name=long)
-    monkeypatch.setenv("COLUMNS", "200")
-    assert memmlp("runs", "list").out.count(long) == 2
-    monkeypatch.setenv("COLUMNS", "90")
-    ran = memmlp("runs", "list")
-    assert lines_up(ran, 90)
-    assert long not in ran.out
-    assert ran.out.count("warmup=100") == 2
-
-
-def test_data_stay_in_a_narrow_list_since_errors_on_others_do_not_compare(
-    memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch
-):
-    for digit, data in (("d", "mine"), ("e", "yours")):
-        config = {
-            "seed": 1,
-            "memory": {"layers": [2]},
-            "optim": {"lr": int(digit, 16)},
-            "data": {"name": data},
-        }
-        Run.of(outputs, digit * 16).begin("memmlp", config, data=digit * 64, prerequisite=None)
-    monkeypatch.setenv("COLUMNS", "40")
-    assert "data" in heads(memmlp("runs", "list").out)
 
 
 def test_no_word_of_the_columns_that_were_asked_for_is_broken(memmlp: Memmlp, outputs: Path):

@@ -7,18 +7,15 @@ import re
 import shlex
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from benchmarks.chaos import examine
 from command_line import BRIEF, run_apart
 from command_line import run as command
 
-from memmlp.cli.tune import _tasks, prepare_search, search, training
+from memmlp.cli.tune import prepare_search, search
 from memmlp.cli.workers import Workers
 from memmlp.common.errors import InputError
-from memmlp.config.build_request import build_request
-from memmlp.config.compose import composed
 from memmlp.runs.identity import VERSIONS
 from memmlp.runs.run import Run
 from memmlp.sweep.search import director as director_module
@@ -175,30 +172,6 @@ def test_another_recipe_of_what_later_trials_use_makes_another_search(
         with monkeypatch.context() as patched:
             patched.setitem(VERSIONS, component, 99)
             assert (prepare_search([*TINY, *space], None, tmp_path).folder.name == before) == same
-
-
-@pytest.mark.parametrize("words", [["experiment=no_codes"], ["search.base=['experiment=no_codes']"]], ids=str)
-def test_beside_an_experiment_the_best_trial_is_told_word_by_word(tmp_path: Path, words: list[str]):
-    space = ["search.space.loss=null", "+search.space.optim={lr: {choices: [1e-3, 2e-3]}}"]
-    setup = prepare_search([*TINY, *words, *space], None, tmp_path)
-    found = {"optim.lr": 2e-3}
-    task = _tasks(setup, found)[0][-1]
-    write_best(setup.folder, "optim: {lr: 2.0e-3}")
-    trial = SimpleNamespace(params=found, user_attrs={"runs": [task.id]})
-    told = training(setup, trial)
-    assert "experiment=best" not in told
-    assert "experiment=no_codes" in told
-    cfg = composed(told)
-    cfg.paths.outputs = str(setup.outputs)
-    request = build_request(cfg)
-    assert request.identity(request.motion.prepare().digest).id == task.id
-
-
-def write_best(folder: Path, content: str) -> None:
-    """Write what a search leaves of its best trial."""
-    path = folder / "experiment/best.yaml"
-    path.parent.mkdir(parents=True)
-    path.write_text(f"# @package _global_\n{content}\n")
 
 
 def test_a_folder_of_ones_own_searches(tmp_path: Path):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import io
-import subprocess
 import tarfile
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import pytest
 
 from memmlp.common import npm
 from memmlp.common.errors import InputError
-from memmlp.common.npm import DEFAULT_REGISTRY, Package
+from memmlp.common.npm import Package
 
 FILES = {"package/package.json": b"{}", "package/dist/a.js": b"let a;", "package/dist/b.js": b"let b;"}
 
@@ -97,14 +96,3 @@ def test_a_registry_out_of_reach_is_one_line(package, address, monkeypatch):
         npm.tarball(package[0])
     assert str(told.value).startswith("@scope/name@1.2.3: cannot be fetched from the npm registry (")
     assert "npm pack @scope/name@1.2.3" in str(told.value)
-
-
-def test_the_registry_is_npm_s(place, monkeypatch):
-    monkeypatch.setattr(npm.shutil, "which", lambda name: None)
-    assert npm.registry() == DEFAULT_REGISTRY
-    monkeypatch.setattr(npm.shutil, "which", lambda name: "/bin/npm")
-    said = subprocess.CompletedProcess([], 0, "https://asked.example/\n", "")
-    monkeypatch.setattr(npm.subprocess, "run", lambda *_, **__: said)
-    assert npm.registry() == "https://asked.example/"
-    monkeypatch.setenv("NPM_CONFIG_REGISTRY", "https://set.example/")
-    assert npm.registry() == "https://set.example/"

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 import memmlp
-from memmlp.common import processes
 from memmlp.common.processes import (
     finish_uninterrupted,
     import_environment,
@@ -62,12 +61,3 @@ def test_a_request_to_end_is_a_ctrl_c():
     with pytest.raises(KeyboardInterrupt), termination_interrupts():
         signal.raise_signal(signal.SIGTERM)
     assert signal.getsignal(signal.SIGTERM) == before
-
-
-def test_a_share_by_clocks_of_the_tests_own(monkeypatch: pytest.MonkeyPatch):
-    clocks = {"perf_counter": 100.0, "thread_time": 3.0}
-    for name in clocks:
-        monkeypatch.setattr(processes.time, name, lambda name=name: clocks[name])
-    clock = processes.CoreClock()
-    clocks |= {"perf_counter": 108.0, "thread_time": 5.0}
-    assert clock.share == 0.25

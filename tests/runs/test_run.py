@@ -10,8 +10,6 @@ import pytest
 from begun_runs import CONFIG, begun, complete
 
 import memmlp.runs.identity
-from memmlp.cli.runs.listing import shown_number
-from memmlp.cli.runs.show import measured_numbers
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.report.tables.measured_run import load
@@ -25,7 +23,6 @@ from memmlp.runs.identity import (
     evaluation_id,
     evaluation_settings,
 )
-from memmlp.runs.loggers.facts import read_run
 from memmlp.runs.query import record
 from memmlp.runs.run import Run
 
@@ -106,25 +103,6 @@ def test_times_shown_are_of_the_file_that_the_config_asks_for(tmp_path: Path, gr
     assert load(run.folder).costs["ms"] == 1.0
     assert read_facts(run.folder)["metrics"]["latency.median_ms"] == 1.0
     assert run.preferred_deployment.settings["graph"] == "auto"
-
-
-@pytest.mark.parametrize(("export", "name", "time"), [
-    ({"precision": "int8"}, "int8", 0.4), ({"graph": "naive"}, "naive", 1.0),
-    ({"graph": "naive", "opset": 15}, "naive-opset15", 1.0),
-])  # fmt: skip
-def test_times_of_another_file_have_its_name(tmp_path: Path, export: dict, name: str, time: float):
-    run = begun(tmp_path, CONFIG | {"export": {"graph": "auto", "precision": "fp32"}})
-    deploy(run, "2026-01-02", INTEGERS, **export)
-    assert list(run.results) == [f"latency-{name}"]
-    one = record(run)
-    assert one[f"latency-{name}.median_ms"] == time
-    assert "latency.median_ms" not in one
-    assert read_facts(run.folder)["metrics"][f"latency-{name}.median_ms"] == time
-    assert shown_number(one, "latency.median_ms") == f"{time:.2f} {name}"
-    results = {point.key: point.value for point in read_run(run).results}
-    assert results[f"latency-{name}/median_ms"] == time
-    assert measured_numbers(run)[f"latency-{name}.median_ms"] == time
-    assert f"latency-{name}.settings" not in " ".join(measured_numbers(run))
 
 
 def test_todays_recipes_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

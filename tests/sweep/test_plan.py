@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -78,32 +77,7 @@ def test_a_run_is_judged_by_its_variant(plan: Plan):
     assert forecast(plan) == Forecast(60.0 + 1200.0, finished=2)
 
 
-def test_a_trained_run_without_what_the_plan_wants_of_it_judges_none(plan: Plan):
-    """Its time lacks an evaluation, and would be a quarter of what the others take."""
-    finish(plan, CODES[0], 10.0)
-    finish(plan, SLOW[0], 60.0)
-    task = next(task for task in plan.tasks if task.id == QUICK[0])
-    finish(plan, QUICK[0], 15.0)
-    wanting = replace(task, stages=("e" * 16,))
-    again = replace(plan, tasks=tuple(wanting if one.id == task.id else one for one in plan.tasks))
-    assert wanting in again.left()
-    assert forecast(again) == Forecast(3 * 60.0, finished=1)
-
-
 def test_an_variant_without_a_finished_run_is_judged_by_the_others_and_counted(plan: Plan):
     finish(plan, CODES[0], 10.0)
     finish(plan, QUICK[0], 60.0)
     assert forecast(plan) == Forecast(60.0 + 2 * 60.0, finished=1)
-
-
-def test_of_a_finished_plan_nothing_is_foretold(plan: Plan):
-    for name in (*CODES, *QUICK, *SLOW):
-        finish(plan, name, 1.0)
-    assert forecast(plan) is None
-
-
-def test_a_run_too_short_for_the_clock_counts_as_finished(plan: Plan):
-    finish(plan, CODES[0], {"vqvae": 0.0})
-    finish(plan, QUICK[0], {"train": 0.0})
-    finish(plan, SLOW[0], 20.0)
-    assert forecast(plan) == Forecast(20.0, finished=2)

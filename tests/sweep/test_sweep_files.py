@@ -7,23 +7,16 @@ errors' definitions imply.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-import tiny
-import torch
 import yaml
 from omegaconf import OmegaConf
 
-from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
-from memmlp.motion.normalizer import Normalizer
 from memmlp.runs.identity import flatten
 from memmlp.sweep.sweep_file import load_sweep
-from memmlp.training.loop import train_step
-from memmlp.training.train_network import MotionTask
 
 FOLDER = Path(__file__).parent.parent.parent / "sweeps"
 FILES = sorted(FOLDER.glob("*.yaml"))
@@ -34,12 +27,6 @@ PRINTED: dict[int, dict[str, Any]] = yaml.safe_load(
     Path(__file__).with_name("paper_values.yaml").read_text(encoding="utf-8")
 )
 UPPER_JOINTS, LOWER_JOINTS = 13, 9
-OTHERS_JOINTS = (
-    "BoDiffusion",
-    "EgoPoser",
-    "MANIKIN-S",
-    "MANIKIN-LN",
-)  # their papers divide the body otherwise
 FULL = {
     4: 3,
     5: 1,
@@ -109,22 +96,6 @@ def test_values_are_those_printed():
 AFTER_IK = {"MPJPE": 3.08, "Jitter": 6.03}  # Table 6, "Rotation + Position Branch"
 
 
-def test_rows_with_table_6s_combined_values_show_the_combined_branch():
-    """The file also says how we know the branch. A network with rotations alone shows these."""
-    for path in TABLES[:15]:
-        sweep = load_sweep(path)
-        assert sweep.branch_source
-        full = [variant for variant in sweep.variants if AFTER_IK.items() <= (variant.paper or {}).items()]
-        assert bool(full) == (sweep.table not in (2, 3))
-        assert {variant.branch for variant in full} <= {"combined"}
-        for variant in sweep.runnable():
-            words = sweep.all_overrides(variant)
-            single = any(word.startswith(("model=", "predictor=rotation_only")) for word in words)
-            assert (variant.branch == "rotation") == (single or variant.label == "Rotation Branch")
-            assert ("evaluation.ik=off" in words) == single
-            assert ("evaluation.ik=lbfgs" in words) != single
-
-
 DECOMPOSITION = load_sweep(FOLDER / "decomposition.yaml")
 
 
@@ -171,24 +142,6 @@ def _trained(config: dict[str, object]) -> dict[str, object]:
     return {key: value for key, value in config.items() if not key.startswith("evaluation.ik")}
 
 
-@pytest.mark.slow
-def test_every_variant_of_the_decomposition_trains():
-    """A step of each variant changes the weights, under the loss that its label names."""
-    for variant in DECOMPOSITION.variants:
-        experiment = build_experiment(composed([*DECOMPOSITION.all_overrides(variant), "profile=tiny"]))
-        torch.manual_seed(0)
-        architecture, frames = experiment.architecture, tiny.frames((60, 70))
-        normalizer = Normalizer.raw(architecture.coordinates, tiny.REST)
-        model = architecture.build(normalizer, architecture.vqvae() if architecture.uses_codes else None)
-        before = model.stem.weight.clone()
-        loss, rollout = experiment.training.loss(model.branches), experiment.training.rollout
-        optim = replace(experiment.training.optim, steps=1)
-        task = MotionTask(model, loss, rollout, frames, optim, 0, lambda network: {})
-        result = train_step(task, optim, optim.build(task.parameter_groups()), 0)
-        assert not torch.equal(model.stem.weight, before)
-        assert set(result.terms) == set(TERMS.get(variant.label, TERMS["rest"]))
-
-
 TERMS = {
     "AGRoL-MLP-41": ["rotation_all"],
     "+ features": ["rotation_all"],
@@ -203,10 +156,3 @@ TERMS = {
 
 
 # Facts that tell whether the transcription is right
-
-
-def test_the_full_model_is_the_same_in_every_table():
-    for table in FULL:
-        headline = row(1, "Mem-MLP-41") | ({"MPJVE": 15.08} if table in OTHER_MPJVE else {})
-        found = {key: value for key, value in rows(table)[FULL[table]].items() if key != "label"}
-        assert found == {key: headline[key] for key in found}

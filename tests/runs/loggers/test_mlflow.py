@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fake_logger import a_run as begun
 from fake_logger import an_outdated_evaluation
-from processes import finished
 
 from memmlp.common.files import write_json
 from memmlp.runs.loggers.logger import Session, sync
@@ -147,29 +145,4 @@ def test_a_server_that_is_not_there_is_told(tmp_path: Path):
     assert said[0].startswith(f"run {'0' * 16} is not shown in mlflow: ")
 
 
-COLD = """
-import os, sys
-from pathlib import Path
-from mlflow import MlflowClient
-from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
-from memmlp.runs.run import Run
-from memmlp.runs.loggers.logger import Session
-from memmlp.runs.loggers.mlflow import MLflow
-outputs, begun = Path(sys.argv[1]), []
-for name in sys.argv[2:]:
-    if not (process := os.fork()):
-        Session(MLflow(None, outputs), Run.of(outputs, name)).end()
-        sys.exit()
-    begun.append(process)
-sys.exit(sum(os.waitpid(process, 0)[1] for process in begun))
-"""
 """Processes that have imported MLflow, and do not know its store yet, which is not there."""
-
-
-def test_cold_starts_at_once_do_not_ruin_the_store(tmp_path: Path):
-    names = [f"{i:016x}" for i in range(2)]
-    for name in names:
-        begun(tmp_path, name)
-    ran = finished([sys.executable, "-c", COLD, str(tmp_path), *names])
-    assert (ran.returncode, ran.stderr) == (0, "")
-    assert shown(tmp_path).keys() == set(names)

@@ -15,8 +15,7 @@ import pytest
 import torch
 from processes import ignoring_interrupts, until
 
-from memmlp.common.errors import InputError
-from memmlp.sweep.executors.local import Debug, Local, divide_gpus, visible_gpus, worker_count
+from memmlp.sweep.executors.local import Debug, Local, visible_gpus
 
 
 def touch(path: str) -> None:
@@ -99,32 +98,3 @@ def test_visible_gpus_are_those_of_the_variable_or_all(monkeypatch: pytest.Monke
     for count in (0, 2):
         monkeypatch.setattr(torch.cuda, "device_count", lambda count=count: count)
         assert visible_gpus() == ("0", "1")[:count]
-
-
-def test_shares():
-    four = ("0", "1", "2", "3")
-    assert divide_gpus(four) == [("0",), ("1",), ("2",), ("3",)]
-    assert divide_gpus(four, 2) == [("0", "1"), ("2", "3")]
-    assert divide_gpus(four, 3) == [("0", "1", "2")]
-    assert divide_gpus(four, 0) == []
-    assert divide_gpus(()) == []
-    for gpus, size, line in (
-        (("0", "1"), 3, "at most 2; visible here: 0, 1"),
-        ((), 1, "visible here: no GPU"),
-    ):
-        with pytest.raises(InputError, match=f"--gpus-per-worker {size}: .*{line}"):
-            divide_gpus(gpus, size)
-
-
-def test_worker_counts():
-    two = [("0",), ("1",)]
-    assert worker_count(two, None, None) == 2
-    assert worker_count(two, 5, None) == 5  # shared as evenly as it goes
-    assert worker_count(two, None, 3) == 6
-    assert worker_count(two, 4, 3) == 4
-    assert worker_count([], 4, None) == 4
-    assert worker_count([], None, None) == os.cpu_count()
-    with pytest.raises(InputError, match="--workers 7: must be at most 6 with --workers-per-gpu 3"):
-        worker_count(two, 7, 3)
-    with pytest.raises(InputError, match="--workers-per-gpu 2"):
-        worker_count([], 4, 2)

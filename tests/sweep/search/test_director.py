@@ -28,7 +28,7 @@ from memmlp.sweep.plan import RunTask
 from memmlp.sweep.search import study as study_module
 from memmlp.sweep.search.progress_table import figures
 from memmlp.sweep.search.search_file import Value
-from memmlp.sweep.search.study import Study, reason
+from memmlp.sweep.search.study import Study
 
 
 def test_a_search_has_the_trials_it_wants_and_the_papers_first(tmp_path: Path):
@@ -130,17 +130,6 @@ def test_values_that_make_no_sense_fail_their_trial_and_hopeless_searches_end(tm
     one = director(study, tmp_path, refused)
     with pytest.raises(InputError, match="all 5 trials failed, the last one: hand=position needs"):
         one.update(2)
-
-
-def test_a_value_that_is_no_number_is_a_failure(tmp_path: Path):
-    study = open_study(tmp_path)
-    one = director(study, tmp_path)
-    run = begun(one.update(1))
-    log(run, STEPS, float("nan"))
-    run.finish([])
-    one.update(1)
-    assert study.trials[0].state == TrialState.FAIL
-    assert reason(study.trials[0]) == "MPJPE is NaN"
 
 
 def test_a_pruned_trials_run_is_wanted_again_by_one_with_its_values(tmp_path: Path):
