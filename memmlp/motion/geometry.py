@@ -128,27 +128,6 @@ def bone_chains() -> Tensor:
     return chains - chains[HEAD]
 
 
-def _levels() -> Iterator[tuple[slice, list[slice]]]:
-    """Yield the joints level by level; the joints of a level are equally far from the root.
-
-    Yields:
-        The joints of a level below the root's, and their parents: runs of joints of the level before it,
-        counted from that level's first joint.
-    """
-    starts = [0]
-    for joint, parent in enumerate(PARENTS):
-        if parent >= starts[-1]:
-            starts.append(joint)
-    bounds = [*starts, len(PARENTS)]
-    for before, start, stop in zip(bounds, bounds[1:], bounds[2:], strict=False):
-        runs: list[slice] = []
-        for parent in PARENTS[start:stop]:
-            goes_on = runs and runs[-1].stop == parent - before
-            first = runs.pop().start if goes_on else parent - before
-            runs.append(slice(first, parent - before + 1))
-        yield slice(start, stop), runs
-
-
 def _take_rows(values: Tensor, runs: list[slice]) -> Tensor:
     """Return the rows of values (..., n, a, b) that lie in runs, one run after the other."""
     if runs == [slice(0, values.shape[-3])]:
@@ -157,7 +136,19 @@ def _take_rows(values: Tensor, runs: list[slice]) -> Tensor:
     return parts[0] if len(parts) == 1 else torch.cat(parts, -3)
 
 
-LEVELS = tuple(_levels())
+LEVELS: tuple[tuple[slice, list[slice]], ...] = (
+    (slice(1, 4), [slice(0, 1)] * 3),  # hips and first spine joint on the pelvis
+    (slice(4, 7), [slice(0, 3)]),
+    (slice(7, 10), [slice(0, 3)]),
+    (
+        slice(10, 15),
+        [slice(0, 3), slice(2, 3), slice(2, 3)],
+    ),  # toes; neck and collars on the last spine joint
+    (slice(15, 18), [slice(2, 5)]),
+    (slice(18, 20), [slice(1, 3)]),
+    (slice(20, 22), [slice(0, 2)]),
+)
+"""The joints level by level, equally far from the root, and their parents: runs in the level before."""
 
 
 def clip_kinematics(clip: Clip, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -91,13 +91,8 @@ def _reach(
 ) -> None:
     """Bring hands towards a target, the trunk, knees and gaze helping.
 
-    Args:
-        puppet: the person, who is changed in place.
-        sides: the hands, of 0 (left) and 1 (right).
-        outward: angle of the target away from straight ahead, radians.
-        elevation: angle of the target above the shoulder, radians.
-        part: distance of the target as a part of the arm's length.
-        weight: how far (N,) the hands have got, in [0, 1].
+    Outward and elevation are the target's angles (radians) from straight ahead and above the shoulder; `part`
+    is its distance in arm's lengths. The weight (N,) is how far the hands have got, in [0, 1].
     """
     turn = sum(LEFT_RIGHT[side] for side in sides)  # a lone hand's shoulder is brought along
     low, high = max(-elevation, 0.0), max(elevation, 0.0)
@@ -207,14 +202,7 @@ def jumping(rng: np.random.Generator, t: Array) -> Puppet:
 def _leap(puppet: Puppet, t: Array, swing: float, start: float, off: float, on: float, depth: float) -> None:
     """Move the pelvis through one jump, the trunk with it, and the arms to help.
 
-    Args:
-        puppet: the person, who is changed in place.
-        t: times (N,), seconds.
-        swing: factor on the arms' swing.
-        start: seconds at which the crouch begins.
-        off: seconds of the take-off.
-        on: seconds of the landing.
-        depth: metres by which the pelvis is lowered in the crouch.
+    Start of the crouch, take-off (`off`) and landing (`on`) are in seconds, the crouch's depth in metres.
     """
     low, deep, end, speed = off - 0.28, on + 0.22, on + 0.9, GRAVITY * (on - off) / 2
     heights, speeds = [0, -depth, -0.04, -0.08, -0.7 * depth, 0], [0, 0, speed, -speed, 0, 0]

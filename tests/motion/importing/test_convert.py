@@ -181,13 +181,6 @@ def standing(frames: int) -> np.ndarray:
     return np.tile(positions + np.array([0, 0, 0.02 - positions[FEET[0], 2]]), (frames, 1, 1))
 
 
-def test_the_lowest_step_of_stairs() -> None:
-    positions = standing(400)
-    positions[..., 2] += np.repeat([0.0, 0.2, 0.4, 0.6], 100)[:, None]
-    assert find_floor(positions, 60.0) == pytest.approx(0.0, abs=1e-9)
-    assert find_floor(positions[::-1], 60.0) == pytest.approx(0.0, abs=1e-9)
-
-
 def test_a_jump_does_not_raise_the_floor() -> None:
     positions = standing(100)
     positions[20:80, :, 2] += 0.6 * np.sin(np.linspace(0, np.pi, 60))[:, None]
@@ -379,21 +372,6 @@ def test_a_zero_pose_serves_if_it_stands(tmp_path: Path, walk: Clip) -> None:
     assert (stance.positions[10] - stance.positions[7])[2] > 0
 
 
-def test_a_runner_whose_feet_point_back_is_no_stance(tmp_path: Path, walk: Clip) -> None:
-    """The next straightest frame serves."""
-    turns = random_turns(own_tree(DAZ), 1)
-    first = found(tmp_path, walk, DAZ, turns=turns)
-    bvh = read_bvh(tmp_path / "clip.bvh")
-    mapped_motion = pick_joints(bvh, DAZ)
-    frame = int(first.source.split()[-1])
-    for ankle, toes in ((7, 10), (8, 11)):
-        foot = mapped_motion.positions[frame, toes] - mapped_motion.positions[frame, ankle]
-        mapped_motion.positions[frame, toes] -= 2 * foot * [1, 0, 1]
-    other = find_stance(bvh, DAZ, mapped_motion)
-    assert other.source.startswith(STRAIGHTEST)
-    assert other.source != first.source
-
-
 def test_who_never_stands_is_refused(tmp_path: Path, walk: Clip) -> None:
     turns = random_turns(own_tree(DAZ), 1)
     with refuse(tmp_path / "clip.bvh", "stands neither in the zero pose (", "nor in any frame (at best, "):
@@ -432,14 +410,6 @@ def test_swapped_sides_are_refused(tmp_path: Path, walk: Clip) -> None:
     turns = random_turns(own_tree(DAZ), 1)
     with refuse(tmp_path / "clip.bvh", "bends forward: left and right"):
         found(tmp_path, walk, swapped(DAZ, LEG), turns=turns)
-
-
-def test_joints_of_a_leg_that_stand_for_others_are_refused(tmp_path: Path, walk: Clip) -> None:
-    """The ankle as a knee makes a leg that bends forward."""
-    joints = DAZ.joints | {"left_knee": "lFoot", "left_ankle": "lFoot.end"}
-    del joints["left_foot"]
-    with refuse(tmp_path / "clip.bvh", "left_knee bends forward: left and right, or the joints of the leg"):
-        found(tmp_path, walk, replace(DAZ, joints=joints))
 
 
 # A map's rest

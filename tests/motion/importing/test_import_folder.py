@@ -93,20 +93,6 @@ def test_bad_files_are_skipped(source: Path, tmp_path: Path) -> None:
     assert str(tmp_path) not in (tmp_path / "out" / "import.json").read_text()
 
 
-def test_a_new_folder_is_there_with_all_its_clips_at_once(source: Path, tmp_path: Path, monkeypatch) -> None:
-    seen, rename = [], Path.rename
-
-    def renamed(self: Path, target: Path) -> Path:
-        seen.append((target, sorted(path.suffix for path in self.rglob("*.*"))))
-        return rename(self, target)
-
-    monkeypatch.setattr(Path, "rename", renamed)
-    monkeypatch.setattr("shutil.move", None)
-    report = import_folder(source, tmp_path / "new")
-    assert seen == [(tmp_path / "new", [".json", *[".npz"] * len(report.clips)])]
-    assert sorted(path.name for path in tmp_path.iterdir() if path.name.startswith(".")) == []
-
-
 def test_an_earlier_record_is_gone_before_its_clips_are(source: Path, tmp_path: Path, monkeypatch) -> None:
     out = tmp_path / "out"
     import_folder(source, out)

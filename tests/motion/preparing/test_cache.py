@@ -177,13 +177,6 @@ def test_other_groups_change_the_cache_but_not_its_digest(root, tmp_path):
     assert (first.groups["a/2"], second.groups["a/2"]) == ("a/2", "a/1")
 
 
-def test_nothing_to_prepare_is_one_line(tmp_path):
-    (tmp_path / "empty").mkdir()
-    for where in ("none", "empty"):
-        with pytest.raises(InputError, match=r"data\.root"):
-            prepare(source(tmp_path / where), tmp_path / "cache")
-
-
 def test_frames_of_an_older_component_version_are_made_again(root, tmp_path, monkeypatch):
     first = prepare(source(root), tmp_path / "cache")
     made = (tmp_path / "cache" / "train.npy").stat().st_mtime_ns

@@ -80,18 +80,6 @@ def test_no_more_than_some_clips_of_a_group_are_held_out():
     assert SeededSplit(per_group=2).describe()["per_group"] == 2
 
 
-def test_a_fraction_of_lists_and_subsets(tmp_path):
-    names = [f"{subset}/{n}" for subset in (*S2_TRAIN, *S2_TEST) for n in range(10)]
-    parts = SubsetSplit(S2_TRAIN, S2_TEST, val=0.1, train_fraction=0.5).assign(names).parts
-    assert [len(part(parts, name)) for name in ("train", "val", "test", None)] == [54, 12, 20, 54]
-    (tmp_path / "CMU").mkdir()
-    (tmp_path / "CMU" / "train_split.txt").write_text("\n".join(f"CMU/01/{n}_poses.npz" for n in range(8)))
-    (tmp_path / "CMU" / "test_split.txt").write_text("CMU/02/1_poses.npz\n")
-    listed = [*(f"CMU/01/{n}_poses" for n in range(8)), "CMU/02/1_poses"]
-    parts = ListSplit(tmp_path, val=0.25, train_fraction=0.5).assign(listed).parts
-    assert [len(part(parts, name)) for name in ("train", "val", "test", None)] == [3, 2, 1, 3]
-
-
 def test_lists_in_agrols_format(tmp_path):
     (tmp_path / "CMU").mkdir()
     lines = [f"./CMU/01/{n}_poses.npz" for n in range(8)] + ["amass/CMU/gone_poses.npz", ""]
