@@ -1,10 +1,8 @@
-"""`memmlp bench` times every graph and compares two recipes; AvatarPoser is the published network."""
+"""`memmlp bench latency` times every graph; AvatarPoser is the published network."""
 
 from __future__ import annotations
 
 import json
-import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +11,7 @@ import torch
 from conftest import Memmlp, one_line
 from torch import Tensor, nn
 
-from memmlp.cli.bench import GRAPHS, conclude, summarize, summarize_seeds
+from memmlp.cli.bench import GRAPHS, summarize
 from memmlp.deploy.latency import InTurn
 from memmlp.motion.body import N_JOINTS, SPARSE_DIM
 
@@ -93,59 +91,3 @@ def test_models_include_the_one_that_others_are_compared_with(memmlp: Memmlp):
     assert one_line(memmlp("bench", "latency", "--models", "mem_mlp@41"), "--models", "avatar_poser")
     for word in ("model=rpm", "model.frames=9"):
         assert one_line(memmlp("bench", "latency", word), word, "--models")
-
-
-TINY = (
-    "profile=tiny",
-    "model.depth=2",
-    "data.synth.minutes=0.1",
-    "threads=1",
-    "memory=none",
-    "optim.steps=4",
-)
-
-
-def row(seed: int, current: float, recipe: float | None) -> dict:
-    mark = {"steps": 1, "error": 1.0}
-    reached = {**mark, "seconds": recipe} if recipe else None
-    return {"seed": seed, "current": {**mark, "seconds": current}, "recipe": reached}
-
-
-def test_ratio_interval_and_verdict_by_hand():
-    """Logarithms of 2, 2.5 and 3.125 are equally far apart: ln(1.25). Student's t of 2 degrees is 4.303."""
-    rows = [row(0, 20, 10), row(1, 25, 10), row(2, 31.25, 10)]
-    found = summarize_seeds(rows, 1.0)
-    half = 4.3027 * math.log(1.25) / math.sqrt(3)
-    assert found["ratio"] == pytest.approx(2.5)
-    assert found["low"] == pytest.approx(2.5 * math.exp(-half), rel=1e-4)
-    assert found["verdict"] == "holds"
-    assert summarize_seeds(rows, 2.0)["ratio"] == pytest.approx(2.5)
-    assert summarize_seeds(rows, 2.0)["verdict"] not in ("holds", "opposite")
-    assert summarize_seeds(rows, 9.0)["verdict"] == "opposite"
-
-
-def test_a_seed_that_never_reached_the_error_leaves_nothing_to_claim():
-    found = summarize_seeds([row(0, 20, 1), row(1, 20, 1.1), row(2, 20, None)], 1.0)
-    assert (found["ratio"], found["never"]) == (None, [2])
-    assert found["verdict"] not in ("holds", "opposite")
-    assert "seed 2" in conclude(found)
-
-
-def test_one_seed_has_no_interval():
-    found = summarize_seeds([row(0, 20, 10)], 1.0)
-    assert found["low"] is None
-    assert conclude(found).startswith("2.00 times sooner in processor seconds (95 % interval: none")
-
-
-@pytest.mark.slow
-def test_two_recipes_are_timed(memmlp: Memmlp, tmp_path: Path):
-    file = tmp_path / "found.json"
-    recipe = ("--recipe", "optim=muon optim.lr=2e-3", "--every", "2", "--json", str(file))
-    ran = memmlp("bench", "train", *recipe, "--seeds", "1", *TINY)
-    assert ran.code == 0, ran.err
-    (row,) = json.loads(file.read_text())["seeds"]
-    assert row["current"]["steps"] in (2, 4)
-    assert row["runs"]["current"] != row["runs"]["recipe"]
-    changed = ("bench", "train", "--recipe", "data.synth.minutes=0.3", "--seeds", "1", *TINY)
-    assert one_line(memmlp(*changed), "--recipe", "the data")
-    assert one_line(memmlp("bench", "train", "--recipe", "threads=2"), "--recipe threads", "OVERRIDES")

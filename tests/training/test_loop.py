@@ -11,7 +11,7 @@ from memmlp.common import progress
 from memmlp.common.errors import TrainingDiverged
 from memmlp.runs.run import Run
 from memmlp.training import loop
-from memmlp.training.loop import Learner, Validation, find_first, train, train_in_turn
+from memmlp.training.loop import train
 from memmlp.training.train_network import perplexity
 
 
@@ -128,29 +128,3 @@ def test_every_knob_of_the_optimiser_changes_the_weights(tmp_path):
 def test_perplexity():
     assert perplexity(torch.ones(8)) == pytest.approx(8)
     assert perplexity(torch.tensor([5.0, 0, 0])) == pytest.approx(1)
-
-
-def test_trainings_in_turn_are_what_they_are_alone(tmp_path):
-    """One has 12 steps and an average, the other 5, so that the first goes on alone."""
-    optims = replace(OPTIM, ema=0.9), replace(OPTIM, steps=5, lr=2e-3)
-    learners = [Learner(motion_task("own", optim), optim, 3, "answer") for optim in optims]
-    assert list(train_in_turn(learners, 2)) == [2, 2, 2, 2, 2, 1, 2, 2, 2]
-    for number, (one, optim) in enumerate(zip(learners, optims, strict=True)):
-        run = Run(tmp_path / str(number))
-        run.folder.mkdir()
-        alone = motion_task("own", optim)
-        train(alone, optim, run, 3, "alone")
-        one.average.put_in_place()
-        pairs = zip(one.task.module.parameters(), alone.module.parameters(), strict=True)
-        assert all(torch.equal(ours, theirs) for ours, theirs in pairs)
-    steps, seconds, errors = zip(*learners[0].validations, strict=True)
-    assert steps == (2, 4, 6, 8, 10, 12)
-    assert set(errors) == {42.0}
-    assert list(seconds) == sorted(seconds)
-
-
-def test_the_first_validation_with_an_error():
-    validations = [Validation(steps, steps / 10, error) for steps, error in ((1, 9.0), (2, 5.0), (3, 4.0))]
-    assert find_first(validations, 5.0) == validations[1]
-    assert find_first(validations, 3.0) is None
-    assert find_first([Validation(1, 0.1, float("nan"))], 3.0) is None
