@@ -9,18 +9,22 @@ from __future__ import annotations
 import json
 import sys
 import tempfile
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Mapping
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tiny
 import torch
-from golden_deployed import deployed, lowered
-from golden_numbers import Numbers, changed, summary, tolerance
-from golden_trained import frames, optimised, parts, refiner, training, vqvae
+from golden_trained import Numbers, frames, optimised, parts, refiner, summary, training, vqvae
 from torch import Tensor
 
+from memmlp.deploy import latency
+from memmlp.deploy.export import export
+from memmlp.deploy.lower_precision import lower
+from memmlp.deploy.onnx_stream import OnnxStream
+from memmlp.deploy.parity import streamed
 from memmlp.evaluation import metrics
 from memmlp.evaluation import modes as evaluation
 from memmlp.evaluation.evaluation import Evaluation
@@ -43,6 +47,7 @@ from memmlp.networks.predictor import (
     TwoBranchSettings,
 )
 from memmlp.networks.recurrent_poser import CELLS
+from memmlp.networks.streaming import streaming
 from memmlp.runs.identity import version_of
 from memmlp.training.loop import seed_step
 from memmlp.training.losses import (
@@ -92,14 +97,12 @@ def _clip(name: str, clip: Clip) -> Numbers:
 
 
 def features() -> Numbers:
-    """Motion -> inputs and targets, and normalised ones."""
     clip = tiny.clip(12)
     fitted = Normalizer.fit(World(), tiny.REST, clip)
     return summary("frames", clip) | summary("encoded", fitted.encode(clip[None]))
 
 
 def coordinates(kind: type[World]) -> Numbers:
-    """There and back."""
     normalizer, clip = tiny.normalizer(kind()), tiny.clip(12)[None]
     origin = normalizer.origin(clip[..., :SPARSE_DIM])
     encoded = normalizer.encode(clip)
@@ -131,7 +134,6 @@ def _used(model: MotionModel, clip: Tensor) -> Numbers:
 
 
 def sampler() -> Numbers:
-    """Draws by frames and by clips."""
     found = {}
     for drawn_by in ("frames", "clips"):
         draws = WindowSampler(frames(), batch=32, window=50, seed=1, drawn_by=drawn_by)
@@ -142,19 +144,17 @@ def sampler() -> Numbers:
 
 
 def mirror() -> Numbers:
-    """Windows of mirrored clips."""
     clips, ends = torch.tensor([3, 1, 5]), torch.tensor([20, 30, 44])
     return summary("frames", MirroredDataset(frames()).stretches(clips, ends, 9))
 
 
 def schedule(name: str) -> Numbers:
-    """Its course."""
     optim = Optim(steps=20, batch=1, lr=1e-2, final_lr=1e-4, schedule=name, drop_at=0.6)
     return {str(step): optim.compute_factor(step) for step in range(20)}
 
 
 def rollout(make: Callable[[], Rollout]) -> Numbers:
-    """The calls of three steps, the network's own motion in them."""
+    """The calls of three steps, with the network's own motion."""
     model, slot, split = tiny.model(NoCodesMemory), make(), frames()
     slot.begin(model)
     draws, found = WindowSampler(split, batch=2, window=7, seed=0), {}
@@ -168,7 +168,6 @@ def rollout(make: Callable[[], Rollout]) -> Numbers:
 
 
 def loss(make: Callable[[], Loss]) -> Numbers:
-    """Terms, sum and slope."""
     predicted, true = pair()
     motion = predicted[..., SPARSE_DIM:].clone().requires_grad_()
     one = make()
@@ -180,13 +179,13 @@ def loss(make: Callable[[], Loss]) -> Numbers:
 
 
 def mixed() -> Numbers:
-    """A loss in a training of mixed precision, which is that in float32."""
+    """A loss under autocast, which computes it in float32."""
     with torch.autocast("cpu", torch.bfloat16):
         return loss(partial(TermsLoss, "absolute", **dict.fromkeys(TERMS, 0.5)))
 
 
 def weighted(make: Callable[[], Loss]) -> Numbers:
-    """A loss, and its terms' weights after a step of what it learns."""
+    """A loss, and its terms' weights after a step."""
     one = make()
     found = loss(lambda: one)
     for parameter in one.parameters():
@@ -195,7 +194,6 @@ def weighted(make: Callable[[], Loss]) -> Numbers:
 
 
 def hand(term: NoHand | HandPosition | HandFK) -> Numbers:
-    """The hand term."""
     predicted, true = pair()
     terms = term(
         predicted[..., SPARSE_DIM:], true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], tiny.normalizer(World())
@@ -204,7 +202,7 @@ def hand(term: NoHand | HandPosition | HandFK) -> Numbers:
 
 
 def measured() -> Numbers:
-    """A clip's report, of both branches, and joints by forward kinematics among it."""
+    """A clip's report of both branches, and of its rotations alone."""
     predicted, true = tiny.clip(30, 1)[:, SPARSE_DIM:], tiny.clip(30, 5)
     report = evaluation.clip_report(tiny.normalizer(World()), predicted, true)
     found = {f"{branch} {name}": value for branch, of in report.items() for name, value in of.items()}
@@ -213,7 +211,7 @@ def measured() -> Numbers:
 
 
 def mode(name: str) -> Numbers:
-    """What a mode makes of clips of unequal length, and the mean of their reports."""
+    """The predictions of a mode for clips of unequal length, and the mean of their reports."""
     model, split = tiny.model(NoCodesMemory), frames()
     found = {}
     for i, motion in enumerate(evaluation.MODE_FUNCTIONS[name](model, split.clips())):
@@ -223,11 +221,41 @@ def mode(name: str) -> Numbers:
 
 
 def ik(solver: IK) -> Numbers:
-    """A few frames brought to the position branch, or hands to their trackers."""
+    """A few frames solved for the position branch, or for the trackers of the hands."""
     predicted, true = tiny.clip(6, 1), tiny.clip(6, 5)
     motion = torch.cat([predicted[:, SPARSE_DIM:][:, :132], true[:, SPARSE_DIM:][:, 132:]], 1)
     (solved,) = solver.solutions(tiny.normalizer(World()), motion, true[:, :SPARSE_DIM]).values()
     return summary("solved", solved)
+
+
+GRAPHS: dict[str, Callable] = {"graph.streaming": streaming, "graph.naive": lambda network: network}
+
+
+def deployed(graph: str) -> Numbers:
+    """An exported stream on a clip, and its multiply-adds."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "step.onnx"
+        path.write_bytes(exported(graph))
+        motion = streamed(OnnxStream(path), tiny.clip(25))
+    return summary("motion", motion) | {"macs": float(latency.macs(GRAPHS[graph](tiny.model())))}
+
+
+@cache
+def exported(graph: str) -> bytes:
+    """The ONNX file of a graph of the tiny network."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "step.onnx"
+        export(GRAPHS[graph](tiny.model()), path, "0" * 16)
+        return path.read_bytes()
+
+
+def lowered(precision: str) -> Numbers:
+    """An exported stream in lower precision."""
+    with tempfile.TemporaryDirectory() as folder:
+        exact, other = (Path(folder) / f"{name}.onnx" for name in ("exact", "other"))
+        exact.write_bytes(exported("graph.streaming"))
+        lower(precision, exact, other, streaming(tiny.model()), [tiny.clip(40)])
+        return summary("motion", streamed(OnnxStream(other), tiny.clip(25)))
 
 
 CASES: dict[str, Callable[[], Numbers]] = {
@@ -317,11 +345,25 @@ CASES: dict[str, Callable[[], Numbers]] = {
     **{precision: partial(lowered, precision) for precision in ("int8", "int8_blocks", "fp16")},
 }  # fmt: skip
 UNSEEN = ("export", "latency")
-"""Components without numbers of their own: a file's form, and times."""
+"""Components without numbers: a file format, and times."""
+
+
+def changed(now: Mapping[str, float], before: Mapping[str, float], tolerance: float) -> list[str]:
+    """The names of the numbers that differ by more than processors do."""
+    close = {
+        name: np.isclose(now[name], before[name], rtol=tolerance, atol=1e-2 * tolerance)
+        for name in now.keys() & before.keys()
+    }
+    return sorted((now.keys() ^ before.keys()) | {name for name, same in close.items() if not same})
+
+
+def tolerance(case: str) -> float:
+    """The relative difference between processors: larger in low precision, which rounds up or down."""
+    return 2e-2 if case in ("int8", "int8_blocks", "fp16", "optim.muon") else 2e-4
 
 
 def numbers(case: str) -> Numbers:
-    """A component's numbers now, on one thread."""
+    """The current numbers of a component, on one thread."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -331,14 +373,14 @@ def numbers(case: str) -> Numbers:
 
 
 def stored() -> dict[str, dict[str, Any]]:
-    """What golden.json holds: a component version and numbers by component."""
+    """The content of golden.json: version and numbers by component."""
     return json.loads(PATH.read_text()) if PATH.exists() else {}
 
 
 def record() -> None:
-    """Write golden.json; exits with 1 where numbers changed, or are gone, and their recipe is as it was.
+    """Write golden.json; exits with 1 if numbers changed or disappeared under an unchanged version.
 
-    Numbers that a recipe had not before, of a new form of its component, are added to it.
+    New numbers of an unchanged version are added.
     """
     before, now = stored(), {case: numbers(case) for case in CASES}
     known = {

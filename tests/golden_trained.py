@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tiny
 import torch
-from golden_numbers import Numbers, summary
 from tiny_tasks import part_task
 from torch import Tensor, nn
 
@@ -29,6 +28,21 @@ ROUNDED = ("quantiser.vectors", "key.bias")
 """Parameters that processors' rounding moves: the nearest of almost equal codes, and the biases of keys of
 attention, whose gradient is 0 but for rounding. `parts` sees codes that are far apart by themselves.
 """
+
+
+Numbers = dict[str, float]
+
+
+def summary(name: str, values: Tensor) -> Numbers:
+    """Four numbers of a tensor that change with nearly every change of it."""
+    flat = values.detach().double().flatten()
+    ramp = torch.linspace(-1, 1, len(flat), dtype=torch.double)
+    return {
+        f"{name} mean": float(flat.mean()),
+        f"{name} size": float(flat.abs().mean()),
+        f"{name} spread": float(flat.square().mean()),
+        f"{name} tilt": float((flat * ramp).mean()),
+    }
 
 
 def frames() -> MotionDataset:

@@ -1,10 +1,10 @@
-"""What components compute is what their versions stand for."""
+"""Components compute the numbers of their versions."""
 
 from __future__ import annotations
 
 import golden
 import pytest
-from golden_numbers import changed, tolerance
+from golden import changed, tolerance
 
 from memmlp.common.components import declared
 from memmlp.runs.identity import VERSIONS, version_of
@@ -12,8 +12,8 @@ from memmlp.runs.identity import VERSIONS, version_of
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", golden.CASES)
-def test_a_component_computes_what_its_recipe_number_stands_for(case: str):
-    """Where this fails, numbers of finished runs and of new ones would be mixed under one identity."""
+def test_a_component_computes_the_numbers_of_its_version(case: str):
+    """Otherwise different numbers would share a run id."""
     known = golden.stored()[case]
     assert known["recipe"] == version_of(case), f"record the numbers of {case}: make golden"
     now = golden.numbers(case)
@@ -27,21 +27,17 @@ def test_every_component_has_numbers():
     assert set(golden.CASES) | set(golden.UNSEEN) == set(VERSIONS) | named
 
 
-def test_numbers_are_recorded_only_under_another_recipe(monkeypatch, tmp_path):
+def test_numbers_are_recorded_only_under_another_version(monkeypatch, tmp_path):
+    def record(**numbers: float) -> dict:
+        monkeypatch.setattr(golden, "CASES", {"hand.off": lambda: numbers})
+        golden.record()
+        return golden.stored()["hand.off"]
+
     monkeypatch.setattr(golden, "PATH", tmp_path / "golden.json")
-    monkeypatch.setattr(golden, "CASES", {"hand.off": lambda: {"a": 1.0}})
-    golden.record()
-    monkeypatch.setattr(golden, "CASES", {"hand.off": lambda: {"a": 1.001}})
-    with pytest.raises(SystemExit, match=r"raise the version of hand\.off"):
-        golden.record()
-    assert golden.stored()["hand.off"]["numbers"] == {"a": 1.0}
-    monkeypatch.setattr(golden, "CASES", {"hand.off": lambda: {"b": 1.0}})
-    with pytest.raises(SystemExit, match=r"raise the version of hand\.off"):
-        golden.record()
-    monkeypatch.setattr(golden, "CASES", {"hand.off": lambda: {"a": 1.0000001, "b": 2.0}})
-    golden.record()
-    assert golden.stored()["hand.off"]["numbers"] == {"a": 1.0, "b": 2.0}  # what is new is no change
-    monkeypatch.setattr(golden, "CASES", {"hand.off": lambda: {"a": 1.001}})
+    record(a=1.0)
+    for wrong in ({"a": 1.001}, {"b": 1.0}):
+        with pytest.raises(SystemExit, match=r"raise the version of hand\.off"):
+            record(**wrong)
+    assert record(a=1.0000001, b=2.0)["numbers"] == {"a": 1.0, "b": 2.0}  # new numbers are no change
     monkeypatch.setitem(VERSIONS, "hand.off", 99)
-    golden.record()
-    assert golden.stored()["hand.off"] == {"recipe": 99, "numbers": {"a": 1.001}}
+    assert record(a=1.001) == {"recipe": 99, "numbers": {"a": 1.001}}
