@@ -1,4 +1,4 @@
-"""Finished runs made of random numbers, for tests of tables and pages. Nothing was trained."""
+"""Finished runs of random numbers, for tests of tables and pages."""
 
 from __future__ import annotations
 
@@ -66,24 +66,15 @@ def fake_run(
         deployment.latency: latency | {"made": "2026"},
     }
     for path, content in files.items():
-        _write(path, json.dumps(content))
+        path.write_text(json.dumps(content))
     of_clips = tuple((clip, groups[clip] if groups else None) for clip in clips)
     about = {"settings": {}, "made_by": manifest, "made": "2026"} | (evaluated or {})
     words = json.dumps(about)[1:]
     for mode, errors in _errors(run.id, seed, factor, of_clips, tuple(branches)).items():
-        _write(run.evaluation(f"{mode}-0"), f"{errors[:-1]}, {words}")
+        run.evaluation(f"{mode}-0").write_text(f"{errors[:-1]}, {words}")
     if log:
-        _write(run.metrics_path, _log(run.id, factor))
+        run.metrics_path.write_text(_log(run.id, factor))
     return run
-
-
-def _write(path: Path, text: str) -> None:
-    """Write a new file, or an existing one anew, with as few calls as can be: there are many such files."""
-    file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
-    try:
-        os.write(file, text.encode())
-    finally:
-        os.close(file)
 
 
 def fake_sweep(
@@ -110,7 +101,7 @@ def fake_sweep(
 
 
 def runs_of(sweep: Sweep, find: Find, read: Callable[[Path], Measured] = load) -> dict[str, RunsBySeed]:
-    """The finished ones of the runs that are found."""
+    """The finished runs."""
 
     def measured(variant: Variant, seed: int) -> Measured | None:
         run = find(variant, seed)
@@ -120,7 +111,7 @@ def runs_of(sweep: Sweep, find: Find, read: Callable[[Path], Measured] = load) -
 
 
 def table_of(sweep: Sweep, find: Find, command: str | None = None, modes: Sequence[str] = MODES) -> Table:
-    """The table of the runs that are found."""
+    """The table of all runs."""
 
     def state(variant: Variant, seed: int) -> str | None:
         run = find(variant, seed)
@@ -130,7 +121,7 @@ def table_of(sweep: Sweep, find: Find, command: str | None = None, modes: Sequen
 
 
 def nothing(variant: Variant, seed: int) -> None:
-    """Finds no run."""
+    """A finder without runs."""
 
 
 def _draw(*words: object) -> np.random.Generator:
@@ -140,7 +131,7 @@ def _draw(*words: object) -> np.random.Generator:
 
 @functools.cache
 def _luck(word: str | int) -> float:
-    """The same for the same word in every run."""
+    """The same number for the same word in every run."""
     return float(_draw(word).normal())
 
 
@@ -148,10 +139,7 @@ def _luck(word: str | int) -> float:
 def _errors(
     name: str, seed: int, factor: float, clips: tuple[tuple[str, str | None], ...], branches: tuple[str, ...]
 ) -> dict[str, str]:
-    """The errors in the files of a run's evaluations, by mode: tests ask for the same runs again and again.
-
-    `clips` are the names of clips and of their groups.
-    """
+    """The errors in a run's evaluations by mode, given the names of clips and of their groups."""
     rows = {clip: _clip(clip, seed, factor, name, branches) for clip, _ in clips}
     found = {}
     for mode in ("window", "stream"):
@@ -189,17 +177,13 @@ def _means(rows: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, f
     return means
 
 
-@functools.lru_cache(maxsize=256)
 def _log(name: str, factor: float) -> str:
     """A metrics log that falls from far above to the run's level, as `Run.log` writes it."""
-    noise, now, lines = _draw(name), round(time.time(), 3), []
-
-    def write(step: int, phase: str, values: dict[str, float]) -> None:
-        lines.append(json.dumps({"step": step, "phase": phase, "time": now, "values": values}))
-
+    noise, about, lines = _draw(name), {"time": round(time.time(), 3)}, []
     for step in range(0, 2001, 100):
         loss = float(factor * (1 + 4 * np.exp(-step / 300)) * float(np.exp(0.05 * noise.normal())))
-        write(step, "train", {"loss": loss, "lr": 1e-3})
+        lines.append({"step": step, "phase": "train", **about, "values": {"loss": loss, "lr": 1e-3}})
         if step % 500 == 0:
-            write(step, "val", {"rotation MPJPE": 6.5 * loss, "rotation MPJRE": 4.1 * loss})
-    return "\n".join([*lines, ""])
+            errors = {"rotation MPJPE": 6.5 * loss, "rotation MPJRE": 4.1 * loss}
+            lines.append({"step": step, "phase": "val", **about, "values": errors})
+    return "".join(f"{json.dumps(line)}\n" for line in lines)

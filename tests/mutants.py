@@ -1,13 +1,9 @@
-"""Random one-line mutants of the package: does the mirrored test file kill each of them?
+"""Change random lines of the package, one at a time: do the tests of its module fail?
 
     python tests/mutants.py --count 20 --seed 0
 
-A mutant is the package with one change on one line. It is put into a throwaway copy of the checkout, and the
-test file that mirrors its module is run there, or the tests of the module's folder where none does. Exits
-with 1 where a mutant survives: a test is missing, or the change makes no difference.
-
-mutmut and cosmic-ray go through all mutants, with one command for all tests; a sample of them, each with its
-own test file, is what this is for.
+Each mutant is tested in a copy of the checkout, by the test file that mirrors its module, or else by its
+folder's tests. Exits with 1 if a mutant survives: a test is missing, or the change makes no difference.
 """
 
 from __future__ import annotations
@@ -33,11 +29,11 @@ OTHER: dict[type, str] = {
     ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*", ast.FloorDiv: "*", ast.Mod: "*",
     ast.Pow: "*", ast.MatMult: "*", ast.BitOr: "&", ast.BitAnd: "|", ast.And: "or", ast.Or: "and",
 }  # fmt: skip
-"""What stands for each operator in a mutant."""
+"""The operator that replaces each one in a mutant."""
 
 
 class Mutant(NamedTuple):
-    """A change: of `file` (relative to the checkout), from `start` to `end` (in bytes), to `text`."""
+    """A change of `file` (relative to the checkout) from byte `start` to `end` into `text`."""
 
     file: Path
     line: int
@@ -50,13 +46,12 @@ class Mutant(NamedTuple):
         return f"{self.file}:{self.line}: {' '.join(before.split())} -> {self.text}"
 
     def apply(self, root: Path) -> None:
-        """Make the change in a copy of the checkout."""
         content = (ROOT / self.file).read_bytes()
         (root / self.file).write_bytes(content[: self.start] + self.text.encode() + content[self.end :])
 
 
 def replacements(node: ast.AST) -> Iterator[tuple[ast.AST, str]]:
-    """Pieces of a node, each with what stands for it in a mutant."""
+    """Pieces of a node, each with its replacement."""
     match node:
         case ast.Compare(left, [op, *_], [right, *rest]) if not rest:
             yield node, f"{ast.unparse(left)} {OTHER[type(op)]} {ast.unparse(right)}"
@@ -79,7 +74,7 @@ def replacements(node: ast.AST) -> Iterator[tuple[ast.AST, str]]:
 
 
 def code(node: ast.AST) -> Iterator[ast.AST]:
-    """The nodes that are computed: no annotations, imports for types alone, or parts of f-strings."""
+    """The nodes that are executed: no annotations, imports for types, or parts of f-strings."""
     if isinstance(node, ast.JoinedStr) or (
         isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
     ):
@@ -93,7 +88,6 @@ def code(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def mutants(file: Path) -> list[Mutant]:
-    """All mutants of a module."""
     content = (ROOT / file).read_bytes()
     starts = [0]
     for line in content.splitlines(keepends=True):
@@ -107,10 +101,10 @@ def mutants(file: Path) -> list[Mutant]:
     return found
 
 
-def drawn(count: int, seed: int, skip: list[str]) -> list[Mutant]:
-    """Lines drawn at random from all that have a mutant, and one mutant of each."""
+def draw(count: int, seed: int, skip: list[str]) -> list[Mutant]:
+    """Random lines that have a mutant, and a random mutant of each."""
     files = sorted(path.relative_to(ROOT) for path in (ROOT / "memmlp").rglob("*.py"))
-    files = [file for file in files if not any(file.is_relative_to(room) for room in skip)]
+    files = [file for file in files if not any(file.is_relative_to(folder) for folder in skip)]
     lines: dict[tuple[Path, int], list[Mutant]] = {}
     for mutant in (mutant for file in files for mutant in mutants(file)):
         lines.setdefault((mutant.file, mutant.line), []).append(mutant)
@@ -118,8 +112,8 @@ def drawn(count: int, seed: int, skip: list[str]) -> list[Mutant]:
     return [dice.choice(lines[line]) for line in dice.sample(sorted(lines), count)]
 
 
-def mirrored(file: Path) -> Path:
-    """The test file of a module or of its folder, or the nearest folder of tests (below the checkout)."""
+def find_tests(file: Path) -> Path:
+    """The test file of a module or of its folder, or the nearest folder of tests."""
     place = Path("tests", *file.parts[1:])
     candidates = [
         (path.with_name(f"test_{path.stem}.py"), path) for path in (place, *list(place.parents)[:-1])
@@ -129,12 +123,11 @@ def mirrored(file: Path) -> Path:
 
 @functools.cache
 def sound(root: Path, tests: Path, marker: str) -> bool:
-    """Whether the tests pass without a mutant."""
     return passes(root, tests, marker)
 
 
 def passes(root: Path, tests: Path, marker: str) -> bool:
-    """Whether the tests with these marks pass in a copy of the checkout; none pass too."""
+    """Whether the tests with this mark pass in a copy of the checkout."""
     line = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", "-m", marker]
     options = {"cwd": root, "env": {**os.environ, "PYTHONPATH": str(root)}, "capture_output": True}
     try:
@@ -144,8 +137,8 @@ def passes(root: Path, tests: Path, marker: str) -> bool:
 
 
 def survives(root: Path, mutant: Mutant) -> bool:
-    """Whether a mutant passes its tests, the quick ones first, all of which pass without it."""
-    tests = mirrored(mutant.file)
+    """Whether a mutant passes its tests, the quick ones first."""
+    tests = find_tests(mutant.file)
     for marker in ("not slow", "slow"):
         if not sound(root, tests, marker):
             sys.exit(f"{tests}: fails without a mutant")
@@ -158,8 +151,8 @@ def survives(root: Path, mutant: Mutant) -> bool:
     return True
 
 
-def copied(folder: str) -> Path:
-    """A copy of what git knows of the checkout."""
+def copy_checkout(folder: str) -> Path:
+    """Copy the files that git tracks."""
     names = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
     root = Path(folder) / "copy"
     for name in names.decode().split("\0"):
@@ -176,14 +169,14 @@ def main() -> None:
     parser.add_argument("--skip", action="append", default=[], help="a folder or file of the package")
     parser.add_argument("--dry-run", action="store_true", help="draw, and run nothing")
     words = parser.parse_args()
-    chosen = drawn(words.count, words.seed, words.skip)
+    chosen = draw(words.count, words.seed, words.skip)
     with tempfile.TemporaryDirectory() as folder:
-        root = copied(folder)
+        root = copy_checkout(folder)
         survivors = 0
         for number, mutant in enumerate(chosen, 1):
             survived = not words.dry_run and survives(root, mutant)
             verdict = "drawn" if words.dry_run else "survived" if survived else "killed"
-            print(f"{number:3} {verdict:8} {mutant} [{mirrored(mutant.file)}]", flush=True)
+            print(f"{number:3} {verdict:8} {mutant} [{find_tests(mutant.file)}]", flush=True)
             survivors += survived
     sys.exit(survivors > 0)
 
