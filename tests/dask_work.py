@@ -1,4 +1,4 @@
-"""What workers of Dask do in tests: importable where they run."""
+"""The work of Dask's workers in tests: a module that they can import."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def stay(folder: Path) -> None:
-    """Write which process of Dask's this one is of, in a file with its own number, and stay."""
+    """Write the parent's process number into a file named after this process, and stay."""
     mine = folder / f"{os.getpid()}.tmp"
     mine.write_text(str(os.getppid()))
     mine.rename(mine.with_suffix(".txt"))

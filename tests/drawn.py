@@ -1,4 +1,4 @@
-"""Differences drawn at random whose means' variances are known."""
+"""Random differences with means of known variance."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ GRID = [(3, 4, 1), (3, 40, 1), (5, 10, 2), (10, 4, 1), (5, 40, 10)]
 
 
 def differences(seeds: int, clips: int, size: int, shares: tuple[float, ...], tables: int) -> np.ndarray:
-    """Draw differences (tables * TABLE, S, C) whose true means are 0; the means have a variance of 1."""
+    """Draw differences (tables * TABLE, S, C) with true means of 0; their means have a variance of 1."""
     rng = np.random.default_rng([seeds, clips, size])
     group = np.arange(clips) // size
     weights = np.bincount(group) / clips
@@ -41,5 +41,5 @@ def groups(clips: int, size: int) -> np.ndarray:
 
 
 def starred(p: np.ndarray) -> float:
-    """Return the share of tables with a star, where all true differences are 0."""
+    """Return the share of tables with a star; all true differences are 0."""
     return float(np.mean([(holm(row) <= 0.05).any() for row in p.reshape(-1, TABLE)]))

@@ -1,4 +1,4 @@
-"""The tiny networks whose streaming step several tests look at."""
+"""Tiny networks with a streaming step that several tests share."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from onnx import GraphProto
 
 BASELINES = [name for name in tiny.BASELINES if name != "manikin_l"]
-"""But for MANIKIN-L, the largest graph of all (LARGEST): AvatarJLM's, and then MANIKIN-S' solver."""
 DIFFUSIONS = ("agrol_diffusion", "bodiffusion")
 NETWORKS: dict[str, Callable[[], MotionModel]] = {
     "mem_mlp": partial(tiny.model, CodeMemory, coordinates=Heading()),
@@ -31,10 +30,10 @@ NETWORKS: dict[str, Callable[[], MotionModel]] = {
     **{name: partial(tiny.baseline, name, depth=1, sampling_steps=2) for name in DIFFUSIONS},
     "avatar_poser": partial(tiny.baseline, "avatar_poser", Heading(), depth=1),
 }
-"""By name. Few are relative to the heading, whose hundred nodes are the same in each graph."""
+"""Few are relative to the heading, which adds the same hundred nodes to each graph."""
 
 LARGEST: dict[str, Callable[[], MotionModel]] = {"manikin_l": partial(tiny.baseline, "manikin_l", depth=1)}
-"""Whose export takes seconds, and whose file so has one test (tests/networks/test_streaming.py)."""
+"""Exported for one test only (tests/networks/test_streaming.py), since that takes seconds."""
 
 
 def write(name: str, path: Path) -> None:
@@ -50,14 +49,14 @@ DATA_DEPENDENT = {
     "Compress", "Equal", "GatherND", "If", "Loop", "NonZero", "Or", "Range", "Scan", "ScatterElements",
     "ScatterND", "Shape", "Unique",
 }  # fmt: skip
-"""Operators whose shape or work follows from the data, and those that lead to them."""
+"""Operators with a shape or work that depends on the data, and those that lead to them."""
 
 INDICES = {"Slice": 1, "Split": 1, "Reshape": 1, "Expand": 1, "Pad": 1, "Tile": 1}
-"""Operators whose inputs from this one on must be constants. (A table may be looked into at any index.)"""
+"""The first input that must be constant, by operator. Tables may be read at any index."""
 
 
 def data_dependent(graph: GraphProto) -> set[str]:
-    """Return the operators of a graph whose shape or work depends on the data."""
+    """The operators of a graph with a shape or work that depends on the data."""
     constants = {tensor.name for tensor in graph.initializer}
     found = set()
     for node in graph.node:

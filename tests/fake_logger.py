@@ -1,4 +1,4 @@
-"""A logger in memory, which can be down or hang, and runs to show in it."""
+"""A logger in memory that can fail or hang, and runs to show in it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from memmlp.runs.run import Run
 
 @dataclass
 class Server:
-    """What a server has; `down` makes it refuse, `drops` makes it take values and then break the line."""
+    """The content of a server, which refuses if `down`, and disconnects after values if it `drops`."""
 
     down: bool = False
     drops: bool = False
@@ -43,12 +43,12 @@ class FakeLogger:
         self.server, self.name = server or Server(), name
 
     def fingerprint(self, run_id: str) -> str | None:
-        """With what the run ended."""
+        """The fingerprint of the run's last state."""
         self.server.ask()
         return self.server.fingerprints.get(run_id)
 
     def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> FakeShown:
-        """Replace what there is of the run."""
+        """Replace the content of the run."""
         self.server.ask()
         self.server.begun += 1
         self.server.status[facts.id] = facts.status
@@ -66,7 +66,7 @@ class FakeShown:
         self.server, self.run_id = server, run_id
 
     def log(self, points: Sequence[CurvePoint]) -> None:
-        """Add to what the server has."""
+        """Append values."""
         self.server.ask()
         self.server.values[self.run_id] += [(p.key, p.step, p.value) for p in points]
         if self.server.drops:
@@ -74,7 +74,6 @@ class FakeShown:
             raise ConnectionError("connection reset")
 
     def end(self, facts: RunFacts) -> None:
-        """Note how it ended."""
         self.server.ask()
         self.server.status[facts.id] = facts.status
         self.server.results[facts.id] = [point.key for point in facts.results]
@@ -85,7 +84,7 @@ class FakeShown:
 
 
 def a_run(outputs: Path, name: str = "0" * 16, steps: int = 3, **config: object) -> Run:
-    """A begun run with some steps."""
+    """A run that has started, with some steps."""
     run = Run.of(outputs, name)
     run.begin("memmlp", {"seed": 0, **config}, data="d" * 64, prerequisite=None, stages=[])
     for step in range(1, steps + 1):
@@ -94,12 +93,12 @@ def a_run(outputs: Path, name: str = "0" * 16, steps: int = 3, **config: object)
 
 
 def losses(steps: int) -> list[tuple[str, int, float]]:
-    """What a logger has of a run's steps."""
+    """A logger's values for a run's steps."""
     return [("train/loss", step, 1 / step) for step in range(1, steps + 1)]
 
 
 def an_outdated_evaluation(run: Run) -> Path:
-    """Write an evaluation by an earlier recipe, and return its file."""
+    """Write an evaluation of an earlier component version, and return its file."""
     settings = {"mode": "stream", "ik": "off"}
     path = run.evaluation(evaluation_id_of(settings))
     versions = {"mode.stream": 0}

@@ -1,4 +1,4 @@
-"""Searches whose runs are written by the tests: a trial's error is known from its values."""
+"""Searches with simulated runs: a trial's error is a function of its values."""
 
 from __future__ import annotations
 

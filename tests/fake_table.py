@@ -1,4 +1,4 @@
-"""A sweep's table of runs made of random numbers."""
+"""A sweep and its table of runs with random numbers."""
 
 from __future__ import annotations
 

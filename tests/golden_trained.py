@@ -1,4 +1,4 @@
-"""The numbers of golden.py that a few steps of training make: losses, and the weights after them."""
+"""Golden numbers of a few training steps: losses, then weights."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from memmlp.training.train_refiner import LOSSES, RefinerTask, RefinerTraining
 from memmlp.training.train_sage import PARTS, DroppingOptim, PartTask
 
 ROUNDED = ("quantiser.vectors", "key.bias")
-"""Parameters that processors' rounding moves: the nearest of almost equal codes, and the biases of keys of
-attention, whose gradient is 0 but for rounding. `parts` sees codes that are far apart by themselves.
+"""Parameters that follow a processor's rounding: the nearest of similar codes, and attention's key biases,
+which have no gradient.
 """
 
 
@@ -46,12 +46,12 @@ def summary(name: str, values: Tensor) -> Numbers:
 
 
 def frames() -> MotionDataset:
-    """Three clips, one shorter than most windows are not."""
+    """Three clips of different lengths."""
     return tiny.frames((60, 45, 80))
 
 
 def vqvae(codebook: str = "ema") -> Numbers:
-    """Three steps of its training, and what it then makes of frames."""
+    """Three training steps, then validation."""
     torch.manual_seed(3)
     model = VQVAE(codes=8, width=12, encoder_depth=2, codebook=codebook)
     optim = vqvae_optim(3, batch=16, lr=1e-3, weight_decay=0.1)
@@ -103,7 +103,7 @@ class Squares(Loss):
 
 
 def training() -> Numbers:
-    """Three steps of the loop, with AdamW and Adam, and clipped."""
+    """Three steps of the loop, with AdamW, Adam and gradient clipping."""
     found = {}
     for name, changes in {"adamw": {}, "adam": {"decoupled": False}, "clipped": {"clip_norm": 0.1}}.items():
         found |= {f"{name} {key}": value for key, value in optimised(**changes).items()}
@@ -119,7 +119,7 @@ def optimised(kind: type[Optim] = Optim, **changes: float) -> Numbers:
 
 
 def refiner() -> Numbers:
-    """Three steps of its training behind a network with each of its losses, and what both then stream."""
+    """Three training steps behind a network with each loss, then the stream of both."""
     found = {}
     for kind, loss in LOSSES.items():
         model, split, optim = tiny.refined(), frames(), Optim(steps=3, batch=4, lr=1e-2)
@@ -132,10 +132,7 @@ def refiner() -> Numbers:
 
 
 def parts() -> Numbers:
-    """Three steps of each of SAGE-Net's parts that has a training of its own, and its errors then.
-
-    The codes are moved towards latents that are far from each other.
-    """
+    """Three training steps of each part of SAGE-Net, then its errors; codes move towards distant latents."""
     optim = DroppingOptim(steps=3, batch=4, lr=1e-2, lr_drops_at=(0.5,), lr_drop=0.25)
     torch.manual_seed(4)
     quantiser = ProductQuantiser()

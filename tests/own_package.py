@@ -1,4 +1,4 @@
-"""The example package of docs/examples, in use for a test, and everything as it was before afterwards."""
+"""The example package of docs/examples, for one test at a time."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ EXAMPLE = Path(__file__).parent.parent / "docs/examples/feet"
 PACKAGE = "memmlp_feet"
 TINY = ["profile=tiny", *SMALL, "loggers=none", "threads=1", "optim.validate_every=20"]
 KILLED = [*TINY, "optim.steps=40", "optim.checkpoint_every=5"]
-"""Words of a run that takes long enough to be killed at a checkpoint."""
+"""Overrides of a run with several checkpoints."""
 REGISTERS = (SMALLEST, UNITS, VERSIONS, HIGHER, plugins._active, components._roots)
 
 
 @contextmanager
 def registers_kept() -> Iterator[None]:
-    """What packages of one's own add is taken away again, and their modules are forgotten."""
+    """Remove all that custom packages add, and their modules, afterwards."""
     before = [one.copy() for one in REGISTERS]
     modules = set(sys.modules)
     try:

@@ -1,4 +1,4 @@
-"""Tiny training tasks of every kind that the tests share, and how they are optimised."""
+"""Tiny training tasks of every kind, and their optimisers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A person who moves smoothly, at any time, and streams of it, for the tests of memmlp.live."""
+"""A person who moves smoothly, and streams of that motion, for tests of memmlp.live."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from memmlp.networks.motion_model import MotionModel
 
 
 def at_ease(network: MotionModel, frames: torch.Tensor) -> MotionModel:
-    """The network with random weights, but about the mean pose of frames (N, 252), as a person stands."""
+    """Let a network with random weights predict poses about the mean of frames (N, 252)."""
     network.normalizer = Normalizer.fit(network.normalizer.coordinates, tiny.REST, frames)
     return network
 

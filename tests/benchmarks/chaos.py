@@ -105,9 +105,8 @@ def storm(
 ) -> None:
     """Keep the processes running until all have succeeded, and kill random ones meanwhile.
 
-    A process that was killed, or that ended before all kills were made, is started again. Where all have
-    ended before anything could be killed, the next pause is half as long: when their work is done, they
-    live shorter than a pause.
+    A process that was killed, or that ended before the last kill, is restarted. If all have ended before a
+    kill, the next pause is half as long.
     """
     processes = [launch() for launch in launches]
     killed, factor = 0, 1.0

@@ -81,18 +81,13 @@ def choices(cell: SimulationSetting) -> dict[str, Shares]:
 class InterimSample(NamedTuple):
     """The sufficient statistics of an interim analysis of K comparisons, for effects in any shares.
 
-    Every kind of effect is scaled so that it gives the mean over all seeds a variance of 1.
-
-    Attributes:
-        noise: the means (K, S) of the noise over clips, by seed.
-        variance: the variance E (K,) of the noise alone (`paired_differences`).
-        covariances: covariances (K, 4, 4) between the groups' means of the effects of groups, clips, skewed
-            clips and noise.
+    Every kind of effect is scaled so that it gives the mean over all seeds a variance of 1. The covariances
+    are those of the groups' means of four effects: groups, clips, skewed clips and noise.
     """
 
-    noise: np.ndarray
-    variance: np.ndarray
-    covariances: np.ndarray
+    noise: np.ndarray  # the means of the noise over clips, by seed (K, S)
+    variance: np.ndarray  # the variance E of the noise alone (K,)
+    covariances: np.ndarray  # (K, 4, 4)
 
 
 class Simulated:
@@ -174,20 +169,12 @@ def grid() -> list[SimulationSetting]:
 
 
 class SimulatedOutcomes(NamedTuple):
-    """Outcomes in simulated tables whose true differences are all zero.
+    """Outcomes in simulated tables with true differences of zero."""
 
-    Attributes:
-        covered: whether the 95 % interval covers the truth (K,).
-        starred: whether a table has a (false) star, with all seeds at once (T,).
-        sequential: the same with interim analyses (T,).
-        found: the smallest true effect that would have been found (K,): half the interval's width at Holm's
-            first step, minus the simulated mean.
-    """
-
-    covered: np.ndarray
-    starred: np.ndarray
-    sequential: np.ndarray
-    found: np.ndarray
+    covered: np.ndarray  # whether the 95 % interval covers the truth (K,)
+    starred: np.ndarray  # whether a table has a (false) star, with all seeds at once (T,)
+    sequential: np.ndarray  # the same with interim analyses (T,)
+    found: np.ndarray  # the smallest true effect that would have been found at Holm's first step (K,)
 
 
 def count(sample: Simulated, shares: Shares) -> SimulatedOutcomes:
@@ -232,19 +219,12 @@ def summary(counts: Sequence[SimulatedOutcomes]) -> dict[str, float]:
 
 
 class Campaign(NamedTuple):
-    """Outcomes in simulated tables that spend seeds until everything is decided.
+    """Outcomes in simulated tables that spend seeds until everything is decided."""
 
-    Attributes:
-        seeds: the number of seeds that each variant spent (T, VARIANTS).
-        decided: whether each comparison was decided in an interim analysis (T, TABLE).
-        at_once: whether each is decided with all seeds at once (T, TABLE).
-        false: whether a table made any false claim in an interim analysis (T,).
-    """
-
-    seeds: np.ndarray
-    decided: np.ndarray
-    at_once: np.ndarray
-    false: np.ndarray
+    seeds: np.ndarray  # the number of seeds that each variant spent (T, VARIANTS)
+    decided: np.ndarray  # whether each comparison was decided in an interim analysis (T, TABLE)
+    at_once: np.ndarray  # whether each is decided with all seeds at once (T, TABLE)
+    false: np.ndarray  # whether a table made any false claim in an interim analysis (T,)
 
 
 def campaign(sample: Simulated, shares: Shares) -> Campaign:

@@ -42,7 +42,7 @@ print("READ", json.dumps(frames))
 
 
 def blender() -> list[str]:
-    """The words before a script: Blender, or a Python with bpy, of which MEMMLP_BPY may name one."""
+    """The command that runs a script: Blender, or a Python with bpy (MEMMLP_BPY may name one)."""
     if given := os.environ.get("MEMMLP_BPY"):
         return [given]
     if importlib.util.find_spec("bpy"):

@@ -1,4 +1,4 @@
-"""The axes of engines: those of the pictures, and the guide's table of how numbers are turned."""
+"""The axes of engines in the pictures and in the guide's table."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def axes(pictures: ModuleType, name: str) -> np.ndarray:
 
 
 def test_the_table_turns_numbers_from_one_convention_to_another(pictures: ModuleType):
-    """A person looks forward in both, so that the axes tell how."""
+    """A person looks forward in both, so the axes determine the conversion."""
     for engine in pictures.ENGINES:
         np.testing.assert_allclose(np.array(engine.axes) @ np.array(engine.axes).T, np.eye(3))
         assert engine.right_handed == (not any(name in engine.name for name in LEFT_HANDED)), engine.name
@@ -47,7 +47,7 @@ def test_the_table_turns_numbers_from_one_convention_to_another(pictures: Module
 
 
 def said(cell: str, names: str, values: np.ndarray) -> np.ndarray:
-    """What a cell like "(100 z, -x)" is at values of its names."""
+    """The values of a cell like "(100 z, -x)", given those of its names."""
     known = dict(zip(names.split(), values, strict=True))
     return np.array(
         [eval(re.sub(r"(\d) ", r"\1 * ", part), {}, known) for part in cell.strip("()").split(",")]

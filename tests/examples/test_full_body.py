@@ -1,4 +1,4 @@
-"""The examples that print joints, in three languages: those of `memmlp.Stream`, and what they refuse."""
+"""The examples that print joints in three languages agree with `memmlp.Stream`."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def python(_folder: Path) -> Command:
 
 
 def node(folder: Path) -> Command:
-    """The example in JavaScript, with the package that pages are made of."""
+    """The example in JavaScript, with the package of the site."""
     if shutil.which("node") is None:
         pytest.skip("node is not installed")
     try:

@@ -1,4 +1,4 @@
-"""The example that sends head and wrists: packets that `memmlp live` takes, of a person's arms."""
+"""The example that sends head and wrists, as `memmlp live` reads them."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The example for Unity, compiled by Mono against stand-ins of Unity's types, with the network run from here.
 
-It shows that the scripts compile in C# 7, and that states, axes, frames, holding, calibration and the rig are
-right as far as the stand-ins (tests/examples/unity) are; it does not show that Unity takes them.
+The scripts compile in C# 7, and states, axes, frames, lost trackers, calibration and the rig are right, as
+far as the stand-ins (tests/examples/unity) are. Unity itself is not tested.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ def test_a_lost_hand_is_held_and_comes_back_slowly(play: Player, stream: Stream)
 
 
 def test_calibration_is_that_of_the_stream(play: Player, stream: Stream):
-    """Devices that sit askew and apart from the joints, on a wearer in T-pose who looks to the side."""
+    """Devices have offsets from the joints, and the wearer in T-pose looks to the side."""
     turn = Rotation.from_euler("y", 50, degrees=True).as_matrix()
     stance = np.array([0.3, 0.95, -0.2]) + REST[[15, 20, 21]] @ turn.T
     joints = [(stance, np.tile(turn, (3, 1, 1)))]
@@ -188,7 +188,7 @@ def test_calibration_is_that_of_the_stream(play: Player, stream: Stream):
 
 
 def test_calibration_of_arms_that_hang_is_refused(play: Player, stream: Stream):
-    """As the stream refuses it, and what was known before stays."""
+    """The stream refuses it, too; the earlier calibration stays."""
     hanging = np.array([[0, 1.6, 0, 0, 0, 0, 1], [-0.25, 0.8, 0, 0, 0, 0, 1], [0.25, 0.8, 0, 0, 0, 0, 1]])
     with pytest.raises(InputError, match="from where a T-pose has it"):
         stream.calibrate(*((device[:3], device[3:]) for device in hanging))

@@ -1,4 +1,4 @@
-"""The example that prints the bones of VMC packets, sent by another implementation of OSC."""
+"""The example that prints bones reads the VMC packets of python-osc."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FRAMES = 4
 
 
 def packet(name: str, values: np.ndarray) -> bytes:
-    """A message as the specification has it, in a bundle within a bundle."""
+    """A message of the specification, in a bundle within a bundle."""
     made = message.OscMessageBuilder(f"/VMC/Ext/{'Root' if name == 'root' else 'Bone'}/Pos")
     made.add_arg(name)
     for value in values:
