@@ -1,7 +1,7 @@
 """The body and every convention of the project, stated once: joints, tree, feature layout.
 
 Frames of reference: motion lives in AMASS' world (Z up, metres). A rest pose lives in SMPL's body frame (Y
-up, the person faces +Z, left is +X, T-pose), and the root's rotation turns the rest pose into the world. A
+up, the person faces +Z, left is +X, T-pose). The root's rotation turns it into the world. A
 body joint's rotation is local, relative to its parent; the root's is global.
 """
 
@@ -110,9 +110,9 @@ def load_rest_joints(body: str | Path) -> np.ndarray:
     except (OSError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"data.body={path}: not an SMPL-H model.npz ({error})") from error
     if joints.ndim != 2 or joints.shape[0] < N_JOINTS or joints.shape[1] != 3:
-        raise InputError(f"data.body={path}: joints of shape {joints.shape}, not (>= 22, 3)")
+        raise InputError(f"data.body={path}: joints of shape {joints.shape}; must be (22 or more, 3)")
     if not np.isfinite(joints).all() or tuple(parents[1:]) != PARENTS[1:]:
-        raise InputError(f"data.body={path}: lacks SMPL's tree of 22 body joints")
+        raise InputError(f"data.body={path}: must have SMPL's tree of 22 body joints")
     return joints[:N_JOINTS]
 
 

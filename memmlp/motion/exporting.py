@@ -126,8 +126,8 @@ def plan_export(source: Path, out: Path, name: str | None = None) -> ExportPlan:
         name: the format, one of FORMATS; by default a file's suffix decides.
 
     Raises:
-        InputError: if there is nothing to export, the format is unclear, `out` is a file where a folder is
-            needed or the other way round, or a file would be written over a source.
+        InputError: if there is nothing to export, the format is unclear, `out` is a file instead of a folder
+            or the reverse, or a source would be overwritten.
     """
     if not source.exists():
         raise InputError(f"{source}: no such file or folder; expected an npz file, or a folder of npz files")
@@ -175,7 +175,7 @@ def export(
     """Write a plan's clips.
 
     Args:
-        plan: what to write.
+        plan: the clips to write.
         body: `builtin`, or an SMPL-H model.npz; it gives the bones in formats that have bones.
         fps: frame rate, Hz, to which the clips are resampled; by default each keeps its own.
         strict: whether a bad file raises; otherwise it is skipped and reported, if there are other files.
@@ -206,7 +206,7 @@ def export_converted(
     """Convert a plan's clips and write them on a body, while a progress bar counts them.
 
     Args:
-        plan: what to write.
+        plan: the clips to write.
         rest: the body's rest joints (22, 3), metres.
         prepare: the first half of the conversion, clip by clip; may raise InputError.
         finish: the other half, of up to `batch` clips at a time, given their names.

@@ -31,7 +31,7 @@ class Prepared(NamedTuple):
 
     @property
     def digest(self) -> str:
-        """The digest of the data, by which identities refer to it."""
+        """The digest of the data, which is part of run ids."""
         return self.manifest.digest
 
     def open(self, part: str) -> MotionDataset:

@@ -67,7 +67,7 @@ class HeadRelative(Coordinates):
 class Heading(HeadRelative):
     """Coordinates relative to the head on the floor, turned so that the head of the same frame faces ahead.
 
-    They are not in the paper. They remove the heading, on which the motion does not depend. The head's
+    They are not in the paper. They remove the heading, because the motion does not depend on it. The head's
     angular velocity is local already and stays. The heading is the twist of the head's rotation about the
     vertical, which is defined unless the head is upside down.
     """

@@ -1,4 +1,4 @@
-"""The faults of a clip: why it cannot be a person's motion, and what may be wrong with one that can be.
+"""The faults of a clip: reasons why it cannot be a person's motion, and likely mistakes in other clips.
 
 Files do not state their units. The limits leave room for human motion (jumping, lying, crawling, climbing,
 dancing far from the origin, on a floor of any height): wrong units are off by factors of 39 to 1000, and a
@@ -60,7 +60,7 @@ def why_implausible(clip: Clip) -> str | None:
 
 
 def find_faults(clip: Clip) -> Iterator[str]:
-    """Yield what may be wrong with a clip that can be a person's motion, one sentence each."""
+    """Yield likely mistakes in a clip that can be a person's motion, one sentence each."""
     joints = _pose_sample(clip, _spread(clip))
     if (joints[:, HEAD, 2] - joints[:, 0, 2] > 0.2).mean() < 0.02:
         yield "the head is never above the pelvis, so the person lies throughout, or Z is not up"
@@ -89,8 +89,8 @@ def find_faults(clip: Clip) -> Iterator[str]:
 def _is_y_up(clip: Clip) -> bool:
     """Return whether a person stands along Y and never along Z, on a floor.
 
-    People who lie throughout with the head towards +Y hardly have the feet at y = 0, and do not rise by a
-    metre while the feet stay in one plane.
+    People who lie throughout with the head towards +Y rarely have the feet at y = 0. They also do not rise
+    by a metre while the feet stay in one plane.
     """
     joints = _pose_sample(clip, _spread(clip))
 

@@ -76,7 +76,8 @@ def prepare(root: Path, overrides: tuple[str, ...], out: Path) -> None:
     """Write the cache of a folder of AMASS npz.
 
     The cache is memory-mappable, and has a manifest with the outcome for each file. It is for custom code:
-    memmlp train makes its own cache of data.root. KEY=VALUE are those of memmlp train, by default data=mocap.
+    memmlp train makes its own cache of data.root. The overrides are those of memmlp train; the default is
+    data=mocap.
     """
     from omegaconf import OmegaConf
 
@@ -95,7 +96,7 @@ def prepare(root: Path, overrides: tuple[str, ...], out: Path) -> None:
 def inspect(path: Path) -> None:
     """Show clips, hours, rates and bad files.
 
-    PATH is a cache, whose splits are shown too, or a folder of npz files.
+    PATH is a cache or a folder of npz files. For a cache, the command also shows the splits.
     """
     from memmlp.motion.preparing.manifest import MANIFEST, Manifest, Total
     from memmlp.motion.preparing.survey import survey

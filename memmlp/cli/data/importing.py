@@ -108,10 +108,10 @@ def _floor(text: str) -> str | float:
 def verify(source: Path, skeleton: str | None, body: str, up: str | None, show_all: bool) -> None:
     """Check imports against the files themselves.
 
-    Each file is imported, and the result is compared with the file's own joints: "worst mm" is the largest
-    distance of any mapped joint on the file's own bones, "worst degrees" the largest angle between a segment
-    (trunk, neck, arms, legs, feet) on the body and in the file. Impossible postures and lengths are faults
-    too. Goes on past bad files; exits with 1 if any file has a fault or can't be imported.
+    Each file is imported, and the result is compared with the file's own joints. "worst mm" is the largest
+    distance of a mapped joint on the file's own bones. "worst degrees" is the largest angle between a segment
+    (trunk, neck, arms, legs, feet) on the body and in the file. Impossible postures and lengths are faults.
+    Continues after bad files; exits with 1 if any file has a fault or can't be imported.
     """
     from memmlp.motion.clip import Skipped
     from memmlp.motion.importing.import_folder import ImportSettings, verify_folder
@@ -190,7 +190,7 @@ def guess(file: Path, out: Path | None) -> None:
 def show(file: Path, map_name: str | None, out: Path) -> None:
     """Draw the stance that a file's skeleton is read from, with the nodes that a map picks.
 
-    The built-in body stands beside it in the same stance: if the two differ, the map is wrong.
+    The picture also has the built-in body in the same stance. If the two differ, the map is wrong.
     """
     from memmlp.motion.body import load_rest_joints
     from memmlp.motion.importing.convert import view_stance

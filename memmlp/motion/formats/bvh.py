@@ -300,7 +300,7 @@ def write_bvh(path: Path, clip: Clip, rest: np.ndarray) -> None:
     """Write a clip on a body with these rest joints (22, 3), metres, atomically.
 
     `memmlp data import` knows the joints (`importing/skeletons/smpl_words.yaml`); `memmlp.yaml` there also
-    gives the axes, for clips in which nobody stands up.
+    gives the axes, for clips without a standing person.
     """
     with atomic_file(path) as file:
         for line in ("HIERARCHY", *_joint_lines(0, rest, ""), *_motion_lines(clip, rest)):

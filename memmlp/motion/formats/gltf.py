@@ -73,7 +73,7 @@ class Buffer:
 
 
 class Mesh(NamedTuple):
-    """Triangles, each vertex of which follows one joint.
+    """Triangles with vertices that each follow one joint.
 
     Attributes:
         positions: vertices (V, 3), metres, in the bind pose.
@@ -118,7 +118,7 @@ def skinned_figure(buffer: Buffer, bind: np.ndarray, parts: Sequence[Mesh]) -> d
 
 
 def _primitive(buffer: Buffer, mesh: Mesh, material: int) -> dict[str, Any]:
-    """Return a mesh as a glTF primitive, with four joints per vertex, of which only one is used."""
+    """Return a mesh as a glTF primitive. It has four joints per vertex; three of them have no weight."""
     joints = np.zeros((len(mesh.joints), 4), "|u1")
     weights = np.zeros((len(mesh.joints), 4), "<f4")
     joints[:, 0], weights[:, 0] = mesh.joints, 1

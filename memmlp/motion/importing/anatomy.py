@@ -35,7 +35,7 @@ HINGE_BEND, HINGE_AGREEMENT = 0.1, 0.8  # least mean sine of the bend, and agree
 
 
 class Segment(NamedTuple):
-    """The straight line from a joint, whose rotation turns it, to the next joint of its chain in the file."""
+    """The straight line from a joint to the next joint of its chain in the file. The first joint turns it."""
 
     start: int
     end: int
@@ -95,7 +95,7 @@ def align(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.nda
 
 
 def why_no_stance(pose: np.ndarray) -> str | None:
-    """Return why a pose (22, 3) isn't that of a person who stands upright; None if it is.
+    """Return why nobody stands upright in a pose (22, 3); None if somebody does.
 
     The direction that the person faces, and left and right, do not matter here.
     """
@@ -208,7 +208,7 @@ def bend(stance: np.ndarray, joint: int) -> np.ndarray | None:
 
 
 def hinge(upper: np.ndarray, positions: np.ndarray, joint: int) -> np.ndarray | None:
-    """Find the axis about which the joint at the end of a thigh or upper arm bends, from the motion.
+    """Find the bending axis of the joint at the end of a thigh or upper arm, from the motion.
 
     Args:
         upper: global rotations (N, 3, 3) of the thigh or upper arm.

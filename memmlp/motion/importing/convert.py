@@ -1,8 +1,8 @@
 """Converts a recording to a clip on the 22-joint tree, by a skeleton map: stance, rotations, floor, check.
 
-The global rotation of a file's node is that of the body joint it is mapped to, up to a constant correction on
-the right. The corrections come from one pose in which the person stands, the stance: in it the rotations of
-the body's joints are known (`anatomy.orientations`), whatever the file's zero pose is. A zero pose may be a
+A file's node and its body joint have the same global rotation, up to a constant correction on the right. The
+corrections come from one pose, the stance: the person stands in it, so the rotations of the body's joints are
+known (`anatomy.orientations`), whatever the file's zero pose is. A zero pose may be a
 T-pose, or a pose that no standing person has: bones along one axis, a folded body, a person who lies. Then a
 frame of the motion is used, or rotations that the skeleton map gives.
 
@@ -164,7 +164,7 @@ def find_stance(recording: Recording, skeleton: SkeletonMap, motion: MappedMotio
     """Find the stance of a file: the map's, else the zero pose, else the straightest frame.
 
     Raises:
-        InputError: if there is no such pose, or left and right contradict each other in it.
+        InputError: if there is no such pose, or its left and right contradict each other.
     """
     upright, positions, path = skeleton.upright, motion.positions, recording.path
 
@@ -208,8 +208,8 @@ def fit(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -> Retarg
     """Fit a recording's skeleton to a body's rest joints (22, 3), metres.
 
     Raises:
-        InputError: if no unit, up axis or pose is found in which the person stands, or left and right
-            contradict each other.
+        InputError: if the file shows no unit, up axis or standing person, or left and right contradict each
+            other.
     """
     skeleton = find_unit_and_up(recording, skeleton)
     motion = pick_joints(recording, skeleton)
@@ -250,7 +250,7 @@ def to_body(fitted: Retargeting, rest: np.ndarray, name: str, fps: float) -> Cli
 
 
 def _aim_segments(motion: MappedMotion, turned: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Return rotations (N, 22, 3, 3) whose segments point as in the recording; unmapped joints stay."""
+    """Turn rotations (N, 22, 3, 3), in place, so that their segments point as in the recording."""
     for start, end in (HIP_LINE, *segments(motion.mapped)):
         joint = 0 if (start, end) == HIP_LINE else start
         if joint > 0 or (start, end) == HIP_LINE:
@@ -294,7 +294,7 @@ def _leg_length(positions: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class StanceView:
-    """The stance from which a skeleton is read, with all nodes: facing +Z, Y up, left on +X, in metres.
+    """The stance of a skeleton with all nodes: facing +Z, Y up, left on +X, in metres.
 
     Attributes:
         nodes: the nodes' names; parents: the index of each node's parent, -1 for the root.
@@ -313,7 +313,7 @@ class StanceView:
 
 
 def view_stance(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -> StanceView:
-    """Return the stance from which an import reads a file's skeleton, and the body in it.
+    """Return the stance that an import uses for a file's skeleton, and the body in it.
 
     Args:
         recording: the file's motion.
@@ -362,7 +362,7 @@ def find_unit_and_up(recording: Recording, skeleton: SkeletonMap) -> SkeletonMap
 
 
 def _find_unit(recording: Recording, skeleton: SkeletonMap, leg: float) -> float:
-    """Return the unit, metres, of a file whose legs have the given length."""
+    """Return the unit, metres, of a file with legs of the given length."""
     if skeleton.unit is not None:
         low, high = GIVEN_LEG
         if not low <= leg * skeleton.unit <= high:
@@ -440,7 +440,7 @@ def find_floor(positions: np.ndarray, fps: float) -> float | None:
 def first_step(recording: Recording) -> float:
     """Return the step from frame 0 to frame 1, divided by the 90 % quantile of all later steps.
 
-    A step is the largest distance by which a node moves relative to the root. The result is 0 for a short
+    A step is the largest distance that a node moves relative to the root. The result is 0 for a short
     recording, or if the first step is small compared with the body. Beyond `JUMP`, frame 0 is a calibration
     pose, such as a T-pose, and not motion.
     """

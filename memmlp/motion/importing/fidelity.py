@@ -96,8 +96,8 @@ def compare(clip: Clip, motion: MappedMotion, rest: np.ndarray, skeleton: str) -
 def _distance(rotations: np.ndarray, expected: np.ndarray, mapped: np.ndarray) -> Worst:
     """Return the worst distance, mm, of joints posed by a clip's rotations on the bones of the file.
 
-    A bone's direction in its joint's frame is its mean over the frames, so rotations that do not turn with
-    the file's joints put the next joint elsewhere.
+    A bone has its mean direction over the frames in its joint's frame. So the next joint is elsewhere if
+    the rotations do not turn with the file's joints.
     """
     posed = expected.copy()
     for joint in np.flatnonzero(mapped)[1:]:

@@ -37,9 +37,9 @@ class ImportedClip:
         skeleton: name of the skeleton map.
         unit: the file's unit, metres.
         up: the file's up axis, `y` or `z`.
-        stance: a description of the pose from which the skeleton was read.
+        stance: a description of the pose that shows the skeleton.
         frames: number of frames.
-        header_fps: frame rate in the file's header, Hz; None if it has none.
+        header_fps: frame rate in the file's header, Hz; None without a rate.
         fps: frame rate of the clip, Hz.
         fps_reason: a description of the rate's origin.
         floor: height of the floor that was subtracted, metres at the body's size; None if none was found or
@@ -94,8 +94,7 @@ class ImportSettings:
         floor: `auto`: the lowest stable contact of the feet is at 0; `none`: left as the file has it; or the
             floor's height in the files, metres.
         strict: whether a bad file raises; otherwise it is skipped and reported.
-        sound: whether a clip with faults is skipped, too; otherwise it is written and its faults are
-            reported.
+        sound: whether to skip clips with faults; otherwise they are written and their faults are reported.
         up: the files' up axis, `y` or `z`; None leaves it to the map.
     """
 
@@ -117,9 +116,8 @@ def import_folder(source: Path, out: Path, settings: ImportSettings | None = Non
         settings: the settings.
 
     Raises:
-        InputError: with nothing written, if there are no files, several of the same name, a rate that fits no
-            folder, clips of another import in `out`, or no file that could be imported; also if `out` cannot
-            be written.
+        InputError: if there are no files or several of one name, a rate is for no folder, `out` has clips of
+            another import or cannot be written, or no file can be imported. Nothing is written then.
     """
     settings, files = settings or ImportSettings(), find_recordings(source)
     _check_import(files, out, settings)
@@ -253,7 +251,7 @@ def _publish(staging: Path, out: Path, report: ImportReport, body: Mapping[str, 
     """Move clips and record from staging to `out`, and remove earlier clips of the files skipped now.
 
     A new folder `out` appears with all files at once. In the folder of an earlier import, the old record is
-    removed first and the new one is written last, so a folder without a record may hold clips of two imports.
+    removed first and the new one is written last. A folder without a record may hold clips of two imports.
     """
     record = {**body, **asdict(report)}
     (staging / RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")

@@ -39,9 +39,8 @@ class SkeletonMap:
         unit: the file's unit in metres, None if it is to be found from the legs.
         up: the file's up axis, `y` or `z`, None if it is to be found from the motion.
         calibration_frame: whether frame 0 is a calibration pose, not motion.
-        rest: the pose in which the person stands, from which the skeleton is read: the rotation values,
-            degrees, of joints as in a frame of the file; None for the zero pose if the person stands in it,
-            else the straightest frame.
+        rest: a pose in which the person stands, as rotation values of joints in degrees, like in a frame of
+            the file. None means the zero pose if the person stands in it, else the straightest frame.
     """
 
     name: str
@@ -84,7 +83,7 @@ def load_skeleton(which: str) -> SkeletonMap:
 
 
 def find_skeleton(recording: Recording, user_map: SkeletonMap | None = None) -> SkeletonMap:
-    """Find the shipped map all of whose nodes the file has; of several maps, the one with the most nodes.
+    """Find the shipped map that fits a file: the file has all of its nodes. The map with the most nodes wins.
 
     Of maps with equally many nodes, the one that finds unit and up axis in the file is preferred. Spellings
     and namespaces may differ (`find_nodes`); the returned map has the file's spellings. A map that the user
@@ -242,7 +241,7 @@ class MappedMotion:
     Attributes:
         path: the file, for messages.
         mapped: whether (22,) each body joint has a node in the file.
-        nodes: index (22,) of that node; without one, that of the parent joint's node.
+        nodes: index (22,) of that node; without one, the index of the parent joint's node.
         rotations: global rotations (N, 22, 3, 3) of these nodes.
         positions: their positions (N, 22, 3).
         zero: their positions (22, 3) in the file's zero pose, where all rotations are the identity.

@@ -1,8 +1,8 @@
 """Turns a folder of AMASS npz into a memory-mappable cache of 60 Hz frames with a manifest.
 
-The sources are read twice, one clip at a time. The first reading finds out which clips are sound and how long
-they are, so that the split divides sound clips only and every array's size is known; the second writes the
-frames. The manifest is written last: a cache without one is unfinished, and the next call makes it again.
+The sources are read twice, one clip at a time. The first reading finds the sound clips and their lengths, so
+that the split divides sound clips only and every array's size is known. The second writes the frames. The
+manifest is written last: a cache without one is unfinished, and the next call makes it again.
 """
 
 from __future__ import annotations

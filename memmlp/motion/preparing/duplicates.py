@@ -2,8 +2,8 @@
 
 Copies are found by their frames, so a file that was saved again is a copy. Two further kinds are found in
 the motion: copies at another frame rate (`find_resampled_copies`), and clips that share a stretch, such as
-overlapping cuts (`find_shared_stretches`). Both compare clips with mirror images, too, since some data sets
-ship their motion mirrored. Clips without motion do not count as copies.
+overlapping cuts (`find_shared_stretches`). Both also compare clips with mirror images, since some data
+sets contain their motion mirrored. Clips without motion do not count as copies.
 
 If the split divides all clips in the folder, copies are drawn together, like any group. A published list may
 have copies in several parts: then those in training give way to those in validation, and both to those in
@@ -66,7 +66,7 @@ def assign_parts(
 def keep_one_part(
     clips: Sequence[ClipRecord], parts: Mapping[str, str | None]
 ) -> tuple[dict[str, str | None], dict[str, str]]:
-    """Return the parts such that no frames are in two of them, and each dropped clip -> a kept copy of it.
+    """Return parts without common frames, and each dropped clip -> its copy that stays.
 
     Args:
         clips: the clips with their content.
@@ -120,7 +120,7 @@ def mirror_clip(clip: Clip) -> Clip:
 
 
 def first_frames(clip: Clip) -> np.ndarray:
-    """Return rotations and position of the first frame, with which all copies at other rates begin.
+    """Return rotations and position of the first frame; copies at other rates begin with the same frame.
 
     Returns:
         (2, 201), for the clip and for its mirror image.
@@ -178,8 +178,8 @@ def _is_same_motion(one: Clip, other: Clip) -> bool:
 class Marks(NamedTuple):
     """The marked frames of a clip at 60 Hz, or of its mirror image.
 
-    A frame is marked by the motion alone, so the same ones are marked in two clips that share it: those at
-    which a fixed sum of the rotations is largest or smallest for a quarter of a second on either side.
+    The marks depend only on the motion, so two clips with common motion have the same marks: the frames where
+    a fixed sum of the rotations is largest or smallest for a quarter of a second on either side.
 
     Attributes:
         frames: their numbers (M,).

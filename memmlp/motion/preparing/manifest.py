@@ -100,7 +100,7 @@ class Coverage:
 
     @property
     def gaps(self) -> str:
-        """A description of the missing entries: the number of all, and of those of each subset."""
+        """A description of the missing entries: their total number, and the number in each subset."""
         present, total = self.counts
         by_subset = [f"{name} {count} of {self.listed[name]}" for name, count in self.absent.items()]
         return (
@@ -120,8 +120,8 @@ class Manifest:
     Attributes:
         digest: sha256 over everything that determines the frames and their split. Groups are not included,
             since training does not use them.
-        request: sha256 over the settings and each source's path, size and times, by which a finished cache is
-            recognised.
+        request: sha256 over the settings and each source's path, size and times. It identifies a finished
+            cache.
         body: "builtin", or the model file's name and a digest of its rest pose: "model.npz 0a1b2c3d".
         rest_joints: rest positions (22, 3), metres.
         split: the split's settings.
@@ -131,7 +131,7 @@ class Manifest:
         skipped: bad files.
         left_out: number of sound clips without a part in the split, by top-level folder.
         listed: number of the split's entries (list entries, subsets) by subset; empty without a list.
-        missing: entries of the split for which there is no sound clip; clips that are too short do not count.
+        missing: entries of the split without a sound clip; clips that are too short do not count.
         duplicates: clip that was left out -> the clip that shares motion with it in another part, and stays.
         unusual: clip -> its faults, though it may be sound (`plausibility.find_faults`).
         sources: names of the sources; every clip's name begins with one of them. Empty for one folder.

@@ -5,8 +5,8 @@ A clip's name is its path below the data root without suffix, `/`-separated. Cli
 (`amass_names`), and patterns of groups see names without the folder of an archive.
 
 Fractions count groups; a clip without ties is a group of its own. Nothing depends on the order of the names:
-groups are ranked by a hash of seed and name, so a clip that is added later moves few others, and a smaller
-`train_fraction` takes some of the clips of a larger one.
+groups are ranked by a hash of seed and name. So a new clip moves few others, and a smaller `train_fraction`
+takes some of the clips of a larger one.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Assignment:
 
 
 class Split:
-    """The split slot's interface; the defaults are those of a split that divides all clips in the folder."""
+    """The split slot's interface; the defaults suit a split that divides all clips in the folder."""
 
     listed: Mapping[str, int] = {}
     """The number of the split's entries by subset; empty if it divides all clips in the folder."""
@@ -280,8 +280,8 @@ class ListSplit(PublishedSplit):
     """Published lists (AvatarPoser, AGRoL): FOLDER/SUBSET/train_split.txt and test_split.txt.
 
     A line is the relative path of an npz; blank lines, CRLF, a leading `./` and anything before the subset's
-    own folder are accepted. An entry stands for the clip of that name, or else for the clip that has that
-    name in another release of AMASS. Clips in no list are left out. Patterns of groups see an entry's name,
+    own folder are accepted. An entry means the clip of that name, or else the clip that has that name
+    in another release of AMASS. Clips in no list are left out. Patterns of groups see an entry's name,
     so that a list divides every release in the same way.
 
     Args:

@@ -102,7 +102,7 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
 
 
 def _check_name(path: Path, file: str, clips: dict[str, ClipRecord]) -> None:
-    """Raise InputError for anything but a regular file whose name can be a clip's."""
+    """Raise InputError unless the path is a regular file with a valid and new clip name."""
     if one_line(file) != file:
         raise InputError(f"{path}: line feeds or other control characters in its name; rename it")
     if clip_name(file) in clips:

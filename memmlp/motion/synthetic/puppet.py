@@ -1,4 +1,4 @@
-"""A person driven by feet, pelvis, trunk, gaze and hands, whose joints follow by inverse kinematics.
+"""A person driven by feet, pelvis, trunk, gaze and hands; the joints follow by inverse kinematics.
 
 Directions of the body are SMPL's: x left, y up, z forward. Angles about them are (pitch, yaw, roll): positive
 leans forward, turns left, leans to the right. Curves are arrays over times of N frames, in seconds.
