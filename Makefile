@@ -17,9 +17,9 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP)
 	$(BIN)/memmlp demo
 
-# One process more than cores, since some tests wait for other processes.
+# One process more than cores, since some tests wait for other processes. They share compiled code.
 CORES := $(shell $(PYTHON) -c 'import os; print(os.cpu_count())')
-PYTEST := $(BIN)/python -m pytest --dist worksteal -n $$(($(CORES) + 1))
+PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder -n $$(($(CORES) + 1))
 
 test: $(STAMP)
 	$(PYTEST)
