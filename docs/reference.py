@@ -22,10 +22,10 @@ import yaml
 
 import memmlp
 from memmlp.cli.main import COMMANDS, commands
-from memmlp.common.components import collected, find, names
+from memmlp.common.components import collect_attribute, find, names
 from memmlp.common.settings import MISSING
 from memmlp.config.component_source import GROUPS
-from memmlp.config.package_data import packaged
+from memmlp.config.plugins import packaged
 from memmlp.config.schema import ONLY, SCHEMAS
 
 ROOT = Path(__file__).parent.parent
@@ -156,8 +156,8 @@ def component_section(group: str, name: str) -> Iterator[str]:
     yield from settings_section(
         settings, {"generator": "data.synth", "loggers": f"loggers.{name}"}.get(group, group)
     )
-    taken = {slot: option or "null" for slot, option in collected(settings, "defaults").items()}
-    others = taken | collected(settings, "recipe")
+    taken = {slot: option or "null" for slot, option in collect_attribute(settings, "defaults").items()}
+    others = taken | collect_attribute(settings, "recipe")
     if others:
         yield f"Sets {', '.join(f'`{key}={written(value)}`' for key, value in others.items())}."
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.identity import evaluation_id_of
-from memmlp.runs.loggers.facts import CurvePoint, RunFacts
+from memmlp.runs.loggers.logger import CurvePoint, RunFacts
 from memmlp.runs.run import Run
 
 

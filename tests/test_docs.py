@@ -23,7 +23,7 @@ from memmlp.cli.main import COMMANDS, commands
 from memmlp.cli.workers import Workers, split_executor
 from memmlp.common.components import names as component_names
 from memmlp.config.build import untrained
-from memmlp.config.compose import composed, composed_plain, parse, preflight
+from memmlp.config.compose import compose_plain, composed, parse, preflight
 from memmlp.config.compose_plan import find_sweep
 from memmlp.config.plugins import activate
 from memmlp.evaluation.metric_facts import SMALLEST, UNITS
@@ -205,7 +205,7 @@ def compose_search(overrides: Sequence[str]) -> None:
     """Compose a search, and the config of its first trial."""
     words = split_executor(overrides)[2]
     own = [word for word in words if word.lstrip("+~").startswith("search")]
-    search = parse_search(composed_plain("tune", own)["search"])
+    search = parse_search(compose_plain("tune", own)["search"])
     rest = [word for word in words if word not in own]
     compose_once([*search.base, *rest, *search.overrides(next(iter(search.first_trials()), {}))])
 

@@ -131,10 +131,10 @@ def _use(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
 
 
 def _search(ctx: click.Context, param: click.Parameter, value: Path | None) -> None:
-    from memmlp.config.plugins import searching
+    from memmlp.config.plugins import search_folder
 
     if not ctx.resilient_parsing:
-        ctx.with_resource(searching(value))
+        ctx.with_resource(search_folder(value))
 
 
 plugins_option = click.option(

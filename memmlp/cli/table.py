@@ -224,8 +224,7 @@ def table_of_plan(
 def find_sweeps(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
     """Find the sweeps with these names and overrides, and return each with the command that runs it."""
     from memmlp.config.compose_plan import find_sweep
-    from memmlp.config.package_data import packaged
-    from memmlp.config.plugins import config_dir_words
+    from memmlp.config.plugins import config_dir_words, packaged
 
     tables = sorted(path.stem for path in packaged("sweeps").glob("table*.yaml"))
     every = [one for name in names for one in (tables if name == "all" else [name])]

@@ -25,7 +25,7 @@ from memmlp.config.compose import (
     parse,
     preflight,
 )
-from memmlp.config.package_data import packaged
+from memmlp.config.plugins import packaged
 
 if TYPE_CHECKING:
     from memmlp.training.request import Outcome

@@ -99,16 +99,16 @@ def prepare_search(overrides: Sequence[str], config_dir: Path | None, outputs: P
         InputError: if a key is wrong; the message names it.
     """
     from memmlp.common.files import digest
-    from memmlp.config.compose import composed_plain
-    from memmlp.config.plugins import activate, named
+    from memmlp.config.compose import compose_plain
+    from memmlp.config.plugins import activate, find_named
     from memmlp.sweep.search.search_file import parse_search
 
-    activate(named(overrides))
+    activate(find_named(overrides))
     own = [text for text in overrides if Override.parse(text).group == "search"]
-    content = composed_plain("tune", own, config_dir).get("search")
+    content = compose_plain("tune", own, config_dir).get("search")
     if not isinstance(content, dict):
         raise InputError("search: has no value; expected the name of a file in conf/search")
-    activate(named(map(str, content.get("base") or ())))
+    activate(find_named(map(str, content.get("base") or ())))
     wanted = parse_search(content)
     remaining = tuple(text for text in overrides if text not in own)
     setup = Setup(wanted, remaining, outputs, outputs / "tune" / wanted.name, config_dir)
@@ -221,7 +221,7 @@ def search(setup: Setup, study: Study, workers: Workers) -> None:
 
 def write_results(setup: Setup, study: Study) -> None:
     """Write the results of the search into its folder."""
-    from memmlp.config.package_data import packaged
+    from memmlp.config.plugins import packaged
     from memmlp.sweep.search import results
 
     results.write_trials(study, setup.folder / "trials.csv")

@@ -134,9 +134,9 @@ class Workers:
 
             return Dask(options, gpus)
         if "." in self.executor:
-            from memmlp.config.plugins import located
+            from memmlp.config.plugins import import_object
 
-            return located(self.executor, "executor")(logs(folder), self.settings)
+            return import_object(self.executor, "executor")(logs(folder), self.settings)
         from memmlp.sweep.executors.local import Debug, Local
 
         return Debug() if self.executor == "debug" else Local(logs(folder), shares)

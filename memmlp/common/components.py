@@ -154,7 +154,7 @@ def chosen(config: Mapping[str, Any], slot: str) -> type[Settings] | None:
     return find(slot, node["name"]).settings if node else None
 
 
-def collected(kind: type[Settings], attribute: str) -> dict[str, Any]:
+def collect_attribute(kind: type[Settings], attribute: str) -> dict[str, Any]:
     """Return `defaults` or `recipe` of a settings' class together with those of its bases."""
     own = [vars(base).get(attribute, {}) for base in reversed(kind.__mro__)]
     return {key: value for each in own for key, value in each.items()}

@@ -255,7 +255,7 @@ def config_of(run: Run, overrides: Sequence[str] = ()) -> DictConfig:
             a package with custom components is not in use.
     """
     check_trained(run)
-    plugins.activate(plugins.named(overrides))
+    plugins.activate(plugins.find_named(overrides))
     plugins.check_allowed(run.config, run.manifest.get("plugins") or {}, f"run {run.id}")
     try:
         cfg = restored(run.config)

@@ -123,7 +123,7 @@ def build_request(cfg: DictConfig) -> RunRequest:
         InputError: if a package of the config is not in use, or its motion source cannot be built.
     """
     config = cast(dict[str, Any], OmegaConf.to_container(cfg, resolve=True))
-    config["plugins"] = plugins.used(config)
+    config["plugins"] = plugins.find_used(config)
     return RunRequest(config, build_motion(cfg))
 
 

@@ -9,7 +9,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import DictConfig, OmegaConf
 
-from memmlp.common.components import SLOTS, collected, find, names
+from memmlp.common.components import SLOTS, collect_attribute, find, names
 from memmlp.common.settings import SIZES
 from memmlp.config.schema import ONLY, SCHEMAS
 
@@ -69,7 +69,7 @@ def _option(group: str, name: str) -> tuple[str | None, DictConfig]:
     node: Any = OmegaConf.structured(settings)
     if group == "loggers":
         return f"loggers.{name}", node
-    others, keys = collected(settings, "defaults"), collected(settings, "recipe")
+    others, keys = collect_attribute(settings, "defaults"), collect_attribute(settings, "recipe")
     if not others and not keys:
         return None, node
     overrides = [{f"override /{slot}": option} for slot, option in others.items()]

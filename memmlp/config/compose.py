@@ -24,13 +24,14 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from memmlp.common.components import SLOTS, collected, declared, names
+from memmlp.common.components import SLOTS, collect_attribute, declared, names
 from memmlp.common.errors import InputError
 from memmlp.common.overrides import Override, last_by_key, parse_overrides
+from memmlp.common.settings import Settings
 from memmlp.config import plugins
 from memmlp.config.check import check, explain, unknown_key
 from memmlp.config.component_source import GROUPS, ONLY, SCHEME, is_group, register
-from memmlp.config.package_data import packaged
+from memmlp.config.plugins import packaged
 from memmlp.config.schema import Config
 from memmlp.runs.identity import flatten
 
@@ -69,7 +70,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--info", "-i", nargs="?", const="all")
     parser.add_argument("overrides", nargs="*")
     args = parser.parse_intermixed_args(list(argv))
-    plugins.activate(plugins.named(args.overrides))
+    plugins.activate(plugins.find_named(args.overrides))
     Plugins.instance().register(UserConfigs)
     register()
     return args
@@ -103,7 +104,7 @@ def composed(overrides: Sequence[str]) -> DictConfig:
     return cfg
 
 
-def composed_plain(name: str, overrides: Sequence[str], folder: Path | None = None) -> dict[str, Any]:
+def compose_plain(name: str, overrides: Sequence[str], folder: Path | None = None) -> dict[str, Any]:
     """Compose a config other than that of `memmlp train`, and return it as plain dictionaries.
 
     Args:
@@ -116,7 +117,7 @@ def composed_plain(name: str, overrides: Sequence[str], folder: Path | None = No
         return cast(dict[str, Any], OmegaConf.to_container(compose(name, args.overrides), resolve=True))
 
 
-def set_by_experiments(options: Sequence[str], overrides: Sequence[str] = ()) -> set[str]:
+def find_experiment_keys(options: Sequence[str], overrides: Sequence[str] = ()) -> set[str]:
     """Return the groups and the dotted keys that options of the group `experiment` set.
 
     Those that an option sets through other experiments in its defaults list are included.
@@ -234,21 +235,21 @@ def _with_components(options: Sequence[str]) -> DictConfig | None:
     model = declared().get(("model", names.get("model") or cfg.model.name))
     if model is None or _brings_more("model", cfg.model.name):
         return None
-    for slot, name in {**collected(model.settings, "defaults"), **names}.items():
+    for slot, name in {**collect_attribute(model.settings, "defaults"), **names}.items():
         if name is None:
             cfg[slot] = None
         elif (slot != "model" and _brings_more(slot, name)) or (node := _make_node(slot, name)) is None:
             return None
         else:
             cfg[slot] = node
-    for key, value in collected(model.settings, "recipe").items():
+    for key, value in collect_attribute(model.settings, "recipe").items():
         OmegaConf.update(cfg, key, value)
     return cfg
 
 
 def _brings_more(slot: str, name: str) -> bool:
-    found = declared().get((slot, name))
-    return bool(found and (collected(found.settings, "defaults") or collected(found.settings, "recipe")))
+    kind = found.settings if (found := declared().get((slot, name))) else Settings
+    return any(collect_attribute(kind, attribute) for attribute in ("defaults", "recipe"))
 
 
 def _make_node(slot: str, name: str) -> DictConfig | None:
@@ -344,7 +345,7 @@ def _hydra(args: argparse.Namespace) -> Iterator[None]:
     main = _folder(args.config_path or packaged("conf"), "--config-path")
     own = _folder(args.config_dir, "--config-dir") if args.config_dir else None
     with (
-        plugins.searching(own) if own else nullcontext(),
+        plugins.search_folder(own) if own else nullcontext(),
         initialize_config_dir(str(main), job_name="train", version_base=VERSION_BASE),
     ):
         yield

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING
 from memmlp.common.errors import InputError
 from memmlp.common.files import digest
 from memmlp.common.overrides import Override
-from memmlp.config.package_data import packaged
-from memmlp.config.plugins import activate, named
-from memmlp.sweep.definition import Sweep, Variant, keep_sweep, key_of
+from memmlp.config.plugins import activate, find_named, packaged
+from memmlp.sweep.definition import Sweep, Variant, key_of, save_sweep_copy
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
 from memmlp.sweep.sweep_file import load_sweep
 
@@ -34,8 +33,8 @@ def find_sweep(name: str, overrides: Sequence[str] = ()) -> Sweep:
     Raises:
         InputError: if there is no such sweep, or its file is wrong.
     """
-    activate(named(overrides))
-    sweep = load_sweep(_path(name), lambda base: activate(named(base))).with_overrides(overrides)
+    activate(find_named(overrides))
+    sweep = load_sweep(_path(name), lambda base: activate(find_named(base))).with_overrides(overrides)
     for variant in sweep.runnable():
         check_preset(sweep, variant)
     return sweep
@@ -50,7 +49,7 @@ def check_preset(sweep: Sweep, variant: Variant) -> None:
     Raises:
         InputError: for such a variant; the message names the sweep, the variant and both overrides.
     """
-    from memmlp.config.compose import EXPERIMENT, set_by_experiments
+    from memmlp.config.compose import EXPERIMENT, find_experiment_keys
 
     own = {key_of(word): word for word in variant.overrides or ()}
     chosen = own.get(EXPERIMENT)
@@ -64,7 +63,7 @@ def check_preset(sweep: Sweep, variant: Variant) -> None:
     if options and (lost := [option for option in before if option not in options]):
         both = ",".join(dict.fromkeys([*before, *options]))
         raise InputError(f"{where} would replace {EXPERIMENT}={lost[0]}; use {EXPERIMENT}=[{both}]")
-    known = set_by_experiments(options, sweep.all_overrides(variant))
+    known = find_experiment_keys(options, sweep.all_overrides(variant))
     for key, word in (around | {key_of(word): word for word in others}).items():
         if key in known:
             raise InputError(f"{where} sets {key}, and {word} would override it; remove it or the experiment")
@@ -126,7 +125,7 @@ def make_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
     plan = Plan(sweep.name, outputs, tuple(entry for entry, _ in planned), tasks)
     if prepare:
         folder = sweep_folder(sweep, outputs)
-        keep_sweep(sweep, folder)
+        save_sweep_copy(sweep, folder)
         plan.save(folder / "plan.json")
     return plan
 

@@ -16,9 +16,9 @@ from memmlp.common.components import SLOTS, declared
 from memmlp.common.overrides import value_text
 from memmlp.config.component_source import register
 from memmlp.config.compose import VERSION_BASE
-from memmlp.config.package_data import packaged
+from memmlp.config.plugins import packaged
 from memmlp.runs.identity import NETWORK, flatten, option_in_slot, training_config
-from memmlp.runs.lookup import kind_words
+from memmlp.runs.lookup import describe_kind
 
 MAX_WORDS = 6
 SEPARATOR = " · "
@@ -36,7 +36,7 @@ def readable_name(kind: str, config: Mapping[str, Any]) -> str:
         kind: the kind of run (see `Identity`).
         config: the run's resolved config.
     """
-    words = [] if kind == NETWORK else [kind_words(kind)]
+    words = [] if kind == NETWORK else [describe_kind(kind)]
     try:
         words += _differences(config)
     except (HydraException, OmegaConfBaseException):  # a name is no reason to stop a run

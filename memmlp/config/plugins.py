@@ -1,4 +1,4 @@
-"""Users' packages with custom components: which ones are in use.
+"""The shipped folders of configs and sweeps, and users' packages with custom components.
 
 A package is in use where the user's command (`plugins=[NAME]`, `--plugins NAME`) or script (`load_run(ID,
 plugins=[NAME])`), a sweep's base, the environment (MEMMLP_PLUGINS) or an installed entry point of the group
@@ -14,7 +14,7 @@ import os
 import pkgutil
 import re
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib import metadata
@@ -23,11 +23,11 @@ from typing import Any
 
 import yaml
 
+import memmlp
 from memmlp.common.components import SLOTS, Component, add_package, declared, find
 from memmlp.common.errors import InputError
 from memmlp.common.overrides import parse_overrides
 from memmlp.common.settings import MetricSettings
-from memmlp.config.package_data import packaged
 from memmlp.evaluation.metric_facts import HIGHER, SMALLEST, UNITS
 
 GROUP = "memmlp.plugins"
@@ -62,7 +62,7 @@ def split_names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-def named(words: Iterable[str]) -> list[str]:
+def find_named(words: Iterable[str]) -> list[str]:
     """Return the packages that overrides such as `plugins=[mine]` name."""
     values = [one.value or "" for one in parse_overrides(words) if one.key == KEY]
     found: list[str] = []
@@ -88,7 +88,7 @@ def folders() -> list[tuple[str, Path]]:
 
 
 @contextmanager
-def searching(folder: Path | None) -> Iterator[None]:
+def search_folder(folder: Path | None) -> Iterator[None]:
     """Search a folder of the user's own configs, that of `--config-dir`, within the context."""
     token = _own.set(folder.absolute() if folder else None)
     try:
@@ -164,7 +164,7 @@ def is_component(option: Path) -> bool:
     return found is not None and found.package == "memmlp"
 
 
-def used(config: Mapping[str, Any]) -> list[str]:
+def find_used(config: Mapping[str, Any]) -> list[str]:
     """Return the packages of a config's components and metrics, except memmlp."""
     options = [(slot, config[slot]["name"]) for slot in SLOTS if config.get(slot)]
     options += [("metric", name) for name in config["evaluation"].get("metrics") or ()]
@@ -197,9 +197,38 @@ def check_allowed(config: Mapping[str, Any], recorded: Mapping[str, Any], where:
             raise InputError(f"{where}: needs code of the package {shown}; to trust it, use {ways}")
 
 
-def located(path: str, key: str) -> Any:
+def import_object(path: str, key: str) -> Any:
     """Return the class or function at a dotted path. Raises InputError, naming the key, for a missing one."""
     try:
         return pkgutil.resolve_name(path)
     except (ImportError, AttributeError, ValueError) as error:
         raise InputError(f"{key}: {path}: {str(error).splitlines()[0]}") from error
+
+
+DEFAULT_GROUPING = "cmu"  # the grouping of data=mocap
+
+
+def packaged(name: str) -> Path:
+    """Return the folder `conf` or `sweeps`.
+
+    In a checkout, the folder is beside the package. In an installed package, it is inside, named `_conf` or
+    `_sweeps`.
+    """
+    package = Path(memmlp.__file__).resolve().parent
+    installed = package / f"_{name}"
+    return installed if installed.is_dir() else package.parent / name
+
+
+def grouping_to_choose(names: Collection[str]) -> str | None:
+    """Return the shipped grouping that `data=mocap` needs for these clips; None if it has the right one.
+
+    Args:
+        names: clips' names below their folder, without `.npz`.
+    """
+    fitting = {
+        path.stem
+        for path in (packaged("conf") / "data" / "grouping").glob("*.yaml")
+        for pattern in yaml.safe_load(path.read_text(encoding="utf-8"))["groups"]
+        if any(re.search(pattern, name) for name in names)
+    }
+    return None if DEFAULT_GROUPING in fitting else min(fitting, default=None)

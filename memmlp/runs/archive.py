@@ -19,7 +19,7 @@ from pathlib import Path
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_file, file_digest, read_json, sync_folder
 from memmlp.runs.identity import ID
-from memmlp.runs.notes import notes_path
+from memmlp.runs.lookup import notes_path
 from memmlp.runs.run import Run
 
 MAX_FILES = 1000

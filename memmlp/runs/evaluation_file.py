@@ -58,7 +58,7 @@ def current(path: Path, report: Mapping[str, Any]) -> bool:
     return {"mode", "ik"} <= settings.keys() and path.stem == evaluation_id_of(settings)
 
 
-def outdated_by(path: Path, report: Mapping[str, Any]) -> str | None:
+def describe_outdated(path: Path, report: Mapping[str, Any]) -> str | None:
     """Return which components of an evaluation have changed since, as "mode.window 2 -> 3"; None if none has.
 
     Custom metrics whose package is not in use are not compared.
@@ -88,7 +88,7 @@ def combined_by(reports: Sequence[Mapping[str, Any]]) -> dict[str, str | None]:
     }
 
 
-def of_one_solver(reports: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def keep_one_solver(reports: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return reports in which the branch `combined` of a mode is by one inverse kinematics only, the last.
 
     Reports with another lose that branch, so that joined results never mix two.
@@ -109,7 +109,7 @@ def _without_combined(report: Mapping[str, Any]) -> dict[str, Any]:
     return {**report, "mean": mean, "clips": clips}
 
 
-def with_solvers(results: Mapping[str, Any], by: Mapping[str, str | None]) -> dict[str, Any]:
+def name_solvers(results: Mapping[str, Any], by: Mapping[str, str | None]) -> dict[str, Any]:
     """Return results with the inverse kinematics in the name of the branch `combined`: "combined-lbfgs-15".
 
     Args:
@@ -161,7 +161,7 @@ class EvaluationsAsConfigured:
             InputError: if a file is damaged.
         """
         found: dict[str, dict[str, dict[str, float | None]]] = {}
-        for report in of_one_solver(self._reports()):
+        for report in keep_one_solver(self._reports()):
             branches = found.setdefault(report["mode"], {})
             for branch, errors in report["mean"].items():  # custom metrics may be in one branch only
                 numbers = {name: to_number(value) for name, value in errors.items()}
@@ -179,7 +179,7 @@ class EvaluationsAsConfigured:
     @property
     def outdated(self) -> dict[str, str]:
         """The changed component versions of each mode whose `results` were measured with earlier ones."""
-        last = {report.get("mode"): outdated_by(path, report) for path, report in self._found.items()}
+        last = {report.get("mode"): describe_outdated(path, report) for path, report in self._found.items()}
         return {str(mode): changed for mode, changed in last.items() if changed}
 
     def _reports(self) -> list[dict[str, Any]]:

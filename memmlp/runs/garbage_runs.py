@@ -11,8 +11,7 @@ from memmlp.common.files import read_json
 from memmlp.common.lease import is_alive
 from memmlp.runs.environment import prerequisite_versions
 from memmlp.runs.identity import NETWORK, outdated
-from memmlp.runs.lookup import kind_words, list_runs
-from memmlp.runs.notes import read_notes
+from memmlp.runs.lookup import describe_kind, list_runs, read_notes
 from memmlp.runs.run import Run
 
 REASONS = ("failed", "old", "orphaned")
@@ -86,7 +85,7 @@ def _orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
     kinds = {run.id: str(run.manifest.get("kind") or NETWORK) for run in runs}
     alone = [run_id for run_id, kind in kinds.items() if kind != NETWORK and run_id not in used]
     empty = [run for run in runs if not run.manifest]
-    found = {run_id: f"a {kind_words(kinds[run_id])} that no run uses" for run_id in alone}
+    found = {run_id: f"a {describe_kind(kinds[run_id])} that no run uses" for run_id in alone}
     return found | {run.id: "an empty folder" for run in empty}
 
 

@@ -303,7 +303,7 @@ def used_as_configured(settings: Mapping[str, Any], config: Mapping[str, Any]) -
     return all(settings.get(key) == value for key, value in inference(config).items())
 
 
-def exported_otherwise(settings: Mapping[str, Any], config: Mapping[str, Any]) -> str:
+def describe_other_export(settings: Mapping[str, Any], config: Mapping[str, Any]) -> str:
     """Say in which settings a deployment's file is not the one of the run's config, such as "naive-int8".
 
     It is empty where it is that file. A config without one (`export.graph=off`) stands for the default graph.

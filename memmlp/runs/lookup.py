@@ -1,12 +1,18 @@
-"""Finds and describes runs below an outputs folder."""
+"""Finds and describes runs below an outputs folder; their tags and notes.
+
+Tags and notes are in the file `notes.json` of a run's folder, and do not affect its id.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
+from memmlp.common.files import read_json, write_json
 from memmlp.runs.identity import ID, NETWORK
 from memmlp.runs.run import Run
 
@@ -54,7 +60,7 @@ def check_trained(run: Run) -> None:
         raise InputError(f"run {run.id}: must be a finished run of a motion network")
 
 
-def kind_words(kind: str) -> str:
+def describe_kind(kind: str) -> str:
     """Return the readable name of a prerequisite run's kind, such as "lower codes"."""
     return "VQ-VAE" if kind == "vqvae" else kind.replace("_", " ")
 
@@ -67,7 +73,7 @@ def run_name(manifest: Mapping[str, Any], config: Mapping[str, Any]) -> str:
         config: the run's config, by dotted key, for a run without a name.
     """
     seed = "" if config.get("seed") is None else f" · seed {config['seed']}"
-    return str(manifest.get("name") or kind_words(str(manifest.get("kind") or "run")) + seed)
+    return str(manifest.get("name") or describe_kind(str(manifest.get("kind") or "run")) + seed)
 
 
 def frames_seen(run: Run) -> float:
@@ -95,3 +101,66 @@ def hardly_trained(frames: float) -> str:
     if not 0 < frames < LITTLE:
         return ""
     return f"hardly trained (its steps saw {frames / MINUTE:.2g} minutes of motion): ignore its errors"
+
+
+TAG = re.compile(r"[\w.+/:-]{1,64}")
+MAX_LENGTH = 10_000  # characters of a note
+
+
+@dataclass(frozen=True)
+class Notes:
+    """A run's tags and note.
+
+    Attributes:
+        tags: short words, sorted.
+        note: a text; empty for none.
+    """
+
+    tags: tuple[str, ...] = ()
+    note: str = ""
+
+
+def notes_path(run: Run) -> Path:
+    """Return the file of a run's tags and note."""
+    return run.folder / "notes.json"
+
+
+def read_notes(run: Run) -> Notes:
+    """Return a run's tags and note; empty ones if there are none or the file is damaged."""
+    found = read_json(notes_path(run))
+    tags, note = found.get("tags"), found.get("note")
+    words = [tag for tag in tags if isinstance(tag, str)] if isinstance(tags, list) else []
+    return Notes(tuple(sorted(set(words))), note if isinstance(note, str) else "")
+
+
+def add_tags(run: Run, tags: Iterable[str]) -> Notes:
+    """Add tags to a run. Raises InputError for a tag that is not a short word."""
+    known = read_notes(run)
+    return _write(run, Notes(tuple(sorted({*known.tags, *map(_checked, tags)})), known.note))
+
+
+def remove_tags(run: Run, tags: Iterable[str]) -> Notes:
+    """Remove tags from a run. Raises InputError for a tag that the run does not have."""
+    known, gone = read_notes(run), set(tags)
+    if missing := sorted(gone - set(known.tags)):
+        has = ", ".join(known.tags) or "none"
+        raise InputError(f"tag '{missing[0]}': run {run.id} does not have it; its tags: {has}")
+    return _write(run, Notes(tuple(tag for tag in known.tags if tag not in gone), known.note))
+
+
+def set_note(run: Run, note: str) -> Notes:
+    """Replace a run's note; an empty one removes it. Raises InputError for one that is too long."""
+    if len(note) > MAX_LENGTH:
+        raise InputError(f"note: must have at most {MAX_LENGTH} characters, not {len(note)}")
+    return _write(run, Notes(read_notes(run).tags, note.strip()))
+
+
+def _checked(tag: str) -> str:
+    if not TAG.fullmatch(tag):
+        raise InputError(f"tag '{tag}': must be up to 64 letters, digits and . _ + / : -")
+    return tag
+
+
+def _write(run: Run, notes: Notes) -> Notes:
+    write_json(notes_path(run), {"tags": list(notes.tags), "note": notes.note})
+    return notes

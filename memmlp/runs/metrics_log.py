@@ -31,7 +31,7 @@ class LogRecord(NamedTuple):
     time: float
 
 
-def parsed(line: bytes) -> LogRecord:
+def parse_record(line: bytes) -> LogRecord:
     """Return the record in a line. Raises ValueError, KeyError or TypeError for a line without one."""
     entry = json.loads(line)
     values = {key: float(value) for key, value in entry["values"].items()}
@@ -87,7 +87,7 @@ class MetricsLog:
         entries: dict[tuple[str, int], LogRecord] = {}
         for number, line in enumerate(self.path.read_bytes().split(b"\n")[:-1], 1):
             try:
-                metrics = parsed(line)
+                metrics = parse_record(line)
             except (ValueError, KeyError, TypeError):
                 raise InputError(
                     f"{self.path}: line {number} is damaged; remove it, or repeat the run with force=true"

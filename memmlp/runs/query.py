@@ -14,10 +14,9 @@ from typing import Any, NamedTuple
 from memmlp.common.errors import InputError
 from memmlp.common.files import to_number
 from memmlp.runs.deployment_folder import with_times_as_deployed
-from memmlp.runs.evaluation_file import with_solvers
+from memmlp.runs.evaluation_file import name_solvers
 from memmlp.runs.identity import SLOTS, flatten, option_in_slot, training_config
-from memmlp.runs.lookup import run_name
-from memmlp.runs.notes import read_notes
+from memmlp.runs.lookup import read_notes, run_name
 from memmlp.runs.run import STATUSES, Run
 
 Record = Mapping[str, Any]
@@ -42,7 +41,7 @@ def record(run: Run) -> dict[str, Any]:
     exported, have its name in the key (`latency-int8.median_ms`).
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
-    found = with_solvers(run.results, run.evaluations_as_configured.combined_by)
+    found = name_solvers(run.results, run.evaluations_as_configured.combined_by)
     results = {key: to_number(value) for key, value in flatten(with_times_as_deployed(found)).items()}
     flat = flatten(config)
     short = {key.replace(".rotation.", "."): value for key, value in results.items()}

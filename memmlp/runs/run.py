@@ -24,7 +24,7 @@ from memmlp.runs import deployment_folder
 from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.environment import changed_since, changes, describe_sources, environment, host, join_origins
 from memmlp.runs.evaluation_file import EvaluationsAsConfigured, intact
-from memmlp.runs.identity import belongs, deployment_settings, exported_otherwise, used_as_configured
+from memmlp.runs.identity import belongs, deployment_settings, describe_other_export, used_as_configured
 from memmlp.runs.metrics_log import LogRecord, MetricsLog
 
 STAGE_WORDS = {"training": "training", "evaluation": "evaluating", "deployment": "exporting"}
@@ -43,7 +43,7 @@ def _parse(text: str) -> Any:
 
 def latency_name(deployed: DeploymentFolder, config: Mapping[str, Any]) -> str:
     """Return the name of a deployment's results: "latency", or another file's, such as "latency-int8"."""
-    return "-".join(filter(None, ["latency", exported_otherwise(deployed.settings, config)]))
+    return "-".join(filter(None, ["latency", describe_other_export(deployed.settings, config)]))
 
 
 class Run:
@@ -141,7 +141,8 @@ class Run:
         return self._best_deployment(
             config,
             lambda one: (
-                one.current, bool(one.accurate_int8), not exported_otherwise(one.settings, config), one.made,
+                one.current, bool(one.accurate_int8), not describe_other_export(one.settings, config),
+                one.made,
             ),
         )  # fmt: skip
 
@@ -161,7 +162,7 @@ class Run:
         return self._best_deployment(
             config,
             lambda one: (
-                not exported_otherwise(one.settings, config), one.current, one.settings == asked, one.made,
+                not describe_other_export(one.settings, config), one.current, one.settings == asked, one.made,
             ),
         )  # fmt: skip
 

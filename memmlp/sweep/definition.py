@@ -218,7 +218,7 @@ def parse_seeds(value: Any, name: str) -> tuple[int, ...]:
     return tuple(map(int, texts))
 
 
-def keep_sweep(sweep: Sweep, folder: Path) -> None:
+def save_sweep_copy(sweep: Sweep, folder: Path) -> None:
     """Write the sweep into its folder, unless the folder has the same content already."""
     content = plain(asdict(sweep))
     if read_json(folder / SWEEP_FILE) != content:
@@ -226,7 +226,7 @@ def keep_sweep(sweep: Sweep, folder: Path) -> None:
         write_json(folder / SWEEP_FILE, content)
 
 
-def kept_sweep(folder: Path) -> Sweep | None:
+def load_sweep_copy(folder: Path) -> Sweep | None:
     """Return the sweep kept in a folder; None without one. Raises InputError if it is damaged."""
     path = folder / SWEEP_FILE
     if not path.exists():

@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from memmlp.runs.identity import NETWORK, training_settings
-from memmlp.runs.lookup import kind_words
+from memmlp.runs.lookup import describe_kind
 from memmlp.runs.metrics_log import LogRecord
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan, RunTask
@@ -120,7 +120,7 @@ def task_name(plan: Plan, task: RunTask) -> str:
         users |= {other.id} if other.prerequisite in users else set()
     seeds = sorted({entry.seed for entry in plan.entries if entry.id in users})
     of_seeds = f" of seed {', '.join(map(str, seeds))}" if seeds else ""
-    return f"{kind_words(task.kind)} {task.id}{of_seeds}"
+    return f"{describe_kind(task.kind)} {task.id}{of_seeds}"
 
 
 def render(plan: Plan, states: Mapping[str, str]) -> Group:

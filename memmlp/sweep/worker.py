@@ -90,7 +90,7 @@ def attempt(plan: Plan, task: RunTask, perform: Perform) -> bool:
 
 
 def _perform(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
-    if deaths(run) >= DEATHS:
+    if count_deaths(run) >= DEATHS:
         run.fail(f"{DEATHS} processes died at step {run.step} of it, one after another")
         return
     try:
@@ -107,7 +107,7 @@ def _perform(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
         run.fail(f"{type(error).__name__}: {error}", traceback.format_exc())
 
 
-def deaths(run: Run) -> int:
+def count_deaths(run: Run) -> int:
     """Count how many processes, one after another, most recently started the run at its present step.
 
     Those before work that ended well, or before the last --retry, don't count.

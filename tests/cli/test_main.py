@@ -17,7 +17,7 @@ from processes import finished
 import memmlp as package
 from memmlp.cli.main import COMMANDS, main
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
-from memmlp.config.package_data import packaged
+from memmlp.config.plugins import packaged
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from own_package import registers_kept
 
-from memmlp.common.components import SLOTS, add_package, collected, declared, find, names
+from memmlp.common.components import SLOTS, add_package, collect_attribute, declared, find, names
 from memmlp.common.errors import InputError
 from memmlp.networks.avatar_poser import EgoPoser, EgoPoserSettings
 
@@ -80,7 +80,7 @@ def test_declared_settings_and_those_of_the_module_are_the_same():
     assert found.settings is not EgoPoserSettings  # it was read without an import
     assert [spec for spec in found.settings.__dataclass_fields__] == [*EgoPoserSettings.__dataclass_fields__]
     assert (found.version, found.package, found.module) == (2, "memmlp", "memmlp.networks.avatar_poser")
-    assert collected(found.settings, "defaults") == {
+    assert collect_attribute(found.settings, "defaults") == {
         "memory": None, "predictor": None, "hand": None, "loss": "ego_poser",
     }  # fmt: skip
 
@@ -100,7 +100,7 @@ def test_a_package_adds_components_whose_settings_extend_each_other(package: Pat
         add_package("mine", package)
         one, two = find("memory", "one"), find("memory", "two")
         assert (one.version, two.version, two.module, two.package) == (4, 1, "mine.derived", "mine")
-        assert collected(two.settings, "defaults") == {"loss": "manual", "hand": "off"}
+        assert collect_attribute(two.settings, "defaults") == {"loss": "manual", "hand": "off"}
         assert "mine.base" not in sys.modules
         made = two.build({"name": "two", "width": 5}, extra=7)
         assert (type(made).__name__, made.width, made.extra) == ("Two", 5, 7)

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from memmlp.common.components import SLOTS, names
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import _hydra, composed, parse, preflight
-from memmlp.config.package_data import packaged
+from memmlp.config.plugins import packaged
 
 OF_TERMS = [path.stem for path in packaged("conf").glob("loss/*.yaml")]
 

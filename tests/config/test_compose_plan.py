@@ -32,7 +32,7 @@ def test_nothing_undoes_what_a_variants_experiment_sets_by_another_one(tmp_path:
     words = [] if near else [f"hydra.searchpath=[file://{folder.parent}]"]
     for name in NESTED:
         path.write_text(f"variants: {{a: [], b: [experiment={name}]}}\n")
-        with plugins.searching(folder.parent if near else None):
+        with plugins.search_folder(folder.parent if near else None):
             for own in ("memory=lstm", "model.width=16"):
                 said = f"experiment={name} sets {own.partition('=')[0]}, and {own} would override it"
                 with pytest.raises(InputError, match=said):

@@ -23,6 +23,7 @@ from memmlp.config.build import build_experiment, config_of
 from memmlp.config.build_request import build_motion
 from memmlp.config.compose import composed
 from memmlp.config.compose_plan import find_sweep
+from memmlp.config.plugins import DEFAULT_GROUPING, grouping_to_choose
 from memmlp.config.schema import restored
 from memmlp.report.tables.table_text import heading
 from memmlp.runs import environment
@@ -144,20 +145,23 @@ def test_metrics_of_ones_own_are_those_of_sweeps_and_searches(on_path: Path):
 def test_a_metric_is_measured_in_both_branches(on_path: Path):
     from tiny import frames, model
 
+    from memmlp.evaluation.evaluation import Evaluation
+    from memmlp.evaluation.ik import NoIK
     from memmlp.evaluation.metrics import UserMetric
-    from memmlp.evaluation.modes import evaluate, quick_stream
+    from memmlp.evaluation.modes import quick_stream
 
     def mean(predicted: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
         return predicted.mean()
 
     own = {"Mean": UserMetric(mean, "positions"), "Turn": UserMetric(mean, "rotations")}
-    report = evaluate(model(), frames(), ["stream"], 4, custom=own)["mean"]["stream"]
+    report = Evaluation(["stream"], 4, NoIK(), 0, own).report(model(), frames(), "stream")["mean"]
     assert {"Mean", "Turn"} <= report["rotation"].keys()
     assert "Mean" in report["position"]
     assert "Turn" not in report["position"]
     assert {"rotation Mean", "position Mean"} <= quick_stream(model(), frames().clips(), own).keys()
+    wrong = {"Mean": UserMetric(lambda p, t: p, "positions")}
     with pytest.raises(InputError, match=r"metric Mean"):
-        evaluate(model(), frames(), ["stream"], 4, custom={"Mean": UserMetric(lambda p, t: p, "positions")})
+        Evaluation(["stream"], 4, NoIK(), 0, wrong).report(model(), frames(), "stream")
 
 
 HEAD = """
@@ -201,7 +205,7 @@ def test_packages_that_cannot_be_used_are_named(folder: Path):
 
 def test_a_folder_of_configs_is_searched_while_a_command_runs(folder: Path):
     write(folder, {"conf/experiment/own.yaml": "# @package _global_\nseed: 7"})
-    with plugins.searching(folder / "conf"):
+    with plugins.search_folder(folder / "conf"):
         assert composed(["experiment=own"]).seed == 7
         assert plugins.config_dir_words() == ["--config-dir", str(folder / "conf")]
     with pytest.raises(InputError, match=r"experiment=own: no such option"):
@@ -318,3 +322,19 @@ def test_code_that_changed_since_is_told_where_nothing_imports_it(folder: Path):
     (folder / "mine.py").unlink()
     importlib.invalidate_caches()
     assert run.changed_sources == []  # nobody knows
+
+
+def test_names_choose_a_grouping():
+    assert grouping_to_choose(["ann/walk", "dataset-1_walk_active_001"]) == "bandai_namco"
+    assert grouping_to_choose(["ann/walk"]) is None
+    assert grouping_to_choose(["salsa/01", "salsa/16"]) is None  # of the default
+
+
+def test_the_default_is_that_of_own_motion(tmp_path: Path):
+    """A grouping that is suggested replaces it."""
+
+    def groups(*overrides: str) -> list[str]:
+        return list(composed(["data=mocap", f"data.root={tmp_path}", *overrides]).data.split.groups)
+
+    assert groups() == groups(f"data/grouping@data.split={DEFAULT_GROUPING}") != []
+    assert groups("data/grouping@data.split=bandai_namco") != groups()

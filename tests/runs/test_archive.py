@@ -11,7 +11,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import file_digest
 from memmlp.runs.archive import export_run, import_run
 from memmlp.runs.evaluation_file import write_report
-from memmlp.runs.notes import add_tags, read_notes
+from memmlp.runs.lookup import add_tags, read_notes
 from memmlp.runs.run import Run
 
 NAME = "0123456789abcdef"

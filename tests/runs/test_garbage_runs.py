@@ -10,7 +10,7 @@ from memmlp.common.files import write_json
 from memmlp.common.lease import current_process
 from memmlp.runs.garbage_runs import delete, garbage
 from memmlp.runs.identity import VERSIONS
-from memmlp.runs.notes import add_tags, remove_tags
+from memmlp.runs.lookup import add_tags, remove_tags
 from memmlp.runs.run import Run
 
 FAILED, OLD, GONE, CODES, USED, GOOD, EMPTY = (f"{letter}" * 16 for letter in "0123456")

@@ -9,7 +9,17 @@ from begun_runs import CONFIG, begun
 from fake_runs import fake_run
 
 from memmlp.common.errors import InputError
-from memmlp.runs.lookup import find_run, frames_seen, list_runs
+from memmlp.runs.lookup import (
+    Notes,
+    add_tags,
+    find_run,
+    frames_seen,
+    list_runs,
+    notes_path,
+    read_notes,
+    remove_tags,
+    set_note,
+)
 from memmlp.runs.run import Run
 
 
@@ -53,3 +63,34 @@ def test_a_refiner_saw_its_network_s_frames_and_its_own_pieces(tmp_path: Path):
     above = {"prerequisite": network.id}
     config = SEEN | {"refiner": {"frames": 20}}
     assert frames_seen(fake_run(tmp_path, "refiner", config=config, origin=above)) == 100 * 8 * (11 + 20)
+
+
+def test_tags_and_note_are_kept_and_survive_a_reset(tmp_path: Path):
+    run = begun(tmp_path)
+    assert read_notes(run) == Notes()
+    add_tags(run, ["good", "a/b"])
+    set_note(run, " a note ")
+    add_tags(run, ["good"])
+    run.reset()
+    assert read_notes(run) == Notes(("a/b", "good"), "a note")
+    assert remove_tags(run, ["good"]) == Notes(("a/b",), "a note")
+    assert set_note(run, "") == Notes(("a/b",), "")
+
+
+def test_bad_tags_and_notes_are_refused(tmp_path: Path):
+    run = begun(tmp_path)
+    for tag in ("", "two words", "x" * 65, "a,b", "a\nb"):
+        with pytest.raises(InputError, match="must be up to 64"):
+            add_tags(run, ["good", tag])
+    assert read_notes(run) == Notes()
+    with pytest.raises(InputError, match="tag 'good'"):
+        remove_tags(run, ["good"])
+    with pytest.raises(InputError, match="note: "):
+        set_note(run, "x" * 10001)
+
+
+def test_a_damaged_file_says_nothing(tmp_path: Path):
+    run = begun(tmp_path)
+    for content in ("", "[]", '{"tags": 5, "note": []}', '{"tags": [3], "note": null}'):
+        notes_path(run).write_text(content)
+        assert read_notes(run) == Notes()

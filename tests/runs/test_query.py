@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
-from memmlp.runs.notes import add_tags
+from memmlp.runs.lookup import add_tags
 from memmlp.runs.query import as_typed, data_labels, differing, parse, record
 
 ONE = {

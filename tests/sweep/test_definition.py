@@ -9,7 +9,7 @@ import pytest
 
 from memmlp.common.errors import InputError
 from memmlp.sweep.definition import SWEEP_FILE as NAME
-from memmlp.sweep.definition import keep_sweep, kept_sweep
+from memmlp.sweep.definition import load_sweep_copy, save_sweep_copy
 from memmlp.sweep.sweep_file import parse_sweep
 
 VARIANTS = {"full": [], "none": {"overrides": ["memory=none"], "paper": {"MPJPE": 4.13}}}
@@ -114,14 +114,14 @@ def test_what_is_read_is_what_was_kept(tmp_path: Path):
         sweep.with_overrides(["seed=4,5", "optim.lr=0.1"]),
         variants=(*sweep.variants[1:], replace(sweep.variants[0], series="a", cell=("b=1", "c=2"))),
     )
-    assert kept_sweep(tmp_path) is None
+    assert load_sweep_copy(tmp_path) is None
     for each in (sweep, changed):
-        keep_sweep(each, tmp_path)
-        assert kept_sweep(tmp_path) == each
+        save_sweep_copy(each, tmp_path)
+        assert load_sweep_copy(tmp_path) == each
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"variants": [{"no": 1}]}'])
 def test_a_damaged_copy_is_named(tmp_path: Path, text: str):
     (tmp_path / NAME).write_text(text)
     with pytest.raises(InputError, match=f"{NAME}: not a sweep"):
-        kept_sweep(tmp_path)
+        load_sweep_copy(tmp_path)

@@ -167,16 +167,16 @@ def test_a_run_that_kills_its_workers_fails_at_last(tmp_path: Path):
     run = Plan.load(path).run_of(ALONE)
     for _ in range(worker.DEATHS - 1):
         run.begin("memmlp", {}, data="d", prerequisite=None)
-    assert worker.deaths(run) == worker.DEATHS - 1
+    assert worker.count_deaths(run) == worker.DEATHS - 1
     run.log(5, {"loss": 1.0})
-    assert worker.deaths(run) == 0
+    assert worker.count_deaths(run) == 0
     for _ in range(worker.DEATHS):
         run.begin("memmlp", {}, data="d", prerequisite=None)
     work_off(path, finish)
     assert run.status == "failed"
     assert "processes died at step 5" in str(run.failure)
     run.retry()
-    assert worker.deaths(run) == 0
+    assert worker.count_deaths(run) == 0
     work_off(path, finish)
     assert run.status == "done"
 

@@ -21,7 +21,7 @@ from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 from memmlp.common.files import file_digest
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
-from memmlp.config.package_data import packaged
+from memmlp.config.plugins import packaged
 from memmlp.live.stream import Stream
 from memmlp.motion.dataset import MotionDataset
 from memmlp.report.tables.measured_run import load
@@ -31,7 +31,7 @@ from memmlp.runs.identity import VERSIONS
 from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
-from memmlp.sweep.worker import Cancelled, deaths
+from memmlp.sweep.worker import Cancelled, count_deaths
 from memmlp.training import run_stages
 from memmlp.training.run_stages import make_prerequisites, recording_outcome
 
@@ -256,10 +256,10 @@ def test_work_that_ended_well_is_no_death(begun):
 
     for _ in range(3):
         evaluate()
-    assert deaths(run) == 0
+    assert count_deaths(run) == 0
     with pytest.raises(KeyboardInterrupt):
         evaluate(KeyboardInterrupt())
-    assert deaths(run) == 1
+    assert count_deaths(run) == 1
 
 
 def test_metrics_of_other_code_are_measured_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -56,7 +56,7 @@ def import_(
     SOURCE is a folder or one file. The clips are brought to the 22-joint tree, and each is compared with its
     file; faults are reported.
     """
-    from memmlp.config.package_data import grouping_to_choose
+    from memmlp.config.plugins import grouping_to_choose
     from memmlp.motion.importing.import_folder import ImportSettings, import_folder
 
     settings = ImportSettings(skeleton, _rates(fps), body, _floor(floor), strict, sound, up)

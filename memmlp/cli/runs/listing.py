@@ -17,7 +17,7 @@ from memmlp.cli.options import outputs_option
 from memmlp.cli.runs.show import SHORT, age, console, outdated_results, plain_table, record_of, value_text
 from memmlp.evaluation.metric_facts import UNITS
 from memmlp.runs.identity import NETWORK
-from memmlp.runs.lookup import kind_words
+from memmlp.runs.lookup import describe_kind
 
 if TYPE_CHECKING:
     from memmlp.runs.query import Record
@@ -82,7 +82,7 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
         more = f" and {len(hidden) - NAMED} more keys" if len(hidden) > NAMED else ""
         option = ",".join(["name", *hidden[:NAMED], "stream.MPJPE"])
         click.echo(f"they also differ in {', '.join(hidden[:NAMED])}{more}: --columns {option}")
-    if parts := Counter(kind_words(run.manifest["kind"]) for run in runs if run not in found):
+    if parts := Counter(describe_kind(run.manifest["kind"]) for run in runs if run not in found):
         counts = ", ".join(f"{count} finished {word}" for word, count in parts.items())
         click.echo(f"{counts}: memmlp runs list --all")
     if len(found) > len(newest):

@@ -44,7 +44,7 @@ def show(run: str, config: bool, outputs: Path) -> None:
     RUN is its id, the beginning of it, or its folder.
     """
     from memmlp.report.tables.measured_run import load
-    from memmlp.runs.evaluation_file import with_solvers
+    from memmlp.runs.evaluation_file import name_solvers
     from memmlp.runs.identity import flatten
     from memmlp.runs.lookup import find_run, is_trained
 
@@ -52,7 +52,7 @@ def show(run: str, config: bool, outputs: Path) -> None:
     console().print(_pairs(_summary(found)))
     if is_trained(found):
         for source, measured in load(found.folder).by_source().items():
-            means = with_solvers(measured.means, found.evaluations_as_configured.combined_by)
+            means = name_solvers(measured.means, found.evaluations_as_configured.combined_by)
             console().print(_pairs(flatten(means), title=f"results on {source}"))
     if found.results:
         console().print(_pairs(measured_numbers(found), title="results"))
@@ -195,10 +195,10 @@ def value_text(record: Record, key: str, whole: bool = False) -> str:
 def measured_numbers(run: Run) -> dict[str, Any]:
     """Return the numbers in a run's results by dotted key, with the names of inverse kinematics in these."""
     from memmlp.runs.deployment_folder import with_times_as_deployed
-    from memmlp.runs.evaluation_file import with_solvers
+    from memmlp.runs.evaluation_file import name_solvers
     from memmlp.runs.identity import flatten
 
-    results = with_solvers(run.results, run.evaluations_as_configured.combined_by)
+    results = name_solvers(run.results, run.evaluations_as_configured.combined_by)
     return {
         key: value
         for key, value in flatten(with_times_as_deployed(results)).items()

@@ -21,8 +21,7 @@ def tag(run: str, tags: tuple[str, ...], remove: bool, outputs: Path) -> None:
     They lie in its folder, and do not change its id. `memmlp runs list --where tag=WORD` finds them, and
     `memmlp runs gc` keeps runs with tags.
     """
-    from memmlp.runs.lookup import find_run
-    from memmlp.runs.notes import add_tags, remove_tags
+    from memmlp.runs.lookup import add_tags, find_run, remove_tags
 
     found = find_run(outputs, run)
     notes = remove_tags(found, tags) if remove else add_tags(found, tags)
@@ -38,8 +37,7 @@ def note(run: str, text: str | None, outputs: Path) -> None:
 
     An empty TEXT removes it.
     """
-    from memmlp.runs.lookup import find_run
-    from memmlp.runs.notes import read_notes, set_note
+    from memmlp.runs.lookup import find_run, read_notes, set_note
 
     found = find_run(outputs, run)
     notes = read_notes(found) if text is None else set_note(found, text)

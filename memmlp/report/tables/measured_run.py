@@ -18,7 +18,7 @@ from memmlp.common.processes import MIN_CORE_SHARE
 from memmlp.motion.preparing.groups import Grouping
 from memmlp.runs.deployment_folder import as_deployed, deployed_precision, timed_on
 from memmlp.runs.environment import prerequisite_versions, recorded_prerequisites
-from memmlp.runs.evaluation_file import intact, of_one_solver
+from memmlp.runs.evaluation_file import intact, keep_one_solver
 from memmlp.runs.lookup import frames_seen
 from memmlp.runs.run import Run
 from memmlp.sweep.definition import TIMES
@@ -234,7 +234,7 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     sources: dict[str, str] = {}
     wanted = [path for name in stages or () if (path := run.evaluation(name)).is_file()]
     paths = wanted or run.evaluations_as_configured.paths
-    reports = of_one_solver(list(map(_read, paths)))
+    reports = keep_one_solver(list(map(_read, paths)))
     for report in reports:
         _join(means.setdefault(report["mode"], {}), report["mean"])
         for clip in report["clips"]:

@@ -14,7 +14,7 @@ from typing import Any
 from memmlp.common.errors import InputError
 from memmlp.common.files import plain, read_json
 from memmlp.runs.deployment_folder import as_deployed
-from memmlp.runs.evaluation_file import EvaluationsAsConfigured, with_solvers
+from memmlp.runs.evaluation_file import EvaluationsAsConfigured, name_solvers
 from memmlp.runs.identity import DEPLOYMENT, EVALUATION, ID, INFERENCE, flatten, training_settings
 from memmlp.runs.lookup import run_name
 from memmlp.runs.run import Run, latency_name
@@ -162,7 +162,7 @@ def _read_metrics(run: Run, config: Mapping[str, Any], damage: list[str]) -> dic
     found: dict[str, Any] = {}
     try:
         evaluations = EvaluationsAsConfigured(run.evaluations, config)
-        found |= flatten(with_solvers(evaluations.results, evaluations.combined_by))
+        found |= flatten(name_solvers(evaluations.results, evaluations.combined_by))
     except (InputError, KeyError, TypeError, AttributeError):
         damage.append("evaluations")
     deployed = run.deployment_shown(config)

@@ -15,7 +15,7 @@ from memmlp.report.tables.measured_run import load
 from memmlp.report.tables.table_text import better, unit
 from memmlp.report.ui.run_index import COSTS, RunIndex, parse_line, read_config
 from memmlp.runs.deployment_folder import as_deployed
-from memmlp.runs.evaluation_file import with_solvers
+from memmlp.runs.evaluation_file import name_solvers
 from memmlp.runs.identity import NETWORK, NEUTRAL, flatten, is_data_path
 from memmlp.runs.lookup import frames_seen, hardly_trained, is_trained
 from memmlp.runs.run import Run
@@ -149,7 +149,7 @@ def read_clips(run: Run) -> list[dict[str, Any]]:
         {
             "name": clip,
             "frames": frames.get(clip),
-            **with_solvers({mode: errors[mode] for mode in ("stream", "window") if mode in errors}, solvers),
+            **name_solvers({mode: errors[mode] for mode in ("stream", "window") if mode in errors}, solvers),
         }
         for clip, errors in found.items()
     ]

@@ -24,7 +24,7 @@ from memmlp.report.tables.table_text import as_json, better, caption, heading, l
 from memmlp.report.ui.run_index import RunIndex
 from memmlp.runs.identity import NETWORK, training_settings
 from memmlp.runs.run import STAGE_WORDS
-from memmlp.sweep.definition import SWEEP_FILE, Sweep, Variant, kept_sweep
+from memmlp.sweep.definition import SWEEP_FILE, Sweep, Variant, load_sweep_copy
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.progress_table import task_name
 
@@ -69,7 +69,7 @@ class Sweeps:
             try:
                 if before and before.stamp == stamp:
                     known[name] = before
-                elif (sweep := kept_sweep(folder)) is None:
+                elif (sweep := load_sweep_copy(folder)) is None:
                     damaged[name] = f"{SWEEP_FILE} is missing; start the sweep again"
                 else:
                     plan = replace(Plan.load(path), name=name, outputs=self.index.outputs)

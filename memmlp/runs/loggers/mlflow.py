@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from memmlp.common.components import component
 from memmlp.common.errors import check_installed
 from memmlp.common.settings import Settings, setting
-from memmlp.runs.loggers.facts import CurvePoint, RunFacts
+from memmlp.runs.loggers.logger import CurvePoint, RunFacts
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

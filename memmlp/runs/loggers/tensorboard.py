@@ -12,7 +12,7 @@ from typing import Any
 from memmlp.common.components import component
 from memmlp.common.errors import check_installed
 from memmlp.common.settings import Settings
-from memmlp.runs.loggers.facts import CurvePoint, RunFacts
+from memmlp.runs.loggers.logger import CurvePoint, RunFacts
 
 MAX_NAME = 120  # characters of a folder's name
 FINGERPRINT = "memmlp-fingerprint"

@@ -14,7 +14,7 @@ from typing import Any
 from memmlp.common.components import component
 from memmlp.common.errors import check_installed
 from memmlp.common.settings import Settings, setting, text
-from memmlp.runs.loggers.facts import CurvePoint, RunFacts
+from memmlp.runs.loggers.logger import CurvePoint, RunFacts
 
 OFFLINE = {"WANDB_MODE": "offline", "WANDB_SILENT": "true", "WANDB_ERROR_REPORTING": "false"}
 FINGERPRINT = "memmlp-fingerprint"

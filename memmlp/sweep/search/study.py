@@ -52,7 +52,7 @@ class Study:
             InputError: if the storage can't be opened.
         """
         if search.storage is None:
-            mend(journal(folder))
+            repair_journal(journal_path(folder))
         after = search.prune_after
         pruner = optuna.pruners.NopPruner() if after is None else optuna.pruners.MedianPruner(after, 0)
         settings: dict[str, Any] = {
@@ -74,7 +74,7 @@ class Study:
     @classmethod
     def view(cls, search: Search, name: str, folder: Path) -> Study | None:
         """Return the study for reading while its owner works; None if it does not exist yet."""
-        if search.storage is None and not journal(folder).exists():
+        if search.storage is None and not journal_path(folder).exists():
             return None
         try:
             storage = open_storage(search.storage, folder)
@@ -161,7 +161,7 @@ class FencedJournal(JournalFileBackend):
         """Append lines to the journal. Raises LeaseLost if its folder has another owner now."""
         lines = "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs)
         with open(self.path, "ab") as file:
-            check_owner(self.path)  # after opening: `mend` gave a later owner another file
+            check_owner(self.path)  # after opening: `repair_journal` gave a later owner another file
             file.write(lines.encode())
             file.flush()
             os.fsync(file.fileno())
@@ -180,7 +180,7 @@ def open_storage(url: str | None, folder: Path) -> BaseStorage:
         except Exception as error:
             reason = " ".join(str(error).split())[:200]
             raise InputError(f"search.storage={url}: {reason}") from None
-    path = journal(folder)
+    path = journal_path(folder)
     check_journal(path)
     try:
         with warnings.catch_warnings():
@@ -190,12 +190,12 @@ def open_storage(url: str | None, folder: Path) -> BaseStorage:
         raise _damaged(path, error) from None
 
 
-def journal(folder: Path) -> Path:
+def journal_path(folder: Path) -> Path:
     """Return the journal file of a search's study, which `optuna-dashboard` can read."""
     return folder / "study.journal"
 
 
-def mend(path: Path) -> None:
+def repair_journal(path: Path) -> None:
     """Replace a journal by a copy without an incomplete last line, which a killed process may leave.
 
     Only for the owner. Optuna takes a line that is appended to an incomplete one for damage. If an earlier

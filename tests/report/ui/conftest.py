@@ -10,7 +10,7 @@ import pytest
 from fake_runs import fake_run
 
 from memmlp.runs.run import Run
-from memmlp.sweep.definition import Sweep, keep_sweep
+from memmlp.sweep.definition import Sweep, save_sweep_copy
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.sweep_file import parse_sweep
 
@@ -46,7 +46,7 @@ def make_outputs(outputs: Path) -> Sweep:
             tasks.append(RunTask(run.id, "memmlp", config))
     folder = outputs / "sweeps" / "mine"
     Plan("mine", outputs, tuple(entries), tuple(tasks)).save(folder / "plan.json")
-    keep_sweep(sweep, folder)
+    save_sweep_copy(sweep, folder)
     return sweep
 
 

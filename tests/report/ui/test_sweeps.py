@@ -19,7 +19,7 @@ from memmlp.report.ui.run_index import RunIndex
 from memmlp.report.ui.server import Answers
 from memmlp.report.ui.sweeps import DAMAGED_ROUNDS, OTHER_ROUNDS, Sweeps
 from memmlp.runs.run import Run
-from memmlp.sweep.definition import keep_sweep, kept_sweep
+from memmlp.sweep.definition import load_sweep_copy, save_sweep_copy
 from memmlp.sweep.plan import Plan, RunTask
 
 
@@ -39,7 +39,7 @@ def describe(sweeps: Sweeps) -> dict:
 
 def test_the_table_is_that_of_the_command(outputs: Path):
     folder = outputs / "sweeps" / "mine"
-    sweep, plan = kept_sweep(folder), Plan.load(folder / "plan.json")
+    sweep, plan = load_sweep_copy(folder), Plan.load(folder / "plan.json")
     assert sweep is not None
     table = json.loads(as_json(make_table(sweep, finished_runs(sweep, run_finder(plan, load)))))
     shown = describe(sweeps_of(outputs))["table"]
@@ -90,7 +90,9 @@ def test_a_run_that_lacks_an_evaluation_is_trained_and_a_vqvae_is_a_prerequisite
         6,
     )
     say = state_finder(Plan.load(path))
-    variant = next(variant for variant in kept_sweep(path.parent).runnable() if variant.label == first.label)
+    variant = next(
+        variant for variant in load_sweep_copy(path.parent).runnable() if variant.label == first.label
+    )
     assert say(variant, first.seed) == "trained, an evaluation or export is missing"
 
 
@@ -106,9 +108,9 @@ def test_no_time_is_left_where_only_the_evaluation_is(outputs: Path):
 
 def test_the_board_shows_the_sweep_s_first_metric_and_its_branch(outputs: Path):
     folder, run = outputs / "sweeps" / "mine", run_of(outputs, "gru", 0)
-    sweep = kept_sweep(folder)
+    sweep = load_sweep_copy(folder)
     assert sweep is not None
-    keep_sweep(replace(sweep, metrics=("FLOPs", "MPJRE", "MPJPE")).with_branch("combined"), folder)
+    save_sweep_copy(replace(sweep, metrics=("FLOPs", "MPJRE", "MPJPE")).with_branch("combined"), folder)
     page = describe(sweeps_of(outputs))
     assert (page["metric"], page["branch"]) == ("MPJRE", "combined")
     (cell,) = [cell for cell in page["cells"] if cell["id"] == run.id]
@@ -137,11 +139,11 @@ def test_variants_of_one_training_have_each_the_value_of_their_own_evaluation(ou
 def test_a_sweep_with_another_control_has_another_table(outputs: Path):
     """The runs stay as they are: a variant's control, metrics and margins are the sweep's own."""
     folder = outputs / "sweeps" / "mine"
-    sweeps, sweep = sweeps_of(outputs), kept_sweep(folder)
+    sweeps, sweep = sweeps_of(outputs), load_sweep_copy(folder)
     assert sweep is not None
     assert describe(sweeps)["table"]["control"] == "none"
     before = sweeps.refresh()
-    keep_sweep(replace(sweep, control="gru", metrics=("MPJRE",)), folder)
+    save_sweep_copy(replace(sweep, control="gru", metrics=("MPJRE",)), folder)
     table = describe(sweeps)["table"]
     assert (table["control"], table["metrics"]) == ("gru", ["MPJRE"])
     assert sweeps.refresh() != before
@@ -150,7 +152,7 @@ def test_a_sweep_with_another_control_has_another_table(outputs: Path):
 def test_a_run_s_control_is_that_of_its_variant(outputs: Path):
     """Most of the paper's tables have a control that does not stand first."""
     folder, answers = outputs / "sweeps" / "mine", Answers(outputs, predict, 0.0)
-    sweep = kept_sweep(folder)
+    sweep = load_sweep_copy(folder)
     assert sweep is not None
 
     def control(variant: str) -> dict | None:
@@ -159,7 +161,7 @@ def test_a_run_s_control_is_that_of_its_variant(outputs: Path):
 
     assert control("none") is None
     assert control("gru")["id"] == run_of(outputs, "none", 1).id
-    keep_sweep(replace(sweep, control="gru"), folder)
+    save_sweep_copy(replace(sweep, control="gru"), folder)
     assert control("gru") is None
     assert control("none")["id"] == run_of(outputs, "gru", 1).id
 
@@ -167,7 +169,7 @@ def test_a_run_s_control_is_that_of_its_variant(outputs: Path):
 def looked(outputs: Path) -> Rounds:
     """Take the first look, at the three seeds that there are."""
     folder = outputs / "sweeps" / "mine"
-    sweep = kept_sweep(folder)
+    sweep = load_sweep_copy(folder)
     assert sweep is not None
     return analyse(sweep, outputs, new_rounds(sweep), Plan.load(folder / "plan.json"))
 

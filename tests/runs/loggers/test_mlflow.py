@@ -13,7 +13,7 @@ from fake_logger import an_outdated_evaluation
 from memmlp.common.files import write_json
 from memmlp.runs.loggers.logger import Session, sync
 from memmlp.runs.loggers.mlflow import MLflow
-from memmlp.runs.notes import add_tags, remove_tags, set_note
+from memmlp.runs.lookup import add_tags, remove_tags, set_note
 from memmlp.runs.run import Run
 
 pytest.importorskip("mlflow")

@@ -11,7 +11,7 @@ from processes import until
 
 from memmlp.runs.loggers.logger import Session, sync
 from memmlp.runs.loggers.tensorboard import TensorBoard
-from memmlp.runs.notes import set_note
+from memmlp.runs.lookup import set_note
 
 pytest.importorskip("tensorboardX")
 

@@ -15,7 +15,7 @@ from processes import until
 from memmlp.common.files import write_json
 from memmlp.runs.loggers.logger import Session, sync
 from memmlp.runs.loggers.wandb import WandB
-from memmlp.runs.notes import add_tags
+from memmlp.runs.lookup import add_tags
 
 pytest.importorskip("wandb")
 pytestmark = pytest.mark.slow

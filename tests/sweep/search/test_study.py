@@ -16,7 +16,7 @@ from fake_search import (
 from machines import fenced
 
 from memmlp.common.errors import InputError, LeaseLost
-from memmlp.sweep.search.study import Study, journal, mend
+from memmlp.sweep.search.study import Study, journal_path, repair_journal
 
 
 def test_a_resumed_search_proposes_what_the_undisturbed_one_does(tmp_path: Path):
@@ -55,9 +55,9 @@ def test_a_torn_line_and_a_dead_owners_lock_are_mended(tmp_path: Path, monkeypat
     one = director(study, tmp_path)
     finish(one.update(2))
     one.update(2)
-    with open(journal(tmp_path), "ab") as file:
+    with open(journal_path(tmp_path), "ab") as file:
         file.write(b'{"op_code":4,"worker_id":"x"')
-    Path(f"{journal(tmp_path)}.lock").symlink_to(journal(tmp_path))
+    Path(f"{journal_path(tmp_path)}.lock").symlink_to(journal_path(tmp_path))
     monkeypatch.setattr("memmlp.runs.run.changes", str)  # git, in a changed checkout, is waited for in sleeps
     monkeypatch.setattr(time, "sleep", sleep)
     to_the_end(open_study(tmp_path), tmp_path)
@@ -79,17 +79,20 @@ class Superseded:
         if self.lost:
             raise LeaseLost("lost")
         self.lost = self.mending = True
-        mend(self.path)
+        repair_journal(self.path)
         self.mending = False
 
 
 @pytest.mark.parametrize("frozen_after", [False, True])
 def test_an_owner_that_wakes_up_superseded_tells_the_study_nothing(tmp_path: Path, frozen_after: bool):
     study = open_study(tmp_path)
-    before = journal(tmp_path).read_bytes()
-    with fenced(tmp_path, Superseded(journal(tmp_path), frozen_after)), pytest.raises((LeaseLost, KeyError)):
+    before = journal_path(tmp_path).read_bytes()
+    with (
+        fenced(tmp_path, Superseded(journal_path(tmp_path), frozen_after)),
+        pytest.raises((LeaseLost, KeyError)),
+    ):
         study.ask()
-    assert journal(tmp_path).read_bytes() == before
+    assert journal_path(tmp_path).read_bytes() == before
     assert open_study(tmp_path).trials == []
 
 
@@ -108,7 +111,7 @@ def test_a_team_storage_and_a_bad_one(tmp_path: Path):
     study = open_study(tmp_path, storage=f"sqlite:///{tmp_path}/team.db")
     to_the_end(study, tmp_path)
     assert len(study.trials) == 6
-    assert not journal(tmp_path).exists()
+    assert not journal_path(tmp_path).exists()
     with pytest.raises(InputError, match=r"search\.storage=nonsense:"):
         open_study(tmp_path, storage="nonsense://x")
 
@@ -117,8 +120,8 @@ def test_a_team_storage_and_a_bad_one(tmp_path: Path):
     "content", [b"x" * 5000, b"hello\nthis is no journal\n", b'{"op_code":0,"x":1}\ngarbage\n{}\n']
 )
 def test_what_is_no_journal_is_left_alone_and_named(tmp_path: Path, content: bytes):
-    journal(tmp_path).write_bytes(content)
+    journal_path(tmp_path).write_bytes(content)
     for look in (open_study, lambda folder: Study.view(search(), "mine", folder)):
         with pytest.raises(InputError, match=r"study.journal: not a journal of Optuna's"):
             look(tmp_path)
-    assert journal(tmp_path).read_bytes() == content
+    assert journal_path(tmp_path).read_bytes() == content
