@@ -33,7 +33,7 @@ NETWORKS: dict[str, Callable[[], MotionModel]] = {
 """Few are relative to the heading, which adds the same hundred nodes to each graph."""
 
 LARGEST: dict[str, Callable[[], MotionModel]] = {"manikin_l": partial(tiny.baseline, "manikin_l", depth=1)}
-"""Exported for one test only (tests/networks/test_streaming.py), since that takes seconds."""
+"""Exported for one test only (tests/networks/test_networks.py), since that takes seconds."""
 
 
 def write(name: str, path: Path) -> None:

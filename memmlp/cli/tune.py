@@ -244,7 +244,7 @@ def summary(setup: Setup, study: Study) -> None:
     from memmlp.sweep.search.progress_table import add_row, count_trials, figures, trials_table
     from memmlp.sweep.search.results import IMPORTANCE, boundary_warnings, importances, too_few_trials
     from memmlp.sweep.search.study import trial_values
-    from memmlp.training.data_remarks import partial_words
+    from memmlp.training.request import partial_words
 
     console = Console(highlight=False)
     best = study.best()

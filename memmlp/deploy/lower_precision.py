@@ -8,7 +8,6 @@ jitter.
 from __future__ import annotations
 
 import logging
-import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -36,7 +35,6 @@ from memmlp.runs.deployment_folder import accurate_enough
 CALIBRATION_CLIPS, CALIBRATION_FRAMES, CALIBRATION_EVERY = 40, 400, 20
 TEST_FRAMES = 20_000  # accuracy is measured on at most this many
 LARGEST = float(np.finfo(np.float16).max)
-CAST = ".cast"  # how the names of fp16's casts end
 BLOCK = 32  # inputs of a product that share a scale; the least that all of ONNX Runtime's kernels know
 LEVELS, ZERO = 127, 128  # a weight w is stored as the byte 128 + 127 w / (largest of its block)
 DOMAIN = "com.microsoft"
@@ -224,30 +222,7 @@ def halve(model: ModelProto, inner: Sequence[str]) -> ModelProto:
 
 
 def _cast(name: str, output: str, kind: int) -> NodeProto:
-    return helper.make_node("Cast", [name], [output], f"{output}{CAST}", to=kind)
-
-
-def round_on_cpu(model: ModelProto) -> ModelProto:
-    """Return a graph in fp16 that a CPU rounds where a GPU does: at the inputs and outputs of its products.
-
-    ONNX Runtime's CPU provider does not multiply in fp16. It computes in float32 and leaves out casts to fp16
-    and back, so that nothing but the weights would be rounded, and nothing could overflow. Here a maximum of
-    the value with itself, which it does have in fp16, stands behind each cast to fp16, and before each cast
-    from it. Sums within a product are float32's, as a GPU's tensor cores make them.
-    """
-    nodes = list[NodeProto]()
-    for node in model.graph.node:
-        if node.op_type != "Cast" or not node.name.endswith(CAST):
-            nodes.append(node)
-        elif helper.get_node_attr_value(node, "to") == TensorProto.FLOAT16:
-            output, node.output[0] = node.output[0], f"{node.output[0]}.unrounded"
-            nodes += [node, helper.make_node("Max", [node.output[0]] * 2, [output])]
-        else:
-            value, node.input[0] = node.input[0], f"{node.input[0]}.rounded"
-            nodes += [helper.make_node("Max", [value] * 2, [node.input[0]]), node]
-    del model.graph.node[:]
-    model.graph.node.extend(nodes)
-    return model
+    return helper.make_node("Cast", [name], [output], f"{output}.cast", to=kind)
 
 
 def measure_accuracy(path: Path, normalizer: Normalizer, clips: Sequence[Tensor]) -> dict[str, float]:
@@ -284,12 +259,7 @@ def compare_accuracy(
         The metrics of both files, the relative growth of MPJPE, of the branch in which that is larger, and of
         Jitter, and whether the other file may be the default (`accurate_enough`).
     """
-    before = measure_accuracy(exact, normalizer, clips)
-    with tempfile.TemporaryDirectory() as folder:
-        if precision == "fp16":
-            graph, other = onnx.load(other), Path(folder) / "rounded.onnx"
-            onnx.save(round_on_cpu(graph), other)
-        after = measure_accuracy(other, normalizer, clips)
+    before, after = (measure_accuracy(path, normalizer, clips) for path in (exact, other))
     growths = {name: after[name] / before[name] - 1 for name in ("MPJPE", "position MPJPE", "Jitter")}
     jitter = growths.pop("Jitter")
     grown = {"growth": float(np.max(list(growths.values()))), "jitter_growth": jitter}  # NaN if either is

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import os
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,8 @@ import torch
 from memmlp.common import distributed
 from memmlp.common.errors import InputError
 
-NVIDIA = Path("/dev/nvidiactl")
-"""What the driver of NVIDIA's GPUs makes on Linux."""
+NVIDIA = Path("/dev/nvidiactl")  # made on Linux by the driver of NVIDIA's GPUs
+OWN_THREADS = torch.get_num_threads()  # before any run has set another number
 
 
 def device(name: str) -> torch.device:
@@ -36,25 +35,18 @@ def device(name: str) -> torch.device:
             raise InputError(f"device={name}: torch does not find a CUDA device; use cpu or auto")
         return torch.device("cpu")
     torch.backends.cudnn.allow_tf32 = False
-    return torch.device("cuda", _checked(name, int(index)) if index else distributed.local_rank())
-
-
-def _checked(name: str, index: int) -> int:
-    """Return the index of a GPU, after checks that it exists and that no other process of the run uses it.
-
-    Raises:
-        InputError: if it does not exist, or if the run has several processes.
-    """
+    if not index:
+        return torch.device("cuda", distributed.local_rank())
     count = torch.cuda.device_count()
-    if index >= count:
+    if int(index) >= count:
         raise InputError(f"device={name}: must be cuda:0{f' to cuda:{count - 1}' * (count > 1)}")
     if distributed.world_size() > 1:
-        raise InputError(f"device={name}: several processes use device=cuda, one GPU each")
-    return index
+        raise InputError(f"device={name}: must be cuda with several processes, which have one GPU each")
+    return torch.device("cuda", int(index))
 
 
 def described(used: torch.device) -> dict[str, Any]:
-    """Return what a manifest says of a device: its kind, the GPU's name, and the GPU's index.
+    """Return the facts of a device for a manifest: its kind, the GPU's name, and the GPU's index.
 
     The index, `gpu_index`, is the GPU's entry in CUDA_VISIBLE_DEVICES where that is set, since inside the
     process the visible GPUs are renumbered.
@@ -72,38 +64,27 @@ def use_threads(number: int) -> None:
 
     A process may perform several runs, one after another, so 0 undoes what an earlier run asked for.
     """
-    own = _own_threads()
-    torch.set_num_threads(number or own)
-
-
-@functools.cache
-def _own_threads() -> int:
-    """Return the number of threads at the first call, before any run has asked for another number."""
-    return torch.get_num_threads()
+    torch.set_num_threads(number or OWN_THREADS)
 
 
 def overlooked_gpu(name: str) -> str | None:
-    """Return a line if the device `auto` is the CPU of a machine with a GPU of NVIDIA; None otherwise.
-
-    It may be that torch was installed without CUDA, or does not fit the driver. GPUs that
-    CUDA_VISIBLE_DEVICES hides are hidden on purpose.
-    """
+    """Return a warning if `auto` is the CPU of a machine with an NVIDIA GPU that is not hidden; else None."""
     hidden = os.environ.get("CUDA_VISIBLE_DEVICES", "all").strip() in ("", "-1")
     if name != "auto" or hidden or torch.cuda.is_available() or not NVIDIA.exists():
         return None
     return (
         f"device=auto: the CPU, since torch {torch.__version__} cannot use this machine's GPU; "
-        "device=cpu says that this is meant"
+        "set device=cpu if this is intended"
     )
 
 
 def missing_gpu() -> str | None:
-    """Return a line that says that torch finds no GPU in a process that should have one; None if it does."""
+    """Return an error if torch finds no GPU in a process that should have one; None if it does."""
     if torch.cuda.is_available():
         return None
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    told = "is not set" if visible is None else f"is '{visible}'"
+    state = "is not set" if visible is None else f"is '{visible}'"
     return (
-        f"a worker is to have a GPU; torch {torch.__version__} finds none: CUDA_VISIBLE_DEVICES {told}; "
-        "nothing is trained on the CPU instead, unless device=cpu"
+        f"this worker needs a GPU, but torch {torch.__version__} finds none: CUDA_VISIBLE_DEVICES {state}; "
+        "set device=cpu to train on the CPU"
     )

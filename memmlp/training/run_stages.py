@@ -40,10 +40,18 @@ from memmlp.runs.identity import (
 )
 from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.run import Run
-from memmlp.training.data_remarks import data_warnings, partial_words
 from memmlp.training.devices import described, overlooked_gpu
 from memmlp.training.loop import ValidationCallback
-from memmlp.training.request import Outcome, RunRequest, announce_data, own_code, results_of, unmeasured
+from memmlp.training.request import (
+    Outcome,
+    RunRequest,
+    announce_data,
+    data_warnings,
+    own_code,
+    partial_words,
+    results_of,
+    unmeasured,
+)
 from memmlp.training.train_network import NetworkTraining, Training
 from memmlp.training.train_refiner import RefinerTraining
 

@@ -31,7 +31,7 @@ def model(*nodes: onnx.NodeProto, **constants: np.ndarray) -> ModelProto:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("network", exported.NETWORKS)
+@pytest.mark.parametrize("network", ["mem_mlp", "lstm", "agrol_mlp", "bodiffusion", "hmd_poser"])
 def test_a_step_computes_the_same_in_every_opset(
     step_files: Callable[[str], Path], tmp_path: Path, network: str
 ):
@@ -46,17 +46,6 @@ def test_a_step_computes_the_same_in_every_opset(
         assert [p.value for p in made.metadata_props] == [p.value for p in native.metadata_props]
         onnx.save(made, path)
         assert float((streamed(OnnxStream(path), CLIP) - expected).abs().max()) <= TOLERANCE
-
-
-def test_data_dependent_operators_are_seen():
-    one = np.array([0], np.int64)
-    graph = model(
-        helper.make_node("NonZero", ["x"], ["found"]),
-        helper.make_node("Slice", ["x", "found", "one"], ["part"]),
-        helper.make_node("Slice", ["x", "one", "one"], ["y"]),
-        one=one,
-    ).graph
-    assert exported.data_dependent(graph) == {"NonZero", "Slice"}
 
 
 def test_older_opsets_have_other_operators():

@@ -59,16 +59,6 @@ def test_a_forgotten_past_is_a_difference_that_a_short_clip_hides():
     assert long > TOLERANCE > short
 
 
-def test_parity_uses_one_thread_and_restores_their_number():
-    model, seen = tiny.model(), []
-    advance = model.advance
-    model.advance = lambda *given: (seen.append(torch.get_num_threads()), advance(*given))[1]
-    torch.set_num_threads(2)
-    in_torch(model, CLIP[:3])
-    assert seen == [1, 1, 1]
-    assert torch.get_num_threads() == 2
-
-
 def test_a_file_of_another_network_does_not_match(step_files: Callable[[str], Path]):
     model, path = exported.NETWORKS["mem_mlp"](), step_files("mem_mlp")
     assert parity(model, path, CLIP) <= TOLERANCE

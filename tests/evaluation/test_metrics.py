@@ -9,12 +9,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from memmlp.evaluation import metrics
+from memmlp.evaluation.evaluation import Evaluation
+from memmlp.evaluation.ik import NoIK
 from memmlp.evaluation.modes import (
-    MODE_FUNCTIONS,
-    chunks,
-    clip_report,
-    evaluate,
-    quick_stream,
     stream,
     window,
 )
@@ -90,29 +87,6 @@ class Copy:
         return motion, {"motion": motion}
 
 
-@pytest.mark.parametrize("mode", ["window", "stream"])
-def test_the_truth_scores_zero(mode):
-    split = tiny.frames((30, 21, 5))
-    results = evaluate(Copy([split.clip(i) for i in range(3)]), split, [mode], batch=2)
-    rotation, position = (results["mean"][mode][branch] for branch in ("rotation", "position"))
-    errors = {name: value for name, value in (rotation | position).items() if "Jitter" not in name}
-    assert errors == pytest.approx(dict.fromkeys(errors, 0.0), abs=2e-2)
-    assert position["Jitter"] == pytest.approx(position["GT Jitter"], rel=1e-6)
-    assert position["MPJPE"] == 0
-    assert [row["name"] for row in results["clips"]] == split.names
-
-
-@pytest.mark.parametrize("mode", ["window", "stream"])
-def test_a_constant_offset_scores_itself(mode):
-    """3, 4, 0 cm of error on every joint is 5 cm of MPJPE and no velocity error."""
-    split = tiny.frames((30, 25))
-    copy = Copy([split.clip(i) for i in range(2)], error=torch.tensor([0.03, 0.04, 0.0]).repeat(22))
-    position = evaluate(copy, split, [mode], batch=8)["mean"][mode]["position"]
-    assert position["MPJPE"] == pytest.approx(5.0, abs=1e-4)
-    assert position["Hand PE"] == pytest.approx(5.0, abs=1e-4)
-    assert position["MPJVE"] == pytest.approx(0.0, abs=1e-3)
-
-
 def test_windows_do_not_overlap_and_the_tail_is_shifted_back():
     """A network that numbers its calls shows which call each frame's output came from."""
 
@@ -153,35 +127,17 @@ def test_the_tail_window_recalls_the_window_before_it(length, monkeypatch):
     assert recalled == list(range(length - 13, length - 6))
 
 
-def test_modes_differ_and_batches_do_not():
-    split, model = tiny.frames((40, 33, 12)), tiny.model()
-    one, many = (evaluate(model, split, list(MODE_FUNCTIONS), batch=batch) for batch in (1, 3))
-    assert one["mean"]["window"] != one["mean"]["stream"]
-    for mode in MODE_FUNCTIONS:
-        for branch in ("rotation", "position"):
-            assert one["mean"][mode][branch] == pytest.approx(many["mean"][mode][branch], rel=1e-3)
-
-
 def test_the_mean_is_over_clips_not_frames():
     split = tiny.frames((40, 10))
     model = tiny.model()
-    results = evaluate(model, split, ["stream"], batch=2)
-    per_clip = [row["stream"]["rotation"]["MPJPE"] for row in results["clips"]]
-    assert results["mean"]["stream"]["rotation"]["MPJPE"] == pytest.approx(np.mean(per_clip), rel=1e-6)
+    results = Evaluation(["stream"], 2, NoIK(), 0).report(model, split, "stream")
+    per_clip = [row["rotation"]["MPJPE"] for row in results["clips"]]
+    assert results["mean"]["rotation"]["MPJPE"] == pytest.approx(np.mean(per_clip), rel=1e-6)
 
 
 def test_jitter_of_too_short_a_clip_is_undefined_and_does_not_count():
     split, model = tiny.frames((3, 30)), tiny.model()
-    results = evaluate(model, split, ["stream"], batch=2)
-    assert math.isnan(results["clips"][0]["stream"]["rotation"]["Jitter"])
-    expected = results["clips"][1]["stream"]["rotation"]["Jitter"]
-    assert results["mean"]["stream"]["rotation"]["Jitter"] == pytest.approx(expected)
-
-
-def test_validation_streams_through_pieces():
-    split, model = tiny.frames((50, 20)), tiny.model()
-    pieces = chunks(split, 24, least=10)
-    assert [len(piece) for piece in pieces] == [24, 24, 20]
-    values = quick_stream(model, pieces)
-    reports = [clip_report(model.normalizer, stream(model, [p])[0], p)["rotation"]["MPJPE"] for p in pieces]
-    assert values["rotation MPJPE"] == pytest.approx(np.mean(reports), rel=1e-4)
+    results = Evaluation(["stream"], 2, NoIK(), 0).report(model, split, "stream")
+    assert math.isnan(results["clips"][0]["rotation"]["Jitter"])
+    expected = results["clips"][1]["rotation"]["Jitter"]
+    assert results["mean"]["rotation"]["Jitter"] == pytest.approx(expected)

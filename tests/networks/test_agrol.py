@@ -39,12 +39,3 @@ def test_the_denoiser_learns_from_the_noised_truth_of_the_window():
     assert len(set(time.tolist())) > 20
     assert float(noise.mean()) == pytest.approx(0, abs=0.02)
     assert float(noise.std()) == pytest.approx(1, abs=0.02)
-
-
-def test_sampling_draws_nothing():
-    model = tiny.baseline("agrol_diffusion")
-    runs = []
-    for seed in (1, 2):
-        torch.manual_seed(seed)
-        runs.append(evaluation.stream(model, [CLIP])[0])
-    assert torch.equal(*runs)

@@ -1,6 +1,5 @@
 """AvatarJLM, part by part."""
 
-import numpy as np
 import tiny
 import torch
 
@@ -9,18 +8,6 @@ from memmlp.networks import avatar_jlm
 
 TRUTH = torch.stack([tiny.clip(7, seed) for seed in (1, 2)])
 SPARSE = TRUTH[..., :SPARSE_DIM]
-
-
-def test_joints_without_a_tracker_hold_a_constant():
-    rows = avatar_jlm.spread_over_joints(SPARSE).unflatten(-1, (22, 18)).numpy()
-    for joint in range(22):
-        if joint not in (15, 20, 21):
-            assert np.all(rows[..., joint, :] == np.float32(0.01))
-    for tracker, joint in enumerate((15, 20, 21)):
-        six, three = slice(6 * tracker, 6 * tracker + 6), slice(3 * tracker, 3 * tracker + 3)
-        parts = [SPARSE[..., :18][..., six], SPARSE[..., 18:36][..., six]]
-        parts += [SPARSE[..., 36:45][..., three], SPARSE[..., 45:][..., three]]
-        np.testing.assert_array_equal(rows[..., joint, :], torch.cat(parts, -1).numpy())
 
 
 @torch.no_grad()
@@ -85,12 +72,3 @@ def test_the_coarse_poses_loss_is_of_joints_relative_to_the_head():
         "coarse"
     ]
     assert float(found) == float(model.compute_coarse_loss(truth)["coarse"]) > 0.1
-
-
-@torch.no_grad()
-def test_coarse_joints_follow_from_their_rotations_in_float32_in_a_mixed_precision_training():
-    model, rotations = tiny.baseline("avatar_jlm"), torch.randn(50, ROTATION.stop)
-    model.coarse = torch.nn.Identity()
-    with torch.autocast("cpu", torch.bfloat16):
-        found = model.place_coarse_joints(rotations)
-    torch.testing.assert_close(found, model.place_coarse_joints(rotations), rtol=0, atol=0)

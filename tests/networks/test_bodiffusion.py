@@ -1,6 +1,5 @@
 """BoDiffusion, part by part."""
 
-import numpy as np
 import pytest
 import tiny
 import torch
@@ -11,22 +10,11 @@ from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import NoIK
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.networks import diffusion as ancestral
-from memmlp.networks.diffusion import Denoised
 from memmlp.networks.streaming import has_stream, streaming
 
 CLIP = tiny.clip(25)
 TRUTH = tiny.clip(7)[None].expand(64, -1, -1)
 FINER = {"diffusion_steps": 60, "sampling_steps": 52, "depth": 1}
-
-
-@torch.no_grad()
-def test_each_joint_gets_a_mixture_of_the_inputs_thirds():
-    model, x = tiny.baseline("bodiffusion"), torch.randn(2, 54)
-    weight = model.spread.weight.numpy()  # joint, third
-    thirds = x.numpy().reshape(2, 3, 18)
-    np.testing.assert_allclose(
-        model.mix_thirds(x).numpy(), np.einsum("jk,bkc->bjc", weight, thirds), rtol=1e-4
-    )
 
 
 def test_the_denoiser_learns_from_the_noised_truth_of_the_window():
@@ -55,23 +43,6 @@ def test_the_denoiser_learns_from_the_noised_truth_of_the_window():
 
 
 @torch.no_grad()
-def test_learning_takes_what_a_perfect_denoiser_would_leave():
-    """With the true noise the motion is the true one, whatever was drawn."""
-    model = tiny.baseline("bodiffusion").double()
-    truth = TRUTH[:4].double()
-    encoded = model.normalizer.encode(truth)[..., SPARSE_DIM:][..., ROTATION]
-
-    def perfect(noisy, time, _):
-        signal = model.diffusion.signal[time][:, None, None]
-        return Denoised((noisy - signal.sqrt() * encoded) / (1 - signal).sqrt(), torch.zeros_like(noisy))
-
-    model.denoise = perfect
-    motion, *_ = model.training_call(truth[:, -1:, :SPARSE_DIM], model.true_state(truth[:, :-1]), truth)
-    true = truth[..., SPARSE_DIM:]
-    torch.testing.assert_close(motion[..., ROTATION], true[..., ROTATION], atol=1e-6, rtol=0)
-
-
-@torch.no_grad()
 def test_windows_are_denoised_together_and_averaged_where_they_overlap(monkeypatch):
     """Window by window and frame by frame, with steps that add noise."""
     monkeypatch.setattr(ancestral, "QUIET", 1)
@@ -94,14 +65,6 @@ def test_windows_are_denoised_together_and_averaged_where_they_overlap(monkeypat
 
 
 @torch.no_grad()
-def test_a_clip_of_one_window_is_that_window():
-    model, stream = tiny.baseline("bodiffusion", offline=True), tiny.baseline("bodiffusion")
-    for length in (7, 5):
-        clips = [CLIP[:length]]
-        torch.testing.assert_close(modes.window(model, clips)[0], modes.window(stream, clips)[0])
-
-
-@torch.no_grad()
 def test_offline_it_is_no_stream():
     model, clip, changed = tiny.baseline("bodiffusion", offline=True), CLIP[:14], CLIP[:14].clone()
     changed[-1] += 0.5
@@ -116,27 +79,3 @@ def test_offline_it_is_no_stream():
     assert "offline" not in Evaluation(["window"], 4, NoIK(), 0).report(
         tiny.baseline("bodiffusion"), tiny.frames((20,)), "window"
     )
-
-
-@torch.no_grad()
-def test_trained_weights_may_sample_with_more_steps():
-    model = tiny.baseline("bodiffusion", diffusion_steps=60, depth=1)
-    finer = tiny.baseline("bodiffusion", seed=1, **FINER)
-    finer.load_state_dict(model.state_dict())
-    assert (len(model.noises), len(finer.noises)) == (2, 9)
-    window = CLIP[None, :7, :SPARSE_DIM]
-    motions = [one.advance(window, one.initial_state())[0] for one in (model, finer)]
-    assert not torch.allclose(*motions, atol=1e-3)
-    live = streaming(finer.double())
-    expected = finer.advance(window.double()[:, :1], finer.initial_state(), 1)[0]
-    torch.testing.assert_close(live.advance(window.double()[:, :1], live.initial_state())[0], expected)
-
-
-def test_sampling_draws_nothing():
-    for offline in (False, True):
-        model = tiny.baseline("bodiffusion", offline=offline)
-        runs = []
-        for seed in (1, 2):
-            torch.manual_seed(seed)
-            runs.append(modes.window(model, [CLIP])[0])
-        assert torch.equal(*runs)

@@ -10,10 +10,8 @@ from memmlp.networks.diffusion import (
     AncestralDiffusion,
     Denoised,
     Diffusion,
-    TimeEmbedding,
     make_cosine_schedule,
     make_linear_schedule,
-    measure_surprise,
 )
 
 
@@ -44,21 +42,6 @@ def test_ddim_is_an_independent_numpy_computation(steps):
         x = np.sqrt(after) * clean + np.sqrt(1 - after) * epsilon
     assert times[0] == 19
     np.testing.assert_allclose(found.numpy(), x, atol=1e-5)
-
-
-def test_training_noise_has_the_schedules_variance():
-    diffusion = Diffusion(10, 2)
-    clean, noise = torch.full((10, 3), 2.0), torch.full((10, 3), 0.5)
-    noisy = diffusion.add_noise(clean, torch.arange(10), noise).numpy()
-    signal = make_cosine_schedule(10).numpy()
-    expected = (np.sqrt(signal) * 2 + np.sqrt(1 - signal) * 0.5)[:, None].repeat(3, 1)
-    np.testing.assert_allclose(noisy, expected, rtol=1e-5)
-
-
-def test_a_perfect_denoiser_is_found_again():
-    """Whatever the noise and the steps, a denoiser that knows the answer gives it."""
-    answer = torch.randn(2, 5)
-    torch.testing.assert_close(Diffusion(50, 4).sample(lambda x, t: answer, torch.randn(2, 5)), answer)
 
 
 OPEN = torch.tensor(-9.0), torch.tensor(9.0)
@@ -116,32 +99,6 @@ def test_sampling_is_an_independent_numpy_computation(count):
     np.testing.assert_allclose(found.numpy(), x, atol=1e-4)
 
 
-def spread_of_samples(count: int, spread: float) -> float:
-    """The spread of a Gaussian's samples of so many steps, by the best denoiser that there is for it."""
-    diffusion = AncestralDiffusion(1000, count).double()
-
-    def step(x: torch.Tensor, index: int) -> tuple[torch.Tensor, torch.Tensor]:
-        signal = diffusion.signal[diffusion.times[index]]
-        best = (1 - signal).sqrt() / (signal * spread**2 + 1 - signal) * x
-        mean, variance = diffusion.step(x, Denoised(best, -torch.ones_like(x)), index, OPEN)
-        return mean, variance.sqrt()
-
-    noise = torch.randn(diffusion.draws, 4000, generator=torch.Generator().manual_seed(0)).double()
-    return float(diffusion.sample(step, noise).std())
-
-
-def test_few_steps_sample_what_many_do():
-    """By means alone, without noise, samples are all alike: their spread is 0.003 of the Gaussian's."""
-    assert 0.3 < spread_of_samples(10, 0.5) < spread_of_samples(1000, 0.5) < 0.5
-
-
-def test_the_share_says_where_a_variance_lies_between_the_least_and_the_largest():
-    diffusion, share = AncestralDiffusion(60, 3).double(), torch.tensor([0.5, -1.0, 1.0]).double()
-    _, variance = diffusion.step(share, Denoised(share, share), 0, OPEN)
-    _, _, least, largest = (table[-1] for table in tables(kept(60)[[19, 39, 59]]))
-    np.testing.assert_allclose(variance, [largest**0.75 * least**0.25, least, largest], rtol=1e-5)
-
-
 def test_the_losses_are_an_independent_numpy_computation():
     """Beyond the first step the bound is the divergence of two Gaussians, by their densities on a grid."""
     diffusion, draw = AncestralDiffusion(20, 2).double(), torch.Generator().manual_seed(0)
@@ -169,33 +126,3 @@ def test_the_losses_are_an_independent_numpy_computation():
     bound.backward()
     assert guess.noise.grad is None  # the variances alone learn from it
     assert guess.share.grad.all()
-
-
-def test_at_the_first_step_the_bound_is_the_surprise_of_the_true_signal():
-    diffusion, clean = AncestralDiffusion(20, 2).double(), torch.tensor([[0.3], [0.3]]).double()
-    noise, share = torch.zeros(2, 1).double(), -torch.ones(2, 1).double()
-    for offset in (0.0, 0.5):
-        guess = Denoised(noise + offset, share)
-        _, bound = diffusion.compute_losses(clean, noise, torch.zeros(2).long(), guess, OPEN)
-        signal = float(diffusion.signal[0])
-        mean = 0.3 - offset * math.sqrt(1 - signal) / math.sqrt(signal)
-        log_variance = torch.tensor(tables(kept(20))[2][0]).log()
-        expected = measure_surprise(torch.tensor(0.3), torch.tensor(mean), log_variance, OPEN)
-        assert float(bound) == pytest.approx(float(expected) / math.log(2), rel=1e-3)
-
-
-def test_the_bins_of_a_gaussian_are_all_there_is():
-    """Their chances add up to 1, the outermost of them without end."""
-    limits = torch.tensor(-1.0), torch.tensor(1.0)
-    values = torch.linspace(-1, 1, 256).double()
-    for mean, log_variance in ((0.2, -3.0), (-0.9, -1.0), (1.2, -2.0)):
-        surprise = measure_surprise(values, torch.tensor(mean), torch.tensor(log_variance), limits)
-        assert float((-surprise).exp().sum()) == pytest.approx(1)
-
-
-def test_time_embedding_is_of_sines_and_cosines():
-    embedding = TimeEmbedding(8)
-    embedding.mlp = torch.nn.Identity()
-    angles = 7 * 10_000 ** -(np.arange(4) / 4)
-    expected = np.concatenate([np.cos(angles), np.sin(angles)])
-    np.testing.assert_allclose(embedding(torch.tensor([7]))[0].numpy(), expected, rtol=1e-5)

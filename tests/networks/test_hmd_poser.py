@@ -48,27 +48,6 @@ def test_an_lstm_is_torchs_with_weights_of_direction_and_gain():
         torch.testing.assert_close(found, of)
 
 
-def test_its_weights_begin_orthogonal_with_gains_that_change_nothing():
-    lstm = NormedLSTM(8)
-    for direction, gain in zip(lstm.directions, lstm.gains, strict=True):
-        torch.testing.assert_close(direction.T @ direction, torch.eye(8), atol=1e-5, rtol=0)
-        torch.testing.assert_close(gain[:, 0], direction.norm(dim=1))
-
-
-@torch.no_grad()
-def test_the_past_counts_without_end_and_the_future_does_not():
-    model, changed = tiny.baseline("hmd_poser").double(), SPARSE.double().clone()
-    changed[:, 5] += 0.5
-    found, other = (model.advance(of, model.initial_state(1))[0] for of in (SPARSE.double(), changed))
-    torch.testing.assert_close(found[:, :5], other[:, :5])
-    assert (found[:, 5:] - other[:, 5:]).abs().amax(-1).min() > 1e-9
-
-
-def test_the_state_of_the_published_network_is_8192_numbers():
-    model = tiny.baseline("hmd_poser", width=256, heads=8, feedforward=8)
-    assert sum(part.numel() for part in model.initial_state(1).values()) == 8192
-
-
 def test_the_shape_is_trained_to_be_the_same_within_a_window():
     model = tiny.baseline("hmd_poser", shape_weight=0.5)
     truth = torch.stack([tiny.clip(7, seed) for seed in (1, 2)])
@@ -81,9 +60,3 @@ def test_the_shape_is_trained_to_be_the_same_within_a_window():
     plain = tiny.baseline("hmd_poser", shape_weight=0)
     assert plain.training_call(truth[..., :SPARSE_DIM], plain.initial_state(2), truth).losses == {}
     assert model.count_parameters() - plain.count_parameters() == 8 * 16 * 16 + 16 + 16 * 16 + 16
-
-
-def test_hands_in_the_heads_frame_are_those_of_float32_in_a_mixed_precision_training():
-    with torch.autocast("cpu", torch.bfloat16):
-        found = locate_hands(SPARSE)
-    torch.testing.assert_close(found, locate_hands(SPARSE), rtol=0, atol=0)

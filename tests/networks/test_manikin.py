@@ -6,14 +6,13 @@ import tiny
 import torch
 from plain_body import posed
 
-from memmlp.motion.body import N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM
+from memmlp.motion.body import N_JOINTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.geometry import forward_kinematics, sixd_to_matrix
 from memmlp.motion.network_coordinates import Heading, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import manikin
 from memmlp.networks.limb_solver import BASES, ENDS, MIDDLES
 from memmlp.networks.manikin import KEPT, PLACED, PredictedParts, Truth
-from memmlp.networks.streaming import has_stream
 
 TRUTH = torch.stack([tiny.clip(7, seed) for seed in (1, 2)]).double()
 SPARSE, MOTION = TRUTH[..., :SPARSE_DIM], TRUTH[..., SPARSE_DIM:]
@@ -54,11 +53,6 @@ def test_the_true_parts_make_the_true_trunk_hands_and_ankles():
     )
     middles = (made - true)[..., [*MIDDLES], :].norm(dim=-1)
     assert float(middles.quantile(0.1)) < 1e-3
-
-
-def test_joints_whose_ancestors_are_all_predicted():
-    assert PLACED == [0, 1, 2, 3, 4, 5, 6, 9, 12, 13, 14, 15, 16, 17, 18, 19]
-    assert all(PARENTS[joint] in (-1, 0, *KEPT) for joint in PLACED)
 
 
 def filled(sixd: np.ndarray) -> np.ndarray:
@@ -174,38 +168,3 @@ def test_training_is_on_windows_turned_by_any_heading_and_the_motion_is_turned_b
     torch.testing.assert_close(
         still.training_call(SPARSE, state, TRUTH)[0], still.advance(SPARSE, state)[0][:, -motion.shape[1] :]
     )
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_the_losses_of_the_parts_have_a_weight(name):
-    found = []
-    for weight in (1.0, 0.5):
-        model = tiny.baseline(name, parts_weight=weight, turned=False)
-        losses = model.training_call(SPARSE.float(), model.initial_state(2), TRUTH.float()).losses
-        found.append({key: float(term.detach()) for key, term in losses.items()})
-    parts = found[0].keys() - {"coarse"}
-    assert len(parts) == {"manikin_s": 6, "manikin_l": 5}[name]
-    assert {key: found[1][key] for key in parts} == pytest.approx(
-        {key: found[0][key] / 2 for key in parts}, rel=1e-5
-    )
-
-
-def test_offline_it_is_not_a_stream():
-    model = tiny.baseline("manikin_l", offline=True)
-    assert not model.is_stream
-    assert not has_stream(model)
-    assert tiny.baseline("manikin_l").is_stream
-
-
-@pytest.mark.parametrize("name", NAMES)
-@torch.no_grad()
-def test_limbs_are_solved_and_compared_in_float32_in_a_mixed_precision_training(name):
-    """A pose and its losses are those of the parts, however the parts were computed."""
-    model, truth = tiny.baseline(name), TRUTH.float()
-    encoded = model.normalizer.encode_sparse(truth[..., :SPARSE_DIM], model.normalizer.origin(truth))
-    made = torch.randn(2, 7, model.regressor[-1].out_features if name == "manikin_l" else 86).bfloat16()
-    with torch.autocast("cpu", torch.bfloat16):
-        posed, losses = model.solve_pose(made, encoded), manikin.Manikin.compute_losses(model, made, truth)
-    torch.testing.assert_close(posed, model.solve_pose(made.float(), encoded), rtol=0, atol=0)
-    expected = manikin.Manikin.compute_losses(model, made.float(), truth)
-    torch.testing.assert_close(losses, expected, rtol=0, atol=0)

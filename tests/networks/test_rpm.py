@@ -72,10 +72,3 @@ def test_training_predicts_the_last_frames_after_free_running(monkeypatch, own_d
         torch.testing.assert_close(first["motion"][1], true)
         assert not last["motion"].requires_grad
         motion.sum().backward()
-
-
-def test_places_are_of_sines_and_cosines():
-    places = tiny.baseline("rpm").places.numpy()
-    for place, index in np.ndindex(places.shape):
-        angle = place / 10_000 ** (2 * (index // 2) / places.shape[1])
-        np.testing.assert_allclose(places[place, index], (np.sin, np.cos)[index % 2](angle), atol=1e-6)

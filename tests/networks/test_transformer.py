@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from memmlp.config.build import untrained
-from memmlp.networks.transformer import Attention, DiTBlock, EncoderLayer, draw_weights
+from memmlp.networks.transformer import Attention, DiTBlock
 
 EMBEDDING = (".query", ".key", ".value")
 
@@ -32,19 +32,6 @@ def test_they_are_small_and_without_biases():
     assert all(layer.bias.any() for layer in linear_layers("hmd_poser").values())
 
 
-def test_attention_s_are_those_of_torch_s_own_layer():
-    """Compared by spread and largest value, for both are drawn."""
-    torch.manual_seed(0)
-    ours, theirs = (layer(256, 8).requires_grad_(False) for layer in (Attention, nn.MultiheadAttention))
-    draw_weights(ours)
-    for part in (ours.query, ours.key, ours.value):
-        assert float(part.weight.std()) == pytest.approx(float(theirs.in_proj_weight.std()), rel=0.02)
-        assert float(part.weight.abs().max()) == pytest.approx(
-            float(theirs.in_proj_weight.abs().max()), rel=0.01
-        )
-    assert len({float(part.weight[0, 0]) for part in (ours.query, ours.key, ours.value)}) == 3
-
-
 @torch.no_grad()
 def test_attention_is_an_independent_computation():
     """Frame by frame and head by head, in NumPy; and the same as torch's own with the same weights."""
@@ -63,22 +50,6 @@ def test_attention_is_an_independent_computation():
                 expected[b, t, part] = sum(share[s] * value[s, part] for s in range(5))
     found = attention(h).numpy()
     np.testing.assert_allclose(found, linear(attention.out, expected), atol=1e-12)
-
-
-@torch.no_grad()
-def test_the_encoder_layer_is_torchs():
-    layer, torchs = EncoderLayer(8, 2, 16, 0.1).eval(), torch.nn.TransformerEncoderLayer(8, 2, 16).eval()
-    parts = [layer.attention.query, layer.attention.key, layer.attention.value]
-    torchs.self_attn.in_proj_weight.copy_(torch.cat([part.weight for part in parts]))
-    torchs.self_attn.in_proj_bias.copy_(torch.cat([part.bias for part in parts]))
-    pairs = [
-        (torchs.self_attn.out_proj, layer.attention.out), (torchs.linear1, layer.widen),
-        (torchs.linear2, layer.narrow), (torchs.norm1, layer.attention_norm), (torchs.norm2, layer.norm),
-    ]  # fmt: skip
-    for theirs, ours in pairs:
-        theirs.load_state_dict(ours.state_dict())
-    h = torch.randn(5, 3, 8)
-    torch.testing.assert_close(layer(h.transpose(0, 1)), torchs(h).transpose(0, 1), atol=1e-5, rtol=0)
 
 
 @torch.no_grad()

@@ -1,7 +1,5 @@
 """VAE-HMD, part by part."""
 
-import math
-
 import pytest
 import tiny
 import torch
@@ -41,13 +39,6 @@ def test_the_divergence_is_torchs():
     mean, variance = latent.chunk(2, -1)
     expected = kl_divergence(Normal(mean, (0.5 * variance).exp()), Normal(0.0, 1.0)).sum(-1).mean()
     torch.testing.assert_close(vae_hmd.compute_divergence(latent), expected)
-
-
-def test_draws_have_the_latents_mean_and_deviation():
-    torch.manual_seed(0)
-    samples = vae_hmd.draw_latent(torch.tensor([2.0, -4.0]).expand(20_000, 2))
-    assert float(samples.mean()) == pytest.approx(2, abs=0.01)
-    assert float(samples.std()) == pytest.approx(math.exp(-2), rel=0.03)
 
 
 @torch.no_grad()

@@ -1,20 +1,10 @@
 """The code-vector model: nearest codes, learning, restarts."""
 
 import pytest
-import tiny
 import torch
 
 from memmlp.motion.body import FRAME_DIM
-from memmlp.networks.vqvae import VQVAE, EMACodebook, GradientCodebook
-
-
-def test_the_nearest_code_is_chosen():
-    book = tiny.vqvae().codebook
-    latent = torch.randn(5, 3, 12)
-    vectors, index = book(latent)
-    brute = ((latent[..., None, :] - book.vectors) ** 2).sum(-1).argmin(-1)
-    assert torch.equal(index, brute)
-    assert torch.equal(vectors, book.vectors[brute])
+from memmlp.networks.vqvae import VQVAE, EMACodebook
 
 
 @pytest.mark.parametrize("codebook", ["ema", "gradient"])
@@ -31,29 +21,6 @@ def test_a_mixed_precision_training_finds_the_code_vectors_that_evaluation_finds
         indices = model.codebook.find_indices(latent)
     assert torch.equal(vectors, model.code_vectors(frames[:, :54], frames[:, 54:]))
     assert torch.equal(indices, model.codebook.find_indices(latent))
-
-
-def learned(codebook: str, steps: int = 150) -> tuple[float, float, int]:
-    torch.manual_seed(0)
-    model = VQVAE(codes=8, width=12, encoder_depth=1, codebook=codebook)
-    optimiser = torch.optim.Adam(model.parameters(), lr=3e-3)
-    data = torch.randn(6, FRAME_DIM)[torch.randint(6, (64,))] + 0.05 * torch.randn(64, FRAME_DIM)
-    errors = []
-    for _ in range(steps):
-        rotations, quantised = model.reconstruct(data)
-        error = (rotations - data[:, 54:186]).abs().mean()
-        optimiser.zero_grad()
-        (error + quantised.loss).backward()
-        optimiser.step()
-        errors.append(float(error.detach()))
-    return errors[0], errors[-1], len(quantised.indices.unique())
-
-
-@pytest.mark.parametrize("codebook", ["ema", "gradient"])
-def test_it_learns(codebook):
-    first, last, used = learned(codebook)
-    assert last < 0.7 * first
-    assert used >= (4 if codebook == "ema" else 1)
 
 
 def test_running_means_find_the_clusters():
@@ -88,18 +55,3 @@ def test_straight_through_reaches_the_encoder_and_commitment_counts():
 
     assert gradient(0.0).abs().sum() > 0
     assert not torch.allclose(gradient(0.0), gradient(5.0))
-
-
-def test_decay_and_depths_change_it():
-    def codes(decay: float) -> torch.Tensor:
-        torch.manual_seed(0)
-        book = EMACodebook(codes=3, width=2, commitment=0.25, decay=decay)
-        for _ in range(3):
-            book.learn(torch.randn(30, 2))
-        return book.vectors
-
-    assert not torch.allclose(codes(0.5), codes(0.99))
-    models = [VQVAE(encoder_depth=e, decoder_depth=d) for e, d in ((2, 1), (4, 1), (4, 2))]
-    sizes = {sum(p.numel() for p in model.parameters()) for model in models}
-    assert len(sizes) == 3
-    assert isinstance(VQVAE(codebook="gradient").codebook, GradientCodebook)

@@ -3,11 +3,10 @@
 from pathlib import Path
 
 import pytest
-import tiny
 
 from memmlp.runs.lookup import list_runs
 
-NAMES = [name for name in tiny.BASELINES if name != "sage"] + ["recurrent_poser"]  # sage: test_sage.py
+NAMES = ["agrol_diffusion", "manikin_s", "rpm", "recurrent_poser"]
 SHORT = [
     "profile=tiny",
     "data.synth.minutes=0.04",

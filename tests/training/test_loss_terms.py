@@ -162,12 +162,6 @@ def test_learned_weights_begin_as_given_and_find_the_reciprocals_of_their_terms(
     assert found == pytest.approx({"rotation": 1.0, "world_position": 1.0}, rel=0.02)
 
 
-def test_a_learned_weight_is_never_zero():
-    with pytest.raises(InputError, match=r"loss\.rotation=0"):
-        TermsLoss(weighting="learned", rotation=0.0)
-    assert TermsLoss(rotation=0.0).weighting.weights() == {"rotation": 0.0}
-
-
 def test_mixed_precision_computes_losses_in_float32():
     """Velocities and jerk are small differences, which bfloat16 has no bits for."""
     truth = TRUE[..., SPARSE_DIM:]

@@ -7,14 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny
 import torch
 from tiny_tasks import OPTIM, motion_task, weights
 from torch import nn
 
 from memmlp.common.errors import InputError
-from memmlp.networks.layers import TimeMix
-from memmlp.networks.recurrent_poser import CELLS
 from memmlp.runs.run import Run
 from memmlp.training.loop import ValidationCallback, train
 from memmlp.training.optim import EMA, ComposedOptimiser, Muon, Optim, ScheduleFree, WideProducts
@@ -94,18 +91,6 @@ def test_muon_has_the_matrices_and_adamw_the_rest():
     assert [group["weight_decay"] for group in optimiser.param_groups] == [1e-4, 1e-4, 0]
 
 
-def test_what_has_one_column_or_row_is_no_matrix():
-    """As the bias of a time mix. RecurrentPoser lacks one, so its identity is without optim.vectors."""
-    mix, gate = TimeMix(7), torch.nn.Linear(4, 1, bias=False)
-    group = {"params": [*mix.parameters(), *gate.parameters()]}
-    for vectors, of_muon in (("adamw", 1), ("muon", 3)):
-        muon = replace(OPTIMS["muon"], vectors=vectors).build([group]).parts[0]
-        assert len(muon.param_groups[0]["params"]) == of_muon
-    for cell in CELLS:
-        matrices = [one for one in tiny.recurrent_poser(cell=cell, members=2).parameters() if one.dim() == 2]
-        assert all(min(one.shape) > 1 for one in matrices)
-
-
 def test_the_warm_up_grows_in_equal_parts_and_then_the_schedule_is_what_it_was():
     plain = Optim(steps=10, batch=1, lr=1.0, final_lr=0.1, schedule="cosine")
     warm = replace(plain, warmup=4)
@@ -113,20 +98,6 @@ def test_the_warm_up_grows_in_equal_parts_and_then_the_schedule_is_what_it_was()
     assert parts == pytest.approx([0.25, 0.5, 0.75, *[1.0] * 7])
     free = replace(OPTIMS["schedule_free"], warmup=2)
     assert [free.compute_factor(step) for step in range(4)] == [0.5, 1, 1, 1]
-
-
-def test_at_another_rate_the_course_is_the_same():
-    plain = Optim(steps=10, batch=1, lr=4.0, final_lr=0.4, schedule="cosine", warmup=2)
-    other = plain.with_lr(1.0)
-    assert (other.lr, other.final_lr) == (1.0, pytest.approx(0.1))
-    assert [other.compute_factor(step) for step in range(10)] == pytest.approx(
-        [plain.compute_factor(n) for n in range(10)]
-    )
-    assert plain.with_lr(None) == plain
-    muon = replace(OPTIMS["muon"], lr=8e-3, other_lr=4e-3)
-    assert muon.with_lr(1e-4).other_lr == pytest.approx(5e-5)
-    assert muon.with_lr(None) == muon
-    assert replace(muon, other_lr=None).with_lr(1e-4).other_lr is None
 
 
 def test_a_library_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch):

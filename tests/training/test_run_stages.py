@@ -13,7 +13,7 @@ import pytest
 import torch
 from command_line import TINY
 from command_line import run as command
-from conftest import INT8, one_line
+from conftest import INT8
 from own_package import registers_kept
 from PIL import Image
 
@@ -22,7 +22,6 @@ from memmlp.common.files import file_digest
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.config.plugins import packaged
-from memmlp.live.stream import Stream
 from memmlp.motion.dataset import MotionDataset
 from memmlp.report.tables.measured_run import load
 from memmlp.runs import environment
@@ -31,7 +30,7 @@ from memmlp.runs.identity import VERSIONS
 from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
-from memmlp.sweep.worker import Cancelled, count_deaths
+from memmlp.sweep.worker import Cancelled
 from memmlp.training import run_stages
 from memmlp.training.run_stages import make_prerequisites, recording_outcome
 
@@ -90,18 +89,6 @@ def test_data_without_test_clips_is_refused_before_the_training(tmp_path, monkey
     assert not list_runs(tmp_path / "outputs")
 
 
-def test_the_same_command_finds_the_run_and_others_share_the_vqvae(home, monkeypatch):
-    before = {run.id: run.marker.stat().st_mtime_ns for run in list_runs(home / "outputs")}
-    assert "finished already" in command(home, "train", *TINY, INT8)
-    assert {run.id: run.marker.stat().st_mtime_ns for run in list_runs(home / "outputs")} == before
-    command(home, "train", *TINY, "seed=1", "vqvae.seed=0", "evaluation.modes=[stream]", "export.graph=off")
-    codes = [run.id for run in list_runs(home / "outputs") if run.manifest["kind"] == "vqvae"]
-    assert len(codes) == 1
-    monkeypatch.chdir(home)
-    experiment = build_experiment(composed([*TINY, "seed=1"]))  # by default a VQ-VAE follows its run's seed
-    assert make_prerequisites(experiment, experiment.motion.prepare()).id not in codes
-
-
 def test_eval_repeats_the_runs_numbers_and_saves_predictions(home):
     run = motion_run(home)
     first = next(r for r in list_runs(home / "outputs") if "window" in r.results)
@@ -149,35 +136,9 @@ def test_a_mode_a_solver_or_a_precision_is_that_stages_work_alone(home):
     assert len(made) == len(stages) + 2 + 1 + 3
 
 
-def test_without_a_graph_nothing_is_exported(home, monkeypatch):
-    """The run is whole without a deployment, and says how it gets one where one is needed."""
-    run = motion_run(home)
-    shutil.rmtree(run.deployments)
-    said = command(home, "train", *TINY, *seed_of(run), "export.graph=off")
-    assert "finished already" in said
-    assert "a frame on one CPU core" not in said
-    assert not run.deployments.exists()
-    with pytest.raises(InputError, match=r"no step\.onnx; make one with memmlp eval \S+ export\.graph=auto"):
-        Stream(run.folder)
-
-
 def seed_of(run: Run) -> list[str]:
     """Return the overrides that give a command line this run's seeds."""
     return [f"seed={run.config['seed']}", f"vqvae.seed={run.config['vqvae']['seed']}"]
-
-
-def test_export_again_and_bad_names(home, memmlp, monkeypatch):
-    monkeypatch.chdir(home)
-    run = motion_run(home)
-    assert "differs from torch" in memmlp("export", run.id, "--out", "again.onnx", "--opset", "17").out
-    onnx.checker.check_model(onnx.load(home / "again.onnx"))
-    full = ["export", run.id, "--out", "full.onnx", "--space", "unity"]
-    whole = ("--scope", "full", "--rotations", "quaternion")  # as in tests/cli/test_export.py
-    assert "differs from torch" in memmlp(*full, *whole).out
-    assert one_line(memmlp(*full), "--scope full")
-    assert one_line(memmlp("eval", "zzz"), "run 'zzz'")
-    assert one_line(memmlp("export", run.id, "--out", "no/where.onnx"), "--out")
-    assert one_line(memmlp("eval", run.manifest["prerequisite"]), "a finished run of a motion network")
 
 
 def test_a_nan_is_not_exported(home, memmlp, monkeypatch):
@@ -242,24 +203,6 @@ def test_a_failure_of_the_work_is_kept_with_the_run_and_an_interruption_is_not(b
         raise error
     assert (run.failure is None) == (failure is None)
     assert (failure or "") in (run.failure or "")
-
-
-def test_work_that_ended_well_is_no_death(begun):
-    """Else the tenth evaluation of a trained run would count as the tenth process that died on it."""
-    experiment, run = begun
-
-    def evaluate(error: BaseException | None = None) -> None:
-        with recording_outcome(experiment, run):
-            run.attempt("evaluation")
-            if error:
-                raise error
-
-    for _ in range(3):
-        evaluate()
-    assert count_deaths(run) == 0
-    with pytest.raises(KeyboardInterrupt):
-        evaluate(KeyboardInterrupt())
-    assert count_deaths(run) == 1
 
 
 def test_metrics_of_other_code_are_measured_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -160,16 +160,3 @@ def test_it_begins_with_the_weights_of_its_parts(tmp_path: Path):
         same = {name for name, stem in stems.items() if torch.equal(stem, known[name])}
         assert same == (set(finished) or set(stems))
         assert {name for name, stem in stems.items() if not stem.requires_grad} == set(finished)
-
-
-def test_the_learning_rate_falls_where_it_is_told():
-    assert [OPTIM.compute_factor(step) for step in range(4)] == pytest.approx([1, 1, 0.2, 0.04])
-
-
-@pytest.mark.parametrize("half", JOINTS)
-def test_latents_to_learn_from_are_those_of_float32_in_a_mixed_precision_training(half):
-    _, codes = parts(f"{half}_diffusion")
-    rotation, encoded = 3 * torch.randn(500, 8, ROTATION.stop), 3 * torch.randn(500, 8, SPARSE_DIM)
-    with torch.autocast("cpu", torch.bfloat16):
-        found = train_sage.encode_latents(codes, rotation, encoded)
-    torch.testing.assert_close(found, train_sage.encode_latents(codes, rotation, encoded), rtol=0, atol=0)

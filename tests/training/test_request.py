@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 from memmlp.motion.clip import Skipped
 from memmlp.motion.preparing.amass_names import S2_TEST, S2_TRAIN
-from memmlp.training import data_remarks
+from memmlp.training import request
 
 
 def clip(name: str, split: str, fps: float = 60.0, group: str = "tied") -> SimpleNamespace:
@@ -18,36 +18,27 @@ def warnings(clips: list[SimpleNamespace], name: str = "mine", part: dict | None
     """The warnings on data with these clips and facts of its manifest."""
     whole = {"coverage": SimpleNamespace(whole=True), "listed": {"CMU": 1}, "split": {}, "unusual": {}}
     manifest = SimpleNamespace(clips=clips, **(whole | facts))
-    return data_remarks.data_warnings(
+    return request.data_warnings(
         {"data": {"name": name, "split": part or {}}}, SimpleNamespace(manifest=manifest)
     )
 
 
 def test_remarks_count_the_clips_and_name_the_first():
     bad = Skipped("b.npz", "NaN in frame 3")
-    assert data_remarks.skipped_remark([]) is data_remarks.unusual_remark({}) is None
+    assert request.skipped_remark([]) is request.unusual_remark({}) is None
     for word in ("2 files", "b.npz (NaN in frame 3)", "data.strict"):
-        assert word in str(data_remarks.skipped_remark([bad, replace(bad, file="c.npz")]))
+        assert word in str(request.skipped_remark([bad, replace(bad, file="c.npz")]))
     odd = {"a/1": "Z is not up", "a/2": "Z is not up", "b": "the pelvis is at z = 20 m", "c": "Z is not up"}
     for word in ("4 clips", "a/1 (Z is not up), a/2, b", "memmlp data inspect"):
-        assert word in str(data_remarks.unusual_remark(odd))
+        assert word in str(request.unusual_remark(odd))
 
 
 def test_a_single_group_of_test_clips_is_too_few():
     for groups, counts, few in (("abb", ("3", "2"), False), ("aa", ("2", "1"), True)):
         clips = [clip("c", "train"), *(clip("t", "test", group=group) for group in groups)]
-        found = data_remarks.tested_clips_remark(clips)
+        found = request.tested_clips_remark(clips)
         assert all(count in found for count in counts)
         assert ("data.split.test" in found) == few
-
-
-def test_unusual_test_clips_are_a_fact_of_the_run():
-    clips = [clip("a", "test"), clip("b", "test"), clip("c", "train")]
-    odd = {"b": "Z is not up", "c": "knees bend backwards"}
-    said = warnings(clips, unusual=odd)["unusual"]
-    assert "1 of 2" in said
-    assert "b (Z is not up)" in said
-    assert warnings(clips[:1], unusual=odd)["unusual"] is None
 
 
 def test_people_in_training_and_in_test_are_a_fact_of_the_run():
@@ -63,11 +54,11 @@ def test_clips_that_were_recorded_at_a_lower_rate_are_said():
     rates = {"a": 30.0, "b": 30.0, "c": 60.0, "d": 59.94, "e": 120.0, "f": 100.0}
     clips = [*(clip(name, "test", fps) for name, fps in rates.items()), clip("g", "train", 25.0)]
     lines, splines = SimpleNamespace(interpolation="lines"), SimpleNamespace(interpolation="splines")
-    assert data_remarks.low_rates_remark(lines, clips, "clips").startswith(
+    assert request.low_rates_remark(lines, clips, "clips").startswith(
         "3 of 7 clips were recorded at 25 to 30"
     )
-    assert data_remarks.low_rates_remark(lines, clips[2:6], "clips") is None
-    assert data_remarks.low_rates_remark(splines, clips, "clips") is None
+    assert request.low_rates_remark(lines, clips[2:6], "clips") is None
+    assert request.low_rates_remark(splines, clips, "clips") is None
     assert warnings(clips, interpolation="lines")["resampled"].startswith(
         "2 of 6 test clips were recorded at 30 Hz"
     )
