@@ -110,18 +110,6 @@ def test_eval_says_that_code_has_changed_since(
     assert "was made before the code of evaluation/metrics.py changed" in memmlp("eval", finished.id).out
 
 
-def test_a_run_is_there_once_unless_labelled(memmlp: Memmlp, finished: Run, tmp_path: Path):
-    same = [finished.id, str(finished.folder)]
-    assert one_line(memmlp("render", *same, "--out", "a.png"), "RUNS: must differ")
-    labels = ["--label", "a", "--label", "b", "--poses", "1", "--to", "0.1"]
-    assert memmlp("render", *same, "--out", str(tmp_path / "a.PNG"), *labels).code == 0
-
-
-def test_an_unknown_clip_lists_the_test_clips(memmlp: Memmlp, finished: Run, clips: list[str]):
-    ran = memmlp("render", finished.id, "--clip", "nobody", "--out", "a.png")
-    assert all(name in ran.err for name in clips)
-
-
 def test_without_pyav_nothing_is_computed(memmlp: Memmlp, finished: Run, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "av", None)
     monkeypatch.delattr("memmlp.config.open_run.open_found")
@@ -147,17 +135,6 @@ def test_a_file_has_no_test_clips(memmlp: Memmlp, finished: Run):
         memmlp("live", str(finished.onnx), "--no-browser"), "has no test clips", "--clip FILE.npz"
     )
     assert one_line(memmlp("live", "nothing.onnx", "--no-browser"), "nothing.onnx: no such file")
-
-
-@pytest.mark.parametrize("option", ["--port", "--udp"])
-def test_a_taken_port_is_one_line(memmlp: Memmlp, finished: Run, option: str):
-    kind = socket.SOCK_DGRAM if option == "--udp" else socket.SOCK_STREAM
-    with socket.socket(socket.AF_INET, kind) as taken:
-        taken.bind(("127.0.0.1", 0))
-        if option == "--port":
-            taken.listen()
-        port = str(taken.getsockname()[1])
-        assert one_line(memmlp("live", finished.id, "--no-browser", option, port), f"port {port}: ")
 
 
 class Watched:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
 import signal
 import sys
 from pathlib import Path
@@ -137,12 +136,6 @@ def test_help_of_train_lists_what_can_be_chosen_and_nothing_else(memmlp: Memmlp)
     assert "\ndevice: cpu\n" in said
 
 
-def test_no_command_shows_the_help(memmlp: Memmlp):
-    ran = memmlp()
-    assert ran.code == 2
-    assert "Commands:" in ran.err
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -236,13 +229,6 @@ def test_a_failed_job_does_not_stop_the_others(memmlp: Memmlp, monkeypatch: pyte
     assert ran.err.splitlines() == ["memmlp: seed 0 is bad", "memmlp: seed 1 is bad"]
 
 
-def test_cfg_job_prints_the_config(memmlp: Memmlp, jobs: list[DictConfig]):
-    ran = memmlp("train", "--cfg", "job", "--resolve", "seed=7")
-    assert "seed: 7\n" in ran.out
-    assert "name: vq" in ran.out
-    assert jobs == []
-
-
 def test_completion(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
     for line, expected in (
         ("memmlp train memory=n", {"memory=no_codes", "memory=none"}),
@@ -255,20 +241,6 @@ def test_completion(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setenv("COMP_LINE", line)
         ran = memmlp("-sc", "query=bash")
         assert (ran.code, set(ran.out.split())) == (0, expected), line
-
-
-@pytest.mark.slow
-def test_completion_in_a_real_shell(tmp_path: Path):
-    folder = Path(sys.executable).parent
-    script = """
-    eval "$(memmlp train -sc install=bash)"
-    COMP_LINE="memmlp train profile=t" COMP_POINT=22 COMP_CWORD=2
-    hydra_bash_completion
-    echo "${COMPREPLY[@]}"
-    """
-    environment = os.environ | {"PATH": f"{folder}:{os.environ['PATH']}"}
-    ran = finished(["bash", "-c", script], cwd=tmp_path, env=environment)
-    assert (ran.stdout.strip(), ran.stderr) == ("profile=tiny", "")
 
 
 @pytest.mark.parametrize("installed", [True, False])

@@ -83,15 +83,6 @@ def test_times_of_a_busy_machine_say_so():
         assert "for 31% of the time" in latency({key: 0.31})
 
 
-def test_side_by_side_has_the_times_of_the_files_that_were_asked_for(capsys: pytest.CaptureFixture[str]):
-    deployed = {"median_ms": 3.39, "settings": {"precision": "int8"}, "int8": {"median_ms": 1.27}}
-    outcome = SimpleNamespace(
-        results={"stream": {"rotation": {"MPJPE": 1.0}}, "latency": MEASURED | deployed}
-    )
-    show_side_by_side({"one": cast(Outcome, outcome)})
-    assert "1.27" in capsys.readouterr().out
-
-
 def test_side_by_side_shows_each_branch_that_differs(capsys: pytest.CaptureFixture[str]):
     """A network that predicts positions, too, is not compared by its rotations alone."""
     two = {"rotation": {"MPJRE": 2.0, "MPJPE": 6.49}, "position": {"MPJPE": 5.46}}

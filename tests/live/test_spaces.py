@@ -63,11 +63,3 @@ def test_quaternions_are_scipys(turn):
     quaternion = matrix_to_quaternion(turn[None])
     np.testing.assert_allclose(quaternion_to_matrix(quaternion)[0], turn, atol=1e-12)
     np.testing.assert_allclose(Rotation.from_quat(quaternion[0]).as_matrix(), turn, atol=1e-12)
-
-
-def test_quaternions_at_no_turn_and_half_a_turn():
-    for axis in ([1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0, 0.8], [1, 1, 1]):
-        for angle in (0, 1e-7, np.pi - 1e-7, np.pi):
-            turn = Rotation.from_rotvec(angle * np.array(axis) / np.linalg.norm(axis)).as_matrix()
-            found = quaternion_to_matrix(matrix_to_quaternion(turn[None]))[0]
-            np.testing.assert_allclose(found, turn, atol=1e-12)

@@ -24,10 +24,8 @@ from memmlp.live.trackers_to_body_graph import (
     export_full,
     full_differences,
     quaternions,
-    trackers_of,
 )
-from memmlp.motion.body import SPARSE_DIM
-from memmlp.motion.geometry import axis_angle_to_matrix, sparse_features
+from memmlp.motion.geometry import axis_angle_to_matrix
 from memmlp.networks.streaming import streaming
 
 pytestmark = pytest.mark.slow
@@ -153,9 +151,3 @@ def test_interface_and_metadata(folder: Path):
         Stream(folder / "unity.onnx")
     with pytest.raises(InputError, match="rotations=euler"):
         export_full(tiny.model(), folder / "euler.onnx", RUN, "unity", "euler")
-
-
-def test_trackers_of_frames_have_their_features():
-    positions, rotations = trackers_of(PERSON.frames.double())
-    again = sparse_features(rotations, positions)
-    np.testing.assert_allclose(again, PERSON.frames[:, :SPARSE_DIM], atol=1e-6)

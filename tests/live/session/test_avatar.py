@@ -15,7 +15,7 @@ from wearer import body_frame
 
 from memmlp.common.errors import InputError
 from memmlp.live.rotations import BodyTree
-from memmlp.live.session.loop import UNIT, avatar_message, make_greeting, to_millimetres
+from memmlp.live.session.loop import avatar_message, make_greeting, to_millimetres
 from memmlp.live.session.server import Hub, LiveServer, mannequin_vrm, read_files
 from memmlp.live.session.sources import ClipSource, TrackedClip
 from memmlp.live.stream import BodyFrame
@@ -156,13 +156,3 @@ def test_an_avatar_is_as_tall_as_the_wearer_of_the_frame(browser: Browser, own: 
             server.hub.publish(told | times | {"dropped": 0, "malformed": 0})
             browser.wait(f"Math.abs(window.size - {size}) < 1e-3")
     assert browser.errors == []
-
-
-def test_the_rotations_of_a_message_are_those_of_vrm_s_t_pose():
-    """Who looks along the page's +Z in T-pose, which is AMASS' -Y, has the identity."""
-    still = np.tile(np.eye(3), (22, 1, 1))
-    still[0] = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    person = body_frame(0.0, still, np.zeros((22, 3)), REST)
-    found = np.array(avatar_message(person)["turns"]).reshape(22, 4)
-    np.testing.assert_array_equal(np.abs(found), np.tile([0, 0, 0, UNIT], (22, 1)))
-    assert to_millimetres(np.array([[1.0, 2, 3]])) == [1000, 3000, -2000]
