@@ -17,11 +17,11 @@ from memmlp.common.errors import InputError
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import RECORD, body_record, load_rest_joints
 from memmlp.motion.clip import FRAME_RATE_RANGE, Skipped
-from memmlp.motion.formats.npz import read_clip, write_clip
+from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.formats.recording import Recording
 from memmlp.motion.geometry import one_thread
 from memmlp.motion.importing.convert import AUTO, JUMP, STRAIGHTEST, Conversion, convert, first_step
-from memmlp.motion.importing.fidelity import Fidelity, compare
+from memmlp.motion.importing.fidelity import Fidelity
 from memmlp.motion.importing.recordings import Rate, find_rate, find_recordings, folder_key, read_recording
 from memmlp.motion.importing.skeleton_map import SkeletonMap, find_skeleton, is_number, load_skeleton
 
@@ -123,25 +123,29 @@ def import_folder(source: Path, out: Path, settings: ImportSettings | None = Non
     _check_import(files, out, settings)
     settings = replace(settings, strict=settings.strict or len(files) == 1)
     rest, clips, skipped = load_rest_joints(settings.body), [], list[Skipped]()
-    with _make_staging(out) as staging:
-        folder = Path(staging) / "clips"
-        folder.mkdir()
-        for relative, result in _convert_all(files, settings, rest):
-            if isinstance(result, Skipped):
-                skipped.append(result)
-                continue
-            write_clip(folder / relative.with_suffix(".npz"), result.converted.clip)
-            clips.append(_describe_clip(relative, result))
-        if not clips:
-            first = f"the first: {skipped[0].file}: {skipped[0].reason}"
-            raise InputError(f"{source}: no usable file of {len(files)}; {first}")
-        report = ImportReport(tuple(clips), tuple(_notes(clips, settings)), tuple(skipped))
-        _publish(folder, out, report, body_record(settings.body, rest))
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as staging:
+            folder = Path(staging) / "clips"
+            folder.mkdir()
+            for relative, result in _convert_all(files, settings, rest):
+                if isinstance(result, Skipped):
+                    skipped.append(result)
+                    continue
+                write_clip(folder / relative.with_suffix(".npz"), result.converted.clip)
+                clips.append(_describe_clip(relative, result))
+            if not clips:
+                first = f"the first: {skipped[0].file}: {skipped[0].reason}"
+                raise InputError(f"{source}: no usable file of {len(files)}; {first}")
+            report = ImportReport(tuple(clips), tuple(_notes(clips, settings)), tuple(skipped))
+            _publish(folder, out, report, body_record(settings.body, rest))
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror})") from error
     return report
 
 
 def verify_folder(source: Path, settings: ImportSettings | None = None) -> Iterator[Fidelity | Skipped]:
-    """Import each file of a folder, or a single one, on trial, and compare the npz with the file.
+    """Import each file of a folder, or a single one, on trial, and compare the clip with the file.
 
     Args:
         source: folder or file.
@@ -158,12 +162,8 @@ def verify_folder(source: Path, settings: ImportSettings | None = None) -> Itera
     for relative, result in _convert_all(find_recordings(source), settings, rest):
         if isinstance(result, Skipped):
             yield result
-            continue
-        with one_thread(), tempfile.TemporaryDirectory() as folder:
-            write_clip(Path(folder) / "clip.npz", result.converted.clip)
-            clip = read_clip(Path(folder) / "clip.npz", relative.as_posix())
-            fidelity = compare(clip, result.converted.fitted.motion, rest, result.skeleton.name)
-        yield fidelity
+        else:
+            yield replace(result.converted.fidelity, name=relative.as_posix())
 
 
 @dataclass(frozen=True)
@@ -218,14 +218,6 @@ def _check_import(files: Mapping[Path, Path], out: Path, settings: ImportSetting
             )
 
 
-def _make_staging(out: Path) -> tempfile.TemporaryDirectory:
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        return tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-")
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror})") from error
-
-
 def _describe_clip(relative: Path, result: _Result) -> ImportedClip:
     converted, recording = result.converted, result.recording
     return ImportedClip(
@@ -255,18 +247,15 @@ def _publish(staging: Path, out: Path, report: ImportReport, body: Mapping[str, 
     """
     record = {**body, **asdict(report)}
     (staging / RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-    try:
-        if not out.exists():
-            staging.rename(out)
-            return
-        (out / RECORD).unlink(missing_ok=True)
-        for name in [*(clip.clip for clip in report.clips), RECORD]:
-            (out / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.move(staging / name, out / name)
-        for skipped in report.skipped:
-            (out / Path(skipped.file).with_suffix(".npz")).unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror})") from error
+    if not out.exists():
+        staging.rename(out)
+        return
+    (out / RECORD).unlink(missing_ok=True)
+    for name in [*(clip.clip for clip in report.clips), RECORD]:
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.move(staging / name, out / name)
+    for skipped in report.skipped:
+        (out / Path(skipped.file).with_suffix(".npz")).unlink(missing_ok=True)
 
 
 def _notes(clips: Sequence[ImportedClip], settings: ImportSettings) -> Iterator[str]:
