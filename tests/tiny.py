@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 import torch
+import yaml
 
-from memmlp.common.components import find
+from memmlp.common.components import find, names
 from memmlp.motion.body import FRAME_DIM, builtin_rest_joints
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.geometry import motion_frames
@@ -145,6 +146,21 @@ BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
     "manikin_s": partial(TermsLoss, orientation=0.02),
     "manikin_l": partial(TermsLoss, orientation=0.02, world_position=40.0, velocity=50.0, hand=5.0),
 }
+
+
+def tiny_sizes(name: str) -> dict[str, Any]:
+    """Return the sizes that a network declares for the tiny profile."""
+    defaults = vars(find("model", name).make_settings({}))
+    return {
+        key: yaml.safe_load(value.removeprefix("${size:").split(",")[0])
+        for key, value in defaults.items()
+        if str(value).startswith("${size:")
+    }
+
+
+for new in set(names("model")) - {*BASELINES, "mem_mlp", "recurrent_poser", "constant_pose"}:
+    BASELINES[new] = tiny_sizes(new)
+    BASELINE_LOSSES[new] = partial(TermsLoss, rotation=1.0)
 
 
 def build_baseline(name: str, normalizer: Normalizer, **changes) -> MotionModel:
