@@ -19,7 +19,7 @@ from memmlp.motion.network_coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import Memory, NoMemory
-from memmlp.networks.motion_model import MotionModel
+from memmlp.networks.motion_model import MotionModel, WindowlessModel
 from memmlp.networks.own_past_memory import CodeMemory, CodeMemorySettings, JointCodeMemory
 from memmlp.networks.predictor import TwoBranchSettings
 from memmlp.networks.recurrent_poser import RecurrentPoser, RecurrentPoserSettings
@@ -126,8 +126,6 @@ BASELINES: dict[str, dict[str, Any]] = {
         diffusion_steps=50, sampling_steps=2, noise=0.01, noise_seed=0,
     ),
 }  # fmt: skip
-WINDOWLESS = ["hmd_poser", "vae_hmd", "rpm"]
-"""Baselines without a window, which are streams in both modes of evaluation."""
 BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
     "agrol_mlp": AGRoLLoss,
     "agrol_diffusion": AGRoLLoss,
@@ -161,6 +159,8 @@ def tiny_sizes(name: str) -> dict[str, Any]:
 for new in set(names("model")) - {*BASELINES, "mem_mlp", "recurrent_poser", "constant_pose"}:
     BASELINES[new] = tiny_sizes(new)
     BASELINE_LOSSES[new] = partial(TermsLoss, rotation=1.0)
+WINDOWLESS = [name for name in BASELINES if issubclass(find("model", name).kind, WindowlessModel)]
+"""Baselines without a window, which are streams in both modes of evaluation."""
 
 
 def build_baseline(name: str, normalizer: Normalizer, **changes) -> MotionModel:
