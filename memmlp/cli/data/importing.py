@@ -8,9 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import click
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table
 
 from memmlp.cli.data.printing import amount, show_skipped, show_some
 from memmlp.cli.options import PATH, body_option, strict_option
@@ -108,20 +105,14 @@ def _floor(text: str) -> str | float:
 def verify(source: Path, skeleton: str | None, body: str, up: str | None, show_all: bool) -> None:
     """Check imports against the files themselves.
 
-    Each file is imported, and the result is compared with the file's own joints. "worst mm" is the largest
-    distance of a mapped joint on the file's own bones. "worst degrees" is the largest angle between a segment
+    Each file is imported, and the result is compared with the file's own joints. The worst values are the
+    largest distance of a mapped joint on the file's own bones, and the largest angle between a segment
     (trunk, neck, arms, legs, feet) on the body and in the file. Impossible postures and lengths are faults.
     Continues after bad files; exits with 1 if any file has a fault or can't be imported.
     """
     from memmlp.motion.clip import Skipped
     from memmlp.motion.importing.import_folder import ImportSettings, verify_folder
 
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column("file", overflow="fold")
-    table.add_column("skeleton")
-    for name in ("frames", "worst\nmm", "worst\ndegrees"):
-        table.add_column(name, justify="right")
-    table.add_column("at")
     sound, bad, errors = 0, [], [(0.0, 0.0)]
     for row in verify_folder(source, ImportSettings(skeleton, body=body, up=up)):
         if isinstance(row, Skipped):
@@ -131,10 +122,8 @@ def verify(source: Path, skeleton: str | None, body: str, up: str | None, show_a
         sound += not row.faults
         bad += [f"{row.name}: {fault}" for fault in row.faults]
         if show_all or row.faults:
-            numbers = (str(row.frames), f"{row.mm.value:.4f}", f"{row.degrees.value:.4f}")
-            table.add_row(row.name, row.skeleton, *numbers, f"{row.mm}\n{row.degrees}")
-    if table.row_count:
-        Console(highlight=False, markup=False).print(table)  # a file's name may have brackets
+            worst = f"{row.mm.value:.4f} mm ({row.mm}), {row.degrees.value:.4f} degrees ({row.degrees})"
+            click.echo(f"compared {row.name}: {row.skeleton}, {row.frames} frames, worst {worst}")
     for line in bad:
         click.echo(line)
     mm, degrees = map(max, zip(*errors, strict=True))
@@ -183,11 +172,9 @@ def guess(file: Path, out: Path | None) -> None:
 
 @skeleton.command("show")
 @click.argument("file", type=PATH)
-@click.option(
-    "--skeleton", "map_name", help="A shipped map or the path of one.  [default: by the joints' names]"
-)
+@skeleton_option
 @click.option("--out", required=True, type=PATH, help="The picture, a .png.")
-def show(file: Path, map_name: str | None, out: Path) -> None:
+def show(file: Path, skeleton: str | None, out: Path) -> None:
     """Draw the stance that a file's skeleton is read from, with the nodes that a map picks.
 
     The picture also has the built-in body in the same stance. If the two differ, the map is wrong.
@@ -201,7 +188,7 @@ def show(file: Path, map_name: str | None, out: Path) -> None:
 
     check_picture(out, "--out", (".png",))
     recording = read_recording(file)
-    skeleton_map = find_skeleton(recording, None if map_name is None else load_skeleton(map_name))
+    skeleton_map = find_skeleton(recording, None if skeleton is None else load_skeleton(skeleton))
     stance = view_stance(recording, skeleton_map, load_rest_joints("builtin"))
     write_skeleton_picture(out, stance, f"{file.name}: {skeleton_map.name}")
     click.echo(f"{skeleton_map.name}, read from {stance.source}: {out}")
