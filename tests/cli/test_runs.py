@@ -186,18 +186,9 @@ def test_list_shows_what_differs_as_far_as_there_is_room(
         seen[width] = memmlp("runs", "list").out
     assert heads(seen["40"]) == {"run", "status", "name", "MPJPE", "stream"}
     assert "differ in seed, memory.layers: --columns name,seed,memory.layers,stream.MPJPE" in seen["40"]
-    assert heads(seen["85"]) == {"run", "status", "name", "seed", "memory.", "layers", "MPJPE", "stream"}
-    assert heads(seen["140"]) == heads(seen["85"]) | {"window", "Jitter", "age", "ms"}
+    assert heads(seen["85"]) == {"run", "status", "name", "seed", "MPJPE", "stream"}
+    assert heads(seen["140"]) == heads(seen["85"]) | {"memory.layers", "window", "Jitter", "age", "ms"}
     assert "differ in" not in seen["140"]
-
-
-def test_no_word_of_the_columns_that_were_asked_for_is_broken(memmlp: Memmlp, outputs: Path):
-    keys = "stream.MPJPE,window.rotation.MPJPE,latency.median_ms,memory.layers,kind,name"
-    said = memmlp("runs", "list", "--columns", keys).out
-    assert {"run", "status", "rotation.", "latency.", "median_ms", "layers", "kind"} < heads(said)
-    assert "age" not in heads(said)
-    for word in ("6.512", "[2,4,6,8,2,", "memmlp", "seed"):
-        assert word in said
 
 
 def test_where_sort_and_columns(memmlp: Memmlp, outputs: Path):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -35,7 +34,6 @@ LEGEND = f"MPJPE [{UNITS['MPJPE']}], Jitter [{UNITS['Jitter']}]: rotation branch
 EXPENDABLE = ("ms", "age", "Jitter\nstream", "MPJPE\nwindow")  # left out first on a narrow screen
 KEYS = 4  # differing keys that have columns, if nobody asked for them
 NAMED = 4  # keys without a column that are named below the table
-FOLD = 12  # characters of a value in a line, where it can be broken
 NAME = 31  # characters of a run's name in a line, at least
 
 
@@ -166,17 +164,12 @@ def _print_table(records: Sequence[Record], keys: Sequence[str], asked: bool) ->
     """
     columns = _columns(records, keys, asked)
     expendable = ["age"] if asked else [*EXPENDABLE, *reversed(keys[:KEYS])]
-    names = [] if asked else columns["name"]
-    flexible = max(0, max(map(len, names), default=0) - NAME)  # by how much wrapped names are narrower
-    while (width := _width(_table(columns, asked)) - flexible) > console().width and expendable:
+    wide = Console(width=10_000)
+    while (width := wide.measure(_table(columns, asked)).minimum) > console().width and expendable:
         columns.pop(expendable.pop(0), None)
     shown = Console(highlight=False, markup=False, width=max(console().width, width))
     shown.print(_table(columns, asked))
     return [key for key in keys if key not in columns]
-
-
-def _width(table: Table) -> int:
-    return Console(width=10_000).measure(table).maximum
 
 
 def _columns(records: Sequence[Record], keys: Sequence[str], asked: bool) -> dict[str, list[str]]:
@@ -192,7 +185,7 @@ def _columns(records: Sequence[Record], keys: Sequence[str], asked: bool) -> dic
             columns["data"] = labels
     for key in keys if asked else keys[:KEYS]:
         values = labels if key == "data" else [value_text(one, key, whole=asked) for one in records]
-        columns[key] = [_fold(value) for value in values]
+        columns[key] = list(values)
     if any(one.get("tag") for one in records):
         columns["tags"] = ["\n".join(one.get("tag", ())) for one in records]
     if not asked:
@@ -209,7 +202,7 @@ def _table(columns: Mapping[str, Sequence[str]], asked: bool) -> Table:
     for head in columns:
         is_name, is_number = head == "name" and not asked, head in RESULTS and not asked
         table.add_column(
-            _fold(head),
+            head,
             justify="right" if is_number else "left",
             no_wrap=not is_name,
             min_width=NAME if is_name else None,
@@ -230,13 +223,3 @@ def shown_number(record: Record, key: str) -> str:
         return "-"
     file = shown.partition(".")[0].removeprefix(group).removeprefix("-")
     return f"{value:.2f} {file}".rstrip()
-
-
-def _fold(text: str, width: int = FOLD) -> str:
-    """Break a text into lines of up to `width` characters, between words of a key and items of a list."""
-    lines = [""]
-    for part in re.findall(r"[^.,_/ ]*[.,_/ ]*", text):
-        if lines[-1] and len(lines[-1]) + len(part.rstrip()) > width:
-            lines.append("")
-        lines[-1] += part
-    return "\n".join(lines)
