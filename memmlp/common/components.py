@@ -42,7 +42,7 @@ SLOTS = (
     "prerequisite",
     "optim",
 )
-"""The groups of the config whose options are components of the network and of its training."""
+"""The groups of the config with components of the network and its training as options."""
 
 _Kind = TypeVar("_Kind", bound=Callable[..., Any])
 _roots: dict[str, Path] = {"memmlp": Path(__file__).parent.parent}
@@ -259,7 +259,7 @@ def _is_constant(node: ast.stmt) -> bool:
 
 
 def _of_option(found: Mapping[str, Any], one: Component) -> Any:
-    """Return what is decorated as a component among the names of its module; None if nothing is."""
+    """Return the component's decorated object among the names of its module; None without one."""
     option = f"{one.slot}={one.name}"
     return next(
         (kind for kind in found.values() if getattr(kind, "__dict__", {}).get("option") == option), None

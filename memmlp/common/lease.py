@@ -217,7 +217,7 @@ class Lock:
 
     @property
     def held(self) -> bool | None:
-        """Whether the process that holds the lock is alive, as far as is known; None if no process holds it.
+        """Whether the process that holds the lock is alive, if that is known; None if no process holds it.
 
         A process on another machine counts as alive until it has not shown a heartbeat for LEASE.
         """

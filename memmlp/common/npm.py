@@ -1,4 +1,4 @@
-"""Pinned packages from the npm registry, whose files are parts of pages: fetched once, checked, and kept.
+"""Pinned packages from the npm registry with files for pages: fetched once, checked, and kept.
 
 The registry is `NPM_CONFIG_REGISTRY`, or else registry.npmjs.org.
 Tarballs are kept below the user's cache folder. They are read member by member, and never unpacked.

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 
 GC_THRESHOLDS = (10_000, 20, 20)  # by default 700, 10 and 10
 
-MIN_CORE_SHARE = 0.9  # a measurement whose thread had less of a core was disturbed by other work
+MIN_CORE_SHARE = 0.9  # with less of a core, other work disturbed a measurement
 
 
 def collect_garbage_rarely() -> None:

@@ -72,7 +72,7 @@ def seed() -> Rule:
 
 
 def each(rule: Rule | None = None, empty: bool = False) -> Rule:
-    """Return the rule that a value is a list without repetitions whose items all obey another rule."""
+    """Return the rule that a value is a list without repetitions, and that each item obeys another rule."""
 
     def allows(value: Any) -> bool:
         items = list(value)
@@ -143,7 +143,7 @@ def setting(rule: Rule | None = None, default: Any = MISSING, **by_profile: Any)
 
 
 def sized(tiny: Any, small: Any, paper: Any, width_fraction: float = 0) -> str:
-    """Return a value of a config of which `profile.sizes` chooses one of three; see `setting`."""
+    """Return a config value of three, from which `profile.sizes` chooses; see `setting`."""
     return _choice("size", tiny, small, paper, *([width_fraction] if width_fraction else []))
 
 
@@ -186,7 +186,7 @@ class Settings:
 
 @dataclass
 class MetricSettings(Settings):
-    """The facts of a custom metric, whose component has the slot "metric" and builds a function.
+    """The facts of a custom metric; its component has the slot "metric" and builds a function.
 
     The function takes the prediction and the truth of one clip and returns one number.
 

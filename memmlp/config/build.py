@@ -207,7 +207,7 @@ def build_loss(cfg: DictConfig) -> Callable[[frozenset[str]], Loss]:
     ignores the branches.
 
     Raises:
-        InputError: for a custom term beside a complete loss, or for a branch that the predictor lacks.
+        InputError: for a custom term with a complete loss, or for a branch that the predictor lacks.
     """
     loss = build(cfg, "loss")
     if isinstance(loss, Loss):
@@ -236,7 +236,7 @@ def build_ik(cfg: DictConfig) -> IK:
 
 
 def build_vqvae_optim(cfg: DictConfig, frames: int) -> Optim:
-    """Build the optimisation of the VQ-VAE, whose length may be given in epochs of `frames` frames each."""
+    """Build the optimisation of the VQ-VAE; its length may be given in epochs of `frames` frames each."""
     own = cfg.vqvae
     keys = {name: own[name] for name in ("batch", "lr", "weight_decay")}
     keys |= {name: cfg.optim[name] for name in ("checkpoint_every", "log_every")}

@@ -89,7 +89,7 @@ def _value(node: DictConfig, own: str, name: str) -> Any:
 
 
 def _problems(cfg: DictConfig) -> Iterator[str]:
-    """Yield which values cannot be combined, as far as no component says so."""
+    """Yield values that cannot be combined, except those that a component checks."""
     for name, node in cfg.loggers.items():
         if node.name != name:
             yield f"loggers.{name}.name={node.name}: must be {name}, the logger's key"

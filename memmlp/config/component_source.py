@@ -1,4 +1,4 @@
-"""Where Hydra finds the options that components declare: a config source beside the folders of YAML files."""
+"""Hydra's source of the options that components declare, in addition to the folders of YAML files."""
 
 from __future__ import annotations
 

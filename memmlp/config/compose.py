@@ -39,7 +39,7 @@ VERSION_BASE = "1.3"
 CONFIG = "train"
 SEARCHPATH = "hydra.searchpath"
 EXPERIMENT = "experiment"
-"""The group whose options set groups and keys in the whole config."""
+"""The group with options that set groups and keys in the whole config."""
 
 SWITCHES = {
     "--help": "-h", "--hydra-help": None, "--resolve": None, "--run": "-r", "--multirun": "-m",
@@ -167,7 +167,7 @@ def preflight(args: argparse.Namespace) -> list[DictConfig]:
 
 
 def _check_first_parts(args: argparse.Namespace) -> None:
-    """Raise InputError for a key whose first part is not in the config, before the costly composition."""
+    """Raise InputError for a key with an unknown first part, before the costly composition."""
     if args.config_name or args.config_path:
         return
     keys = [spec.name for spec in dataclasses.fields(Config)]

@@ -39,7 +39,7 @@ def readable_name(kind: str, config: Mapping[str, Any]) -> str:
     words = [] if kind == NETWORK else [describe_kind(kind)]
     try:
         words += _differences(config)
-    except (HydraException, OmegaConfBaseException):  # a name is no reason to stop a run
+    except (HydraException, OmegaConfBaseException):  # a name must not stop a run
         words.append("own config")
     if len(words) > MAX_WORDS:
         words = [*words[:MAX_WORDS], f"{len(words) - MAX_WORDS} more"]

@@ -25,7 +25,7 @@ from memmlp.training.devices import device
 from memmlp.training.run_stages import Experiment
 
 ACTING = (*EVALUATION, *DEPLOYMENT, "data", "paths", "plugins", "loggers")
-"""The groups whose keys have an effect on a finished run; so have the keys of INFERENCE."""
+"""The groups with keys that affect a finished run; the keys of INFERENCE do, too."""
 
 
 class OpenedRun(NamedTuple):

@@ -81,7 +81,7 @@ def active() -> Mapping[str, Path]:
 
 
 def folders() -> list[tuple[str, Path]]:
-    """Return the folders of configs searched beside memmlp's: the packages', by name, and the user's."""
+    """Return the further folders of configs that are searched: those of packages, by name, and the user's."""
     own = _own.get()
     found = [(name, root / "conf") for name, root in _active.items() if (root / "conf").is_dir()]
     return [*found, *([(OWN, own)] if own else [])]

@@ -199,7 +199,7 @@ class NormalizerConfig:
 
 @dataclass
 class VQVAEConfig:
-    """The VQ-VAE whose code-vectors the memory uses (App. A, reading 5).
+    """The VQ-VAE with the code-vectors that the memory uses (App. A, reading 5).
 
     Exactly one of `epochs` and `steps` is set. A stage of its own trains it, then it is frozen. An epoch has
     all frames of the training part alike: data.drawn_by and the sources' weights are for windows.

@@ -1,4 +1,4 @@
-"""Costs of networks that were not trained, for tables of costs alone: their sizes and times."""
+"""Costs of networks that were not trained, for tables that show only costs: their sizes and times."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def with_costs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> tuple[dict[str, 
 
 
 def check_costs(sweep: Sweep) -> None:
-    """Check that a sweep's table shows costs alone. Raises InputError if it needs runs."""
+    """Check that a sweep's table shows only costs. Raises InputError if it needs runs."""
     if beyond := [metric for metric in sweep.metrics if metric not in COSTS]:
         raise InputError(
             f"--untrained: sweep {sweep.name} shows {', '.join(beyond)}; "

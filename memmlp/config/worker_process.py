@@ -26,7 +26,7 @@ def work(path: str, threads: int, controller: str | None, gpu: bool) -> str | No
         gpu: whether this worker should have a GPU.
 
     Returns:
-        A line if there is no such GPU, in which case nothing was done; else None.
+        A line if there is no such GPU and nothing was done; else None.
     """
     if gpu and (line := missing_gpu()):
         return line

@@ -1,6 +1,6 @@
 """A run as one file: a zip of its own files, in a folder named by the run's id.
 
-An archive is not trusted. It is unpacked into a folder beside the runs. Only names of a run's files are
+An archive is not trusted. It is unpacked into a temporary folder. Only names of a run's files are
 accepted; nothing is executed or unpickled. Only a complete run, which fits the digests in its own files, is
 then moved among the runs.
 """
@@ -111,7 +111,7 @@ def _check_names(archive: zipfile.ZipFile, path: Path, largest: int) -> tuple[st
 
 
 def _place(archive: zipfile.ZipFile, path: Path, run_id: str, outputs: Path) -> tuple[Run, bool]:
-    """Unpack into a folder beside the runs, check the run there, and move it to its place."""
+    """Unpack into a temporary folder, check the run there, and move it to its place."""
     place = Run.of(outputs, run_id)
     place.folder.parent.mkdir(parents=True, exist_ok=True)
     staging = Path(tempfile.mkdtemp(dir=place.folder.parent, prefix=".import-"))

@@ -51,7 +51,7 @@ class DeploymentFolder:
 
     @property
     def done(self) -> bool:
-        """Whether the deployment is complete, and belongs to the run in whose folder it is."""
+        """Whether the deployment is complete, and belongs to the run of its folder."""
         record = self.record
         whole = all((self.folder / name).is_file() for name in record.get("artifacts", {}))
         return bool(record) and whole and belongs(record.get("run"), self.folder.parent.parent)

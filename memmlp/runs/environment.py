@@ -22,12 +22,12 @@ import memmlp
 
 PACKAGE = Path(memmlp.__file__).parent
 NOT_NUMBERS = ("cli", "config", "live", "report", "runs/loggers", "sweep")
-"""Folders of the package whose code does not affect results; only `live` measures one, the time of a pose."""
+"""Folders with code that does not affect results; only `live` measures one, the time of a pose."""
 WIRING = ("config/build.py", "config/build_request.py")
 """Files of these folders that count nevertheless, since they decide what reaches the constructors."""
 PATCH = 1_000_000  # at most so many characters of changes are kept with a run
 MIXED = "mixed"
-"""Stands in place of a digest for a file whose code changed while the run was made."""
+"""The value in place of a digest for a file that changed while the run was made."""
 NOT_USERS = ("memmlp", "torch", "numpy", *sys.stdlib_module_names)
 """Modules that are not the user's, wherever they lie."""
 
@@ -101,7 +101,7 @@ def code_digests(packages: Iterable[str] = ()) -> dict[str, str]:
 
 
 def code_files(packages: Iterable[str] = ()) -> dict[str, bytes]:
-    """Return the content of each file of which `code_digests` has a digest, as this process runs it."""
+    """Return the content of each file of `code_digests`, as this process runs it."""
     users = _user_files(packages).items()
     return _package_code() | {f"{name}:{file}": code for name, files in users for file, code in files.items()}
 
@@ -121,7 +121,7 @@ def byte_digest(content: bytes) -> str:
 
 
 def changed_since(manifest: Mapping[str, Any]) -> list[str]:
-    """Return the files whose code has changed since a run with this manifest began (see `changed`).
+    """Return the files with other code than when a run with this manifest began (see `changed`).
 
     A file is parsed only if its bytes differ from those of the run: parsing all takes half a second.
     """
@@ -137,7 +137,7 @@ def changed_since(manifest: Mapping[str, Any]) -> list[str]:
 
 
 def changed(before: Mapping[str, str], after: Mapping[str, str]) -> list[str]:
-    """Return the files whose code differs between two records (`code_digests`).
+    """Return the files with different code in two records (`code_digests`).
 
     A file that is in only one of them is not compared: new code runs only if other code, or the config, names
     it.
@@ -259,7 +259,7 @@ FACTS = ("component_versions", "git", "version", "sources", "plugins", "packages
 def prerequisite_origins(manifest: Mapping[str, Any], weights: str | None) -> list[dict[str, Any]]:
     """Return the origins of the prerequisite runs of a run that begins, the nearest first.
 
-    Each has the run's `id` and `kind`, the SHA-256 of its `weights`, and FACTS as far as known.
+    Each has the run's `id` and `kind`, the SHA-256 of its `weights`, and the known FACTS.
 
     Args:
         manifest: the manifest of the finished run whose weights the run uses.
@@ -284,7 +284,7 @@ def prerequisite_versions(manifest: Mapping[str, Any]) -> dict[str, int]:
 def join_origins(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
     """Join the origins of a training before and after it was resumed; if they differ, both are kept.
 
-    A file whose code changed in between gets "mixed" in place of a digest. Prerequisite runs that changed
+    A file with code that changed in between gets "mixed" in place of a digest. Prerequisite runs that changed
     since (trained again, under the same ids) follow the present ones.
 
     Args:

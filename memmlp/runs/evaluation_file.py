@@ -1,4 +1,4 @@
-"""The files of evaluations, each of which contains its own digest."""
+"""The files of evaluations; each contains its own digest."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def current(path: Path, report: Mapping[str, Any]) -> bool:
 def describe_outdated(path: Path, report: Mapping[str, Any]) -> str | None:
     """Return which components of an evaluation have changed since, as "mode.window 2 -> 3"; None if none has.
 
-    Custom metrics whose package is not in use are not compared.
+    Custom metrics of packages that are not in use are not compared.
     """
     known = {
         name: number for name, number in report.get("component_versions", {}).items() if version_of(name)

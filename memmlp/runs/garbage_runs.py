@@ -1,4 +1,4 @@
-"""Runs that are no longer needed: failed ones, ones by older component versions, and orphans."""
+"""Runs that are no longer needed: failed ones, ones with older component versions, and orphans."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def delete(one: Garbage) -> bool:
 
 
 def _reason(run: Run, orphans: Mapping[str, str]) -> tuple[str, str]:
-    if run.failure and not run.done:  # a trained run may have failed in an export alone
+    if run.failure and not run.done:  # a trained run may have failed only in an export
         return "failed", run.failure
     if changed := outdated(
         {**prerequisite_versions(run.manifest), **(run.manifest.get("component_versions") or {})}

@@ -23,7 +23,7 @@ from memmlp.common.files import plain
 VERSIONS: dict[str, int] = {
     # what networks see (memmlp.motion)
     "features": 1,
-    # parts of networks that are no option of a slot
+    # parts of networks that are not an option of a slot
     "vqvae": 1,
     "codebook.ema": 1,
     "codebook.gradient": 1,
@@ -53,7 +53,7 @@ VERSIONS: dict[str, int] = {
     "fp16": 3,
     "latency": 1,
 }
-"""The versions of what is no option of a slot."""
+"""The versions of parts that are not an option of a slot."""
 
 
 def version_of(component: str) -> int:
@@ -82,7 +82,7 @@ NEUTRAL = (
     "device",  # recorded, and flagged where runs that are compared differ in it
     "threads",
     "force",
-    "plugins",  # says which packages are looked at; what is used of them has its path in the config
+    "plugins",  # the packages in use; their components are named in the config
     "save_predictions",
     "optim.checkpoint_every",
     "optim.log_every",
@@ -293,7 +293,7 @@ def is_data_path(key: str) -> bool:
 def belongs(run_id: str | None, folder: Path) -> bool:
     """Return whether a file of the run with that id is in that run's folder.
 
-    A folder whose name is no id is a copy of a run, to which everything in it belongs.
+    A folder with another name than an id is a copy of a run: everything in it belongs to the run.
     """
     return run_id in (None, folder.name) or not ID.fullmatch(folder.name)
 
@@ -316,7 +316,7 @@ def describe_other_export(settings: Mapping[str, Any], config: Mapping[str, Any]
 
 
 def inference(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the keys that matter when the network is used, as far as the config has them."""
+    """Return the config's keys that matter when the network is used."""
     flat = flatten(config)
     return {key: _canonical(flat[key]) for key in INFERENCE if key in flat}
 

@@ -17,7 +17,7 @@ from memmlp.runs.identity import ID, NETWORK
 from memmlp.runs.run import Run
 
 MINUTE = 60 * 60  # frames at 60 Hz
-LITTLE = 30 * MINUTE  # a twenty-third of what `profile=small` draws
+LITTLE = 30 * MINUTE  # frames: 1/23 of those that `profile=small` draws
 
 
 def list_runs(outputs: Path | str) -> list[Run]:

@@ -148,11 +148,11 @@ class Run:
 
     @property
     def deployment_as_configured(self) -> DeploymentFolder:
-        """The deployment whose measurements are shown (see `deployment_shown`)."""
+        """The deployment with the measurements that are shown (see `deployment_shown`)."""
         return self.deployment_shown(self.config)
 
     def deployment_shown(self, config: Mapping[str, Any]) -> DeploymentFolder:
-        """Return the deployment whose measurements are shown, given the run's config.
+        """Return the deployment with the measurements that are shown, given the run's config.
 
         It is of the file that the config asks for, whatever else was exported since; if there are several,
         one with the present component versions, then one with just the config's settings, then the last. Only
@@ -367,9 +367,9 @@ class Run:
 
     @property
     def changed_sources(self) -> list[str]:
-        """The files whose code has changed since the run was made; empty if that is not known.
+        """The files with code that has changed since the run was made; empty if that is unknown.
 
-        Files of the user's packages that are found, and of what these import, are included.
+        Files of the user's packages are included, if these are found.
         """
         return changed_since(self.manifest)
 

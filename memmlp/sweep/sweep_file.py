@@ -95,7 +95,7 @@ def parse_sweep(name: str, content: Any) -> Sweep:
     variants = _variants(content.get("variants", {}), branch)
     grids, seeds = _axes(content)
     if "axes" in content and not variants:
-        variants = [Variant("" if grids else BASE, branch=branch)]  # axes of seeds alone
+        variants = [Variant("" if grids else BASE, branch=branch)]  # only seeds as axes
     variants = list(_over_cells(variants, _cells(grids))) if grids else variants
     runnable = [variant.label for variant in variants if variant.overrides is not None]
     if not runnable:

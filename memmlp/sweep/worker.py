@@ -19,7 +19,7 @@ from memmlp.common.lease import Changes, current_process, is_alive
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan, RunTask
 
-PAUSE = 0.5  # seconds before another look at a plan whose tasks other workers do
+PAUSE = 0.5  # seconds between two looks at a plan while other workers do its tasks
 ABANDONED = 600.0  # seconds without a sign of life after which an open plan's controller counts as dead
 DEATHS = 10  # workers that died at the same step of a run before it counts as failed
 
@@ -82,7 +82,7 @@ def attempt(plan: Plan, task: RunTask, perform: Perform) -> bool:
         if not mine:
             return False
         try:
-            if not plan.complete(task) and not run.failure:  # no other process ended it meanwhile
+            if not plan.complete(task) and not run.failure:  # unless another process has ended it
                 _perform(plan, task, run, perform)
         except LeaseLost as lost:
             print(f"memmlp: {lost}", file=sys.stderr, flush=True)

@@ -94,7 +94,7 @@ def _work_apart(work: Work, stop: str, gpus: bool) -> str | None:
     from distributed import Event, get_worker
 
     declared = get_worker().state.total_resources.get(GPU, 0)
-    if gpus and declared > 1:  # nobody would say which of them is this task's
+    if gpus and declared > 1:  # it is unknown which of them is this task's
         return f"a Dask worker declares {declared:g} GPUs; must be one, each with its CUDA_VISIBLE_DEVICES"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

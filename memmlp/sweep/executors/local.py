@@ -145,7 +145,7 @@ def start_process(
             stdin=subprocess.PIPE if with_parent else subprocess.DEVNULL,
             stdout=log,
             stderr=log,
-            start_new_session=True,  # so that Ctrl-C reaches the controller alone, which ends its workers
+            start_new_session=True,  # Ctrl-C reaches only the controller, which ends its workers
         )
 
 

@@ -84,7 +84,7 @@ class Ray:
         self.task = {key: options[key] for key in ("accelerator_type", "resources") if key in options}
         if "memory_gb" in options:
             self.task["memory"] = options["memory_gb"] * 2**30
-        # A task that is run again by Ray would be one beside the worker that replaces it.
+        # The fleet replaces dead workers; Ray must not run a task again as well.
         self.task |= {"num_cpus": num_cpus, "num_gpus": self.num_gpus, "max_retries": 0, "max_calls": 1}
 
     def _connect(self, options: Mapping[str, Any]) -> None:

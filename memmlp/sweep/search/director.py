@@ -27,7 +27,7 @@ from memmlp.sweep.search.search_file import Objective, Value
 from memmlp.sweep.search.study import Study, trial_values
 
 MAX_FAILURES = 5  # so many trials that all fail end the search
-DROPPED = (TrialState.PRUNED, TrialState.FAIL)  # states of trials whose runs nobody wants any more
+DROPPED = (TrialState.PRUNED, TrialState.FAIL)  # states of trials that no longer need their runs
 
 Compose = Callable[[Mapping[str, Value]], Sequence[Sequence[RunTask]]]
 """Makes a list of tasks for each seed from a trial's values; the last task of a list is the seed's run.
@@ -104,7 +104,7 @@ class Director:
         return self._make_plan()
 
     def _start(self, trial: Trial) -> None:
-        """Add a trial's first run to the plan. A trial whose values the config rejects fails at once."""
+        """Add a trial's first run to the plan. A trial fails at once if the config rejects its values."""
         try:
             started = RunningTrial(trial, self.compose(trial_values(trial, self.study.search)))
         except InputError as error:
@@ -141,7 +141,7 @@ class Director:
     def _busy(self) -> int:
         """Return how many workers the running trials can use: one for each wanted run that is not done.
 
-        A trial whose runs are all done still counts as one until it is recorded as ended.
+        A trial with only finished runs still counts as one until it is recorded as ended.
         """
         outputs = self.plan.outputs
         return sum(

@@ -62,7 +62,7 @@ def write_trials(study: Study, path: Path) -> None:
 def write_experiments(study: Study, folder: Path, groups: Collection[str]) -> list[Path]:
     """Write the best trial to experiment/best.yaml, and the others of a Pareto front to trial-N.yaml.
 
-    Files of trials that are no longer of the front are removed.
+    Files of trials that left the front are removed.
 
     Args:
         study: the study.
@@ -152,7 +152,7 @@ def _first(trial: FrozenTrial) -> float:
 
 
 def boundary_warnings(study: optuna.Study) -> list[str]:
-    """Return a warning for each key whose best value is at an end of its range: better ones may lie beyond.
+    """Return a warning for each key with its best value at an end of its range: better ones may lie beyond.
 
     A value within a fiftieth of the range's width is at its end (of the logarithm's width, if that is
     searched). There are no warnings for several objectives, whose front reaches the ends, and none at zero,

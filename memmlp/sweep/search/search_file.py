@@ -10,7 +10,7 @@ space:                              # a tree of config keys; its leaves are rang
   hand: {choices: ['off', fk]}
 objectives: [MPJPE]                 # on validation, to be lowered; [MPJPE, Jitter] gives a Pareto front
 n_trials: 30                        # in all, however often the search is started
-seeds: 1                            # runs of each trial, whose value is their mean; the first alone is pruned
+seeds: 1                            # runs of each trial; its value is their mean; the first can be pruned
 sampler: tpe                        # or random; or grid: each combination of choices once
 startup: 10                         # random trials (after the first) before TPE learns; null without TPE
 seed: 0                             # of the sampler
