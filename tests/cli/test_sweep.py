@@ -62,7 +62,7 @@ def test_what_can_be_done_is_done_once(home: Path):
     runs = list_runs(home / "outputs")
     assert sorted(run.manifest["kind"] for run in runs if run.done) == ["memmlp", "memmlp", "vqvae"]
     assert {(run.manifest["device"], run.manifest["processes"]) for run in runs} == {("cpu", 1)}
-    assert "none seed 0: done on cpu" in said
+    assert "none seed 0: done" in said
     before = stamps(home)
     assert "3 of 4 runs done" in command(home, code=1)
     assert stamps(home) == before
