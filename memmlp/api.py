@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from memmlp.live.spaces import SpaceName
     from memmlp.live.stream import RotationFormat
     from memmlp.networks.motion_model import MotionModel
-    from memmlp.report.pictures.clip_piece import ClipPiece
+    from memmlp.report.pictures.clip_pictures import ClipPiece
 
 StrPath = str | os.PathLike[str]
 Mode = Literal["stream", "window"]
@@ -313,8 +313,7 @@ class Prediction:
             InputError: for another kind of file, a folder that does not exist, another branch, a piece
                 without frames, a number of poses out of range, or an MP4 without PyAV installed.
         """
-        from memmlp.report.pictures.clip_pictures import check_picture, write_picture
-        from memmlp.report.pictures.clip_piece import frame_range
+        from memmlp.report.pictures.clip_pictures import check_picture, frame_range, write_picture
 
         file = Path(path)
         check_picture(file)
@@ -349,7 +348,7 @@ class Prediction:
         return file
 
     def _piece(self, branch: Branch, first: int = 0, last: int | None = None) -> ClipPiece:
-        from memmlp.report.pictures.clip_piece import ClipPiece
+        from memmlp.report.pictures.clip_pictures import ClipPiece
 
         branches = {"rotation": self.positions}
         branches |= {} if self.position_branch is None else {"position": self.position_branch}

@@ -11,7 +11,7 @@ from memmlp.cli.options import Finite, check_runs, outputs_option, plugins_optio
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
-    from memmlp.report.pictures.clip_piece import ClipPiece
+    from memmlp.report.pictures.clip_pictures import ClipPiece
 
 POSITIONS = {"rotation": "predicted_positions", "position": "predicted_positions_of_position_branch"}
 
@@ -107,7 +107,7 @@ def _predict_piece(
     from memmlp.common.progress import announce
     from memmlp.config.open_run import clip_of
     from memmlp.evaluation.predictions import predict_clip
-    from memmlp.report.pictures.clip_piece import ClipPiece, frame_range
+    from memmlp.report.pictures.clip_pictures import ClipPiece, frame_range
 
     first_run = next(iter(runs.values()))
     title = clip or first_run.test.names[0]

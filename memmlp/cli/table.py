@@ -99,7 +99,7 @@ def table(
     selection = TableSelection(branch, source, together, untrained)
     gc.disable()  # what is read from the runs stays in use, and searching it for garbage takes a second
     try:
-        found = gathered([name], overrides, outputs, SHOWN_MODES[mode], functools.cache(load), selection)
+        found = gather(name, overrides, outputs, SHOWN_MODES[mode], functools.cache(load), selection)
     finally:
         gc.enable()
     tables = [functools.reduce(rows_measured_in_browsers.with_rows, measured, one.table) for one in found]
@@ -140,21 +140,21 @@ class SweepTable(NamedTuple):
     table: Table
 
 
-def gathered(
-    names: Sequence[str],
+def gather(
+    name: str,
     overrides: Sequence[str],
     outputs: Path,
     modes: Sequence[str],
     read: Read,
     selection: TableSelection = WHOLE,
 ) -> list[SweepTable]:
-    """Gather the tables with the given names.
+    """Gather the tables with a name.
 
     A table of the paper whose config lacks something (such as the folder of AMASS) shows only the paper's
     values, and says so.
 
     Args:
-        names: names of sweeps, as given to `memmlp table`.
+        name: the name of a sweep, as given to `memmlp table`; `all` for all tables of the paper.
         overrides: the command line's overrides.
         outputs: the folder of runs and caches.
         modes: modes of evaluation to show.
@@ -168,7 +168,7 @@ def gathered(
     from memmlp.report.tables.build_table import without_runs
 
     found, failures = [], []
-    sweeps = find_sweeps(names, overrides)
+    sweeps = find_sweeps(name, overrides)
     for sweep, command in progress_bar(sweeps, "tables") if len(sweeps) > 1 else sweeps:
         sweep = sweep.with_branch(selection.branch) if selection.branch else sweep
         if selection.untrained:
@@ -221,16 +221,15 @@ def table_of_plan(
     return SweepTable(sweep, runs, replace(table, flags=(*table.flags, *flags)))
 
 
-def find_sweeps(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
-    """Find the sweeps with these names and overrides, and return each with the command that runs it."""
+def find_sweeps(name: str, overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
+    """Find the sweeps with a name and overrides, and return each with the command that runs it."""
     from memmlp.config.compose_plan import find_sweep
     from memmlp.config.plugins import config_dir_words, packaged
 
     tables = sorted(path.stem for path in packaged("sweeps").glob("table*.yaml"))
-    every = [one for name in names for one in (tables if name == "all" else [name])]
     return [
         (find_sweep(one, overrides), " ".join(["memmlp sweep", one, *overrides, *config_dir_words()]))
-        for one in every
+        for one in (tables if name == "all" else [name])
     ]
 
 

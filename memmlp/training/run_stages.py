@@ -306,8 +306,10 @@ def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequen
 
 def draw_first_clip(model: MotionModel, test: MotionDataset, path: Path) -> None:
     """Draw the start of the first test clip beside the truth, as a PNG."""
-    from memmlp.report.pictures.clip_pictures import write_picture  # matplotlib takes 0.5 s to import
-    from memmlp.report.pictures.clip_piece import ClipPiece
+    from memmlp.report.pictures.clip_pictures import (
+        ClipPiece,
+        write_picture,  # matplotlib takes 0.5 s to import
+    )
 
     truth, predicted = predict_first_clip(model, test)
     write_picture(path, ClipPiece(test.names[0], truth, {"prediction": predicted}))

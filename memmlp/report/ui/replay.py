@@ -14,7 +14,7 @@ from memmlp.common.errors import InputError
 from memmlp.live.spaces import SPACES
 from memmlp.motion.body import FPS, JOINTS
 from memmlp.motion.limb_shapes import HEAT, LIMBS
-from memmlp.report.pictures.clip_piece import colour_scale_top
+from memmlp.report.pictures.clip_pictures import colour_scale_top
 from memmlp.runs.run import Run
 
 Predict = Callable[[Run, str, str], Mapping[str, np.ndarray]]

@@ -15,8 +15,13 @@ from memmlp.common.errors import InputError
 from memmlp.evaluation.modes import joint_positions
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.report.pictures import clip_pictures
-from memmlp.report.pictures.clip_pictures import check_picture, write_picture
-from memmlp.report.pictures.clip_piece import ClipPiece, colour_scale_top, frame_range
+from memmlp.report.pictures.clip_pictures import (
+    ClipPiece,
+    check_picture,
+    colour_scale_top,
+    frame_range,
+    write_picture,
+)
 
 TRUTH = joint_positions(tiny.clip(31)[:, SPARSE_DIM:]).numpy().astype(np.float64)
 OFF = np.array([0.0, 0.0, 0.08])

@@ -36,5 +36,5 @@ def test_sides_are_on_their_sides(tmp_path: Path, far: bool):
     width = picture.shape[1] // 5
     front, body = picture[:, width : 2 * width], picture[60:-60, 3 * width :]
     right, left, middle = (np.median(columns(front, colour)) for colour in (RIGHT, LEFT, MIDDLE))
-    assert right + 20 < middle < left - 20
+    assert right + 5 < middle < left - 5
     assert 0.05 < (body.max(-1) < 200).mean() < 0.5
