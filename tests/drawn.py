@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from memmlp.report.tables.statistics import (
-    holm,
+    correct_by_holm,
 )
 
 TABLE = 24  # comparisons of a table
@@ -42,4 +42,4 @@ def groups(clips: int, size: int) -> np.ndarray:
 
 def starred(p: np.ndarray) -> float:
     """Return the share of tables with a star; all true differences are 0."""
-    return float(np.mean([(holm(row) <= 0.05).any() for row in p.reshape(-1, TABLE)]))
+    return float(np.mean([(correct_by_holm(row) <= 0.05).any() for row in p.reshape(-1, TABLE)]))

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from memmlp.report.tables.build_table import finished_runs, make_table
+from memmlp.report.tables.build_table import find_finished_runs, make_table
 from memmlp.report.tables.effects import RunsBySeed
 from memmlp.report.tables.measured_run import Measured, load
 from memmlp.report.tables.table import Table
@@ -107,7 +107,7 @@ def runs_of(sweep: Sweep, find: Find, read: Callable[[Path], Measured] = load) -
         run = find(variant, seed)
         return read(run.folder) if run is not None and run.done else None
 
-    return finished_runs(sweep, measured)
+    return find_finished_runs(sweep, measured)
 
 
 def table_of(sweep: Sweep, find: Find, command: str | None = None, modes: Sequence[str] = MODES) -> Table:

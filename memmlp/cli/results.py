@@ -63,12 +63,15 @@ def save_command(
     from memmlp.common.files import plain
     from memmlp.config.compose_plan import find_sweep, is_path
     from memmlp.report.kept_results import Kept, list_overrides, load_kept, save, shorten_paths
-    from memmlp.report.tables.build_table import finished_runs, run_finder
+    from memmlp.report.tables.build_table import find_finished_runs, make_run_finder
     from memmlp.report.tables.measured_run import load
 
     sweep = find_sweep(name, overrides)
     shown = shown_sweep(sweep, overrides, outputs.absolute())
-    runs, flags = finished_runs(shown.sweep, run_finder(shown.plan, functools.cache(load))), shown.flags
+    runs, flags = (
+        find_finished_runs(shown.sweep, make_run_finder(shown.plan, functools.cache(load))),
+        shown.flags,
+    )
     if untrained:
         from memmlp.config.untrained_costs import with_costs
 
@@ -177,7 +180,7 @@ def _make_table(kept: Kept, source: str | None = None, patterns: Sequence[str] =
     """
     from memmlp.cli.table import flag_of_other_rounds
     from memmlp.config.compose_plan import find_sweep
-    from memmlp.report.tables.build_table import make_table, restrict
+    from memmlp.report.tables.build_table import make_table, restrict_clips
     from memmlp.report.tables.seed_rounds import Rounds
     from memmlp.runs.identity import outdated
 
@@ -197,7 +200,7 @@ def _make_table(kept: Kept, source: str | None = None, patterns: Sequence[str] =
         # Seeds of the definition without a kept run are missing: one seed of five is not a finished table.
         seeds = sorted({*sweep.seeds, *(seed for by_seed in kept.runs.values() for seed in by_seed)})
         sweep = sweep.with_overrides([f"seed={','.join(map(str, seeds))}"])
-        sweep, runs, restricted = restrict(sweep, kept.runs_of(sweep), source, patterns)
+        sweep, runs, restricted = restrict_clips(sweep, kept.runs_of(sweep), source, patterns)
         flags = [*restricted, *([other] if other else [])]
         table = make_table(sweep, runs, command=kept.command)
     changed = sorted({change for run in kept.every for change in outdated(run.origin.every_version)})

@@ -154,9 +154,11 @@ def show(chosen: Sweep, plan: Plan, labels: Collection[str]) -> None:
         Console(highlight=False).print(render(shown, states))
         done = [(e.label, shown.run_of(e).manifest) for e in shown.entries if states[e.key] == "done"]
         if done:
-            from memmlp.report.tables.flags import older_code  # it imports SciPy
+            from memmlp.report.tables.flags import flag_older_code  # it imports SciPy
 
-            for line in older_code((label, m.get("sources", {}), m.get("plugins", ())) for label, m in done):
+            for line in flag_older_code(
+                (label, m.get("sources", {}), m.get("plugins", ())) for label, m in done
+            ):
                 click.echo(line)
     if count := count_unprepared(chosen, shown, labels):
         click.echo(f"{count} runs: their data is not prepared yet; the sweep does that first")
@@ -225,11 +227,11 @@ def check_rounds_options(overrides: Sequence[str], wanted: bool, most: int | Non
     if most is None and not wanted:
         return  # SciPy takes long to import
     from memmlp.report.tables.seed_rounds import MOST
-    from memmlp.report.tables.statistics import analysis_schedule
+    from memmlp.report.tables.statistics import make_schedule
 
     if most is not None and not wanted:
         raise InputError("--max-seeds: needs --until-decided")
-    if most is not None and most < (first := analysis_schedule(MOST)[0]):
+    if most is not None and most < (first := make_schedule(MOST)[0]):
         raise InputError(f"--max-seeds {most}: must be at least {first}, the seeds of the first analysis")
     for override in overrides:
         if wanted and override.startswith("seed="):
@@ -249,13 +251,13 @@ def current_rounds(sweep: Sweep, outputs: Path, most: int | None) -> Rounds:
         InputError: if the analyses were of a sweep that has changed since, or with another maximum.
     """
     from memmlp.cli.table import rounds_path
-    from memmlp.report.tables.seed_rounds import MOST, Rounds, new_rounds
+    from memmlp.report.tables.seed_rounds import MOST, Rounds, start_rounds
 
     path = rounds_path(sweep, outputs)
     kept = Rounds.read(path)
     if kept is None or not kept.analyses:
-        return new_rounds(sweep, most or MOST)
-    wanted = new_rounds(sweep, most or len(kept.seeds))
+        return start_rounds(sweep, most or MOST)
+    wanted = start_rounds(sweep, most or len(kept.seeds))
     if len(wanted.seeds) != len(kept.seeds):
         raise InputError(f"--max-seeds {most}: must be {len(kept.seeds)}, as in the rounds of {path}")
     if other := kept.difference(wanted):
@@ -301,18 +303,18 @@ def analyse(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
     from memmlp.cli.table import rounds_path
     from memmlp.common.files import write_json
     from memmlp.common.lease import Lock
-    from memmlp.report.tables.build_table import finished_runs, run_finder
+    from memmlp.report.tables.build_table import find_finished_runs, make_run_finder
     from memmlp.report.tables.measured_run import load
-    from memmlp.report.tables.seed_rounds import Rounds, advance, digest_of_runs
+    from memmlp.report.tables.seed_rounds import Rounds, advance, digest_runs
 
     path = rounds_path(sweep, outputs)
     with Lock(path.parent).hold():
         kept = Rounds.read(path)
         if kept is not None and len(kept.analyses) > len(rounds.analyses):
             return kept
-        runs: dict[str, RunsBySeed] = finished_runs(rounds.spent(sweep), run_finder(plan, load))
+        runs: dict[str, RunsBySeed] = find_finished_runs(rounds.spent(sweep), make_run_finder(plan, load))
         digests = {
-            label: digest_of_runs(rounds, sweep, plan, label, rounds.schedule[number])
+            label: digest_runs(rounds, sweep, plan, label, rounds.schedule[number])
             for label, number in rounds.upcoming(sweep).items()
         }
         after = advance(rounds, sweep, runs, digests)
@@ -323,9 +325,9 @@ def analyse(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
 def describe_progress(rounds: Rounds, sweep: Sweep, last: Analysis | None = None) -> list[str]:
     """Describe each variant's progress: its verdicts, its seeds so far, and its next interim analysis."""
     from memmlp.cli.table import aligned
-    from memmlp.report.tables.seed_rounds import progress
+    from memmlp.report.tables.seed_rounds import list_progress
 
-    variants = progress(rounds, sweep)
+    variants = list_progress(rounds, sweep)
     decided = sum(variant.decided for variant in variants)
     head = f"analysis at {last.seeds} seeds ({100 * last.level:.2g} %): " if last else ""
     rows = [("variant", "decided", "inconclusive", "seeds", "next")]

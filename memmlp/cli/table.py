@@ -102,7 +102,7 @@ def table(
         found = gather(name, overrides, outputs, SHOWN_MODES[mode], functools.cache(load), selection)
     finally:
         gc.enable()
-    tables = [functools.reduce(rows_measured_in_browsers.with_rows, measured, one.table) for one in found]
+    tables = [functools.reduce(rows_measured_in_browsers.add_rows, measured, one.table) for one in found]
     if form is None and out is None:
         print_tables(tables)
         return
@@ -165,7 +165,7 @@ def gather(
         InputError: if none of them can be composed with the command line's overrides, or has that selection.
     """
     from memmlp.common.progress import progress_bar
-    from memmlp.report.tables.build_table import without_runs
+    from memmlp.report.tables.build_table import make_empty_table
 
     found, failures = [], []
     sweeps = find_sweeps(name, overrides)
@@ -180,7 +180,7 @@ def gather(
             found.append(table_of_plan(known, modes, command, read, selection))
         except InputError as error:
             failures.append(error)
-            table = without_runs(sweep, modes, f"nothing measured: {error}")
+            table = make_empty_table(sweep, modes, f"nothing measured: {error}")
             found.append(SweepTable(sweep, {variant.label: {} for variant in sweep.runnable()}, table))
     asked = overrides or selection.source or selection.together or found[0].sweep.table is None
     if failures and asked and len(failures) == len(found):
@@ -197,27 +197,27 @@ def table_of_plan(
 ) -> SweepTable:
     """Return a planned sweep's finished runs, and the table of a part of their results."""
     from memmlp.report.tables.build_table import (
-        finished_runs,
+        find_finished_runs,
+        make_run_finder,
+        make_state_finder,
         make_table,
-        restrict,
-        run_finder,
-        state_finder,
+        restrict_clips,
     )
 
     sweep, plan, rounds, flags = shown
     for option, given in (("source", selection.source), ("together", " ".join(selection.together))):
         if given and rounds:
             raise InputError(f"--{option} {given}: does not go with rounds of seeds (--until-decided)")
-    runs = finished_runs(sweep, run_finder(plan, read))
+    runs = find_finished_runs(sweep, make_run_finder(plan, read))
     if selection.untrained:
         from memmlp.config.untrained_costs import with_costs
 
         runs, measured = with_costs(sweep, runs)
         flags = (*flags, *measured)
-    sweep, runs, restricted = restrict(sweep, runs, selection.source, selection.together)
+    sweep, runs, restricted = restrict_clips(sweep, runs, selection.source, selection.together)
     flags = (*restricted, *flags)
     command = f"{command} --until-decided" if rounds else command
-    table = make_table(sweep, runs, modes, command, state_finder(plan), rounds)
+    table = make_table(sweep, runs, modes, command, make_state_finder(plan), rounds)
     return SweepTable(sweep, runs, replace(table, flags=(*table.flags, *flags)))
 
 
@@ -327,9 +327,9 @@ def flag_of_other_rounds(kept: Rounds, sweep: Sweep, seeds_given: bool = False) 
 
     `seeds_given` says that the sweep's seeds were given on the command line.
     """
-    from memmlp.report.tables.seed_rounds import new_rounds
+    from memmlp.report.tables.seed_rounds import start_rounds
 
-    other = "seeds" if seeds_given else kept.difference(new_rounds(sweep, len(kept.seeds)))
+    other = "seeds" if seeds_given else kept.difference(start_rounds(sweep, len(kept.seeds)))
     if other is None:
         return None
     return f"seeds were spent in rounds with other {other}: these verdicts do not keep the 5 %"

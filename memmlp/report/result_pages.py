@@ -14,15 +14,15 @@ from memmlp.report.tables.table import Cell, Row, Table
 from memmlp.report.tables.table_text import (
     MINUS,
     MISSING,
-    caption,
-    decimals,
-    effect_words,
-    escaped,
-    markdown,
-    number_words,
-    unit,
-    value_words,
-    with_unit,
+    add_unit,
+    count_decimals,
+    escape_markdown,
+    find_unit,
+    format_effect,
+    format_number,
+    format_value,
+    make_caption,
+    to_markdown,
 )
 
 MARK = "<!-- made by: memmlp results docs -->"
@@ -61,7 +61,7 @@ def make_pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -
     """
     pages = {}
     for name, source in sorted(sources.items()):
-        tables = "\n".join(map(markdown, (source.table, *source.by_source)))
+        tables = "\n".join(map(to_markdown, (source.table, *source.by_source)))
         pages[f"{name}.md"] = f"{MARK}\n\n{tables}\n{describe_origin(source.kept)}\n"
     for name in sorted(pages.keys() & templates.keys()):
         raise InputError(f"{name}: a template and a table's page have the same name; rename one of them")
@@ -91,12 +91,13 @@ def describe_origin(kept: Kept) -> str:
         values = {one for run in kept.every for one in str(getattr(run.origin, attribute)).split(", ")}
         *others, last = sorted(values - {UNKNOWN}) or [""]
         if last:
-            parts.append(f"{what} {escaped(' and '.join(filter(None, [', '.join(others), last])))}")
-    parts += sorted({escaped(run.origin.partial) for run in kept.every if run.origin.partial})
+            parts.append(f"{what} {escape_markdown(' and '.join(filter(None, [', '.join(others), last])))}")
+    parts += sorted({escape_markdown(run.origin.partial) for run in kept.every if run.origin.partial})
     versions = sorted({item for run in kept.every for item in run.origin.every_version.items()})
     if versions:
         parts.append(
-            f"component versions {', '.join(f'{escaped(name)} {number}' for name, number in versions)}"
+            "component versions "
+            + ", ".join(f"{escape_markdown(name)} {number}" for name, number in versions)
         )
     command = kept.command
     if not counts["run"]:
@@ -121,7 +122,7 @@ class Placeholders:
 
     def title(self, name: str) -> str:
         """Return a table's title."""
-        return escaped(caption(self._table(name)))
+        return escape_markdown(make_caption(self._table(name)))
 
     def origin(self, name: str) -> str:
         """Return where a table's runs come from, and which command makes them again."""
@@ -130,7 +131,7 @@ class Placeholders:
 
     def effect(self, name: str, variant: str, mode: str, metric: str) -> str:
         """Return a measured difference with its interval and verdict: `+1.17 [0.40, 2.23], holds`."""
-        words = effect_words(self._cell(name, variant, mode, metric), metric)
+        words = format_effect(self._cell(name, variant, mode, metric), metric)
         number = " ".join(word.replace("*", "") for word in words[:2])
         return f"{number}, {self.verdict(name, variant, mode, metric)}"
 
@@ -141,13 +142,13 @@ class Placeholders:
 
     def value(self, name: str, variant: str, mode: str, metric: str) -> str:
         """Return a variant's mean and standard deviation over seeds."""
-        return value_words(self._cell(name, variant, mode, metric), metric)
+        return format_value(self._cell(name, variant, mode, metric), metric)
 
     def detectable(self, name: str, mode: str, metric: str, variant: str) -> str:
         """Return the smallest difference of a variant that is detectable with 80 % power."""
         effect = self._cell(name, variant, mode, metric).effect
         least = effect.detectable if effect else None
-        return "unknown" if least is None else f"{number_words(least)} {unit(metric)}".rstrip()
+        return "unknown" if least is None else f"{format_number(least)} {find_unit(metric)}".rstrip()
 
     def summary(self, name: str, mode: str = "stream") -> str:
         """Return a table with a line for each variant: measured and the paper's differences, and verdicts.
@@ -167,7 +168,7 @@ class Placeholders:
             [row.label, *(_describe_cost(cells[metric], metric) for metric in table.metrics)]
             for row, cells in zip(shown, costs, strict=True)
         ]
-        return _markdown(["variant", *map(with_unit, table.metrics)], rows)
+        return _markdown(["variant", *map(add_unit, table.metrics)], rows)
 
     def _compare(self, name: str, row: Row, mode: str, metric: str) -> str:
         printed = row.cells[mode][metric].paper_effect
@@ -260,21 +261,22 @@ class Placeholders:
 def _markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a table; cells are escaped, unless they are links."""
     cells = [
-        [cell if cell and cell.endswith(".md)") else escaped(cell or "") for cell in row] for row in rows
+        [cell if cell and cell.endswith(".md)") else escape_markdown(cell or "") for cell in row]
+        for row in rows
     ]
-    lines = [list(map(escaped, heads)), ["---"] * len(heads), *cells]
+    lines = [list(map(escape_markdown, heads)), ["---"] * len(heads), *cells]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def _describe_cost(cell: Cell, metric: str) -> str:
-    return value_words(cell, metric) + ("" if cell.paper is None else f"; paper {cell.paper:.2f}")
+    return format_value(cell, metric) + ("" if cell.paper is None else f"; paper {cell.paper:.2f}")
 
 
 def _share(step: Cell, total: Cell, metric: str) -> str:
     """Return a step's difference, its share of the chain's total, and its verdict."""
     if step.effect is None:
         return MISSING
-    words = [effect_words(step, metric)[0].replace("*", "")]
+    words = [format_effect(step, metric)[0].replace("*", "")]
     if total.effect is not None and (total.effect.low or 0) * (total.effect.high or 0) > 0:
         words.append(f"{round(100 * step.effect.mean / -total.effect.mean)} %".replace("-", MINUS))
     return ", ".join([*words, str(step.effect.verdict or "no verdict")])
@@ -286,7 +288,7 @@ def _reverse(cell: Cell) -> str:
         return MISSING
     verdict = REVERSED.get(cell.effect.verdict, cell.effect.verdict) if cell.effect.verdict else "no verdict"
     printed = "" if cell.paper_effect is None else f"; paper {-cell.paper_effect:+.2f}"
-    digits = 2 if cell.mean is None else decimals(cell.mean)
+    digits = 2 if cell.mean is None else count_decimals(cell.mean)
     return f"{-cell.effect.mean:+.{digits}f}, {verdict}{printed}".replace("-", MINUS)
 
 

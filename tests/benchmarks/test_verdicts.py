@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from benchmarks.verdicts import SHARES, Shares, Simulated, SimulationSetting, broken, draw, grid, simulate
 
-from memmlp.report.tables.statistics import error
+from memmlp.report.tables.statistics import estimate_error
 
 
 @pytest.mark.parametrize("cell", [SimulationSetting(5, 10, 1), SimulationSetting(5, 11, 2)])
@@ -22,7 +22,7 @@ def test_mixed_effects_equal_simulated_differences(cell: SimulationSetting):
     differences = by_group[:, :, cell.groups]
     for seeds in (3, 5):
         known, mean = sample.mixed(shares, seeds)
-        expected = error(differences[:, :seeds], cell.groups)
+        expected = estimate_error(differences[:, :seeds], cell.groups)
         np.testing.assert_allclose(known.variances, expected.variances)
         assert (known.seeds, known.groups) == (expected.seeds, expected.groups)
         np.testing.assert_allclose(mean, differences[:, :seeds].mean((1, 2)))

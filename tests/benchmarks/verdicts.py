@@ -18,11 +18,11 @@ from memmlp.common.progress import progress_bar
 from memmlp.report.tables.statistics import (
     LEVEL,
     Error,
-    analysis_schedule,
-    by_group,
-    holm,
-    sequential,
-    spending,
+    average_groups,
+    correct_by_holm,
+    correct_sequentially,
+    divide_level,
+    make_schedule,
 )
 
 
@@ -102,7 +102,7 @@ class Simulated:
         self.means = fixed @ self.weights  # (K, 3)
         variances = noise.var(2, ddof=1)
         self.interim = {
-            n: self._sample(fixed, noise[:, :n], variances[:, :n]) for n in analysis_schedule(cell.seeds)
+            n: self._sample(fixed, noise[:, :n], variances[:, :n]) for n in make_schedule(cell.seeds)
         }
 
     def _sample(self, fixed: np.ndarray, noise: np.ndarray, variances: np.ndarray) -> InterimSample:
@@ -141,11 +141,11 @@ def draw(rng: np.random.Generator, cell: SimulationSetting, comparisons: int) ->
     by_clip = np.sqrt(clips) * np.stack(
         [rng.normal(size=(comparisons, clips)), rng.exponential(size=(comparisons, clips)) - 1], 1
     )
-    by_clip, weights = by_group(by_clip, cell.groups)
+    by_clip, weights = average_groups(by_clip, cell.groups)
     of_groups = rng.normal(size=(comparisons, 1, len(weights))) / np.sqrt(weights @ weights)
     noise = np.sqrt(seeds * clips) * rng.normal(size=(comparisons, seeds, clips))
     if cell.size > 1:
-        noise, _ = by_group(noise, cell.groups)
+        noise, _ = average_groups(noise, cell.groups)
     return np.concatenate([of_groups, by_clip], 1), noise, weights
 
 
@@ -193,7 +193,7 @@ def count(sample: Simulated, shares: Shares) -> SimulatedOutcomes:
 
 def levels(sample: Simulated) -> Iterator[tuple[int, float]]:
     """Return the number of seeds of each interim analysis, and the level that it may spend."""
-    return zip(sample.interim, spending(len(sample.interim)), strict=True)
+    return zip(sample.interim, divide_level(len(sample.interim)), strict=True)
 
 
 def _any(claims: np.ndarray) -> np.ndarray:
@@ -244,7 +244,9 @@ def campaign(sample: Simulated, shares: Shares) -> Campaign:
         now_same = _claimed(q, same, differ, level)
         differ = _claimed(p, differ, now_same, level)
         same = now_same
-    at_once = np.array([(holm(x) <= LEVEL) | (holm(y) <= LEVEL) for x, y in zip(p, q, strict=True)])
+    at_once = np.array(
+        [(correct_by_holm(x) <= LEVEL) | (correct_by_holm(y) <= LEVEL) for x, y in zip(p, q, strict=True)]
+    )
     false = (differ & (truth == 0) | same & (truth > 0)).any(1)
     return Campaign(seeds, differ | same, at_once, false)
 
@@ -259,7 +261,7 @@ def _claimed(p: np.ndarray, before: np.ndarray, closed: np.ndarray, level: float
         level: the level that this analysis may spend.
     """
     rows = zip(p, before, closed & ~before, strict=True)
-    return np.array([sequential(*row) <= level for row in rows])
+    return np.array([correct_sequentially(*row) <= level for row in rows])
 
 
 def simulate(cell: SimulationSetting, tables: int, seed: int) -> dict[str, Any]:

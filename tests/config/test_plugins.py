@@ -25,7 +25,7 @@ from memmlp.config.compose import composed
 from memmlp.config.compose_plan import find_sweep
 from memmlp.config.plugins import DEFAULT_GROUPING, grouping_to_choose
 from memmlp.config.schema import restored
-from memmlp.report.tables.table_text import heading
+from memmlp.report.tables.table_text import make_heading
 from memmlp.runs import environment
 from memmlp.runs.environment import user_packages
 from memmlp.runs.identity import evaluation_id, evaluation_settings
@@ -129,12 +129,12 @@ def test_a_loss_has_the_term_with_its_weight(on_path: Path):
 
 
 def test_metrics_of_ones_own_are_those_of_sweeps_and_searches(on_path: Path):
-    assert heading("FootSkate") == "FootSkate"  # nobody knows here what is better
+    assert make_heading("FootSkate") == "FootSkate"  # nobody knows here what is better
     sweep = find_sweep(str(EXAMPLE / "feet.yaml"), ["profile=tiny"])
     assert (sweep.metrics, sweep.smallest["FootSkate"]) == (("MPJPE", "FootSkate"), 0.5)
-    assert heading("FootSkate") == "FootSkate [cm/s] ↓"
+    assert make_heading("FootSkate") == "FootSkate [cm/s] ↓"
     plugins.HIGHER.add("FootSkate")
-    assert heading("FootSkate") == "FootSkate [cm/s] ↑"
+    assert make_heading("FootSkate") == "FootSkate [cm/s] ↑"
     content = yaml.safe_load((Path(__file__).parents[2] / "conf/search/loss_weights.yaml").read_text())
     with pytest.raises(InputError, match=r"FootSkate is better if higher"):
         parse_search({"storage": None, **content, "objectives": ["FootSkate"]})

@@ -18,8 +18,8 @@ from memmlp.cli.results import make_tables
 from memmlp.common.errors import InputError
 from memmlp.report.kept_results import Kept, list_overrides
 from memmlp.report.result_pages import KeptTable, Placeholders, make_pages
-from memmlp.report.tables.build_table import make_table, together
-from memmlp.report.tables.statistics import Verdict, error
+from memmlp.report.tables.build_table import group_clips, make_table
+from memmlp.report.tables.statistics import Verdict, estimate_error
 from memmlp.report.tables.table_text import MINUS
 from memmlp.sweep.definition import Sweep
 
@@ -72,7 +72,7 @@ def test_significant_differences_are_counted_with_coarser_groups_too(sweep: Swee
 
     def coarser(patterns: Sequence[str]):
         assert patterns == ("a", "b")
-        return make_table(sweep, together(kept.runs_of(sweep), ["."])[0])
+        return make_table(sweep, group_clips(kept.runs_of(sweep), ["."])[0])
 
     made = made._replace(regroup=coarser)
     words = '{{ decided("t") }}, {{ decided("t", "a", "b") }}'
@@ -166,7 +166,7 @@ def by_hand(
         errors = [run["errors"][mode][branches[label]][metric] for run in runs]
         sides.append(np.array(errors)[:, places])
     differences = (sides[0] - sides[1])[None]
-    half = error(differences, np.array(list(groups.values()))).half(0.05)[0]
+    half = estimate_error(differences, np.array(list(groups.values()))).half(0.05)[0]
     return float(differences.mean() - half), float(differences.mean() + half)
 
 

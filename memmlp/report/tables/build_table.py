@@ -15,13 +15,13 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
 from memmlp.report.tables.effects import (
     RunsBySeed,
-    control_variant,
-    effects,
-    paper_effect,
-    with_existing_branches,
+    compute_effects,
+    find_control,
+    find_paper_effect,
+    use_existing_branches,
 )
-from memmlp.report.tables.flags import DescribeRun, early_tables, find_flags, no_description
-from memmlp.report.tables.measured_run import Measured, measured_for
+from memmlp.report.tables.flags import DescribeRun, describe_nothing, find_flags, flag_early_tables
+from memmlp.report.tables.measured_run import Measured, select_measured
 from memmlp.report.tables.table import Cell, Effect, Key, Row, Table
 from memmlp.report.tables.table_text import FORMATS
 from memmlp.sweep.definition import COSTS, MODES, Sweep, Variant
@@ -34,7 +34,7 @@ Find = Callable[[Variant, int], Measured | None]
 Read = Callable[[Path, tuple[str, ...]], Measured]
 
 
-def run_finder(plan: Plan, read: Read) -> Find:
+def make_run_finder(plan: Plan, read: Read) -> Find:
     """Return a function that finds the results of the plan's finished run for a variant and a seed."""
     entries = {(entry.label, entry.seed): entry for entry in plan.entries}
 
@@ -46,7 +46,7 @@ def run_finder(plan: Plan, read: Read) -> Find:
     return find
 
 
-def state_finder(plan: Plan) -> DescribeRun:
+def make_state_finder(plan: Plan) -> DescribeRun:
     """Return a function that describes the state of an unfinished run of the plan, once it has started."""
     entries = {(entry.label, entry.seed): entry for entry in plan.entries}
 
@@ -63,7 +63,7 @@ def state_finder(plan: Plan) -> DescribeRun:
     return describe
 
 
-def finished_runs(sweep: Sweep, find: Find) -> dict[str, RunsBySeed]:
+def find_finished_runs(sweep: Sweep, find: Find) -> dict[str, RunsBySeed]:
     """Return the finished runs of each runnable variant, by seed."""
     return {
         variant.label: {
@@ -78,14 +78,14 @@ def make_table(
     runs: Mapping[str, RunsBySeed],
     modes: Sequence[str] = MODES,
     command: str | None = None,
-    state: DescribeRun = no_description,
+    state: DescribeRun = describe_nothing,
     rounds: Rounds | None = None,
 ) -> Table:
     """Make the table of a sweep.
 
     Args:
         sweep: the sweep; if seeds were spent in rounds, `rounds.spent(sweep)`.
-        runs: the finished runs of every runnable variant, by seed (`finished_runs`).
+        runs: the finished runs of every runnable variant, by seed (`find_finished_runs`).
         modes: the modes of evaluation to show ("stream", "window"); a mode that no run has is left out, if
             runs have another one.
         command: the command that makes missing runs; `memmlp sweep` with the sweep's name by default.
@@ -96,9 +96,9 @@ def make_table(
     evaluated = {mode for found in runs.values() for run in found.values() for mode in run.means}
     existing = tuple(mode for mode in modes if mode in evaluated) or tuple(modes)
     shown_modes = existing if has_errors else tuple(modes)[:1]
-    shown = with_existing_branches(sweep, runs)
+    shown = use_existing_branches(sweep, runs)
     # The correction is over both modes, whichever of them are shown.
-    found = effects(shown, runs, MODES if has_errors else shown_modes)
+    found = compute_effects(shown, runs, MODES if has_errors else shown_modes)
     comparisons = sum(effect.p is not None for effect in found.values())
     if rounds:
         found, comparisons = rounds.apply_verdicts(found), len(rounds.comparisons(sweep))
@@ -115,7 +115,7 @@ def make_table(
         comparisons=comparisons,
         rows=tuple(_row(shown, one, runs.get(one.label), shown_modes, found) for one in shown.variants),
         notes=(*sweep.notes, *(f"{one.label}: {one.note}" for one in sweep.variants if one.note)),
-        flags=(*flags, *(() if rounds else early_tables(shown, runs))),
+        flags=(*flags, *(() if rounds else flag_early_tables(shown, runs))),
         analyses=tuple((one.seeds, one.level) for one in rounds.analyses) if rounds else (),
     )
 
@@ -125,13 +125,15 @@ def _row(
 ) -> Row:
 
     def cell(mode: str, metric: str) -> Cell:
-        counted = measured_for(metric, runs or {})
+        counted = select_measured(metric, runs or {})
         numbers = {seed: run.value(mode, variant.branch, metric) for seed, run in counted.items()}
         values = {seed: value for seed, value in numbers.items() if value is not None}
         effect = found.get(Key(variant.label, mode, metric))
-        return Cell(values, (variant.paper or {}).get(metric), effect, paper_effect(sweep, variant, metric))
+        return Cell(
+            values, (variant.paper or {}).get(metric), effect, find_paper_effect(sweep, variant, metric)
+        )
 
-    control = control_variant(sweep, variant)
+    control = find_control(sweep, variant)
     pairing = ""
     if control and variant.cell and control.cell == variant.cell:
         pairing = f"'{variant.series}' from '{control.series}' in the same cell"
@@ -147,13 +149,13 @@ def _row(
     )
 
 
-def without_runs(sweep: Sweep, modes: Sequence[str], reason: str) -> Table:
+def make_empty_table(sweep: Sweep, modes: Sequence[str], reason: str) -> Table:
     """Make the table of a sweep whose runs can't be identified: the paper's values, and the reason."""
     runs: dict[str, RunsBySeed] = {variant.label: {} for variant in sweep.runnable()}
     return replace(make_table(sweep, runs, modes), flags=(reason,))
 
 
-def on_source(
+def restrict_to_source(
     sweep: Sweep, runs: Mapping[str, RunsBySeed], source: str
 ) -> tuple[Sweep, dict[str, RunsBySeed], tuple[str, ...]]:
     """Restrict a sweep and its finished runs to one source's test clips.
@@ -193,18 +195,18 @@ def on_source(
     return replace(sweep, variants=tuple(variants), control=control, title=title), left, flags
 
 
-def restrict(
+def restrict_clips(
     sweep: Sweep, runs: Mapping[str, RunsBySeed], source: str | None, patterns: Sequence[str]
 ) -> tuple[Sweep, dict[str, RunsBySeed], tuple[str, ...]]:
-    """Restrict a sweep and its runs to a source (`on_source`), and put clips `together`, where given."""
+    """Restrict a sweep and its runs to a source, and group clips by patterns, if these are given."""
     flags: tuple[str, ...] = ()
     if source:
-        sweep, runs, flags = on_source(sweep, runs, source)
-    grouped, tied = together(runs, patterns)
+        sweep, runs, flags = restrict_to_source(sweep, runs, source)
+    grouped, tied = group_clips(runs, patterns)
     return sweep, grouped, (*flags, *tied)
 
 
-def together(
+def group_clips(
     runs: Mapping[str, RunsBySeed], patterns: Sequence[str]
 ) -> tuple[dict[str, RunsBySeed], tuple[str, ...]]:
     """Put test clips whose names match a pattern alike into one group, beside the groups of the data.

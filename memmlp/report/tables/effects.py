@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from memmlp.report.tables.measured_run import SHARED, Measured, measured_for
+from memmlp.report.tables.measured_run import SHARED, Measured, select_measured
 from memmlp.report.tables.statistics import (
-    detectable,
-    equivalence_p,
-    holm,
-    paired_effects,
-    verdict,
+    compute_detectable,
+    compute_equivalence_p,
+    correct_by_holm,
+    decide,
+    estimate_paired_effects,
 )
 from memmlp.report.tables.table import STEADY, Effect, Key
 from memmlp.sweep.definition import COSTS, TIMES, Sweep, Variant
@@ -48,39 +48,39 @@ class Paired(NamedTuple):
         return len(self.matrix) > 1 and len(set(self.groups)) > 1 and not self.diverged
 
 
-def control_variant(sweep: Sweep, variant: Variant) -> Variant | None:
+def find_control(sweep: Sweep, variant: Variant) -> Variant | None:
     """Return a variant's control; None for the sweep's control and for rows with only the paper's values."""
     label = sweep.control_of(variant) if variant.overrides is not None else None
     return next((other for other in sweep.variants if other.label == label), None)
 
 
-def compared(sweep: Sweep) -> Iterator[tuple[Variant, Variant]]:
+def list_comparisons(sweep: Sweep) -> Iterator[tuple[Variant, Variant]]:
     """Yield each variant that has a control, with its control."""
     for variant in sweep.runnable():
-        other = control_variant(sweep, variant)
+        other = find_control(sweep, variant)
         if other is not None:
             yield variant, other
 
 
-def paper_effect(sweep: Sweep, variant: Variant, metric: str) -> float | None:
+def find_paper_effect(sweep: Sweep, variant: Variant, metric: str) -> float | None:
     """Return the paper's difference from the control, from printed values; None if one is not printed."""
-    other = control_variant(sweep, variant)
+    other = find_control(sweep, variant)
     ours = (variant.paper or {}).get(metric)
     theirs = (other.paper or {}).get(metric) if other else None
     return None if ours is None or theirs is None else round(ours - theirs, 6)
 
 
-def paired(
+def pair_differences(
     sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str], labels: Container[str] | None = None
 ) -> dict[Key, Paired]:
     """Return the differences in all error metrics for all variants, or for those with the given labels."""
     found = {}
-    for variant, other in compared(sweep):
+    for variant, other in list_comparisons(sweep):
         ours, theirs = runs[variant.label], runs[other.label]
         seeds = [seed for seed in ours if seed in theirs]
         if (labels is not None and variant.label not in labels) or not seeds:
             continue
-        if one_and_the_same(variant, other, ours, theirs):
+        if show_same_errors(variant, other, ours, theirs):
             continue
         sides = [[side[seed] for seed in seeds] for side in (ours, theirs)]
         every = [*sides[0], *sides[1]]
@@ -96,21 +96,23 @@ def paired(
     return {key: pair for key, pair in found.items() if pair.matrix.size}
 
 
-def effects(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -> dict[Key, Effect]:
+def compute_effects(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -> dict[Key, Effect]:
     """Return the effects of all variants, with p-values corrected over all of them.
 
     For costs there are only the differences, without p-values.
     """
     printed = {
-        Key(variant.label, mode, metric): paper_effect(sweep, variant, metric)
+        Key(variant.label, mode, metric): find_paper_effect(sweep, variant, metric)
         for variant, mode, metric in itertools.product(sweep.runnable(), modes, sweep.metrics)
     }
     return _costs(sweep, runs, modes) | _judged(
-        tested(paired(sweep, runs, modes), sweep.smallest, sensitivity=True), sweep.smallest, printed
+        estimate_effects(pair_differences(sweep, runs, modes), sweep.smallest, sensitivity=True),
+        sweep.smallest,
+        printed,
     )
 
 
-def one_and_the_same(variant: Variant, other: Variant, ours: RunsBySeed, theirs: RunsBySeed) -> bool:
+def show_same_errors(variant: Variant, other: Variant, ours: RunsBySeed, theirs: RunsBySeed) -> bool:
     """Return whether two variants show the same errors of the same run, so that there is nothing to compare.
 
     One run may have several kinds of errors, such as those after two kinds of inverse kinematics.
@@ -171,7 +173,7 @@ def _diverged(values: np.ndarray, positions: np.ndarray) -> bool:
     return bool((lost & ~known.all((0, 1))).any())
 
 
-def tested(
+def estimate_effects(
     pairs: Mapping[Key, Paired], smallest: Mapping[str, float], sensitivity: bool
 ) -> dict[Key, Effect]:
     """Return the effects with their own p-values, not corrected yet, in the order of the pairs.
@@ -183,7 +185,7 @@ def tested(
             rest.
     """
     found: dict[Key, Effect] = {}
-    comparisons = max(1, testable(pairs))  # with none, nothing computed by it is shown
+    comparisons = max(1, count_testable(pairs))  # with none, nothing computed by it is shown
     # Those of equal seeds and groups are computed at once.
     batches: dict[tuple[int, bytes], list[Key]] = defaultdict(list)
     for key, pair in pairs.items():
@@ -192,10 +194,10 @@ def tested(
         differences, groups = np.stack([pairs[key].matrix for key in keys]), pairs[keys[0]].groups
         size = {"seeds": differences.shape[1], "clips": differences.shape[2], "groups": len(set(groups))}
         margins = np.array([smallest.get(key.metric, np.nan) for key in keys])
-        same = equivalence_p(differences, margins, groups)
+        same = compute_equivalence_p(differences, margins, groups)
         nothing = np.full(len(keys), np.nan)
-        seen = detectable(differences, comparisons, groups) if sensitivity else nothing
-        numbers = paired_effects(differences, groups)
+        seen = compute_detectable(differences, comparisons, groups) if sensitivity else nothing
+        numbers = estimate_paired_effects(differences, groups)
         columns = zip(keys, numbers.mean, numbers.low, numbers.high, numbers.p, same, seen, strict=True)
         for key, mean, low, high, p, equal, least in columns:
             values = {"low": low, "high": high}
@@ -205,7 +207,7 @@ def tested(
     return {key: found[key] for key in pairs}
 
 
-def testable(pairs: Mapping[Key, Paired]) -> int:
+def count_testable(pairs: Mapping[Key, Paired]) -> int:
     """Return how many comparisons have a p-value, so that Holm's correction is over them."""
     return sum(pair.testable for pair in pairs.values())
 
@@ -219,11 +221,11 @@ def _judged(
     separate family.
     """
     keys = list(tested)
-    different = holm(np.array([or_nan(tested[key].p) for key in keys]))
-    equal = holm(np.array([or_nan(tested[key].equal) for key in keys]))
+    different = correct_by_holm(np.array([or_nan(tested[key].p) for key in keys]))
+    equal = correct_by_holm(np.array([or_nan(tested[key].equal) for key in keys]))
     judged = {}
     for key, p, q in zip(keys, different, equal, strict=True):
-        said = verdict(float(p), float(q), tested[key].mean, printed.get(key))
+        said = decide(float(p), float(q), tested[key].mean, printed.get(key))
         judged[key] = replace(tested[key], holm=or_none(p), equal=or_none(q), verdict=said)
     return judged
 
@@ -235,18 +237,18 @@ def _costs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -
     """
 
     found = {}
-    for variant, other in compared(sweep):
+    for variant, other in list_comparisons(sweep):
         for mode, metric in itertools.product(modes, set(sweep.metrics) & set(COSTS)):
-            sides = [mean_cost(runs[one.label], metric) for one in (variant, other)]
+            sides = [compute_mean_cost(runs[one.label], metric) for one in (variant, other)]
             if not any(math.isnan(side) for side in sides):
                 noise = metric in TIMES and max(sides) < STEADY * min(sides)
                 found[Key(variant.label, mode, metric)] = Effect(sides[0] - sides[1], within_noise=noise)
     return found
 
 
-def mean_cost(runs: RunsBySeed, metric: str) -> float:
+def compute_mean_cost(runs: RunsBySeed, metric: str) -> float:
     """Return a cost's mean over the runs that count for it; NaN if none has it."""
-    costs = [run.costs[metric] for run in measured_for(metric, runs).values() if metric in run.costs]
+    costs = [run.costs[metric] for run in select_measured(metric, runs).values() if metric in run.costs]
     return statistics.mean(costs) if costs else math.nan  # the mean of equal costs is exactly their value
 
 
@@ -260,7 +262,7 @@ def or_nan(number: float | None) -> float:
     return math.nan if number is None else number
 
 
-def with_existing_branches(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Sweep:
+def use_existing_branches(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Sweep:
     """Return the sweep with the rotation branch for variants whose networks have no other.
 
     A network without a position branch may still have been evaluated after inverse kinematics.

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from memmlp.common.processes import MIN_CORE_SHARE
-from memmlp.report.tables.effects import RunsBySeed, compared, one_and_the_same
-from memmlp.report.tables.measured_run import SHARED, UNKNOWN, Measured, core_share, undisturbed
+from memmlp.report.tables.effects import RunsBySeed, list_comparisons, show_same_errors
+from memmlp.report.tables.measured_run import SHARED, UNKNOWN, Measured, find_core_share, select_undisturbed
 from memmlp.report.tables.table import STEADY
 from memmlp.runs.environment import changed, code_digests
 from memmlp.runs.lookup import hardly_trained
@@ -33,7 +33,7 @@ ORIGIN = {
 }  # fmt: skip
 
 
-def no_description(variant: Variant, seed: int) -> None:
+def describe_nothing(variant: Variant, seed: int) -> None:
     """Return None, as there is nothing to say about a run: the default for a `DescribeRun`."""
 
 
@@ -60,7 +60,7 @@ def find_flags(
     if has_errors:
         yield from _branches(sweep, asked, runs, command)
     if offline := [label for label, run in every if run.origin.offline]:
-        yield f"offline: uses future frames: {quoted(offline)}"
+        yield f"offline: uses future frames: {join_quoted(offline)}"
     yield from _same_runs(sweep, runs)
     yield from _unequal_clips(sweep, runs)
     yield from _unequal_groups(every)
@@ -74,11 +74,11 @@ def find_flags(
     for attribute, what in ORIGIN.items():
         unknown = "none" if attribute == "gpu" else UNKNOWN
         values = [(getattr(run.origin, attribute).replace(UNKNOWN, unknown), label) for label, run in every]
-        yield from differences(what, values)
-    yield from older_code((label, run.code, run.origin.plugins) for label, run in every)
+        yield from flag_differences(what, values)
+    yield from flag_older_code((label, run.code, run.origin.plugins) for label, run in every)
     if set(TIMES) & set(sweep.metrics):
         timed = [(run.origin.timed_on, label) for label, run in every if run.costs]
-        yield from differences("machine of the times", [one for one in timed if one[0] != UNKNOWN])
+        yield from flag_differences("machine of the times", [one for one in timed if one[0] != UNKNOWN])
         yield from _busy_machine(sweep, runs)
     if has_errors:
         yield from _hardly_trained(every)
@@ -87,31 +87,31 @@ def find_flags(
     yield from _data_warnings(every, "divided")
     yield from _unequal_versions(every)
     if uncommitted := [label for label, run in every if run.origin.changed]:
-        yield f"made by code with uncommitted changes: {quoted(uncommitted)}"
+        yield f"made by code with uncommitted changes: {join_quoted(uncommitted)}"
     if has_errors:
         yield from _replicates(sweep, runs)
         yield from _other_bodies_and_files(sweep, every)
 
 
-def early_tables(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
+def flag_early_tables(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
     """Flag variants whose planned seeds are only partly finished.
 
     Testing them now and again later inflates the false-positive rate.
     """
     several = [one for one in sweep.runnable() if len(runs[one.label]) > 1]
-    if early := [one.label for one in several if missing_seeds(sweep, one, runs)]:
+    if early := [one.label for one in several if find_missing_seeds(sweep, one, runs)]:
         yield (
             "seeds are missing: repeated tests as they come give false positives more often than 1 in 20 "
-            f"(--until-decided corrects for this): {quoted(early)}"
+            f"(--until-decided corrects for this): {join_quoted(early)}"
         )
 
 
-def missing_seeds(sweep: Sweep, variant: Variant, runs: Mapping[str, RunsBySeed]) -> list[int]:
+def find_missing_seeds(sweep: Sweep, variant: Variant, runs: Mapping[str, RunsBySeed]) -> list[int]:
     """Return the seeds of a variant for which there is no run."""
     return [seed for seed in sweep.seeds_of(variant) if seed not in runs[variant.label]]
 
 
-def older_code(runs: Iterable[tuple[str, Mapping[str, str], Iterable[str]]]) -> Iterator[str]:
+def flag_older_code(runs: Iterable[tuple[str, Mapping[str, str], Iterable[str]]]) -> Iterator[str]:
     """Flag runs that were made before code changed, though no component version was raised.
 
     Args:
@@ -122,12 +122,12 @@ def older_code(runs: Iterable[tuple[str, Mapping[str, str], Iterable[str]]]) -> 
     found = [(label, changed(code, current(tuple(packages)))) for label, code, packages in runs if code]
     names = sorted({name for _, files in found for name in files})
     if names:
-        labels = quoted(label for label, files in found if files)
+        labels = join_quoted(label for label, files in found if files)
         since = "has changed since these runs, under the same component versions"
-        yield f"code of {listed(names, FILES)} {since}: {labels}"
+        yield f"code of {join_some(names, FILES)} {since}: {labels}"
 
 
-def differences(what: str, found: Iterable[tuple[str, str]]) -> Iterator[str]:
+def flag_differences(what: str, found: Iterable[tuple[str, str]]) -> Iterator[str]:
     """Flag a property in which variants differ, and name the variants that have each value.
 
     `found` has pairs of a value and a variant's label.
@@ -136,21 +136,21 @@ def differences(what: str, found: Iterable[tuple[str, str]]) -> Iterator[str]:
     for value, label in found:
         groups[value].append(label)
     if len(groups) > 1:
-        parts = [f"{value} of {quoted(labels)}" for value, labels in groups.items()]
+        parts = [f"{value} of {join_quoted(labels)}" for value, labels in groups.items()]
         yield f"{what} differs: {'; '.join(parts)}"
 
 
-def unique(texts: Iterable[str]) -> list[str]:
+def drop_repeats(texts: Iterable[str]) -> list[str]:
     """Return texts without repetitions, in their order."""
     return list(dict.fromkeys(texts))
 
 
-def quoted(labels: Iterable[str]) -> str:
-    """Return labels in quotes, each once, joined with commas (`listed`)."""
-    return listed([f"'{label}'" for label in unique(labels)])
+def join_quoted(labels: Iterable[str]) -> str:
+    """Return labels in quotes, each once, joined with commas (`join_some`)."""
+    return join_some([f"'{label}'" for label in drop_repeats(labels)])
 
 
-def listed(texts: Sequence[str], most: int = 12) -> str:
+def join_some(texts: Sequence[str], most: int = 12) -> str:
     """Join texts with commas; of many texts, only the first ones and the number of the others."""
     return ", ".join(texts[:most]) + (f", and {len(texts) - most} more" if len(texts) > most else "")
 
@@ -175,13 +175,13 @@ def _missing_runs(
 ) -> Iterator[str]:
     lacking: dict[str, str] = {}
     for variant in sweep.runnable():
-        if seeds := missing_seeds(sweep, variant, runs):
-            states = unique(text for seed in seeds if (text := state(variant, seed)))
+        if seeds := find_missing_seeds(sweep, variant, runs):
+            states = drop_repeats(text for seed in seeds if (text := state(variant, seed)))
             described = f" ({', '.join(states)})" if states else ""
             lacking[variant.label] = f"seed {', '.join(map(str, seeds))}{described}"
     alike = 1 < len(sweep.runnable()) == len(lacking) and len(set(lacking.values())) == 1
     if lacking:
-        gaps = listed([f"'{label}' {gap}" for label, gap in lacking.items()])
+        gaps = join_some([f"'{label}' {gap}" for label, gap in lacking.items()])
         gaps = f"every variant's {next(iter(lacking.values()))}" if alike else gaps
         yield f"missing: {gaps}; fill with: {command}"
 
@@ -190,19 +190,25 @@ def _branches(sweep: Sweep, asked: Sweep, runs: Mapping[str, RunsBySeed], comman
     wanted = {variant.label: variant.branch for variant in asked.variants}
     other = [one for one in sweep.runnable() if one.branch != wanted[one.label]]
     if other:
-        labels, branches = quoted(one.label for one in other), listed(unique(one.branch for one in other))
+        labels, branches = (
+            join_quoted(one.label for one in other),
+            join_some(drop_repeats(one.branch for one in other)),
+        )
         yield f"the network has no other branch, so the row shows {branches}: {labels}"
     every = [(one, run) for one in sweep.runnable() for run in runs[one.label].values()]
     if lacking := [one for one, run in every if not run.has(one.branch)]:
-        branches, labels = listed(unique(a.branch for a in lacking)), quoted(a.label for a in lacking)
+        branches, labels = (
+            join_some(drop_repeats(a.branch for a in lacking)),
+            join_quoted(a.label for a in lacking),
+        )
         yield f"not evaluated in the branch {branches}: {labels}; do so with: {command}"
 
 
 def _same_runs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
     """Flag variants that are the same run, because nothing distinguishes them under these overrides."""
-    for variant, other in compared(sweep):
+    for variant, other in list_comparisons(sweep):
         ours, theirs = runs[variant.label], runs[other.label]
-        if one_and_the_same(variant, other, ours, theirs):
+        if show_same_errors(variant, other, ours, theirs):
             reason = "the difference between them has no effect here"
             if any(ours[seed].costs != theirs[seed].costs for seed in ours.keys() & theirs.keys()):
                 reason = "they differ in how it is deployed, and in nothing but costs"
@@ -210,7 +216,7 @@ def _same_runs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
 
 
 def _unequal_clips(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
-    for variant, other in compared(sweep):
+    for variant, other in list_comparisons(sweep):
         sides = [run.clips.keys() for one in (variant, other) for run in runs[one.label].values()]
         every: set[str] = set().union(*sides)
         shared = every.intersection(*sides)
@@ -227,7 +233,7 @@ def _unequal_groups(every: Labelled) -> Iterator[str]:
         for clip in run.clips:
             groups[clip].add(run.group(clip))
     if several := [clip for clip, names in groups.items() if len(names) > 1]:
-        yield f"runs differ in the groups of test clips (data.split.groups): {quoted(several)}"
+        yield f"runs differ in the groups of test clips (data.split.groups): {join_quoted(several)}"
 
 
 def _unmeasured_seeds(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
@@ -241,8 +247,10 @@ def _unmeasured_seeds(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[
             for seed in without if len(without) < len(found) else ():
                 lacking[variant.label, seed].append(metric)
     if lacking:
-        texts = [f"'{label}' seed {seed} ({listed(unique(m))})" for (label, seed), m in lacking.items()]
-        yield f"not measured, so the mean is of the other seeds: {listed(texts)}"
+        texts = [
+            f"'{label}' seed {seed} ({join_some(drop_repeats(m))})" for (label, seed), m in lacking.items()
+        ]
+        yield f"not measured, so the mean is of the other seeds: {join_some(texts)}"
 
 
 def _diverged_runs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
@@ -274,7 +282,8 @@ def _diverged_runs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str
                 lost[cell] |= clips - short
     found = [f"'{label}' seed {seed} ({len(clips)} clips)" for (label, seed), clips in lost.items() if clips]
     if found:
-        yield f"NaN errors on clips, left out of differences, so verdicts stay inconclusive: {listed(found)}"
+        cells = join_some(found)
+        yield f"NaN errors on clips, left out of differences, so verdicts stay inconclusive: {cells}"
 
 
 def _smoother_than_truth(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
@@ -294,16 +303,16 @@ def _smoother_than_truth(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterat
             if made and true and np.mean(made) < np.mean(true):
                 smoother[mode, f"{np.mean(true):.2f}"].append(f"'{variant.label}' {np.mean(made):.2f}")
     for (mode, truth), texts in smoother.items():
-        less = f"Jitter below the truth's {truth} ({mode}): {listed(texts)}"
+        less = f"Jitter below the truth's {truth} ({mode}): {join_some(texts)}"
         yield f"{less}; motion that is smoother than the truth is not better"
 
 
 def _hardly_trained(every: Labelled) -> Iterator[str]:
     found = [(label, hardly_trained(run.training.get("frames", 0.0))) for label, run in every]
-    for warning in unique(warning for _, warning in found if warning):
-        labels = unique(label for label, one in found if one == warning)
+    for warning in drop_repeats(warning for _, warning in found if warning):
+        labels = drop_repeats(label for label, one in found if one == warning)
         every_variant = len(labels) == len({label for label, _ in every})
-        yield f"{warning}: {'every variant' if every_variant else quoted(labels)}"
+        yield f"{warning}: {'every variant' if every_variant else join_quoted(labels)}"
 
 
 def _unequal_training(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
@@ -313,23 +322,25 @@ def _unequal_training(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[
     }
 
     def millions(label: str) -> str:
-        return "-".join(unique(f"{number / 1e6:.3g}" for number in (frames[label][0], frames[label][-1])))
+        return "-".join(
+            drop_repeats(f"{number / 1e6:.3g}" for number in (frames[label][0], frames[label][-1]))
+        )
 
     unequal = []
-    for variant, other in compared(sweep):
+    for variant, other in list_comparisons(sweep):
         both = frames[variant.label] + frames[other.label]
         if frames[variant.label] and frames[other.label] and max(both) > ALIKE * min(both):
             ours, theirs = millions(variant.label), millions(other.label)
             unequal.append(f"'{variant.label}' {ours} M to '{other.label}' {theirs} M")
     if unequal:
-        yield f"number of frames seen in training differs: {listed(unequal)}"
+        yield f"number of frames seen in training differs: {join_some(unequal)}"
 
 
 def _busy_machine(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
     found, fewer = [], []
     for variant in sweep.runnable():
-        label, counted = variant.label, undisturbed(runs[variant.label])
-        shares = [share for run in counted.values() if (share := core_share(run)) is not None]
+        label, counted = variant.label, select_undisturbed(runs[variant.label])
+        shares = [share for run in counted.values() if (share := find_core_share(run)) is not None]
         ratios = [run.costs["ratio"] for run in counted.values() if "ratio" in run.costs]
         if shares and min(shares) < MIN_CORE_SHARE:
             found.append(describe_core_share(label, min(shares)))
@@ -338,14 +349,14 @@ def _busy_machine(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]
         if len(counted) < len(runs[label]):
             fewer.append(f"'{label}' ({len(counted)} of {len(runs[label])})")
     if found:
-        yield f"timed on a busy machine, so that other work is in the times: {listed(found)}"
+        yield f"timed on a busy machine, so that other work is in the times: {join_some(found)}"
     if fewer:
-        yield f"times are of the seeds that were timed with a core to themselves: {listed(fewer)}"
+        yield f"times are of the seeds that were timed with a core to themselves: {join_some(fewer)}"
 
 
 def _data_warnings(every: Labelled, field: str, ending: str = "") -> Iterator[str]:
-    for warning in unique(text for _, run in every if (text := getattr(run.origin, field))):
-        labels = quoted(label for label, run in every if getattr(run.origin, field) == warning)
+    for warning in drop_repeats(text for _, run in every if (text := getattr(run.origin, field))):
+        labels = join_quoted(label for label, run in every if getattr(run.origin, field) == warning)
         yield f"{warning}{ending}: {labels}"
 
 
@@ -353,25 +364,26 @@ def _unequal_versions(every: Labelled) -> Iterator[str]:
     versions = [(run.origin.every_version, label) for label, run in every]
     for name in sorted({name for known, _ in versions for name in known}):
         having = [(str(known[name]), label) for known, label in versions if name in known]
-        yield from differences(f"recipe of {name}", having)
+        yield from flag_differences(f"recipe of {name}", having)
     weights: dict[str, list[tuple[str, str]]] = defaultdict(list)
     for label, run in every:
         for prerequisite, digests in run.origin.prerequisite_weights.items():
             weights[prerequisite] += [(digest, label) for digest in digests.split(", ")]
     for prerequisite, having in weights.items():  # trained again, or on another machine
-        yield from differences(f"digest of the weights of prerequisite run {prerequisite}", having)
+        yield from flag_differences(f"digest of the weights of prerequisite run {prerequisite}", having)
     for name in sorted({name for _, run in every for name in run.origin.plugins}):
         having = [(run.origin.plugins[name], label) for label, run in every if name in run.origin.plugins]
-        yield from differences(f"code of {name}", having)
+        yield from flag_differences(f"code of {name}", having)
 
 
 def _other_bodies_and_files(sweep: Sweep, every: Labelled) -> Iterator[str]:
     bare = [label for label, run in every if run.origin.body == BUILT_IN]
     if sweep.table in SMPLH and bare:
-        yield f"on the built-in skeleton; the paper uses SMPL-H bodies (data.body=FILE): {quoted(bare)}"
+        yield f"on the built-in skeleton; the paper uses SMPL-H bodies (data.body=FILE): {join_quoted(bare)}"
     less_precise = [label for label, run in every if run.origin.deployed != "fp32"]
     if less_precise:
-        yield f"size and times are of a file of less precision, errors of float32: {quoted(less_precise)}"
+        labels = join_quoted(less_precise)
+        yield f"size and times are of a file of less precision, errors of float32: {labels}"
 
 
 def _replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
@@ -388,12 +400,13 @@ def _replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
         yield "one seed a variant: the intervals are about other clips, not about other seeds; no star"
     else:
         shared = {
-            one.label: len(runs[one.label].keys() & runs[two.label].keys()) for one, two in compared(sweep)
+            one.label: len(runs[one.label].keys() & runs[two.label].keys())
+            for one, two in list_comparisons(sweep)
         }
         few = [label for label, number in shared.items() if number == 1]
         if few:
             interval = "no interval" if one_group else "an interval about other clips alone"
-            yield f"one seed, so {interval} and no star: {quoted(few)}"
+            yield f"one seed, so {interval} and no star: {join_quoted(few)}"
 
     def ungrouped(run: Measured) -> int:
         return list(Counter(map(run.group, run.clips)).values()).count(1)
@@ -412,4 +425,4 @@ def _replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterator[str]:
         if len(found) > 1 and len(prerequisite[label]) == 1 and None not in prerequisite[label]
     ]
     if one_vqvae:
-        yield f"all seeds share one VQ-VAE, so they do not replicate it: {quoted(one_vqvae)}"
+        yield f"all seeds share one VQ-VAE, so they do not replicate it: {join_quoted(one_vqvae)}"

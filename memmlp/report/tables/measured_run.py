@@ -258,7 +258,7 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     return Measured(run.id, means, clips, groups, costs, origin, run, sources, training, code)
 
 
-def of_untrained(
+def measure_untrained(
     overrides: Sequence[str], record: Mapping[str, Any], environment: Mapping[str, Any]
 ) -> Measured:
     """Return the costs of a network that was not trained, whose id is a digest of its overrides.
@@ -383,20 +383,20 @@ def _both(known: Mapping[str, str], more: Mapping[str, str]) -> dict[str, str]:
     return {**known, **{name: ", ".join(each) for name, each in words.items()}}
 
 
-def core_share(run: Measured) -> float | None:
+def find_core_share(run: Measured) -> float | None:
     """Return the least share of a run's measured times in which the thread had a core; None if unknown."""
     return min((run.costs[name] for name in CORE_SHARES if name in run.costs), default=None)
 
 
-def undisturbed(runs: Mapping[int, Measured]) -> Mapping[int, Measured]:
+def select_undisturbed(runs: Mapping[int, Measured]) -> Mapping[int, Measured]:
     """Return the runs whose thread had a core while it was timed; all of them if that is known of none.
 
     A time does not depend on the seed, so one undisturbed measurement says more than a mean with others.
     """
-    alone = {seed: run for seed, run in runs.items() if (core_share(run) or 0) >= MIN_CORE_SHARE}
+    alone = {seed: run for seed, run in runs.items() if (find_core_share(run) or 0) >= MIN_CORE_SHARE}
     return alone or runs
 
 
-def measured_for(metric: str, runs: Mapping[int, Measured]) -> Mapping[int, Measured]:
+def select_measured(metric: str, runs: Mapping[int, Measured]) -> Mapping[int, Measured]:
     """Return the runs whose values of a metric count: of a time the undisturbed ones, else every run."""
-    return undisturbed(runs) if metric in TIMES else runs
+    return select_undisturbed(runs) if metric in TIMES else runs

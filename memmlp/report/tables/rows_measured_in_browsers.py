@@ -77,7 +77,7 @@ def _check(found: Mapping[str, Any], name: str, kind: type, optional: bool = Fal
     raise ValueError(f"{name}: {str(value)[:60]}: must be a {'text' if kind is str else 'number above 0'}")
 
 
-def with_rows(table: Table, measured: BrowserBench) -> Table:
+def add_rows(table: Table, measured: BrowserBench) -> Table:
     """Return Table 17 with a browser's rows below its own.
 
     Their differences and ratios compare with AvatarPoser as published, in the same browser on the same

@@ -25,20 +25,20 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import digest
 from memmlp.report.tables.effects import (
     RunsBySeed,
-    compared,
+    estimate_effects,
+    find_paper_effect,
+    list_comparisons,
     or_nan,
     or_none,
-    paired,
-    paper_effect,
-    tested,
-    with_existing_branches,
+    pair_differences,
+    use_existing_branches,
 )
 from memmlp.report.tables.statistics import (
     Verdict,
-    analysis_schedule,
-    sequential,
-    spending,
-    verdict,
+    correct_sequentially,
+    decide,
+    divide_level,
+    make_schedule,
 )
 from memmlp.report.tables.table import Effect, Key
 from memmlp.sweep.definition import COSTS, MODES, Sweep, Variant
@@ -107,7 +107,7 @@ class Rounds:
     """The rounds of a sweep.
 
     Attributes:
-        subject: what the verdicts depend on (`subject`).
+        subject: what the verdicts depend on (`describe_subject`).
         seeds: all seeds that may be spent, in order.
         schedule: the number of seeds at each interim analysis.
         levels: the level that each of them spends.
@@ -220,14 +220,14 @@ class Rounds:
             raise InputError(f"{path}: not a record of rounds ({error}); remove it to restart them") from None
 
 
-def subject(sweep: Sweep) -> dict[str, Any]:
+def describe_subject(sweep: Sweep) -> dict[str, Any]:
     """Return what the verdicts depend on, in types for JSON; it must not change between two analyses."""
     return {
         "variants": {
             variant.label: {
                 "branch": variant.branch,
                 "against": sweep.control_of(variant),
-                "paper": {metric: paper_effect(sweep, variant, metric) for metric in sweep.metrics},
+                "paper": {metric: find_paper_effect(sweep, variant, metric) for metric in sweep.metrics},
             }
             for variant in sweep.runnable()
         },
@@ -236,15 +236,15 @@ def subject(sweep: Sweep) -> dict[str, Any]:
     }
 
 
-def new_rounds(sweep: Sweep, most: int = MOST) -> Rounds:
+def start_rounds(sweep: Sweep, most: int = MOST) -> Rounds:
     """Return new rounds of a sweep with at most `most` seeds.
 
     The sweep's own seeds come first, then the whole numbers that follow the largest of them.
     """
     following = itertools.count(max(sweep.seeds) + 1)
     seeds = tuple(itertools.islice(itertools.chain(sweep.seeds, following), most))
-    schedule = analysis_schedule(most)
-    return Rounds(subject(sweep), seeds, schedule, spending(len(schedule)))
+    schedule = make_schedule(most)
+    return Rounds(describe_subject(sweep), seeds, schedule, divide_level(len(schedule)))
 
 
 def advance(
@@ -293,7 +293,7 @@ class VariantProgress:
     next: int | None
 
 
-def progress(rounds: Rounds, sweep: Sweep) -> list[VariantProgress]:
+def list_progress(rounds: Rounds, sweep: Sweep) -> list[VariantProgress]:
     """Return each variant's progress through the rounds."""
     upcoming = rounds.upcoming(sweep)
     verdicts: dict[str, list[Verdict]] = {}
@@ -308,7 +308,7 @@ def progress(rounds: Rounds, sweep: Sweep) -> list[VariantProgress]:
     return found
 
 
-def digest_of_runs(rounds: Rounds, sweep: Sweep, plan: Plan, label: str, seeds: int) -> str:
+def digest_runs(rounds: Rounds, sweep: Sweep, plan: Plan, label: str, seeds: int) -> str:
     """Return a digest of the identities of a variant's and its control's runs with the first `seeds` seeds.
 
     The identities include the evaluations that the sweep shows.
@@ -326,7 +326,7 @@ def check_same_runs(rounds: Rounds, sweep: Sweep, plan: Plan, path: Path) -> Non
     """
     for one in rounds.analyses:
         for label, known in one.runs.items():
-            if known != digest_of_runs(rounds, sweep, plan, label, one.seeds):
+            if known != digest_runs(rounds, sweep, plan, label, one.seeds):
                 raise InputError(
                     f"{path}: its interim analyses were of other runs of '{label}': data, configs or "
                     "versions changed since; remove it to restart them"
@@ -334,7 +334,7 @@ def check_same_runs(rounds: Rounds, sweep: Sweep, plan: Plan, path: Path) -> Non
 
 
 def _compared(sweep: Sweep) -> Iterator[tuple[Variant, Variant]]:
-    return compared(sweep) if set(sweep.metrics) - set(COSTS) else iter(())
+    return list_comparisons(sweep) if set(sweep.metrics) - set(COSTS) else iter(())
 
 
 def _possible_keys(sweep: Sweep, variant: Variant) -> list[Key]:
@@ -351,11 +351,11 @@ def _findings(
 ) -> list[Finding]:
     seeds = rounds.seeds[: analysis.seeds]
     cut = {label: {s: found[s] for s in seeds if s in found} for label, found in runs.items()}
-    pairs = paired(with_existing_branches(sweep, cut), cut, MODES, analysis.runs)
+    pairs = pair_differences(use_existing_branches(sweep, cut), cut, MODES, analysis.runs)
     before = {key: finding.verdict for key, (finding, _) in rounds.latest().items()}
     fresh = {
         key: effect
-        for key, effect in tested(pairs, sweep.smallest, sensitivity=False).items()
+        for key, effect in estimate_effects(pairs, sweep.smallest, sensitivity=False).items()
         if before.get(key, Verdict.INCONCLUSIVE) is Verdict.INCONCLUSIVE
     }
     elsewhere = [
@@ -367,8 +367,8 @@ def _findings(
     variants = {variant.label: variant for variant in sweep.variants}
     found = []
     for (key, effect), p, q in zip(fresh.items(), different, equal, strict=True):
-        paper = paper_effect(sweep, variants[key.label], key.metric)
-        claim = verdict(float(p), float(q), effect.mean, paper, analysis.level)
+        paper = find_paper_effect(sweep, variants[key.label], key.metric)
+        claim = decide(float(p), float(q), effect.mean, paper, analysis.level)
         found.append(Finding(*key, claim, effect.mean, effect.p, or_none(p), or_none(q)))
     return found
 
@@ -392,6 +392,6 @@ def _corrected(
         np.array([or_nan(getattr(effect, name)) for effect in fresh] + [math.nan] * len(elsewhere))
         for name in ("p", "equal")
     )
-    equal = sequential(q, same, away & ~same)
-    different = sequential(p, differ, (away | (equal <= level)) & ~differ)
+    equal = correct_sequentially(q, same, away & ~same)
+    different = correct_sequentially(p, differ, (away | (equal <= level)) & ~differ)
     return different[: len(fresh)], equal[: len(fresh)]

@@ -70,14 +70,16 @@ class Error:
         Satterthwaite's degrees of freedom. The noise is in both sides; it counts once, with the larger
         quantile, and the result is no less than either side alone.
 
-        Effects of groups may be `skewed`, noise is not. A value of B that is no larger than E may be noise,
+        Effects of groups may be skewed, noise is not. A value of B that is no larger than E may be noise,
         or a few skewed values that happen to be alike; the smaller the level, the more this matters. So the
         smaller quantile of noise is used for a part of B alone, which simulations showed to be safe: at most
         TRUST x level x E, never more than E, and none with two groups.
         """
         level = np.asarray(level)
         a, b, e = self.variances
-        seeds, groups, heavy = (_squared(df, level) for df in (self.seeds, self.groups, skewed(self.groups)))
+        seeds, groups, heavy = (
+            _squared(df, level) for df in (self.seeds, self.groups, reduce_freedom(self.groups))
+        )
         light = np.minimum(b, np.minimum(1, TRUST * level) * e) if self.groups > 1 else 0.0
         a, b = seeds * a, groups * light + heavy * (b - light)
         return np.sqrt(np.maximum(np.maximum(a, b), a + b - np.minimum(seeds, groups) * e))
@@ -94,7 +96,7 @@ class Error:
         # alone, with the smaller quantile, is too narrow; one of sqrt(2) of its width, with the larger
         # quantile, is too wide. Where the first bound is not the level itself, a root is sought between them.
         levels = np.where(distance > 0, self._wider(distance, self.groups), 1.0)
-        most = self._wider(distance / 1.42, skewed(self.groups))
+        most = self._wider(distance / 1.42, reduce_freedom(self.groups))
         unsure = np.flatnonzero((distance > 0) & (levels > 0))
         args = (distance[unsure], *self.variances[:, unsure])
         wider = self._excess(np.log(levels[unsure]), *args) > 1e-9
@@ -119,7 +121,7 @@ def _squared(freedom: float, level: np.ndarray) -> np.ndarray:
     return stdtrit(freedom, level / 2) ** 2
 
 
-def skewed(freedom: float) -> float:
+def reduce_freedom(freedom: float) -> float:
     """Return the degrees of freedom at which Student's t has the tails of t statistics of skewed values.
 
     The mean of a few skewed values that all happen to be small looks more certain than it is. For 2 to 536
@@ -133,19 +135,19 @@ def skewed(freedom: float) -> float:
     return min(freedom, 0.9 * freedom**0.6)
 
 
-def error(differences: np.ndarray, groups: Groups = None) -> Error:
+def estimate_error(differences: np.ndarray, groups: Groups = None) -> Error:
     """Return the error of the means of differences (K, S, C) over seeds and clips."""
-    means, weights = by_group(differences, groups)
+    means, weights = average_groups(differences, groups)
     _, s, g = means.shape
     none = np.zeros(len(means))
     a = (means @ weights).var(1, ddof=1) / s if s > 1 else none
     b = means.mean(1).var(1, ddof=1) * (weights @ weights) if g > 1 else none
-    e = noise(means, weights) if s > 1 and g > 1 else none
+    e = estimate_noise(means, weights) if s > 1 and g > 1 else none
     single = " and ".join(name for name, number in (("seeds", s), ("clips", g)) if number == 1)
     return Error(np.stack([a, b, e]), max(s - 1, 1), max(g - 1, 1), single)
 
 
-def by_group(differences: np.ndarray, groups: Groups = None) -> tuple[np.ndarray, np.ndarray]:
+def average_groups(differences: np.ndarray, groups: Groups = None) -> tuple[np.ndarray, np.ndarray]:
     """Average differences (K, S, C) over the clips of each group.
 
     Returns:
@@ -160,7 +162,7 @@ def by_group(differences: np.ndarray, groups: Groups = None) -> tuple[np.ndarray
     return sums / sizes, sizes / clips
 
 
-def noise(means: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def estimate_noise(means: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return the variance E (K,) of the groups' means (K, S, G), whose weights are (G,)."""
     seeds = means.shape[1]
     rest = means - means.mean(1, keepdims=True)
@@ -186,27 +188,29 @@ class EffectEstimates(NamedTuple):
     conditional: str
 
 
-def paired_effects(differences: np.ndarray, groups: Groups = None) -> EffectEstimates:
+def estimate_paired_effects(differences: np.ndarray, groups: Groups = None) -> EffectEstimates:
     """Return the effects of differences (K, S, C) over seeds and clips, whose groups are `groups` (C,).
 
     Interval and p-value agree: 0 is outside the interval exactly if p is below 0.05.
     """
-    mean, known = differences.mean((1, 2)), error(differences, groups)
+    mean, known = differences.mean((1, 2)), estimate_error(differences, groups)
     nothing = np.full_like(mean, np.nan)
     half = nothing if known.conditional == "seeds and clips" else known.half(LEVEL)
     p = nothing if known.conditional else known.level(np.abs(mean))
     return EffectEstimates(mean, mean - half, mean + half, p, known.conditional)
 
 
-def seed_effects(differences: np.ndarray) -> EffectEstimates:
+def estimate_seed_effects(differences: np.ndarray) -> EffectEstimates:
     """Return the effects of differences (K, S) in something that each seed has once, such as a time."""
     alone = differences[:, :, None]
-    effects, several = paired_effects(alone), differences.shape[1] > 1
-    p = error(alone).level(np.abs(effects.mean)) if several else effects.p
+    effects, several = estimate_paired_effects(alone), differences.shape[1] > 1
+    p = estimate_error(alone).level(np.abs(effects.mean)) if several else effects.p
     return effects._replace(p=p, conditional="" if several else "seeds")
 
 
-def equivalence_p(differences: np.ndarray, margin: float | np.ndarray, groups: Groups = None) -> np.ndarray:
+def compute_equivalence_p(
+    differences: np.ndarray, margin: float | np.ndarray, groups: Groups = None
+) -> np.ndarray:
     """Return the p-values (K,) of the claim that means of differences (K, S, C) lie within +-margin.
 
     The margin is () or (K,), in the unit of the differences. A p-value is the level at which the interval
@@ -214,13 +218,13 @@ def equivalence_p(differences: np.ndarray, margin: float | np.ndarray, groups: G
     1987). So this test is on the safe side, and it agrees with the interval that is shown. The p-values are
     NaN with one seed or one group.
     """
-    known = error(differences, groups)
+    known = estimate_error(differences, groups)
     if known.conditional:
         return np.full(len(differences), np.nan)
     return known.level(margin - np.abs(differences.mean((1, 2))))
 
 
-def detectable(
+def compute_detectable(
     differences: np.ndarray, comparisons: int, groups: Groups = None, power: float = 0.8
 ) -> np.ndarray:
     """Return the effects (K,) that tables like these differences (K, S, C) would find with this power.
@@ -229,15 +233,15 @@ def detectable(
     measured variances are taken as the true ones, and all effects as normal. The result is NaN with one seed
     or one group.
     """
-    known = error(differences, groups)
+    known = estimate_error(differences, groups)
     if known.conditional:
         return np.full(len(differences), np.nan)
     seeds, clips, noise = known.variances
     parts = np.stack([np.maximum(seeds - noise, 0), np.maximum(clips - noise, 0), noise])
-    return found(parts, differences.shape[1], known.groups, LEVEL / comparisons, power)
+    return find_effects(parts, differences.shape[1], known.groups, LEVEL / comparisons, power)
 
 
-def found(parts: np.ndarray, seeds: int, groups: float, level: float, power: float) -> np.ndarray:
+def find_effects(parts: np.ndarray, seeds: int, groups: float, level: float, power: float) -> np.ndarray:
     """Return the effects (K,) that are found at this level with this power.
 
     An effect is found if it exceeds half the width of the interval minus the error of the mean. So the result
@@ -287,7 +291,7 @@ class Verdict(StrEnum):
     INCONCLUSIVE = "inconclusive"
 
 
-def holm(p: np.ndarray) -> np.ndarray:
+def correct_by_holm(p: np.ndarray) -> np.ndarray:
     """Correct p-values (K,) for their number by Holm's step-down method; NaN stays NaN and does not count.
 
     The probability of any wrong claim of a difference stays below the level (Holm 1979).
@@ -300,7 +304,7 @@ def holm(p: np.ndarray) -> np.ndarray:
     return corrected
 
 
-def verdict(
+def decide(
     difference: float, equivalence: float, mean: float, paper: float | None = None, level: float = LEVEL
 ) -> Verdict:
     """Return the verdict on one comparison of a table.
@@ -311,7 +315,7 @@ def verdict(
 
     Args:
         difference: the p-value of a difference, corrected over the table; NaN if undefined.
-        equivalence: the p-value of `equivalence_p`, corrected in the same way.
+        equivalence: the p-value of `compute_equivalence_p`, corrected in the same way.
         mean: the measured mean difference.
         paper: the paper's difference; None or 0 if the paper claims no sign.
         level: the level that either family may spend, less than 5 % for an interim analysis.
@@ -325,7 +329,7 @@ def verdict(
     return Verdict.HIGHER if mean > 0 else Verdict.LOWER
 
 
-def analysis_schedule(most: int) -> tuple[int, ...]:
+def make_schedule(most: int) -> tuple[int, ...]:
     """Return the numbers of seeds of the interim analyses: 3, 5, 8, 13, ... up to `most`.
 
     Two seeds never decide anything at the levels of a table, so the first one is at three.
@@ -336,7 +340,7 @@ def analysis_schedule(most: int) -> tuple[int, ...]:
     return (*itertools.takewhile(lambda count: count < most, counts), most)
 
 
-def spending(number: int) -> tuple[float, ...]:
+def divide_level(number: int) -> tuple[float, ...]:
     """Return the level that each of `number` interim analyses may spend.
 
     Together they are 5 %, so that nothing need be assumed about how the analyses depend on each other. Each
@@ -347,7 +351,7 @@ def spending(number: int) -> tuple[float, ...]:
     return tuple(map(float, LEVEL * weights / weights.sum()))
 
 
-def sequential(p: np.ndarray, claimed: np.ndarray, closed: np.ndarray) -> np.ndarray:
+def correct_sequentially(p: np.ndarray, claimed: np.ndarray, closed: np.ndarray) -> np.ndarray:
     """Correct p-values (K,) by Holm at an interim analysis; compare them with the analysis' level.
 
     What was decided stays decided. Comparisons that this family has claimed are removed from the correction
@@ -361,4 +365,4 @@ def sequential(p: np.ndarray, claimed: np.ndarray, closed: np.ndarray) -> np.nda
         claimed: what this family claimed at earlier analyses, (K,) bool.
         closed: which comparisons are closed without such a claim, (K,) bool.
     """
-    return holm(np.where(claimed, 0.0, np.where(closed, 1.0, p)))
+    return correct_by_holm(np.where(claimed, 0.0, np.where(closed, 1.0, p)))

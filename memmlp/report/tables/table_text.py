@@ -51,13 +51,13 @@ class Grid:
         return [[" ".join(cell) for cell in line] for group in self.groups for line in group]
 
 
-def grids(table: Table) -> list[Grid]:
+def make_grids(table: Table) -> list[Grid]:
     """Return a grid for each mode.
 
     There is a single grid without a mode if all modes would show the same: costs alone, or nothing measured.
     """
     timeless = set(table.metrics) <= set(COSTS) or not any(row.found for row in table.rows)
-    header = ("variant", "seeds", *map(heading, table.metrics))
+    header = ("variant", "seeds", *map(make_heading, table.metrics))
     found = []
     for mode in table.modes[:1] if timeless else table.modes:
         groups = tuple(tuple(_lines(table, row, mode)) for row in table.rows)
@@ -65,17 +65,17 @@ def grids(table: Table) -> list[Grid]:
     return found
 
 
-def heading(metric: str) -> str:
+def make_heading(metric: str) -> str:
     """Return a metric's name with its unit and the direction that is better."""
-    return f"{with_unit(metric)} {ARROWS.get(better(metric), '')}".rstrip()
+    return f"{add_unit(metric)} {ARROWS.get(find_direction(metric), '')}".rstrip()
 
 
-def with_unit(metric: str) -> str:
+def add_unit(metric: str) -> str:
     """Return a metric's name with its unit in brackets; the name alone if it has no unit."""
-    return f"{metric} [{unit(metric)}]" if unit(metric) else metric
+    return f"{metric} [{find_unit(metric)}]" if find_unit(metric) else metric
 
 
-def better(metric: str) -> str:
+def find_direction(metric: str) -> str:
     """Return whether "lower" or "higher" values of a metric are better; empty if that is unknown.
 
     It is unknown for a custom metric whose package is not in use.
@@ -85,17 +85,17 @@ def better(metric: str) -> str:
     return "higher" if metric == "FPS" or metric in HIGHER else "lower"
 
 
-def unit(metric: str) -> str:
+def find_unit(metric: str) -> str:
     """Return a metric's unit; empty for a metric without one."""
     return UNITS.get(metric, COST_UNITS.get(metric, "")).replace("10^2", "10²").replace("s^3", "s³")
 
 
-def caption(table: Table) -> str:
+def make_caption(table: Table) -> str:
     """Return the table's title, with its number in the paper."""
     return f"Table {table.number}: {table.title}" if table.number else table.title
 
 
-def legend(table: Table) -> list[str]:
+def make_legend(table: Table) -> list[str]:
     """Return the lines that explain the table: whose errors it shows, and how to read the measured values."""
     lines = [_branch(table)] if table.measured_metrics else []
     if not any(row.found for row in table.rows):
@@ -145,7 +145,7 @@ def _differences(table: Table) -> str:
 
 def _meanings(table: Table) -> str:
     margins = [
-        f"{metric} {number_words(table.smallest[metric])} {unit(metric)}"
+        f"{metric} {format_number(table.smallest[metric])} {find_unit(metric)}"
         for metric in table.measured_metrics
         if metric in table.smallest
     ]
@@ -165,13 +165,13 @@ def _power(table: Table) -> list[str]:
             means = [cell.mean for _, name, cell, _ in table.effects(mode) if name == metric]
             finite = [mean for mean in means if mean is not None and math.isfinite(mean)]
             if value <= max(finite, default=0.0):
-                parts.append(f"{number_words(value)} ({mode})")
+                parts.append(f"{format_number(value)} ({mode})")
         if parts:
             blind = dict.fromkeys(label for mode in least for label in table.blind(mode, metric))
             but = f" but {', '.join(repr(label) for label in blind)}" if blind else ""
             lines.append(
-                f"{metric}: a true difference of {' or '.join(parts)} {unit(metric)} would have been found "
-                f"in every variant{but} with 80 % power, a smaller one perhaps not"
+                f"{metric}: a true difference of {' or '.join(parts)} {find_unit(metric)} would have been "
+                f"found in every variant{but} with 80 % power, a smaller one perhaps not"
             )
         elif least:
             lines.append(
@@ -198,30 +198,30 @@ def _lines(table: Table, row: Row, mode: str) -> Iterator[Line]:
     A row with only the paper's values has just the last line.
     """
     cells = [(row.cells[mode][metric], metric) for metric in table.metrics]
-    paper = tuple((paper_words(cell, metric),) for cell, metric in cells)
+    paper = tuple((format_paper(cell, metric),) for cell, metric in cells)
     if row.paper_only:
         yield ((row.label,), ("paper",), *paper)
         return
-    values = ((value_words(cell, metric),) for cell, metric in cells)
+    values = ((format_value(cell, metric),) for cell, metric in cells)
     yield ((row.label,), (f"{len(row.found)}/{len(row.wanted)}",), *values)
     if any(cell.effect for cell, _ in cells):
-        yield (("",), ("diff.",), *(effect_words(cell, metric) for cell, metric in cells))
+        yield (("",), ("diff.",), *(format_effect(cell, metric) for cell, metric in cells))
     if any(cell.paper is not None for cell, _ in cells):
         yield (("",), ("paper",), *paper)
 
 
-def value_words(cell: Cell, metric: str) -> str:
+def format_value(cell: Cell, metric: str) -> str:
     """Return mean ± standard deviation over seeds; for costs other than the column `ms` only the mean."""
     if cell.mean is None:
         return MISSING
     if metric in COSTS and (metric != "ms" or cell.sd is None):
-        return significant(cell.mean, 3)
-    digits = decimals(cell.mean)
+        return format_significant(cell.mean, 3)
+    digits = count_decimals(cell.mean)
     sd = "" if cell.sd is None else f" ± {cell.sd:.{digits}f}"
     return f"{cell.mean:.{digits}f}{sd}"
 
 
-def effect_words(cell: Cell, metric: str) -> tuple[str, ...]:
+def format_effect(cell: Cell, metric: str) -> tuple[str, ...]:
     """Return the parts of a difference's cell: the difference, its interval and its verdict.
 
     A significant difference has a star. For a cost, the parts are the difference and the ratio to the
@@ -231,28 +231,28 @@ def effect_words(cell: Cell, metric: str) -> tuple[str, ...]:
     if effect is None:
         return (MISSING,)
     if metric in COSTS:
-        return significant(effect.mean, 3, "+").replace("-", MINUS) if effect.mean else "0", *_ratio(
+        return format_significant(effect.mean, 3, "+").replace("-", MINUS) if effect.mean else "0", *_ratio(
             cell.mean, effect.mean
         )
-    least = 2 if cell.mean is None else decimals(cell.mean)
+    least = 2 if cell.mean is None else count_decimals(cell.mean)
     if effect.low is None or effect.high is None:
-        return (signed(effect.mean, f"+.{least}f"),)
-    digits = decimals_of_interval(effect.high - effect.low, least)
+        return (format_signed(effect.mean, f"+.{least}f"),)
+    digits = count_interval_decimals(effect.high - effect.low, least)
     if effect.significant and effect.mean:  # a star beside zeros alone would say nothing
         digits = max(digits, -math.floor(math.log10(abs(effect.mean))))
-    low, high = (signed(number, f".{digits}f") for number in (effect.low, effect.high))
+    low, high = (format_signed(number, f".{digits}f") for number in (effect.low, effect.high))
     star = "*" if effect.significant else ""
     at = f" ({effect.decided})" if effect.decided else ""
     verdict = () if effect.verdict is None else (f"{effect.verdict}{at}",)
-    return signed(effect.mean, f"+.{digits}f") + star, f"[{low}, {high}]", *verdict
+    return format_signed(effect.mean, f"+.{digits}f") + star, f"[{low}, {high}]", *verdict
 
 
-def number_words(value: float) -> str:
+def format_number(value: float) -> str:
     """Return a number with two significant digits."""
-    return significant(value, 2)
+    return format_significant(value, 2)
 
 
-def significant(value: float, digits: int, sign: str = "") -> str:
+def format_significant(value: float, digits: int, sign: str = "") -> str:
     """Return a number with so many significant digits; large ones are whole, without an exponent."""
     words = f"{value:{sign}.{digits}g}"
     return f"{value:{sign}.0f}" if "e+" in words else words
@@ -261,25 +261,25 @@ def significant(value: float, digits: int, sign: str = "") -> str:
 def _ratio(value: float | None, difference: float) -> tuple[str, ...]:
     if value is None or value == difference:
         return ()
-    return (f"(x {significant(value / (value - difference), 3)})",)
+    return (f"(x {format_significant(value / (value - difference), 3)})",)
 
 
-def signed(number: float, form: str) -> str:
+def format_signed(number: float, form: str) -> str:
     """Return a number in a format, with a typographic minus; "0" for zero."""
     return format(number, form).replace("-", MINUS) if number else "0"
 
 
-def decimals(value: float) -> int:
+def count_decimals(value: float) -> int:
     """Return the decimals of an error: 2, or enough to show two digits of an error below 0.1."""
     return max(1 - math.floor(math.log10(abs(value))), 2) if value and math.isfinite(value) else 2
 
 
-def decimals_of_interval(width: float, least: int = 2) -> int:
+def count_interval_decimals(width: float, least: int = 2) -> int:
     """Return the decimals, `least` or one more, that show two digits of half an interval's width."""
     return min(max(1 - math.floor(math.log10(width / 2)), least), least + 1) if width > 0 else least
 
 
-def paper_words(cell: Cell, metric: str) -> str:
+def format_paper(cell: Cell, metric: str) -> str:
     """Return the paper's value, its difference from the control, and whether it holds here."""
     if cell.paper is None:
         return MISSING
@@ -289,33 +289,33 @@ def paper_words(cell: Cell, metric: str) -> str:
         return value
     mark = {None: "", True: " ✓", False: " ✗"}[cell.agrees]
     ratio = "".join(f" {words}" for words in _ratio(cell.paper, cell.paper_effect)) if metric in COSTS else ""
-    return f"{value} ({signed(cell.paper_effect, f'+.{digits}f')}{mark}){ratio}"
+    return f"{value} ({format_signed(cell.paper_effect, f'+.{digits}f')}{mark}){ratio}"
 
 
-def markdown(table: Table) -> str:
+def to_markdown(table: Table) -> str:
     """Return the table in GitHub's Markdown."""
-    parts = [f"### {escaped(caption(table))}"]
-    for grid in grids(table):
-        rows = [list(map(escaped, grid.header)), ["---", ":---:", *["---:"] * len(table.metrics)]]
-        rows += [list(map(escaped, line)) for line in grid.lines]
+    parts = [f"### {escape_markdown(make_caption(table))}"]
+    for grid in make_grids(table):
+        rows = [list(map(escape_markdown, grid.header)), ["---", ":---:", *["---:"] * len(table.metrics)]]
+        rows += [list(map(escape_markdown, line)) for line in grid.lines]
         text = "\n".join(f"| {' | '.join(row)} |" for row in rows)
         parts.append(f"**{grid.mode}**\n\n{text}" if grid.mode else text)
-    remarks = "\n".join(f"- {escaped(line)}" for line in _remarks(table))
+    remarks = "\n".join(f"- {escape_markdown(line)}" for line in _remarks(table))
     return "\n\n".join([*parts, remarks] if remarks else parts) + "\n"
 
 
-def escaped(text: str) -> str:
+def escape_markdown(text: str) -> str:
     """Return the text with all characters escaped that Markdown would interpret."""
     return re.sub(r"([\\`*_|<>\[\]#])", r"\\\1", text)
 
 
-def latex(table: Table) -> str:
+def to_latex(table: Table) -> str:
     """Return a LaTeX table for the packages booktabs and amssymb."""
     lines = ["% needs \\usepackage{booktabs,amssymb}", r"\begin{table}", r"\centering", r"\small"]
-    lines.append(rf"\caption{{{_tex(caption(table))}}}")
+    lines.append(rf"\caption{{{_tex(make_caption(table))}}}")
     lines.append(rf"\begin{{tabular}}{{ll{'r' * len(table.metrics)}}}")
     lines.append(r"\toprule")
-    for number, grid in enumerate(grids(table)):
+    for number, grid in enumerate(make_grids(table)):
         columns = len(grid.header)
         lines += [r"\midrule"] if number else []
         lines += [rf"\multicolumn{{{columns}}}{{l}}{{\emph{{{grid.mode} mode}}}} \\"] if grid.mode else []
@@ -326,7 +326,7 @@ def latex(table: Table) -> str:
     return "\n".join([*lines, r"\end{table}"]) + "\n"
 
 
-def as_json(table: Table) -> str:
+def to_json(table: Table) -> str:
     """Return the table's whole content as JSON, including the values of each seed."""
     fields = asdict(table)
     for row, words in zip(table.rows, fields["rows"], strict=True):
@@ -339,8 +339,8 @@ def as_json(table: Table) -> str:
 
 def show(table: Table, console: Console) -> None:
     """Print the table on a terminal; columns that do not fit are put into further blocks below."""
-    console.print(caption(table), style="bold", soft_wrap=True)
-    for grid in grids(table):
+    console.print(make_caption(table), style="bold", soft_wrap=True)
+    for grid in make_grids(table):
         if grid.mode:
             console.print(f"{grid.mode} mode", style="italic")
         for columns in _fitting(grid, console.width):
@@ -350,11 +350,11 @@ def show(table: Table, console: Console) -> None:
     console.print()
 
 
-FORMATS: dict[str, Callable[[Table], str]] = {"md": markdown, "tex": latex, "json": as_json}
+FORMATS: dict[str, Callable[[Table], str]] = {"md": to_markdown, "tex": to_latex, "json": to_json}
 
 
 def _remarks(table: Table) -> list[str]:
-    return [*legend(table), *table.flags, *table.notes]
+    return [*make_legend(table), *table.flags, *table.notes]
 
 
 def _tex(text: str) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 from memmlp.common.errors import InputError
 from memmlp.common.files import plain, read_json
 from memmlp.report.tables.measured_run import load
-from memmlp.report.tables.table_text import better, unit
+from memmlp.report.tables.table_text import find_direction, find_unit
 from memmlp.report.ui.run_index import COSTS, RunIndex, parse_line, read_config
 from memmlp.runs.deployment_folder import as_deployed
 from memmlp.runs.evaluation_file import name_solvers
@@ -91,8 +91,11 @@ def describe_units(metrics: Iterable[str]) -> dict[str, dict[str, str]]:
     for metric in dict.fromkeys(dotted.rpartition(".")[2] for dotted in metrics):
         if metric in COSTS:
             found[metric] = {"unit": COSTS[metric], "better": "lower"}
-        elif direction := better(metric):
-            found[metric] = {"unit": unit(metric), "better": "" if metric.startswith("GT ") else direction}
+        elif direction := find_direction(metric):
+            found[metric] = {
+                "unit": find_unit(metric),
+                "better": "" if metric.startswith("GT ") else direction,
+            }
     return found
 
 

@@ -16,11 +16,17 @@ from typing import Any, NamedTuple
 from memmlp.common.errors import InputError
 from memmlp.common.files import plain
 from memmlp.evaluation.metric_facts import UNITS
-from memmlp.report.tables.build_table import finished_runs, make_table
+from memmlp.report.tables.build_table import find_finished_runs, make_table
 from memmlp.report.tables.measured_run import Measured, load
-from memmlp.report.tables.seed_rounds import ROUNDS_FILE, Rounds, check_same_runs, progress, subject
+from memmlp.report.tables.seed_rounds import (
+    ROUNDS_FILE,
+    Rounds,
+    check_same_runs,
+    describe_subject,
+    list_progress,
+)
 from memmlp.report.tables.statistics import Verdict
-from memmlp.report.tables.table_text import as_json, better, caption, heading, legend
+from memmlp.report.tables.table_text import find_direction, make_caption, make_heading, make_legend, to_json
 from memmlp.report.ui.run_index import RunIndex
 from memmlp.runs.identity import NETWORK, training_settings
 from memmlp.runs.run import STAGE_WORDS
@@ -215,7 +221,7 @@ class Sweeps:
                 values[variant.label, seed] = value
             return run
 
-        runs = finished_runs(sweep, find)
+        runs = find_finished_runs(sweep, find)
         table = make_table(sweep, runs, rounds=rounds)
         table = replace(table, flags=(*table.flags, *flag, *flags))
         described = describe_rounds(rounds, sweep) if rounds else None
@@ -224,11 +230,11 @@ class Sweeps:
             "metric": metric,
             "branch": branches.pop() if len(branches) == 1 else "",
             "table": {
-                **json.loads(as_json(table)),
-                "caption": caption(table),
-                "headings": {metric: heading(metric) for metric in table.metrics},
-                "better": {metric: better(metric) for metric in table.metrics},
-                "legend": legend(table),
+                **json.loads(to_json(table)),
+                "caption": make_caption(table),
+                "headings": {metric: make_heading(metric) for metric in table.metrics},
+                "better": {metric: find_direction(metric) for metric in table.metrics},
+                "legend": make_legend(table),
             },
             "rounds": described,
             "values": values,
@@ -242,7 +248,7 @@ def find_rounds(sweep: Sweep, plan: Plan) -> tuple[Rounds | None, list[str]]:
         rounds = Rounds.read(path)
         if rounds is None or not rounds.analyses:
             return None, []
-        if rounds.subject != plain(subject(sweep)):
+        if rounds.subject != plain(describe_subject(sweep)):
             return None, [OTHER_ROUNDS]
         check_same_runs(rounds, sweep, plan, path)
     except InputError:
@@ -257,7 +263,7 @@ def describe_rounds(rounds: Rounds, sweep: Sweep) -> dict[str, Any]:
         found = [finding for one in rounds.analyses if one.seeds == seeds for finding in one.findings]
         decided = sum(finding.verdict is not Verdict.INCONCLUSIVE for finding in found)
         analyses.append({"seeds": seeds, "level": level, "compared": len(found), "decided": decided})
-    variants = [asdict(variant) for variant in progress(rounds, sweep)]
+    variants = [asdict(variant) for variant in list_progress(rounds, sweep)]
     return {"comparisons": len(rounds.comparisons(sweep)), "analyses": analyses, "variants": variants}
 
 

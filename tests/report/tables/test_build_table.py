@@ -11,7 +11,7 @@ from fake_runs import CLIPS, fake_sweep, runs_of
 from processes import finished
 
 from memmlp.common.errors import InputError
-from memmlp.report.tables.build_table import make_table, on_source, together
+from memmlp.report.tables.build_table import group_clips, make_table, restrict_to_source
 from memmlp.sweep.sweep_file import parse_sweep
 
 
@@ -44,20 +44,22 @@ def test_variants_without_a_sources_clips_are_left_out_and_named(tmp_path: Path)
         return {seed: replace(run, clip_sources=sources) for seed, run in runs[label].items()}
 
     runs = {label: mixed(label) for label in runs}
-    part, part_runs, flags = on_source(sweep, runs, "new")
+    part, part_runs, flags = restrict_to_source(sweep, runs, "new")
     assert (list(part_runs), part.control) == (["both", "more"], "both")
     assert flags == ("no test clip of new, so left out: 'one'",)
-    waiting, left, _ = on_source(sweep, runs | {"both": {}}, "new")  # a variant without a run is no control
+    waiting, left, _ = restrict_to_source(
+        sweep, runs | {"both": {}}, "new"
+    )  # a variant without a run is no control
     assert (list(left), waiting.control) == (["both", "more"], "more")
     table = make_table(part, part_runs)
     assert [row.label for row in table.rows] == ["both", "more"]
     assert not any("missing" in flag for flag in table.flags)
-    old, old_runs, flags = on_source(sweep, runs, "old")
+    old, old_runs, flags = restrict_to_source(sweep, runs, "old")
     assert (list(old_runs), old.variants, flags) == (["one", "both", "more"], sweep.variants, ())
     assert "test clips of old alone" in old.title
     assert all(len(run.clips) == len(clips) // 2 for run in old_runs["both"].values())
     with pytest.raises(InputError, match=r"--source third: no finished run .* expected new, old"):
-        on_source(sweep, runs, "third")
+        restrict_to_source(sweep, runs, "third")
 
 
 def test_clips_that_are_put_together_count_as_those_that_the_data_has_together(tmp_path: Path):
@@ -68,7 +70,7 @@ def test_clips_that_are_put_together_count_as_those_that_the_data_has_together(t
     effects = {"other": 1.1}
     own = runs_of(sweep, fake_sweep(tmp_path / "own", sweep, effects, groups=pairs))
     coarser = runs_of(sweep, fake_sweep(tmp_path / "coarser", sweep, effects, groups=wanted))
-    found, flags = together(own, ["^(kicks)/"])
+    found, flags = group_clips(own, ["^(kicks)/"])
     assert flags == (
         "7 groups of test clips in place of 8: those whose names match '^(kicks)/' alike are together "
         "(--together)",
@@ -76,11 +78,11 @@ def test_clips_that_are_put_together_count_as_those_that_the_data_has_together(t
     cells = [row.cells for row in make_table(sweep, coarser).rows]
     assert [row.cells for row in make_table(sweep, found).rows] == cells
     assert [row.cells for row in make_table(sweep, own).rows] != cells
-    assert together(own, []) == (own, ())
+    assert group_clips(own, []) == (own, ())
     with pytest.raises(InputError, match=r"^--together nothing: puts no test clips together"):
-        together(own, ["^(kicks)/", "nothing"])
+        group_clips(own, ["^(kicks)/", "nothing"])
     with pytest.raises(InputError, match=r"^--together \(: .*regular expression"):
-        together(own, ["("])
+        group_clips(own, ["("])
 
 
 def test_a_mode_in_which_nothing_was_measured_is_left_out(tmp_path: Path):

@@ -14,9 +14,9 @@ from fake_runs import CLIPS, fake_run, fake_sweep, runs_of, table_of
 from fake_table import EFFECTS, cell, printed
 
 from memmlp.report.tables.build_table import make_table
-from memmlp.report.tables.effects import mean_cost
+from memmlp.report.tables.effects import compute_mean_cost
 from memmlp.report.tables.measured_run import load
-from memmlp.report.tables.statistics import Verdict, holm, paired_effects
+from memmlp.report.tables.statistics import Verdict, correct_by_holm, estimate_paired_effects
 from memmlp.report.tables.table import Table
 from memmlp.runs.evaluation_file import write_report
 from memmlp.sweep.definition import Sweep
@@ -81,13 +81,13 @@ def test_verdicts_follow_from_the_statistics(sweep: Sweep, tmp_path: Path):
                 )
                 for one, b in ((label, branch), ("full_model", "rotation"))
             ]
-            known = paired_effects((sides[0] - sides[1])[None])
+            known = estimate_paired_effects((sides[0] - sides[1])[None])
             effect = cell(table, label, metric, mode).effect
             assert (effect.mean, effect.low, effect.high) == pytest.approx(
                 (known.mean[0], known.low[0], known.high[0])
             )
             p[label, mode, metric] = known.p[0]
-    corrected = dict(zip(p, holm(np.array(list(p.values()))), strict=True))
+    corrected = dict(zip(p, correct_by_holm(np.array(list(p.values()))), strict=True))
     for (label, mode, metric), value in corrected.items():
         effect = cell(table, label, metric, mode).effect
         assert effect.holm == pytest.approx(value)
@@ -219,4 +219,4 @@ def test_equal_costs_differ_by_nothing_however_many_seeds_have_them():
     """Means in floating point are off by a rounding for some numbers of equal ones."""
     for seeds, size in itertools.product(range(1, 11), (1.66427, 0.0016469, 0.357113)):
         runs = {seed: SimpleNamespace(costs={"parameters": size}) for seed in range(seeds)}
-        assert mean_cost(runs, "parameters") == size
+        assert compute_mean_cost(runs, "parameters") == size

@@ -10,8 +10,8 @@ import pytest
 
 from memmlp.common.errors import InputError
 from memmlp.config.compose_plan import find_sweep
-from memmlp.report.tables.build_table import without_runs
-from memmlp.report.tables.rows_measured_in_browsers import read, with_rows
+from memmlp.report.tables.build_table import make_empty_table
+from memmlp.report.tables.rows_measured_in_browsers import add_rows, read
 from memmlp.report.tables.table_text import FORMATS
 
 ROW = {
@@ -38,8 +38,8 @@ def written(folder: Path, content: Any) -> Path:
 
 
 def test_they_stand_below_the_table_s_own_with_device_and_browser(tmp_path: Path):
-    table = without_runs(find_sweep("17", ()), ("stream",), "nothing measured")
-    shown = with_rows(table, read(written(tmp_path, FILE)))
+    table = make_empty_table(find_sweep("17", ()), ("stream",), "nothing measured")
+    shown = add_rows(table, read(written(tmp_path, FILE)))
     base, ours = shown.rows[len(table.rows) :]
     assert (
         base.label == "AvatarPoser of 4.12 M parameters, as published, fp32, wasm: Quest 9, OculusBrowser 1"
@@ -61,9 +61,9 @@ def test_they_stand_below_the_table_s_own_with_device_and_browser(tmp_path: Path
 
 
 def test_rows_of_other_threads_steps_and_backends(tmp_path: Path):
-    table = without_runs(find_sweep("17", ()), ("stream",), "nothing measured")
+    table = make_empty_table(find_sweep("17", ()), ("stream",), "nothing measured")
     rows = [ROW, OURS | {"threads": 4, "steps": 200, "backend": "webgpu"}]
-    shown = with_rows(table, read(written(tmp_path, FILE | {"rows": rows})))
+    shown = add_rows(table, read(written(tmp_path, FILE | {"rows": rows})))
     assert "1 or 4 threads, the median of 200 or 500 steps" in shown.flags[-1]
     assert shown.rows[-1].against is None  # its backend has no AvatarPoser
     assert shown.rows[-1].cells["stream"]["ms"].effect is None
@@ -102,6 +102,6 @@ def test_words_of_a_file_do_not_reach_a_terminal_as_commands(tmp_path: Path):
 
 
 def test_other_tables_take_none(tmp_path: Path):
-    table = without_runs(find_sweep("5", ()), ("stream",), "nothing measured")
+    table = make_empty_table(find_sweep("5", ()), ("stream",), "nothing measured")
     with pytest.raises(InputError, match=r"--add: .* is not Table 17"):
-        with_rows(table, read(written(tmp_path, FILE)))
+        add_rows(table, read(written(tmp_path, FILE)))

@@ -11,9 +11,9 @@ import pytest
 from memmlp.report.tables.build_table import make_table
 from memmlp.report.tables.effects import RunsBySeed
 from memmlp.report.tables.measured_run import Measured, Origin
-from memmlp.report.tables.seed_rounds import Rounds, advance, new_rounds
+from memmlp.report.tables.seed_rounds import Rounds, advance, start_rounds
 from memmlp.report.tables.statistics import Verdict
-from memmlp.report.tables.table_text import markdown
+from memmlp.report.tables.table_text import to_markdown
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import parse_sweep
 
@@ -94,7 +94,7 @@ def verdicts(rounds: Rounds, mode: str = "stream") -> dict[str, tuple[str, int]]
 
 
 def test_the_schedule_is_fixed_at_the_start():
-    rounds = new_rounds(SWEEP, 6)
+    rounds = start_rounds(SWEEP, 6)
     assert rounds.seeds == (4, 2, 5, 6, 7, 8)  # the sweep's own, then those that follow
     assert rounds.schedule == (3, 5, 6)
     assert sum(rounds.levels) == pytest.approx(0.05)
@@ -104,12 +104,12 @@ def test_the_schedule_is_fixed_at_the_start():
         TRUTH, (4, 2, 5)
     )
     assert len(spent.variant_seeds()) == 12
-    assert new_rounds(SWEEP, 1 + 2).schedule == (3,)
+    assert start_rounds(SWEEP, 1 + 2).schedule == (3,)
 
 
 def test_open_variants_and_their_control_alone_go_on():
     world = World()
-    rounds = world.look(new_rounds(SWEEP))
+    rounds = world.look(start_rounds(SWEEP))
     assert verdicts(rounds) == {
         "worse": ("higher", 3),
         "same": ("equivalent", 3),
@@ -137,7 +137,7 @@ def test_what_is_decided_stays_though_later_data_would_reverse_it():
         return planted({"other": "worse"}.get(label, label), seed, metric) + 2 * (label == "unsure")
 
     world = World(sweep, draw)
-    rounds = world.to_the_end(new_rounds(sweep, 5))
+    rounds = world.to_the_end(start_rounds(sweep, 5))
     assert rounds.seed_counts(sweep) == {"full": 3, "other": 5, "unsure": 5}
     assert verdicts(rounds)["other"] == ("higher", 3)
     assert [f.label for f in rounds.analyses[1].findings] == [
@@ -161,7 +161,7 @@ def test_a_decided_comparison_of_an_open_variant_is_not_looked_at_again():
             return planted({"other": "unsure"}.get(label, label), seed, metric)
         return planted("worse", seed, metric) - 9 * (seed >= 3)
 
-    rounds = World(sweep, draw).to_the_end(new_rounds(sweep))
+    rounds = World(sweep, draw).to_the_end(start_rounds(sweep))
     assert verdicts(rounds) == {"other": ("higher", 3)}
     assert len(rounds.analyses) > 1
     assert {finding.mode for look in rounds.analyses[1:] for finding in look.findings} == {"window"}
@@ -169,7 +169,7 @@ def test_a_decided_comparison_of_an_open_variant_is_not_looked_at_again():
 
 def test_a_look_uses_its_seeds_alone_whatever_other_runs_there_are():
     few, many = World(), World()
-    whole = new_rounds(SWEEP, 13)
+    whole = start_rounds(SWEEP, 13)
     for seed in whole.seeds:
         for label in TRUTH:
             many.runs[label][seed] = run(label, seed, planted, ("MPJPE",), {})
@@ -178,7 +178,7 @@ def test_a_look_uses_its_seeds_alone_whatever_other_runs_there_are():
 
 def test_one_group_of_clips_ends_it_at_once():
     world = World(groups=dict.fromkeys(CLIPS, "one take"))
-    rounds = world.to_the_end(new_rounds(SWEEP))
+    rounds = world.to_the_end(start_rounds(SWEEP))
     assert len(rounds.analyses) == 1
     assert {verdict for verdict, _ in verdicts(rounds).values()} == {"inconclusive"}
     assert rounds.upcoming(SWEEP) == {}
@@ -187,7 +187,7 @@ def test_one_group_of_clips_ends_it_at_once():
 def test_an_variant_whose_runs_failed_is_late_and_others_do_not_wait():
     world = World()
     world.failing = {("worse", 2)}
-    rounds = world.to_the_end(new_rounds(SWEEP, 5))
+    rounds = world.to_the_end(start_rounds(SWEEP, 5))
     assert [sorted(look.runs) for look in rounds.analyses] == [["same", "unsure"], ["unsure"]]
     assert rounds.upcoming(SWEEP) == {"worse": 0}
     assert len(rounds.comparisons(SWEEP)) == 6  # its comparisons count although they were not looked at
@@ -200,12 +200,12 @@ def test_an_variant_whose_runs_failed_is_late_and_others_do_not_wait():
 def test_a_control_that_failed_stops_what_needs_it():
     world = World()
     world.failing = {("full", 5)}
-    assert world.to_the_end(new_rounds(SWEEP)).analyses == ()
+    assert world.to_the_end(start_rounds(SWEEP)).analyses == ()
 
 
 def test_corrections_are_over_all_that_nobody_has_claimed():
     """Of 6 comparisons, 2 differences are claimed at the first look; the next corrects by 4."""
-    rounds = World().look(World().look(new_rounds(SWEEP)))
+    rounds = World().look(World().look(start_rounds(SWEEP)))
     first, second = rounds.analyses
     plain = {finding.key: finding for finding in first.findings}
     unsure = [f for f in second.findings if f.mode == "stream"]
@@ -218,19 +218,19 @@ def test_corrections_are_over_all_that_nobody_has_claimed():
 
 def test_the_table_shows_rounds(tmp_path):
     world = World()
-    rounds = world.to_the_end(new_rounds(SWEEP, 5))
+    rounds = world.to_the_end(start_rounds(SWEEP, 5))
     table = make_table(rounds.spent(SWEEP), world.runs, rounds=rounds)
     assert {row.label: (len(row.found), len(row.wanted)) for row in table.rows[:4]} == {
         "full": (5, 5), "worse": (3, 3), "same": (3, 3), "unsure": (5, 5)
     }  # fmt: skip
-    text = markdown(table)
+    text = to_markdown(table)
     assert "higher (3)" in text
     assert "equivalent (3)" in text
     assert "analyses at 3 (1.7 %), 5 (3.3 %) seeds" in text
     assert "p \\< the analysis' level by Holm's correction over the table's 6 comparisons" in text
     assert "missing" not in text
     del world.runs["unsure"][6]
-    assert "'unsure' seed 6; fill with" in markdown(
+    assert "'unsure' seed 6; fill with" in to_markdown(
         make_table(rounds.spent(SWEEP), world.runs, rounds=rounds)
     )
 
@@ -258,7 +258,7 @@ def false_claims(truth: float, noise: float, times: int = 120) -> float:
             difference = noise * normal(number, seed, label, metric) + truth if label != "full" else 0.0
             return np.full(2, difference)
 
-        rounds = World(sweep, draw).to_the_end(new_rounds(sweep))
+        rounds = World(sweep, draw).to_the_end(start_rounds(sweep))
         counts.append(any(finding.verdict in false for finding, _ in rounds.latest().values()))
     return float(np.mean(counts))
 

@@ -12,37 +12,37 @@ from scipy import stats
 from memmlp.report.tables.statistics import (
     EffectEstimates,
     Verdict,
-    analysis_schedule,
-    detectable,
-    equivalence_p,
-    error,
-    holm,
-    paired_effects,
-    sequential,
-    skewed,
-    spending,
-    verdict,
+    compute_detectable,
+    compute_equivalence_p,
+    correct_by_holm,
+    correct_sequentially,
+    decide,
+    divide_level,
+    estimate_error,
+    estimate_paired_effects,
+    make_schedule,
+    reduce_freedom,
 )
 
 
 def test_two_by_two_by_hand():
     # Seeds' means 2, 4 and clips' means 2, 4: A = B = 2 / 2; nothing is left, so E = 0.
-    known = error(np.array([[[1.0, 3.0], [3.0, 5.0]]]))
+    known = estimate_error(np.array([[[1.0, 3.0], [3.0, 5.0]]]))
     np.testing.assert_allclose(known.variances[:, 0], [1, 1, 0], atol=1e-12)
     # 0.9 degrees of freedom for clips, which may be skewed
     half = np.hypot(stats.t.ppf(0.975, 1), stats.t.ppf(0.975, 0.9))
-    effects = paired_effects(np.array([[[1.0, 3.0], [3.0, 5.0]]]))
+    effects = estimate_paired_effects(np.array([[[1.0, 3.0], [3.0, 5.0]]]))
     assert effects.mean[0] == 3
     assert effects.high[0] == pytest.approx(3 + half)
     assert effects.low[0] == pytest.approx(3 - half)
     # No seed and no clip differs from another: all is noise, of squares 4 with one degree of freedom.
-    noise = error(np.array([[[1.0, -1.0], [-1.0, 1.0]]]))
+    noise = estimate_error(np.array([[[1.0, -1.0], [-1.0, 1.0]]]))
     np.testing.assert_allclose(noise.variances[:, 0], [0, 0, 1])
 
 
 def test_clips_that_do_not_differ_leave_students_test_of_the_seeds():
     sample = np.random.default_rng(2).normal(1, 1, 6)
-    effects = paired_effects(np.repeat(sample[None, :, None], 9, 2))
+    effects = estimate_paired_effects(np.repeat(sample[None, :, None], 9, 2))
     expected = stats.ttest_1samp(sample, 0)
     assert effects.p[0] == pytest.approx(expected.pvalue, rel=1e-9)
     assert effects.low[0] == pytest.approx(expected.confidence_interval().low)
@@ -50,7 +50,7 @@ def test_clips_that_do_not_differ_leave_students_test_of_the_seeds():
 
 def test_seeds_that_do_not_differ_leave_students_test_of_clips_with_fewer_degrees_of_freedom():
     sample = np.random.default_rng(2).normal(1, 1, 12)
-    effects = paired_effects(np.repeat(sample[None, None], 3, 1))
+    effects = estimate_paired_effects(np.repeat(sample[None, None], 3, 1))
     t = sample.mean() / stats.sem(sample)
     assert effects.p[0] == pytest.approx(2 * stats.t.sf(t, 0.9 * 11**0.6), rel=1e-6)
 
@@ -59,17 +59,19 @@ def test_equal_groups_are_the_analysis_of_their_means():
     d = np.random.default_rng(3).normal(size=(5, 3, 12))
     labels = np.array(list("aabbccddeeff"))
     order = np.random.default_rng(4).permutation(12)
-    grouped = paired_effects(d[:, :, order], labels[order])
-    for ours, theirs in zip(grouped[:4], paired_effects(d.reshape(5, 3, 6, 2).mean(3))[:4], strict=True):
+    grouped = estimate_paired_effects(d[:, :, order], labels[order])
+    for ours, theirs in zip(
+        grouped[:4], estimate_paired_effects(d.reshape(5, 3, 6, 2).mean(3))[:4], strict=True
+    ):
         np.testing.assert_allclose(ours, theirs)
 
 
 def test_unequal_groups_weigh_as_their_clips():
     # weights 1/4 and 3/4; seeds' means by group 0, 4 and 2, 4, over both 3 and 3.5; groups' means 1 and 4
     d = np.array([[[0.0, 4.0, 5.0, 3.0], [2.0, 4.0, 3.0, 5.0]]])
-    assert paired_effects(d, [7, 1, 1, 1]).mean[0] == 3.25
+    assert estimate_paired_effects(d, [7, 1, 1, 1]).mean[0] == 3.25
     # 0.125 / 2; 4.5 x 10/16; what is left is -1, 0 and 1, 0: (0.5 + 0.5) x 10/16 / 2
-    np.testing.assert_allclose(error(d, [7, 1, 1, 1]).variances[:, 0], [0.0625, 2.8125, 0.3125])
+    np.testing.assert_allclose(estimate_error(d, [7, 1, 1, 1]).variances[:, 0], [0.0625, 2.8125, 0.3125])
 
 
 @pytest.mark.parametrize(
@@ -78,44 +80,44 @@ def test_unequal_groups_weigh_as_their_clips():
 )
 def test_one_seed_or_one_group_has_an_interval_of_the_other_alone(shape, labels, conditional: str):
     d = np.random.default_rng(1).normal(3, 0.1, (2, *shape))
-    effects = paired_effects(d, labels)
+    effects = estimate_paired_effects(d, labels)
     assert effects.conditional == conditional
     assert np.isnan(effects.p).all()
     assert (effects.low < effects.mean).all()
     assert (effects.mean < effects.high).all()
-    assert np.isnan(equivalence_p(d, 100, labels)).all()
-    assert np.isnan(detectable(d, 1, labels)).all()
+    assert np.isnan(compute_equivalence_p(d, 100, labels)).all()
+    assert np.isnan(compute_detectable(d, 1, labels)).all()
     if conditional == "clips":
         sample = d.mean(2)[0]
         assert effects.high[0] == pytest.approx(stats.ttest_1samp(sample, 0).confidence_interval().high)
 
 
 def test_differences_that_are_all_the_same():
-    effects = paired_effects(np.stack([np.zeros((3, 4)), np.full((3, 4), 2.0)]))
+    effects = estimate_paired_effects(np.stack([np.zeros((3, 4)), np.full((3, 4), 2.0)]))
     np.testing.assert_array_equal(effects.low, [0, 2])
     np.testing.assert_array_equal(effects.high, [0, 2])
     np.testing.assert_array_equal(effects.p, [1, 0])
-    np.testing.assert_array_equal(equivalence_p(np.full((1, 3, 4), 2.0), 3), [0])
+    np.testing.assert_array_equal(compute_equivalence_p(np.full((1, 3, 4), 2.0), 3), [0])
 
 
 @pytest.mark.parametrize("shares", SHARES.values())
 def test_zero_is_outside_exactly_where_p_is_small(shares: tuple[float, ...]):
     d = differences(4, 6, 1, shares, tables=40) + np.linspace(-8, 8, 40 * TABLE)[:, None, None]
-    effects = paired_effects(d)
+    effects = estimate_paired_effects(d)
     inside = (effects.low < 0) & (effects.high > 0)
     np.testing.assert_array_equal(inside, effects.p > 0.05)
     assert 0.2 < inside.mean() < 0.8
-    np.testing.assert_allclose(error(d).half(effects.p), np.abs(effects.mean), rtol=1e-6)
+    np.testing.assert_allclose(estimate_error(d).half(effects.p), np.abs(effects.mean), rtol=1e-6)
 
 
 def test_equivalence_is_the_interval_within_the_margin():
     d = differences(6, 40, 1, SHARES["equal"], tables=20)
-    effects, p = paired_effects(d), equivalence_p(d, 4.0)
+    effects, p = estimate_paired_effects(d), compute_equivalence_p(d, 4.0)
     within = (effects.low > -4) & (effects.high < 4)
     np.testing.assert_array_equal(within, p < 0.05)
     assert 0.1 < within.mean() < 0.9
-    assert equivalence_p(d + 10, 4.0).min() == 1
-    np.testing.assert_array_equal(equivalence_p(d, np.full(len(d), 4.0)), p)
+    assert compute_equivalence_p(d + 10, 4.0).min() == 1
+    np.testing.assert_array_equal(compute_equivalence_p(d, np.full(len(d), 4.0)), p)
 
 
 @pytest.mark.slow
@@ -123,7 +125,7 @@ def test_equivalence_is_the_interval_within_the_margin():
 def test_promises(name: str):
     for shape in [(3, 4, 1), (5, 10, 2), (5, 40, 10)]:
         d = differences(*shape, SHARES[name], tables=300)
-        effects = paired_effects(d, groups(*shape[1:]))
+        effects = estimate_paired_effects(d, groups(*shape[1:]))
         covered = np.mean((effects.low <= 0) & (effects.high >= 0))
         assert covered >= 0.93
         assert covered <= 0.995 or shape[1] / shape[2] < 5
@@ -140,7 +142,7 @@ def test_unequal_groups_keep_the_promises():
             + effects_of_groups
             + 1e-3 * rng.normal(size=(9600, 3, 16))
         )
-        effects = paired_effects(d, labels)
+        effects = estimate_paired_effects(d, labels)
         assert np.mean((effects.low <= 0) & (effects.high >= 0)) >= 0.95
         assert starred(effects.p) <= 0.05
 
@@ -159,12 +161,12 @@ def test_order_and_names_do_not_matter(size: tuple[int, int, int]):
     seeds, clips, number = size
     rng = np.random.default_rng(number)
     d, labels = rng.normal(0.5, 1, (3, seeds, clips)), rng.integers(0, 3, clips)
-    effects = paired_effects(d, labels)
+    effects = estimate_paired_effects(d, labels)
     order = rng.permutation(clips)
-    assert_same(effects, paired_effects(d[:, rng.permutation(seeds)][:, :, order], labels[order]))
-    assert_same(effects, paired_effects(d, np.array(["z", "a", "m"])[labels]))
-    assert_same(paired_effects(d), paired_effects(d, np.arange(clips)))
-    alone = [paired_effects(one[None], labels) for one in d]
+    assert_same(effects, estimate_paired_effects(d[:, rng.permutation(seeds)][:, :, order], labels[order]))
+    assert_same(effects, estimate_paired_effects(d, np.array(["z", "a", "m"])[labels]))
+    assert_same(estimate_paired_effects(d), estimate_paired_effects(d, np.arange(clips)))
+    alone = [estimate_paired_effects(one[None], labels) for one in d]
     assert_same(effects, EffectEstimates(*(np.concatenate([e[i] for e in alone]) for i in range(4)), ""))
 
 
@@ -173,20 +175,24 @@ def test_order_and_names_do_not_matter(size: tuple[int, int, int]):
 def test_units_and_signs_do_not_matter(size: tuple[int, int, int], scale: float):
     seeds, clips, number = size
     d = np.random.default_rng(number).normal(0.5, 1, (3, seeds, clips))
-    e, scaled, turned = paired_effects(d), paired_effects(scale * d), paired_effects(-d)
+    e, scaled, turned = (
+        estimate_paired_effects(d),
+        estimate_paired_effects(scale * d),
+        estimate_paired_effects(-d),
+    )
     assert_same(scaled, EffectEstimates(scale * e.mean, scale * e.low, scale * e.high, e.p, ""))
     assert_same(turned, EffectEstimates(-e.mean, -e.high, -e.low, e.p, ""))
-    np.testing.assert_allclose(detectable(scale * d, 5), scale * detectable(d, 5))
+    np.testing.assert_allclose(compute_detectable(scale * d, 5), scale * compute_detectable(d, 5))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_an_error_that_is_no_number_is_evidence_of_nothing(value: float):
     """Of a network that diverged on one clip; the other comparison keeps its own."""
     differences = np.random.default_rng(0).normal(1, 0.1, size=(2, 3, 8))
-    alone = paired_effects(differences[1:]).p
+    alone = estimate_paired_effects(differences[1:]).p
     differences[0, 1, 2] = value
     with np.errstate(invalid="ignore"):
-        p, equal = paired_effects(differences).p, equivalence_p(differences, 5.0)
+        p, equal = estimate_paired_effects(differences).p, compute_equivalence_p(differences, 5.0)
     assert np.isnan([p[0], equal[0]]).all()
     assert p[1] == alone[0]
     assert equal[1] < 0.05
@@ -194,7 +200,7 @@ def test_an_error_that_is_no_number_is_evidence_of_nothing(value: float):
 
 def test_noise_is_counted_once():
     # A = B = E, as of noise alone: no wider than the wider of the two sides alone
-    known = error(np.random.default_rng(0).normal(size=(1, 8, 8)))
+    known = estimate_error(np.random.default_rng(0).normal(size=(1, 8, 8)))
     known.variances[:] = 1.0
     assert known.half(0.001)[0] == pytest.approx(stats.t.isf(0.0005, 0.9 * 7**0.6), rel=0.01)
 
@@ -204,7 +210,7 @@ def test_means_of_few_skewed_values_have_the_tails_they_are_given(count: int):
     x = np.random.default_rng(count).exponential(size=(200_000, count)) - 1
     t = np.abs(x.mean(1)) / (x.std(1, ddof=1) / np.sqrt(count))
     for level in (0.05, 0.05 / TABLE):
-        missed = np.mean(t > stats.t.isf(level / 2, skewed(count - 1)))
+        missed = np.mean(t > stats.t.isf(level / 2, reduce_freedom(count - 1)))
         assert 0.45 * level < missed < 1.45 * level
         assert np.mean(t > stats.t.isf(level / 2, count - 1)) > 1.3 * level
 
@@ -214,7 +220,7 @@ def test_means_of_few_skewed_values_have_the_tails_they_are_given(count: int):
 def test_detectable_is_found_with_its_power(shape: tuple[int, int], comparisons: int):
     # Differences whose measured shares are what the repetitions are drawn from; these have normal effects.
     d = differences(*shape, 1, SHARES["equal"], tables=1)[:1]
-    a, b, e = error(d).variances[:, 0]
+    a, b, e = estimate_error(d).variances[:, 0]
     rng = np.random.default_rng(5)
     again = (
         np.sqrt(shape[0] * max(a - e, 0)) * rng.normal(size=(4000, shape[0], 1))
@@ -222,20 +228,22 @@ def test_detectable_is_found_with_its_power(shape: tuple[int, int], comparisons:
         + np.sqrt(shape[0] * shape[1] * e) * rng.normal(size=(4000, *shape))
     )
     for power in (0.5, 0.8):
-        effect = detectable(d, comparisons, power=power)[0]
-        found = np.mean(paired_effects(again + effect).p <= 0.05 / comparisons)
+        effect = compute_detectable(d, comparisons, power=power)[0]
+        found = np.mean(estimate_paired_effects(again + effect).p <= 0.05 / comparisons)
         assert found == pytest.approx(power, abs=0.03)
 
 
 def test_holm_known_examples():
     # Wikipedia, "Holm-Bonferroni method"; R: p.adjust(c(0.01, 0.02, 0.03, 0.04, 0.05), "holm")
-    np.testing.assert_allclose(holm(np.array([0.01, 0.04, 0.03, 0.005])), [0.03, 0.06, 0.06, 0.02])
-    np.testing.assert_allclose(holm(np.array([0.01, 0.02, 0.03, 0.04, 0.05])), [0.05, 0.08, 0.09, 0.09, 0.09])
+    np.testing.assert_allclose(correct_by_holm(np.array([0.01, 0.04, 0.03, 0.005])), [0.03, 0.06, 0.06, 0.02])
+    np.testing.assert_allclose(
+        correct_by_holm(np.array([0.01, 0.02, 0.03, 0.04, 0.05])), [0.05, 0.08, 0.09, 0.09, 0.09]
+    )
 
 
 def test_holm_stays_below_one_and_leaves_nan_out():
-    np.testing.assert_allclose(holm(np.array([0.7, np.nan, 0.02, 0.6])), [1, np.nan, 0.06, 1])
-    assert holm(np.array([])).shape == (0,)
+    np.testing.assert_allclose(correct_by_holm(np.array([0.7, np.nan, 0.02, 0.6])), [1, np.nan, 0.06, 1])
+    assert correct_by_holm(np.array([])).shape == (0,)
 
 
 @pytest.mark.parametrize(
@@ -252,18 +260,18 @@ def test_holm_stays_below_one_and_leaves_nan_out():
     ],
 )
 def test_verdicts(difference: float, equivalence: float, mean: float, paper: float | None, expected: Verdict):
-    assert verdict(difference, equivalence, mean, paper) is expected
-    assert verdict(0.03, 1.0, 1.0, 1.0, level=0.02) is Verdict.INCONCLUSIVE
-    assert verdict(0.03, 1.0, 1.0, 1.0, level=0.03) is Verdict.HOLDS
+    assert decide(difference, equivalence, mean, paper) is expected
+    assert decide(0.03, 1.0, 1.0, 1.0, level=0.02) is Verdict.INCONCLUSIVE
+    assert decide(0.03, 1.0, 1.0, 1.0, level=0.03) is Verdict.HOLDS
 
 
 def test_looks_and_what_they_spend():
-    assert analysis_schedule(13) == (3, 5, 8, 13)
-    assert analysis_schedule(10) == (3, 5, 8, 10)
-    assert analysis_schedule(2) == (2,)
-    assert spending(1) == (0.05,)
-    assert spending(2) == pytest.approx((0.05 / 3, 0.1 / 3))
-    assert sum(spending(5)) == pytest.approx(0.05)
+    assert make_schedule(13) == (3, 5, 8, 13)
+    assert make_schedule(10) == (3, 5, 8, 10)
+    assert make_schedule(2) == (2,)
+    assert divide_level(1) == (0.05,)
+    assert divide_level(2) == pytest.approx((0.05 / 3, 0.1 / 3))
+    assert sum(divide_level(5)) == pytest.approx(0.05)
 
 
 def test_claims_leave_the_correction_and_other_decisions_stay_in_it():
@@ -271,16 +279,16 @@ def test_claims_leave_the_correction_and_other_decisions_stay_in_it():
     claimed = np.array([True, False, False, False, False])
     closed = np.array([False, False, True, False, False])
     # of four, one is claimed and one can't be: 0.01 is corrected for the three that are left
-    np.testing.assert_allclose(sequential(p, claimed, closed), [0, 0.03, 1, 0.04, np.nan])
+    np.testing.assert_allclose(correct_sequentially(p, claimed, closed), [0, 0.03, 1, 0.04, np.nan])
 
 
 def test_looks_keep_the_error_where_one_level_for_all_would_not():
     d = differences(13, 8, 1, SHARES["seeds"], tables=600)
-    rounds = analysis_schedule(13)
+    rounds = make_schedule(13)
     kept, wasted = np.zeros((2, 600), bool)
-    for seeds, level in zip(rounds, spending(len(rounds)), strict=True):
-        p = paired_effects(d[:, :seeds]).p.reshape(600, TABLE)
-        least = np.array([holm(row).min() for row in p])
+    for seeds, level in zip(rounds, divide_level(len(rounds)), strict=True):
+        p = estimate_paired_effects(d[:, :seeds]).p.reshape(600, TABLE)
+        least = np.array([correct_by_holm(row).min() for row in p])
         kept |= least <= level
         wasted |= least <= 0.05
     assert kept.mean() <= 0.06 < 0.09 < wasted.mean()

@@ -16,9 +16,9 @@ from memmlp.report.tables.table import Cell, Effect, Table
 from memmlp.report.tables.table_text import (
     FORMATS,
     MINUS,
-    effect_words,
-    legend,
-    value_words,
+    format_effect,
+    format_value,
+    make_legend,
 )
 from memmlp.sweep.definition import Sweep
 from memmlp.sweep.sweep_file import load_sweep
@@ -38,13 +38,13 @@ def test_an_error_below_a_tenth_has_two_digits_as_its_difference_has():
     """A metric of one's own may have any unit."""
     effect = Effect(-0.0004, low=-0.0011, high=0.0003)
     small = Cell({0: 0.0031, 1: 0.0035}, effect=effect)
-    assert value_words(small, "slide") == "0.0033 ± 0.0003"
-    assert effect_words(small, "slide") == ("\N{MINUS SIGN}0.00040", "[\N{MINUS SIGN}0.00110, 0.00030]")
-    assert effect_words(Cell({0: 0.0031}, effect=Effect(0.0004)), "slide") == ("+0.0004",)
+    assert format_value(small, "slide") == "0.0033 ± 0.0003"
+    assert format_effect(small, "slide") == ("\N{MINUS SIGN}0.00040", "[\N{MINUS SIGN}0.00110, 0.00030]")
+    assert format_effect(Cell({0: 0.0031}, effect=Effect(0.0004)), "slide") == ("+0.0004",)
     usual = Cell({0: 4.25, 1: 4.31}, effect=Effect(0.123, low=0.05, high=0.196))
-    assert value_words(usual, "MPJRE") == "4.28 ± 0.04"
-    assert effect_words(usual, "MPJRE") == ("+0.123", "[0.050, 0.196]")
-    assert value_words(Cell({0: 0.0, 1: 0.0}), "slide") == "0.00 ± 0.00"
+    assert format_value(usual, "MPJRE") == "4.28 ± 0.04"
+    assert format_effect(usual, "MPJRE") == ("+0.123", "[0.050, 0.196]")
+    assert format_value(Cell({0: 0.0, 1: 0.0}), "slide") == "0.00 ± 0.00"
 
 
 def test_an_variant_in_which_nothing_would_have_been_found_is_named(sweep: Sweep, tmp_path: Path):
@@ -69,7 +69,7 @@ def test_a_power_beyond_the_values_themselves_is_no_number(table: Table, monkeyp
 
 def test_power_is_that_of_the_table_where_a_run_diverged(table: Table):
     """A mean that is no number is no size that a difference could be compared with."""
-    before = [line for line in legend(table) if "power" in line]
+    before = [line for line in make_legend(table) if "power" in line]
     bad = replace(cell(table, "no | memory", "MPJPE"), values={0: math.nan, 1: 8.0})
     rows = [
         replace(row, cells={**row.cells, "stream": {**row.cells["stream"], "MPJPE": bad}})
@@ -77,23 +77,23 @@ def test_power_is_that_of_the_table_where_a_run_diverged(table: Table):
         else row
         for row in table.rows
     ]
-    assert [line for line in legend(replace(table, rows=tuple(rows))) if "power" in line] == before
+    assert [line for line in make_legend(replace(table, rows=tuple(rows))) if "power" in line] == before
 
 
 def test_a_star_has_a_digit_beside_it():
     small = Effect(0.0004, low=0.0001, high=0.0007, holm=0.01)
-    assert effect_words(Cell({0: 8.0}, effect=small), "MPJPE") == ("+0.0004*", "[0.0001, 0.0007]")
+    assert format_effect(Cell({0: 8.0}, effect=small), "MPJPE") == ("+0.0004*", "[0.0001, 0.0007]")
     open_one = Effect(0.0004, low=-0.0001, high=0.0009, holm=0.3)
-    assert effect_words(Cell({0: 8.0}, effect=open_one), "MPJPE") == ("+0.000", f"[{MINUS}0.000, 0.001]")
+    assert format_effect(Cell({0: 8.0}, effect=open_one), "MPJPE") == ("+0.000", f"[{MINUS}0.000, 0.001]")
 
 
 def test_large_costs_and_their_differences_have_no_exponent():
-    assert value_words(Cell({0: 999.7}), "FPS") == "1000"
-    assert value_words(Cell({0: 1234.5}), "FPS") == "1234"
-    assert value_words(Cell({0: 41.24}), "FPS") == "41.2"
-    assert effect_words(Cell({0: 2500.0}, effect=Effect(1500.0)), "FPS") == ("+1500", "(x 2.5)")
-    assert effect_words(Cell({0: 2500.0}, effect=Effect(-1500.0)), "FPS") == (f"{MINUS}1500", "(x 0.625)")
-    assert effect_words(Cell({0: 2.0}, effect=Effect(0.0)), "FPS")[0] == "0"
+    assert format_value(Cell({0: 999.7}), "FPS") == "1000"
+    assert format_value(Cell({0: 1234.5}), "FPS") == "1234"
+    assert format_value(Cell({0: 41.24}), "FPS") == "41.2"
+    assert format_effect(Cell({0: 2500.0}, effect=Effect(1500.0)), "FPS") == ("+1500", "(x 2.5)")
+    assert format_effect(Cell({0: 2500.0}, effect=Effect(-1500.0)), "FPS") == (f"{MINUS}1500", "(x 0.625)")
+    assert format_effect(Cell({0: 2.0}, effect=Effect(0.0)), "FPS")[0] == "0"
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from report.ui.conftest import SEEDS, make_outputs, predict, run_of, started_run
 from memmlp.cli.sweep import analyse
 from memmlp.common.errors import InputError
 from memmlp.evaluation.metric_facts import UNITS
-from memmlp.report.tables.seed_rounds import new_rounds
+from memmlp.report.tables.seed_rounds import start_rounds
 from memmlp.report.ui.report_file import write_page
 from memmlp.report.ui.server import Answers, RunsServer
 from memmlp.runs.run import Run
@@ -198,7 +198,7 @@ def test_no_difference_is_shown_from_a_control_on_other_data(browser: Browser, t
 
 def test_rounds_of_a_sweep(browser: Browser, tmp_path: Path):
     sweep, folder = make_outputs(tmp_path), tmp_path / "sweeps" / "mine"
-    analyse(sweep, tmp_path, new_rounds(sweep), Plan.load(folder / "plan.json"))
+    analyse(sweep, tmp_path, start_rounds(sweep), Plan.load(folder / "plan.json"))
     with RunsServer(Answers(tmp_path, predict), 0) as running:
         go(browser, running.url, "sweep/mine", "document.body.textContent.includes('Rounds')")
         words = browser.value("document.body.textContent")

@@ -11,10 +11,15 @@ from fake_runs import fake_run
 from report.ui.conftest import predict, run_of
 
 from memmlp.cli.sweep import analyse
-from memmlp.report.tables.build_table import finished_runs, make_table, run_finder, state_finder
+from memmlp.report.tables.build_table import (
+    find_finished_runs,
+    make_run_finder,
+    make_state_finder,
+    make_table,
+)
 from memmlp.report.tables.measured_run import load
-from memmlp.report.tables.seed_rounds import Rounds, new_rounds
-from memmlp.report.tables.table_text import as_json
+from memmlp.report.tables.seed_rounds import Rounds, start_rounds
+from memmlp.report.tables.table_text import to_json
 from memmlp.report.ui.run_index import RunIndex
 from memmlp.report.ui.server import Answers
 from memmlp.report.ui.sweeps import DAMAGED_ROUNDS, OTHER_ROUNDS, Sweeps
@@ -41,7 +46,7 @@ def test_the_table_is_that_of_the_command(outputs: Path):
     folder = outputs / "sweeps" / "mine"
     sweep, plan = load_sweep_copy(folder), Plan.load(folder / "plan.json")
     assert sweep is not None
-    table = json.loads(as_json(make_table(sweep, finished_runs(sweep, run_finder(plan, load)))))
+    table = json.loads(to_json(make_table(sweep, find_finished_runs(sweep, make_run_finder(plan, load)))))
     shown = describe(sweeps_of(outputs))["table"]
     assert shown["rows"] == table["rows"]
     (row,) = [row for row in shown["rows"] if row["label"] == "gru"]
@@ -89,7 +94,7 @@ def test_a_run_that_lacks_an_evaluation_is_trained_and_a_vqvae_is_a_prerequisite
         {"done": 1},
         6,
     )
-    say = state_finder(Plan.load(path))
+    say = make_state_finder(Plan.load(path))
     variant = next(
         variant for variant in load_sweep_copy(path.parent).runnable() if variant.label == first.label
     )
@@ -171,7 +176,7 @@ def looked(outputs: Path) -> Rounds:
     folder = outputs / "sweeps" / "mine"
     sweep = load_sweep_copy(folder)
     assert sweep is not None
-    return analyse(sweep, outputs, new_rounds(sweep), Plan.load(folder / "plan.json"))
+    return analyse(sweep, outputs, start_rounds(sweep), Plan.load(folder / "plan.json"))
 
 
 def test_verdicts_of_rounds_and_their_analyses_are_shown(outputs: Path):
