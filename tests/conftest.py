@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 import math
 import os
 import re
@@ -34,6 +35,8 @@ settings.register_profile(
 settings.load_profile("memmlp")
 processes.mark()
 collect_garbage_rarely()
+# Otherwise pytest captures this log, and torch describes each pass of each export in it.
+logging.getLogger("torch.__trace").addHandler = lambda handler: None  # type: ignore[method-assign]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
