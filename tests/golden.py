@@ -24,7 +24,7 @@ from memmlp.deploy import latency
 from memmlp.deploy.export import export
 from memmlp.deploy.lower_precision import lower
 from memmlp.deploy.onnx_stream import OnnxStream
-from memmlp.deploy.parity import streamed
+from memmlp.deploy.parity import stream_onnx
 from memmlp.evaluation import metrics
 from memmlp.evaluation import modes as evaluation
 from memmlp.evaluation.evaluation import Evaluation
@@ -236,8 +236,8 @@ def deployed(graph: str) -> Numbers:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "step.onnx"
         path.write_bytes(exported(graph))
-        motion = streamed(OnnxStream(path), tiny.clip(25))
-    return summary("motion", motion) | {"macs": float(latency.macs(GRAPHS[graph](tiny.model())))}
+        motion = stream_onnx(OnnxStream(path), tiny.clip(25))
+    return summary("motion", motion) | {"macs": float(latency.count_macs(GRAPHS[graph](tiny.model())))}
 
 
 @cache
@@ -255,7 +255,7 @@ def lowered(precision: str) -> Numbers:
         exact, other = (Path(folder) / f"{name}.onnx" for name in ("exact", "other"))
         exact.write_bytes(exported("graph.streaming"))
         lower(precision, exact, other, streaming(tiny.model()), [tiny.clip(40)])
-        return summary("motion", streamed(OnnxStream(other), tiny.clip(25)))
+        return summary("motion", stream_onnx(OnnxStream(other), tiny.clip(25)))
 
 
 CASES: dict[str, Callable[[], Numbers]] = {

@@ -130,7 +130,7 @@ def size(model: MotionModel, step: MotionModel | StreamingGraph, path: Path) -> 
         step: the network or streaming graph that was exported.
         path: the exported file.
     """
-    multiplied = macs(model.cpu().eval())
+    multiplied = count_macs(model.cpu().eval())
     books = [part for part in model.modules() if isinstance(part, EMACodebook)]
     running_means = sum(book.vectors.numel() for book in books)  # learned, but not by gradients
     return {
@@ -138,13 +138,13 @@ def size(model: MotionModel, step: MotionModel | StreamingGraph, path: Path) -> 
         "parameters_with_vqvae": sum(p.numel() for p in model.parameters()) + running_means,
         "macs": multiplied,
         "flops": 2 * multiplied,
-        "step_macs": macs(step.cpu().eval()),
+        "step_macs": count_macs(step.cpu().eval()),
         "onnx_bytes": path.stat().st_size,
     }
 
 
 @torch.no_grad()
-def macs(model: MotionModel | StreamingGraph) -> int:
+def count_macs(model: MotionModel | StreamingGraph) -> int:
     """Count the multiply-adds of the matrix products of one streaming step."""
     counter = FlopCounterMode(display=False)
     counter.flop_registry = {**flop_registry, **CPU_FORMULAS}

@@ -24,7 +24,7 @@ from memmlp.common.lease import publish, temporary
 from memmlp.common.progress import progress_bar
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.opsets import Constants
-from memmlp.deploy.parity import streamed
+from memmlp.deploy.parity import stream_onnx
 from memmlp.evaluation.metrics import positions_report
 from memmlp.evaluation.modes import joint_positions, rotations_report
 from memmlp.motion.body import SPARSE_DIM
@@ -55,7 +55,7 @@ def lower(precision: str, source: Path, path: Path, network: StreamingGraph, tra
         InputError: for a graph without inner layers, or a weight that sixteen bits cannot hold.
     """
     model = onnx.load(source)
-    inner = inner_layers(model, network.float32_modules)
+    inner = find_inner_layers(model, network.float32_modules)
     if precision == "int8":
         _quantise(source, path, inner, train)
     else:
@@ -63,7 +63,7 @@ def lower(precision: str, source: Path, path: Path, network: StreamingGraph, tra
         atomic_write(path, change(model, inner).SerializeToString())
 
 
-def inner_layers(model: ModelProto, kept: Sequence[str]) -> list[str]:
+def find_inner_layers(model: ModelProto, kept: Sequence[str]) -> list[str]:
     """Return the names of the nodes that multiply by a layer's weight, except those in the kept modules.
 
     Raises:
@@ -236,7 +236,7 @@ def measure_accuracy(path: Path, normalizer: Normalizer, clips: Sequence[Tensor]
     rows = []
     for clip in progress_bar(clips, "measuring"):
         truth = clip[: max(int(share * len(clip)), 2)]
-        motion = streamed(stream, truth)
+        motion = stream_onnx(stream, truth)
         positions = joint_positions(motion), joint_positions(truth[:, SPARSE_DIM:])
         position = positions_report(*positions)["MPJPE"]
         rows.append(rotations_report(normalizer, motion, truth) | {"position MPJPE": position})

@@ -73,7 +73,7 @@ def differences(model: MotionModel, path: Path, clip: Tensor) -> Tensor:
     which an untrained network sometimes produces, forward kinematics would amplify rounding a hundredfold.
     """
     model, clip = model.cpu().eval(), clip.cpu()
-    expected, found = in_torch(model, clip), streamed(OnnxStream(path), clip)
+    expected, found = stream_torch(model, clip), stream_onnx(OnnxStream(path), clip)
     if "position" not in model.branches:
         exact = copy.deepcopy(model.normalizer).double()
         positions = exact.pose(found.double(), clip[:, :SPARSE_DIM].double())
@@ -93,7 +93,7 @@ def is_rounding(apart: Tensor) -> bool:
 
 
 @torch.no_grad()
-def in_torch(model: MotionModel, clip: Tensor) -> Tensor:
+def stream_torch(model: MotionModel, clip: Tensor) -> Tensor:
     """Return the world motion (N, 198) that torch's network streams for a clip's inputs (N, 252 or 54).
 
     One thread computes it: a frame is little work, which several threads do more slowly, and far more slowly
@@ -107,7 +107,7 @@ def in_torch(model: MotionModel, clip: Tensor) -> Tensor:
     return torch.stack(motions)
 
 
-def streamed(stream: OnnxStream, clip: Tensor) -> Tensor:
+def stream_onnx(stream: OnnxStream, clip: Tensor) -> Tensor:
     """Return the world motion (N, 198) that a fresh ONNX stream makes of a clip's inputs (N, 252 or 54)."""
     stream.reset()
     outputs = [stream.step(sparse) for sparse in clip[:, None, :SPARSE_DIM].numpy()]

@@ -155,7 +155,7 @@ def joint_positions(motion: Tensor) -> Tensor:
     return motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
 
 
-def chunks(dataset: MotionDataset, length: int, least: int) -> list[Tensor]:
+def cut_clips(dataset: MotionDataset, length: int, least: int) -> list[Tensor]:
     """Cut a dataset's clips into pieces of `length` frames.
 
     Pieces of fewer than `least` frames are left out, unless all pieces are that short.
@@ -165,7 +165,7 @@ def chunks(dataset: MotionDataset, length: int, least: int) -> list[Tensor]:
 
 
 @torch.no_grad()
-def quick_stream(
+def measure_stream(
     network: MotionModel, pieces: Sequence[Tensor], custom: metrics.UserMetrics | None = None
 ) -> dict[str, float]:
     """Return the stream-mode metrics, averaged over pieces of clips, for validation during training."""

@@ -26,7 +26,7 @@ from memmlp.common.errors import InputError
 from memmlp.deploy.export import metadata, save
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.opsets import NATIVE
-from memmlp.deploy.parity import in_torch
+from memmlp.deploy.parity import stream_torch
 from memmlp.live.rotations import BodyTree, quaternion_to_matrix
 from memmlp.live.spaces import Space, space_of
 from memmlp.motion.body import (
@@ -200,7 +200,7 @@ def full_differences(model: MotionModel, path: Path, clip: Tensor, space: str = 
     """
     positions, rotations = trackers_of(clip[:, :SPARSE_DIM].cpu())
     sparse, reference, stream = sparse_features(rotations, positions), space_of(space), OnnxStream(path)
-    motion = in_torch(model.cpu().eval(), sparse)
+    motion = stream_torch(model.cpu().eval(), sparse)
     local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6))).numpy()
     joints = [model.normalizer.pose(motion, sparse), motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))]
     expected = [reference.pose_out(local), *(reference.positions_out(part.numpy()) for part in joints)]

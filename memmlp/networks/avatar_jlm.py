@@ -60,7 +60,7 @@ def replace_tracked(joints: Tensor, tracked: Tensor) -> Tensor:
     return torch.stack(rows, -2)
 
 
-def attended(layer: EncoderLayer, h: Tensor, seen: Tensor) -> Tensor:
+def apply_layer(layer: EncoderLayer, h: Tensor, seen: Tensor) -> Tensor:
     """Apply an encoder layer to (N, n, d), which attends to (N, m, d), written as plain matrix products."""
     attention, flat, all_seen = layer.attention, h.flatten(0, 1), seen.flatten(0, 1)
     query = attention.query(flat).view(h.shape)
@@ -91,10 +91,10 @@ class AvatarJLMGraph(StemGraph):
         first = h[:, -1:]
         for index, layer in enumerate(self.layers[:-1]):
             turned = h if index % 2 == 0 else h.transpose(0, 1)
-            made = attended(layer, turned, turned)
+            made = apply_layer(layer, turned, turned)
             h = self.model.reset_input_token(made if index % 2 == 0 else made.transpose(0, 1), first)
         by_token = h.transpose(0, 1)
-        newest = attended(self.layers[-1], by_token[:, -1:], by_token).transpose(0, 1)
+        newest = apply_layer(self.layers[-1], by_token[:, -1:], by_token).transpose(0, 1)
         features = self.model.reset_input_token(newest, first[-1:]).flatten(1)
         return self.read(self.model.regressor(features), encoded)
 

@@ -57,7 +57,7 @@ def rotate(rotation: Tensor, vector: Tensor) -> Tensor:
     return (rotation @ vector[..., None])[..., 0]
 
 
-def about(axis: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
+def rotate_about(axis: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
     """Return the rotations (..., 3, 3) about unit axes (..., 3), given the cosine and sine (..., 1)."""
     across, identity = skew(axis), axis.new_tensor(IDENTITY)
     return identity + sine[..., None] * across + (1 - cosine)[..., None] * (across @ across)
@@ -69,12 +69,12 @@ def align(start: Tensor, goal: Tensor) -> Tensor:
     return identity + across + across @ across / (1 + dot(start, goal)).clamp_min(1e-6)[..., None]
 
 
-def frame(first: Tensor, second: Tensor) -> Tensor:
+def build_frame(first: Tensor, second: Tensor) -> Tensor:
     """Return the rotations (..., 3, 3) whose columns are two perpendicular unit vectors and their product."""
     return torch.stack([first, second, cross(first, second)], -1)
 
 
-def circle(axis: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
+def find_circle(axis: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
     """Return the directions (..., 3) that belong to swivels of 0 and of 90 degrees.
 
     Args:
@@ -88,14 +88,14 @@ def circle(axis: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
 def measure_swivels(base: Tensor, middle: Tensor, end: Tensor, up: Tensor) -> Tensor:
     """Return the cosines and sines (..., 2) of swivels, from limbs' joints (..., 3) and the bases' Y axes."""
     axis = F.normalize(end - base, dim=-1)
-    start, quarter = circle(axis, up)
+    start, quarter = find_circle(axis, up)
     away = middle - base
     return F.normalize(torch.cat([dot(away, start), dot(away, quarter)], -1), dim=-1)
 
 
 def find_bend_direction(axis: Tensor, up: Tensor, swivel: Tensor) -> Tensor:
     """Return the unit vectors (..., 3) from the axis to the middle, for swivels (..., 2), cosine and sine."""
-    start, quarter = circle(axis, up)
+    start, quarter = find_circle(axis, up)
     return swivel[..., :1] * start + swivel[..., 1:] * quarter
 
 
@@ -118,13 +118,13 @@ def place_middle(
     return base + upper * (cosine * axis + sine * find_bend_direction(axis, up, swivel))
 
 
-def bones(rest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def find_bones(rest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the limbs' upper and lower bones (4, 3) and axes of flexion (4, 3) in a rest pose (22, 3)."""
     base, middle, end = (rest[list(joints)] for joints in (BASES, MIDDLES, ENDS))
     return middle - base, end - middle, F.normalize(rest.new_tensor(FLEXION), dim=-1)
 
 
-def flex(upper: Tensor, lower: Tensor, axis: Tensor, reach: Tensor) -> Tensor:
+def bend_middles(upper: Tensor, lower: Tensor, axis: Tensor, reach: Tensor) -> Tensor:
     """Return the rotations (..., 4, 3, 3) of elbows and knees that bring hands and feet to a given reach.
 
     Of the two ways to bend, each limb takes the one about its own axis of flexion. If the reach is out of a
@@ -141,10 +141,10 @@ def flex(upper: Tensor, lower: Tensor, axis: Tensor, reach: Tensor) -> Tensor:
     bend = (wanted / size).clamp(-1 + STRAIGHT, 1 - STRAIGHT)
     across, cosine, sine = ((1 - bend) * (1 + bend)).sqrt(), cosine / size, sine / size
     axes = axis.expand(*bend.shape[:-1], 3)
-    return about(axes, cosine * bend - sine * across, sine * bend + cosine * across)
+    return rotate_about(axes, cosine * bend - sine * across, sine * bend + cosine * across)
 
 
-def twist(rotation: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
+def measure_twist(rotation: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
     """Return cosines and sines (..., 1) of the angles by which rotations (..., 3, 3) turn about an axis.
 
     Args:
@@ -182,7 +182,7 @@ def limit_twist(local: Tensor, bone: Tensor, axis: Tensor) -> Tensor:
     nearest = torch.where(found[0].abs() < found[1].abs(), found[0], found[1])
     half = torch.where(turned.abs() > limit * real, nearest, 0.0)
     size = 1 + half.square()
-    return about(axis, 2 / size - 1, 2 * half / size)
+    return rotate_about(axis, 2 / size - 1, 2 * half / size)
 
 
 def solve_limbs(
@@ -210,22 +210,22 @@ def solve_limbs(
         toe: vectors (..., 2, 3) from the ankles to the toes, of any length.
         rest: rest positions (22, 3), metres.
     """
-    upper, lower, flexion = bones(rest)
+    upper, lower, flexion = find_bones(rest)
     away = end - base
-    bent = flex(upper, lower, flexion, away.norm(dim=-1, keepdim=True))
+    bent = bend_middles(upper, lower, flexion, away.norm(dim=-1, keepdim=True))
     back = select_joints(turned, [PARENTS[joint] for joint in BASES], -3).transpose(-1, -2)
     axis = F.normalize(away, dim=-1)
     direction = find_bend_direction(axis, select_joints(turned[..., 1], BASES), swivel)
     # Before a base is turned, its end lies along `chain`, and its middle to the side of that line.
     chain = F.normalize(upper + rotate(bent, lower), dim=-1)
     side = upper + OFFSET * cross(chain, flexion)
-    unturned = frame(chain, F.normalize(side - dot(side, chain) * chain, dim=-1))
-    bases = back @ frame(axis, direction) @ unturned.transpose(-1, -2)
+    unturned = build_frame(chain, F.normalize(side - dot(side, chain) * chain, dim=-1))
+    bases = back @ build_frame(axis, direction) @ unturned.transpose(-1, -2)
     bases = limit_twist(bases, F.normalize(upper, dim=-1), rotate(back, axis)) @ bases
     arms, shins = (back.transpose(-1, -2) @ bases @ bent).split(2, -3)
     seen = arms.transpose(-1, -2) @ hands
     forearm = F.normalize(lower[:2], dim=-1).expand(*seen.shape[:-2], 3)
-    rolled = about(forearm, *twist(seen, forearm))
+    rolled = rotate_about(forearm, *measure_twist(seen, forearm))
     wrists = rolled.transpose(-1, -2) @ seen
     goal = rotate(shins.transpose(-1, -2), F.normalize(toe, dim=-1))
     foot = F.normalize(rest[list(TOES)] - rest[list(ANKLES)], dim=-1).expand(goal.shape)

@@ -45,7 +45,7 @@ def device(name: str) -> torch.device:
     return torch.device("cuda", int(index))
 
 
-def described(used: torch.device) -> dict[str, Any]:
+def describe_device(used: torch.device) -> dict[str, Any]:
     """Return the facts of a device for a manifest: its kind, the GPU's name, and the GPU's index.
 
     The index, `gpu_index`, is the GPU's entry in CUDA_VISIBLE_DEVICES where that is set, since inside the

@@ -40,7 +40,7 @@ from memmlp.runs.identity import (
 )
 from memmlp.runs.loggers.logger import Loggers
 from memmlp.runs.run import Run
-from memmlp.training.devices import described, overlooked_gpu
+from memmlp.training.devices import describe_device, overlooked_gpu
 from memmlp.training.loop import ValidationCallback
 from memmlp.training.request import (
     Outcome,
@@ -366,7 +366,7 @@ def user() -> str | None:
 def machine(experiment: Experiment) -> dict[str, Any]:
     """Return the facts that can change the last digits of a result: device, GPU, threads, precision."""
     return {
-        **described(experiment.device),
+        **describe_device(experiment.device),
         "threads": torch.get_num_threads(),
         "precision": experiment.training.optim.precision,
     }

@@ -68,7 +68,7 @@ class Training:
         raise NotImplementedError
 
 
-def last_errors(run: Run) -> dict[str, float]:
+def read_last_errors(run: Run) -> dict[str, float]:
     """Return the errors of a run's last validation; empty in a process that does not validate."""
     found = [entry.values for entry in run.metrics() if entry.phase == "val"]
     return dict(found[-1]) if found else {}
@@ -112,7 +112,7 @@ class NetworkTraining(Training):
         train(task, self.optim, run, self.seed, "network", on_validation)
         if distributed.is_first():
             checkpoint.write(run.model, checkpoint.module_tensors("model", task.model), {})
-        return last_errors(run)
+        return read_last_errors(run)
 
     def task(
         self, architecture: Architecture, data: Prepared, prerequisite: Path | None, device: torch.device
@@ -126,7 +126,7 @@ class NetworkTraining(Training):
         normalizer = architecture.make_normalizer(data.manifest, dataset.frames)
         model = architecture.build_for_training(normalizer, prerequisite).to(device)
         self.rollout.begin(model)
-        pieces = modes.chunks(data.open("val").to(device), VALIDATION_PIECE, least=60)
+        pieces = modes.cut_clips(data.open("val").to(device), VALIDATION_PIECE, least=60)
         return MotionTask(
             model,
             self.loss(model.branches).to(device),
@@ -134,7 +134,7 @@ class NetworkTraining(Training):
             MirroredDataset(dataset) if self.mirror else dataset,
             self.optim,
             self.seed,
-            validate=lambda network: modes.quick_stream(network, pieces, self.metrics),
+            validate=lambda network: modes.measure_stream(network, pieces, self.metrics),
             drawn_by=self.drawn_by,
             shares=self.shares,
         )
@@ -258,7 +258,7 @@ class VQVAETask(TrainingTask):
 
     def report(self) -> dict[str, float]:
         """Return the perplexity of the step's codes, the exponential of the entropy of their counts."""
-        return {"perplexity": perplexity(self.used)}
+        return {"perplexity": compute_perplexity(self.used)}
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
@@ -267,10 +267,10 @@ class VQVAETask(TrainingTask):
         vectors, index = self.model.codebook(self.model.encode(frames))
         used = torch.bincount(index, minlength=len(self.used)).float()
         error = measure_rotation_error(self.model.decoder(vectors), frames, self.normalizer)
-        return {"rotation": float(error), "perplexity": perplexity(used)}
+        return {"rotation": float(error), "perplexity": compute_perplexity(used)}
 
 
-def perplexity(counts: Tensor) -> float:
+def compute_perplexity(counts: Tensor) -> float:
     """Return the exponential of the entropy of counts (K,): K if all are equal, 1 if just one is not 0."""
     share = counts / counts.sum().clamp_min(1)
     return float(torch.special.entr(share).sum().exp())

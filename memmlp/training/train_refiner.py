@@ -26,7 +26,7 @@ from memmlp.training.loop import StepResult, TrainingTask, ValidationCallback, t
 from memmlp.training.losses import Fixed, Loss, Terms, TermsLoss
 from memmlp.training.losses.terms import Comparison, measure_jerk
 from memmlp.training.optim import Optim
-from memmlp.training.train_network import VALIDATION_PIECE, Training, last_errors
+from memmlp.training.train_network import VALIDATION_PIECE, Training, read_last_errors
 
 TOGETHER = 64  # pieces that the network streams through side by side
 
@@ -110,19 +110,19 @@ class RefinerTraining(Training):
         finished = replace(architecture, refiner=None).load(prerequisite).to(device).requires_grad_(False)
         torch.manual_seed(self.seed)
         model = self.refiner.build(finished).to(device)
-        validation = modes.chunks(data.open("val").to(device), VALIDATION_PIECE, least=60)
+        validation = modes.cut_clips(data.open("val").to(device), VALIDATION_PIECE, least=60)
         task = RefinerTask(
             model,
             LOSSES[self.refiner.velocities](),
             dataset,
             self.draw_pieces(dataset),
             self.optim,
-            validate=lambda: modes.quick_stream(model.eval(), validation, self.metrics),
+            validate=lambda: modes.measure_stream(model.eval(), validation, self.metrics),
         )
         train(task, self.optim, run, self.seed, "refiner", on_validation)
         finished.requires_grad_(True)
         checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
-        return last_errors(run)
+        return read_last_errors(run)
 
     def draw_pieces(self, dataset: MotionDataset) -> tuple[Tensor, Tensor]:
         """Draw the pieces: frames (P, n, 252), and the indices (P,) of the clips that they come from."""

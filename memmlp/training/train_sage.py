@@ -33,7 +33,7 @@ from memmlp.runs.run import Run
 from memmlp.training.loop import StepResult, TrainingTask, ValidationCallback, train
 from memmlp.training.losses.terms import Body
 from memmlp.training.optim import Optim
-from memmlp.training.train_network import NetworkTraining, Training, last_errors
+from memmlp.training.train_network import NetworkTraining, Training, read_last_errors
 
 PARTS = ("upper_codes", "lower_codes", "upper_diffusion", "lower_diffusion", "decoder")
 """In the order of their training; each builds upon the one before."""
@@ -195,7 +195,7 @@ class PartTraining(Training):
         train(task, self.network.optim, run, self.network.seed, self.kind.replace("_", " "), on_validation)
         if distributed.is_first():
             checkpoint.write(run.model, before | checkpoint.module_tensors(name, part), {})
-        return last_errors(run)
+        return read_last_errors(run)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.deploy.lower_precision import lower
 from memmlp.deploy.onnx_stream import OnnxStream
-from memmlp.deploy.parity import streamed
+from memmlp.deploy.parity import stream_onnx
 from memmlp.networks.streaming import streaming
 from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.lookup import list_runs
@@ -74,7 +74,7 @@ def test_inner_layers_are_int8_and_the_ends_are_not(step_files, tmp_path, networ
 
 def test_int8_is_near_and_keeps_the_metadata(pair):
     exact, quantised = pair
-    before, after = (streamed(OnnxStream(path), CLIPS[0]) for path in pair)
+    before, after = (stream_onnx(OnnxStream(path), CLIPS[0]) for path in pair)
     assert 1e-6 < float((before - after).abs().mean()) < 0.02
     props = [{p.key: p.value for p in onnx.load(path).metadata_props} for path in pair]
     assert props[0].items() <= props[1].items()

@@ -9,7 +9,7 @@ from torch import nn
 
 from memmlp.common import processes
 from memmlp.deploy import latency
-from memmlp.deploy.latency import macs, strip_conversions
+from memmlp.deploy.latency import count_macs, strip_conversions
 from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM
 from memmlp.motion.network_coordinates import World
 from memmlp.motion.normalizer import Normalizer
@@ -40,7 +40,7 @@ def test_without_conversions_it_is_the_same_network(name):
         whole, ours = model.advance(clip[:, t : t + 1], ours, 1)
         bare, theirs = alone.advance(clip[:, t : t + 1], theirs, 1)
         torch.testing.assert_close(bare[..., ROTATION], whole[..., ROTATION], atol=1e-5, rtol=1e-5)
-    assert macs(alone) <= macs(model)
+    assert count_macs(alone) <= count_macs(model)
 
 
 @pytest.mark.slow
@@ -85,7 +85,7 @@ def test_macs_are_counted_by_hand():
     newest = frames * hidden + hidden * hidden  # the branches' last block makes the newest frame alone
     expected = frames * 54 * hidden + 4 * block + 2 * newest + hidden * (132 + 66)
     with torch.no_grad():
-        assert latency.macs(model) == expected
+        assert latency.count_macs(model) == expected
 
 
 class Attentive(MotionModel):
@@ -115,4 +115,4 @@ def test_products_of_torchs_own_attention_are_counted(mixer: str):
     """In evaluation an encoder is one kernel, of which torch's counter counts nothing."""
     scores = 2 * 7 * 7 * 16
     inner = 2 * (4 * 7 * 16 * 16 + scores + 2 * 7 * 16 * 32) if mixer == "encoder" else scores
-    assert macs(Attentive(mixer).eval()) == 7 * 16 * (SPARSE_DIM + MOTION_DIM) + inner
+    assert count_macs(Attentive(mixer).eval()) == 7 * 16 * (SPARSE_DIM + MOTION_DIM) + inner

@@ -19,14 +19,14 @@ from memmlp.deploy.lower_precision import (
     ZERO,
     blocks,
     compare_accuracy,
-    inner_layers,
+    find_inner_layers,
     lower,
     measure_accuracy,
     store_in_blocks,
 )
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.opsets import Constants
-from memmlp.deploy.parity import streamed
+from memmlp.deploy.parity import stream_onnx
 from memmlp.evaluation import modes as evaluation
 from memmlp.motion.network_coordinates import Heading
 from memmlp.networks.streaming import streaming
@@ -47,7 +47,7 @@ def test_every_layer_between_the_ends_is_an_inner_one(step_files, network: str):
         if name.endswith("weight") and weight.ndim == 2
     }
     ends = [weight for name, weight in weights.items() if name.startswith(stream.float32_modules)]
-    inner, constants = set(inner_layers(graph, stream.float32_modules)), Constants(graph.graph)
+    inner, constants = set(find_inner_layers(graph, stream.float32_modules)), Constants(graph.graph)
     left = [
         node.name
         for node in graph.graph.node
@@ -70,7 +70,7 @@ def test_the_products_of_inner_layers_are_fp16(step_files, tmp_path: Path, netwo
     source, path = step_files(network), tmp_path / "half.onnx"
     stream = streaming(exported.NETWORKS[network]())
     lower("fp16", source, path, stream, [])
-    made, inner = onnx.load(path), set(inner_layers(onnx.load(source), stream.float32_modules))
+    made, inner = onnx.load(path), set(find_inner_layers(onnx.load(source), stream.float32_modules))
     onnx.checker.check_model(made, full_check=True)
     kinds = {tensor.name: tensor.data_type for tensor in made.graph.initializer}
     products = [node for node in made.graph.node if node.op_type in ("Gemm", "MatMul")]
@@ -79,7 +79,7 @@ def test_the_products_of_inner_layers_are_fp16(step_files, tmp_path: Path, netwo
     ends_of_file = (*made.graph.input, *made.graph.output)
     assert {end.type.tensor_type.elem_type for end in ends_of_file} == {TensorProto.FLOAT}
     assert path.stat().st_size < source.stat().st_size + 200 * len(made.graph.node)
-    apart = (streamed(OnnxStream(source), CLIP) - streamed(OnnxStream(path), CLIP)).abs()
+    apart = (stream_onnx(OnnxStream(source), CLIP) - stream_onnx(OnnxStream(path), CLIP)).abs()
     assert 1e-7 < float(apart.mean()) < 1e-3
 
 
@@ -130,7 +130,7 @@ def test_only_cells_are_in_blocks_and_the_motion_is_near(tmp_path: Path, cell: s
     member = "model.model.members.member1"
     assert {f"{member}.stem.weight", f"{member}.head.weight"} <= stored
     assert sum(before.values()) == sum(after.values())
-    apart = streamed(OnnxStream(exact), CLIP) - streamed(OnnxStream(path), CLIP)
+    apart = stream_onnx(OnnxStream(exact), CLIP) - stream_onnx(OnnxStream(path), CLIP)
     assert 1e-6 < float(apart.abs().mean()) < 0.005
 
 

@@ -16,7 +16,7 @@ from memmlp.common.errors import InputError
 from memmlp.config.schema import ExportConfig
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.opsets import NATIVE, OPSETS, convert
-from memmlp.deploy.parity import TOLERANCE, streamed
+from memmlp.deploy.parity import TOLERANCE, stream_onnx
 
 CLIP = tiny.clip(20)
 
@@ -38,14 +38,14 @@ def test_a_step_computes_the_same_in_every_opset(
     source, path = step_files(network), tmp_path / "step.onnx"
     native = onnx.load(source)
     assert exported.data_dependent(native.graph) == set()
-    expected = streamed(OnnxStream(source), CLIP)
+    expected = stream_onnx(OnnxStream(source), CLIP)
     for opset in OPSETS if network == "mem_mlp" else (15, 17, OPSETS[-1]):
         made = convert(native, opset)
         onnx.checker.check_model(made, full_check=True)
         assert [(one.domain, one.version) for one in made.opset_import] == [("", opset)]
         assert [p.value for p in made.metadata_props] == [p.value for p in native.metadata_props]
         onnx.save(made, path)
-        assert float((streamed(OnnxStream(path), CLIP) - expected).abs().max()) <= TOLERANCE
+        assert float((stream_onnx(OnnxStream(path), CLIP) - expected).abs().max()) <= TOLERANCE
 
 
 def test_older_opsets_have_other_operators():

@@ -20,10 +20,10 @@ from memmlp.deploy.parity import (
     TOLERANCE,
     clips_to_check,
     differences,
-    in_torch,
     is_rounding,
     parity,
-    streamed,
+    stream_onnx,
+    stream_torch,
 )
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.network_coordinates import Heading
@@ -53,7 +53,7 @@ def test_a_forgotten_past_is_a_difference_that_a_short_clip_hides():
     broken.memory.remember = lambda motion, past, state, new: {"motion": torch.zeros_like(state["motion"])}
     (clip,) = clips_to_check(model, [tiny.clip(200)])
     long, short = (
-        float((in_torch(model, one) - in_torch(broken, one)).abs().max())
+        float((stream_torch(model, one) - stream_torch(broken, one)).abs().max())
         for one in (clip, clip[: model.frames])
     )
     assert long > TOLERANCE > short
@@ -78,7 +78,7 @@ def test_almost_parallel_columns_are_no_failure(tmp_path):
     with torch.no_grad():
         model.head.bias.view(22, 6)[9, 3] += 1e-3  # 4e-6 of the rotation, the rounding of a large network
     assert parity(model, path, CLIP) <= TOLERANCE
-    assert float((in_torch(model, CLIP) - streamed(OnnxStream(path), CLIP)).abs().max()) > TOLERANCE
+    assert float((stream_torch(model, CLIP) - stream_onnx(OnnxStream(path), CLIP)).abs().max()) > TOLERANCE
     model.normalizer.rest[15] += 0.01  # of the joints alone
     assert parity(model, path, CLIP) > TOLERANCE
 

@@ -9,7 +9,7 @@ import torch
 
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import NoIK
-from memmlp.evaluation.modes import quick_stream
+from memmlp.evaluation.modes import measure_stream
 from memmlp.motion.network_coordinates import Heading
 
 STREAM = Evaluation(("stream",), batch=4, ik=NoIK(), seed=0)
@@ -37,6 +37,6 @@ def test_a_clip_without_numbers_is_no_clip_less(broken: bool):
     network, clips = tiny.model(), [tiny.clip(40, seed=1), tiny.clip(2, seed=2)]
     if broken:
         clips[0][20] = math.nan
-    found = quick_stream(network, clips)
+    found = measure_stream(network, clips)
     assert math.isnan(found["rotation MPJPE"]) == broken
     assert math.isnan(found["rotation Jitter"]) == broken

@@ -45,7 +45,7 @@ def person(count: int = 40) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 def reachable(base: torch.Tensor) -> torch.Tensor:
     """Ends that every limb can reach."""
-    upper, lower, _ = limbs.bones(REST)
+    upper, lower, _ = limbs.find_bones(REST)
     longest = upper.norm(dim=-1) + lower.norm(dim=-1)
     share = 0.3 + 0.65 * torch.rand(*base.shape[:2], generator=DRAW).double()
     return base + unit(*base.shape) * (share * longest)[..., None]
@@ -78,11 +78,13 @@ def test_hands_and_ankles_come_to_their_ends_and_feet_point_to_their_toes(body):
 
 def test_elbows_and_knees_bend_about_their_axes_and_roll_about_their_forearms(body):
     """The knee's rotation keeps the axis of flexion; the elbow's is such a bend and then a roll."""
-    _, lower, axis = limbs.bones(REST)
+    _, lower, axis = limbs.find_bones(REST)
     knees = body["made"][:, list(MIDDLES[2:])]
     torch.testing.assert_close(limbs.rotate(knees, axis[2:]), axis[2:].expand(40, -1, -1))
     elbows = body["made"][:, list(MIDDLES[:2])]
-    bent = limbs.flex(*limbs.bones(REST), (body["end"] - body["base"]).norm(dim=-1, keepdim=True))[:, :2]
+    bent = limbs.bend_middles(
+        *limbs.find_bones(REST), (body["end"] - body["base"]).norm(dim=-1, keepdim=True)
+    )[:, :2]
     rolled = bent.mT @ elbows
     torch.testing.assert_close(
         limbs.rotate(rolled, lower[:2]), lower[:2].expand(40, -1, -1), atol=1e-9, rtol=0
@@ -93,8 +95,8 @@ def test_a_middle_is_where_its_swivel_says_unless_its_twist_is_limited(body):
     """Unlimited bases have the swivel that was asked for; limited ones are at their limits."""
     back = body["turned"][:, [limbs.PARENTS[joint] for joint in BASES]].mT
     local = back @ body["turned"][:, list(BASES)]
-    bone = torch.nn.functional.normalize(limbs.bones(REST)[0], dim=-1)
-    cosine, sine = limbs.twist(local, bone.expand(40, -1, -1))
+    bone = torch.nn.functional.normalize(limbs.find_bones(REST)[0], dim=-1)
+    cosine, sine = limbs.measure_twist(local, bone.expand(40, -1, -1))
     found = torch.atan2(sine, cosine)[..., 0].rad2deg().abs()
     limit = torch.tensor(limbs.TWIST).double()
     assert (found <= limit + 1e-6).all()
@@ -110,8 +112,8 @@ def test_the_smallest_turn_to_a_limit_is_what_a_search_finds():
     local, bone, axis = sixd_to_matrix(drawn(6, 4, 6)), unit(4, 3), unit(6, 4, 3)
     turn = limbs.limit_twist(local, bone, axis)
     tried = torch.linspace(-math.pi, math.pi, 7201).double()[:, None, None, None]
-    every = limbs.about(axis.expand(7201, 6, 4, 3), tried.cos(), tried.sin()) @ local
-    cosine, sine = limbs.twist(every, bone.expand(7201, 6, 4, 3))
+    every = limbs.rotate_about(axis.expand(7201, 6, 4, 3), tried.cos(), tried.sin()) @ local
+    cosine, sine = limbs.measure_twist(every, bone.expand(7201, 6, 4, 3))
     inside = torch.atan2(sine, cosine)[..., 0].rad2deg().abs() <= torch.tensor(limbs.TWIST) + 0.3
     least = torch.where(inside, tried[..., 0].abs(), 10.0).amin(0)
     found = torch.acos(((turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1))
@@ -141,7 +143,7 @@ def test_swivels_are_an_independent_computation():
 def test_what_is_out_of_reach_is_a_limb_as_straight_or_bent_as_can_be_with_finite_slopes(share):
     local, turned, joints = person(3)
     base = joints[:, list(BASES)]
-    end = (base + share * limbs.bones(REST)[0]).requires_grad_()
+    end = (base + share * limbs.find_bones(REST)[0]).requires_grad_()
     swivel, toe = unit(3, 4, 2).requires_grad_(), drawn(3, 2, 3).requires_grad_()
     hands = sixd_to_matrix(drawn(3, 2, 6))
     made = limbs.solve_limbs(local, turned, base, end, swivel, hands, toe, REST)
@@ -150,7 +152,7 @@ def test_what_is_out_of_reach_is_a_limb_as_straight_or_bent_as_can_be_with_finit
     assert all(torch.isfinite(part.grad).all() for part in (end, swivel, toe))
     if share == 5:
         straight = forward_kinematics(made, torch.zeros(3, 3).double(), REST)[1]
-        upper, lower, _ = limbs.bones(REST)
+        upper, lower, _ = limbs.find_bones(REST)
         reach = (straight[:, list(ENDS)] - base).norm(dim=-1)
         assert (reach > 0.99 * (upper.norm(dim=-1) + lower.norm(dim=-1))).all()
 

@@ -12,7 +12,7 @@ from memmlp.common.errors import TrainingDiverged
 from memmlp.runs.run import Run
 from memmlp.training import loop
 from memmlp.training.loop import train
-from memmlp.training.train_network import perplexity
+from memmlp.training.train_network import compute_perplexity
 
 
 class Kill(Exception):
@@ -126,5 +126,5 @@ def test_every_knob_of_the_optimiser_changes_the_weights(tmp_path):
 
 
 def test_perplexity():
-    assert perplexity(torch.ones(8)) == pytest.approx(8)
-    assert perplexity(torch.tensor([5.0, 0, 0])) == pytest.approx(1)
+    assert compute_perplexity(torch.ones(8)) == pytest.approx(8)
+    assert compute_perplexity(torch.tensor([5.0, 0, 0])) == pytest.approx(1)
