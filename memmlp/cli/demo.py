@@ -81,10 +81,10 @@ def next_steps(overrides: Sequence[str], environment: Path | None = None, runs: 
         environment: the folder of a virtual environment that this shell has not activated, or None.
         runs: ids of the demo's runs; two of them are drawn beside the truth.
     """
-    words = " ".join(map(shlex.quote, ["memmlp", "train", *overrides, "memory=none"]))
+    command = shlex.join(["memmlp", "train", *overrides, "memory=none"])
     kept = [shlex.quote(word) for word in overrides if word.startswith(("profile=", "threads=", "device="))]
     lines = [
-        f"{words}          the same without the memory; then memmlp runs list",
+        f"{command}          the same without the memory; then memmlp runs list",
         "memmlp data import BVH_FOLDER --out outputs/data/mine",
         " ".join(["memmlp train", *kept, "data=mocap data.root=outputs/data/mine"]),
     ]
@@ -98,6 +98,6 @@ def next_steps(overrides: Sequence[str], environment: Path | None = None, runs: 
 def inactive_environment() -> Path | None:
     """Return the folder of this Python's virtual environment if the shell has not activated it, else None."""
     here = Path(sys.prefix)
-    found = shutil.which("memmlp")
-    inside = found is not None and Path(found).parent == here / "bin"
+    path = shutil.which("memmlp")
+    inside = path is not None and Path(path).parent == here / "bin"
     return None if inside or not (here / "bin" / "activate").exists() else here

@@ -162,10 +162,10 @@ def copy_deployed(run: Run, out: Path, form: Form, max_growth: float) -> str | N
 def describe_cost(cost: dict[str, Any], precision: str) -> str:
     """Describe what lower precision costs in accuracy."""
     names = ("MPJPE", "position MPJPE", "Jitter")
-    found = {name: f"{cost['fp32'][name]:.2f} -> {cost[precision][name]:.2f}" for name in names}
-    if found["position MPJPE"] == found["MPJPE"]:  # without a position branch
-        del found["position MPJPE"]
-    return ", ".join(f"{name} {change}" for name, change in found.items())
+    changes = {name: f"{cost['fp32'][name]:.2f} -> {cost[precision][name]:.2f}" for name in names}
+    if changes["position MPJPE"] == changes["MPJPE"]:  # without a position branch
+        del changes["position MPJPE"]
+    return ", ".join(f"{name} {change}" for name, change in changes.items())
 
 
 def load(opened: OpenedRun, form: Form) -> tuple[MotionModel, MotionModel | StreamingGraph]:

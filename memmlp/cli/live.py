@@ -174,10 +174,10 @@ def check_options(given: LiveOptions) -> None:
         raise InputError(f"--space {given.space}: must be {SPACE} with a clip; others are for packets")
     if given.packets and given.hz != HZ:
         raise InputError("--hz: needs a clip; packets arrive at any rate")
-    if given.packets is None and (names := [name for name, said in worn.items() if said]):
+    if given.packets is None and (names := [name for name, used in worn.items() if used]):
         raise InputError(f"{names[0]}: needs --udp PORT or --osc PORT, the packets of a wearer's devices")
     osc = {"--osc": given.osc is not None, "--vmc": given.vmc, "--vrchat": given.vrchat}
-    if (needing := [name for name, said in osc.items() if said]) and find_spec("pythonosc") is None:
+    if (needing := [name for name, used in osc.items() if used]) and find_spec("pythonosc") is None:
         raise InputError(f"{needing[0]}: needs python-osc: pip install 'memmlp[osc]'")
     check_token(given.host, given.token)
 
@@ -210,7 +210,7 @@ def load_clip(given: LiveOptions) -> TrackedClip:
     if given.is_file:
         check_file(Path(given.network))
         raise InputError(f"{given.network}: needs --clip FILE.npz, --udp or --osc; a file has no test clips")
-    if sys.stderr.isatty():  # somebody waits, for seconds
+    if sys.stderr.isatty():  # it takes seconds
         note(f"opening run {given.network} and its test clips")
     from memmlp.config.open_run import clip_index, open_run
 
@@ -233,9 +233,9 @@ def serve(given: LiveOptions) -> None:
     with contextlib.closing(make_source(given)) as source:
         file, name = network_file(given)
         stream = Stream(file, space=source.space)
-        known = combine_calibration(given, source.space, stream)
-        stream.fit(known.height, known.floor)
-        stream.offsets = known.offsets
+        calibration = combine_calibration(given, source.space, stream)
+        stream.fit(calibration.height, calibration.floor)
+        stream.offsets = calibration.offsets
         avatar, vrm = given.avatar, None
         if avatar is not None:
             vrm = page.mannequin_vrm(stream.rest) if avatar == BUILTIN else page.read_vrm(Path(avatar))
@@ -279,14 +279,14 @@ def combine_calibration(given: LiveOptions, space: SpaceName, stream: Stream) ->
     from memmlp.live.wearer import SAME, Calibration, read_calibration, stature
 
     body = stature(stream.network.body)
-    known = Calibration(space)
+    saved = Calibration(space)
     if given.calibration is not None and given.calibration.exists():
-        known = read_calibration(given.calibration, space, stream.network.body)
-    height = known.height if given.height is None else given.height
-    floor = known.floor if given.floor is None else given.floor
-    offsets = known.offsets
-    if offsets is not None and abs((height or body) - (known.height or body)) > SAME:
-        was = known.height or body
+        saved = read_calibration(given.calibration, space, stream.network.body)
+    height = saved.height if given.height is None else given.height
+    floor = saved.floor if given.floor is None else given.floor
+    offsets = saved.offsets
+    if offsets is not None and abs((height or body) - (saved.height or body)) > SAME:
+        was = saved.height or body
         note(f"{given.calibration}: its calibration is for a height of {was:.2f} m; calibrate again")
         offsets = None
     return Calibration(space, offsets, height, floor)

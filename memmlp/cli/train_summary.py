@@ -71,15 +71,15 @@ def show_side_by_side(outcomes: Mapping[str, Outcome]) -> None:
     The errors are those in stream mode if that was measured. A network whose branches differ has a column
     for each.
     """
-    found = {name: outcome.results for name, outcome in outcomes.items()}
-    mode = "stream" if all("stream" in results for results in found.values()) else "window"
-    branches = {name: _differing(results[mode]) for name, results in found.items()}
+    results = {name: outcome.results for name, outcome in outcomes.items()}
+    mode = "stream" if all("stream" in own for own in results.values()) else "window"
+    branches = {name: _differing(own[mode]) for name, own in results.items()}
     columns = [(name, branch) for name, own in branches.items() for branch in own]
     headers = [f"{name}\n{branch}" if len(branches[name]) > 1 else name for name, branch in columns]
-    errors = [found[name][mode][branch] for name, branch in columns]
+    errors = [results[name][mode][branch] for name, branch in columns]
     table = _error_table(f"side by side, {mode}", headers, errors)
-    if all("latency" in results for results in found.values()):
-        costs = [as_deployed(found[name]["latency"]) for name, _ in columns]
+    if all("latency" in own for own in results.values()):
+        costs = [as_deployed(results[name]["latency"]) for name, _ in columns]
         table.add_row("a frame", "ms", *(f"{cost['median_ms']:.2f}" for cost in costs))
         table.add_row("parameters", "M", *(f"{cost['parameters'] / 1e6:.2f}" for cost in costs))
     Console(highlight=False).print(table)
@@ -87,12 +87,12 @@ def show_side_by_side(outcomes: Mapping[str, Outcome]) -> None:
 
 def _differing(branches: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Return the branches whose positions differ: those of a network that predicts rotations alone don't."""
-    found: list[str] = []
+    differing: list[str] = []
     for branch in (branch for branch in BRANCHES if branch in branches):
         own = branches[branch][SHARED]
-        if not any(math.isclose(own, branches[other][SHARED], rel_tol=SAME) for other in found):
-            found.append(branch)
-    return found
+        if not any(math.isclose(own, branches[other][SHARED], rel_tol=SAME) for other in differing):
+            differing.append(branch)
+    return differing
 
 
 def describe_latency(record: Mapping[str, Any]) -> Iterator[str | Text]:

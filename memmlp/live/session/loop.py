@@ -237,7 +237,7 @@ class Fitting:
     def _carry_out(self, order: Order, trackers: QuaternionPoses | None) -> None:
         """Carry out an order, save what it changed, and publish the result."""
         try:
-            said = self._change(order, trackers)
+            line = self._change(order, trackers)
             if self.path is not None and order.action != "cancel":
                 stream = self.stream
                 made = Calibration(self.space, stream.offsets, self.height, stream.wearer.floor)
@@ -245,17 +245,16 @@ class Fitting:
         except InputError as error:
             self._publish_state(str(error), failed=True)
         else:
-            self._publish_state(said)
+            self._publish_state(line)
 
     def _change(self, order: Order, trackers: QuaternionPoses | None) -> str:
         """Change the stream by an order, and return a line about the result."""
         stream, value = self.stream, order.value
         if order.action == "calibrate" and trackers:
             offsets = stream.calibrate(*trackers)
-            said = (
-                f"Calibrated; the devices are up to {100 * offsets.distances.max():.0f} cm from the joints."
-            )
-            return f"{said} But {offsets.doubt}" if offsets.doubt else said
+            farthest = 100 * offsets.distances.max()
+            line = f"Calibrated; the devices are up to {farthest:.0f} cm from the joints."
+            return f"{line} But {offsets.doubt}" if offsets.doubt else line
         if order.action == "height":
             calibrated = stream.offsets is not None
             stream.fit(value, stream.wearer.floor)
@@ -275,7 +274,7 @@ class Fitting:
             return "The calibration is forgotten."
         return ""  # cancel
 
-    def _publish_state(self, said: str, failed: bool = False) -> None:
+    def _publish_state(self, line: str, failed: bool = False) -> None:
         stream, waiting = self.stream, self.waiting
         remaining = round(max(self.due - self.clock(), 0.0), 2)
         state = {
@@ -283,7 +282,7 @@ class Fitting:
             "floor": round(100 * stream.wearer.floor, 1),
             "calibrated": stream.offsets is not None,
             "waiting": waiting and {"action": waiting.action, "seconds": remaining},
-            "said": said,
+            "line": line,
             "failed": failed,
             "file": self.path and self.path.name,
         }

@@ -291,7 +291,7 @@ class PacketSource:
     """Takes packets that arrive at a UDP port, from this machine and from listed other machines.
 
     Args:
-        name: the kind of packets, in words.
+        name: the kind of packets, for messages.
         port: the port; 0 for any free one.
         parse: reads the packet of a datagram, or raises InputError.
         space: the frame of reference of the poses.

@@ -68,7 +68,7 @@ def test_a_calibration_waits_for_its_countdown(worn: Wearing):
     state = worn.states[-1]
     assert (state["waiting"], state["file"]) == (None, "me.json")
     assert (state["calibrated"], state["failed"]) == (True, False)
-    assert "0 cm from the joints" in state["said"]
+    assert "0 cm from the joints" in state["line"]
     saved = read_calibration(worn.path, "amass", worn.stream.network.body).offsets
     np.testing.assert_allclose(saved.positions, worn.stream.offsets.positions)
 
@@ -90,18 +90,18 @@ def test_a_failed_order_is_reported_and_changes_nothing(worn: Wearing):
         worn.order("calibrate", 0)
         worn.fitting.step(pose)
         assert worn.states[-1]["failed"]
-        assert words in worn.states[-1]["said"]
+        assert words in worn.states[-1]["line"]
         assert worn.stream.offsets is before is not None
     worn.order("height", 18.0)
     worn.fitting.step(None)
-    assert worn.states[-1]["said"].startswith("height=18.0: ")
+    assert worn.states[-1]["line"].startswith("height=18.0: ")
     assert worn.stream.wearer.scale == 1
     assert worn.stream.offsets is before
     worn.stream.odd.report = (lines := []).append
     worn.order("calibrate", 0)
     worn.fitting.step(tuple((place, np.roll(turn, 1)) for place, turn in worn.pose()))
     assert worn.states[-1]["calibrated"]  # quaternions in another order are only warned of
-    assert "90 degrees from upright" in worn.states[-1]["said"]
+    assert "90 degrees from upright" in worn.states[-1]["line"]
     assert len(lines) == 1
 
 
@@ -132,7 +132,7 @@ def test_another_height_forgets_the_calibration(worn: Wearing):
     assert worn.stream.offsets is None
     state = worn.states[-1]
     assert (state["calibrated"], state["height"], state["failed"]) == (False, 190, False)
-    assert state["said"].startswith("Calibrate again")
+    assert state["line"].startswith("Calibrate again")
     saved = read_calibration(worn.path, "amass", worn.stream.network.body)
     assert (saved.offsets, saved.height) == (None, 1.90)
 

@@ -5,23 +5,23 @@ import { GLTFLoader } from './npm/examples/jsm/loaders/GLTFLoader.js';
 import { VRMLoaderPlugin, VRMUtils } from './npm/lib/three-vrm.module.min.js';
 
 export class Avatar {
-  static async load(url, words) {
+  static async load(url, description) {
     const loader = new GLTFLoader();
     loader.register(parser => new VRMLoaderPlugin(parser));
     const { vrm } = (await loader.loadAsync(url)).userData;
     if (!vrm) throw new Error('no VRM avatar in the file');
-    return new Avatar(vrm, words);
+    return new Avatar(vrm, description);
   }
 
-  // words: bones by joint, their parents, and the unit of quaternions.
-  constructor(vrm, words) {
-    Object.assign(this, words, { vrm, scene: vrm.scene });
-    this.nodes = words.bones.map(name => vrm.humanoid.getNormalizedBoneNode(name));
+  // description: bones by joint, their parents, and the unit of quaternions.
+  constructor(vrm, description) {
+    Object.assign(this, description, { vrm, scene: vrm.scene });
+    this.nodes = description.bones.map(name => vrm.humanoid.getNormalizedBoneNode(name));
     this.rest = this.nodes[0].position.y;
     this.mirrored = vrm.meta.metaVersion === '0'; // VRM 0.x faces -Z
     VRMUtils.rotateVRM0(vrm);
     this.scene.traverse(object => Object.assign(object, { frustumCulled: false, castShadow: Boolean(object.isMesh) }));
-    this.missing = words.bones.map(() => new Quaternion());
+    this.missing = description.bones.map(() => new Quaternion());
     this.turned = new Quaternion();
     this.then = performance.now();
   }

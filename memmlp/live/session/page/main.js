@@ -11,14 +11,14 @@ const wearer = new Wearer();
 let stage = null;
 let avatar = null;
 let greeting = null;
-let greeted = null; // the greeting as it came
+let greetingText = null; // the greeting as it came
 let arrived = -Infinity;
 let malformed = 0;
 
 const events = new EventSource('events');
 events.addEventListener('greeting', event => {
-  if (greeted !== null && event.data !== greeted) return location.reload(); // another command is there now
-  greeted = event.data;
+  if (greetingText !== null && event.data !== greetingText) return location.reload(); // another command is there now
+  greetingText = event.data;
   greet(JSON.parse(event.data));
 });
 events.addEventListener('wearer', event => wearer.show(JSON.parse(event.data)));
@@ -31,31 +31,31 @@ events.addEventListener('frame', event => {
   arrived = performance.now();
 });
 
-function greet(words) {
-  greeting = words;
-  $('about').textContent = `${words.network} · ${words.source}`;
-  $('remark').hidden = !words.remark;
-  $('remark').textContent = `This network is ${words.remark}.`;
-  $('ramp').style.background = `linear-gradient(to right, ${words.heat.join(', ')})`;
-  document.querySelector('.prediction').style.background = words.heat[1];
-  $('top').textContent = `${words.top}+`;
-  $('budget').textContent = `of ${(1000 / words.fps).toFixed(1)} ms at ${words.fps} Hz`;
-  $('wearer').hidden = !words.worn;
-  $('goes').hidden = !words.outputs.length;
-  $('outputs').replaceChildren(...words.outputs.map(name => Object.assign(document.createElement('li'), { textContent: name })));
+function greet(message) {
+  greeting = message;
+  $('about').textContent = `${message.network} · ${message.source}`;
+  $('remark').hidden = !message.remark;
+  $('remark').textContent = `This network is ${message.remark}.`;
+  $('ramp').style.background = `linear-gradient(to right, ${message.heat.join(', ')})`;
+  document.querySelector('.prediction').style.background = message.heat[1];
+  $('top').textContent = `${message.top}+`;
+  $('budget').textContent = `of ${(1000 / message.fps).toFixed(1)} ms at ${message.fps} Hz`;
+  $('wearer').hidden = !message.worn;
+  $('goes').hidden = !message.outputs.length;
+  $('outputs').replaceChildren(...message.outputs.map(name => Object.assign(document.createElement('li'), { textContent: name })));
   try {
-    stage ??= new Stage(document.querySelector('canvas'), words);
+    stage ??= new Stage(document.querySelector('canvas'), message);
   } catch (error) {
     trouble(`This browser does not support WebGL (${error.message}); the numbers continue.`);
   }
-  if (stage && words.avatar && !avatar) dress(words.avatar);
+  if (stage && message.avatar && !avatar) dress(message.avatar);
 }
 
 // The avatar's scripts are fetched only where the command serves an avatar.
-async function dress(words) {
+async function dress(description) {
   try {
     const { Avatar } = await import('./avatar.js');
-    avatar ??= await Avatar.load('avatar.vrm', words);
+    avatar ??= await Avatar.load('avatar.vrm', description);
     stage.wear(avatar);
     $('dress').hidden = false;
     document.documentElement.dataset.avatar = 'there';
@@ -64,8 +64,8 @@ async function dress(words) {
   }
 }
 
-function trouble(words) {
-  $('trouble').textContent = words;
+function trouble(line) {
+  $('trouble').textContent = line;
   $('trouble').hidden = false;
 }
 
@@ -100,11 +100,11 @@ function status() {
   return history.paused ? ['', 'paused'] : ['live', 'live'];
 }
 
-function tell(frame) {
-  const [kind, words] = status();
+function show(frame) {
+  const [kind, line] = status();
   $('status').className = kind;
   $('trackers').classList.toggle('waiting', kind !== 'live' && !history.paused);
-  $('status').textContent = words;
+  $('status').textContent = line;
   $('pause').textContent = history.paused ? 'Play' : 'Pause';
   $('pause').setAttribute('aria-pressed', history.paused);
   $('newest').disabled = !history.paused;
@@ -137,7 +137,7 @@ function tick(now) {
     document.documentElement.dataset.shown = frame.number;
   }
   if (now - reported > 100) {
-    tell(frame);
+    show(frame);
     reported = now;
   }
   requestAnimationFrame(tick);

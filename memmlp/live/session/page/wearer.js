@@ -27,7 +27,7 @@ export class Wearer {
   show(state) {
     for (const name of ['height', 'floor']) if (document.activeElement !== $(name)) $(name).value = state[name];
     $('forget').disabled = !state.calibrated;
-    $('said').textContent = [state.said, kept(state)].filter(Boolean).join(' ');
+    $('said').textContent = [state.line, kept(state)].filter(Boolean).join(' ');
     $('said').classList.toggle('failed', state.failed);
     this.waiting = state.waiting && { ...state.waiting, until: performance.now() + 1000 * state.waiting.seconds };
     if (!this.waiting && !$('countdown').hidden) this.beep(state.failed ? 220 : 880, 0.5);

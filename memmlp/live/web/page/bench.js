@@ -56,12 +56,12 @@ class Bench {
     document.documentElement.dataset.bench = 'ready';
   }
 
-  stop(words) {
+  stop(line) {
     this.proxy?.close();
     this.proxy = null;
     this.start.textContent = 'Start';
     this.bar.hidden = true;
-    if (words) this.note.textContent = words;
+    if (line) this.note.textContent = line;
   }
 
   async measure() {

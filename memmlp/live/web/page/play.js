@@ -36,24 +36,24 @@ class Play {
     Object.assign(this, { site, page, history: new History(), dropped: 0, round: 0 });
     this.network = site.networks.find(network => network.clips.length) ?? site.networks[0];
     this.canvas = h('canvas', { 'aria-label': 'Truth and prediction in 3D' });
-    this.layout();
+    this.layOut();
     this.tick = this.tick.bind(this);
   }
 
-  layout() {
+  layOut() {
     const { site } = this;
     const named = id => (this[id] = h('b', { id }, '–'));
     const choices = h('div', { class: 'tools' },
       site.networks.length > 1 && select('Network', site.networks.map(network => [network.key, network.name]), this.network.key, key => {
         this.network = site.networks.find(network => network.key === key);
-        this.layout();
+        this.layOut();
         this.begin();
       }),
       select('Clip', this.clips().map(clip => [clip.key, `${clip.name} (${(clip.frames / 60).toFixed(0)} s)`]), this.clip?.key, key => {
         this.clip = site.clips.find(clip => clip.key === key);
         this.begin();
       }));
-    this.pause = h('button', { type: 'button', class: 'primary', id: 'pause', onclick: () => this.paused() }, 'Pause');
+    this.pause = h('button', { type: 'button', class: 'primary', id: 'pause', onclick: () => this.togglePause() }, 'Pause');
     this.scrub = h('input', { type: 'range', min: 0, max: 0, value: '0', step: 1, 'aria-label': 'Frame', oninput: event => this.history.choose(event.target.valueAsNumber) });
     this.time = h('output', {}, '0.00 s');
     this.trouble = h('p', { class: 'trouble', hidden: true });
@@ -81,32 +81,32 @@ class Play {
     this.history.resume();
     this.dropped = 0;
     if (!this.clips().includes(this.clip)) this.clip = this.clips()[0];
-    if (!this.clip) return this.tell('This site has no test clip of this network.');
-    this.tell('Loading the network.');
+    if (!this.clip) return this.showProblem('This site has no test clip of this network.');
+    this.showProblem('Loading the network.');
     try {
       const [content] = await Promise.all([fetched(this.clip.file), this.proxy.call('open', ['play', this.network.play])]);
       const clip = new Clip(content.buffer);
-      this.tell('');
-      this.stage ??= this.drawn();
+      this.showProblem('');
+      this.stage ??= this.makeStage();
       this.ticking ??= requestAnimationFrame(this.tick);
       await this.rounds(clip, round);
     } catch (error) {
-      if (round === this.round) this.tell(error.message);
+      if (round === this.round) this.showProblem(error.message);
     }
   }
 
-  drawn() {
+  makeStage() {
     try {
       return new Stage(this.canvas, this.site);
     } catch (error) {
-      this.tell(`This browser does not support WebGL (${error.message}); the numbers continue.`);
+      this.showProblem(`This browser does not support WebGL (${error.message}); the numbers continue.`);
       return null;
     }
   }
 
-  tell(words) {
-    this.trouble.textContent = words;
-    this.trouble.hidden = !words;
+  showProblem(line) {
+    this.trouble.textContent = line;
+    this.trouble.hidden = !line;
   }
 
   // Feed the clip to the stream at 60 Hz, repeatedly. Frames that are due during a step are dropped.
@@ -142,7 +142,7 @@ class Play {
     this.history.add({ number, time, held, restarted, ms, positions: millimetres(pose.positions), truth: millimetres(truth) });
   }
 
-  paused() { return this.history.paused ? this.history.resume() : this.history.choose(this.history.last); }
+  togglePause() { return this.history.paused ? this.history.resume() : this.history.choose(this.history.last); }
 
   tick() {
     if (!this.canvas.isConnected) return;

@@ -29,7 +29,7 @@ class Wear {
     this.height = h('input', { type: 'number', id: 'height', min: 100, max: 230, step: 'any', placeholder: 'by headset' });
     this.buttons = Object.entries(MODES).map(([mode, name]) =>
       h('button', { type: 'button', class: 'primary', id: mode, disabled: true, onclick: () => this.enter(mode) }, name));
-    this.layout();
+    this.layOut();
     try {
       this.mirror = new WornScene(this.canvas, site);
     } catch (error) {
@@ -39,7 +39,7 @@ class Wear {
     this.ready();
   }
 
-  layout() {
+  layOut() {
     const facts = [['display', 'rate', 'Hz'], ['frames', 'frames', ''], ['skipped samples', 'skipped', ''], ['pose, median', 'middle', 'ms'], ['pose, p95', 'p95', 'ms'], ['height', 'tall', 'm']];
     const named = id => (this[`${id}Text`] = h('b', { id }, '–'));
     replace(this.page,
@@ -111,10 +111,10 @@ class Wear {
     };
     this.seen.hidden = false;
     this.mirror.through(mode === 'immersive-ar');
-    this.mirror.tell(...INVITE);
+    this.mirror.write(...INVITE);
     session.addEventListener('select', () => { this.worn.due ??= performance.now() + 1000 * COUNTDOWN; });
     session.addEventListener('visibilitychange', () => { this.worn.last = null; });
-    session.addEventListener('end', () => this.ended());
+    session.addEventListener('end', () => this.end());
     this.mirror.renderer.setAnimationLoop((time, frame) => this.tick(time, frame));
   }
 
@@ -124,7 +124,7 @@ class Wear {
       this.count(time);
       const trackers = trackersOf(frame, space, this.worn.session.inputSources);
       this.change(kindsOf(this.worn.session.inputSources));
-      if (trackers[0] && !this.worn.placed) this.stand(trackers[0]);
+      if (trackers[0] && !this.worn.placed) this.placeMirror(trackers[0]);
       this.calibrate(trackers);
       this.feed(trackers, time / 1000);
     }
@@ -137,7 +137,7 @@ class Wear {
     if (worn.passed.length > USUAL) worn.passed.shift();
     worn.last = time;
     worn.frames++;
-    if (worn.frames % 20 === 0) this.tell();
+    if (worn.frames % 20 === 0) this.showFacts();
   }
 
   // Controllers and hands have other offsets, so a calibration with one does not hold for the other. A side without
@@ -146,14 +146,14 @@ class Wear {
     const { worn } = this;
     const kinds = seen.map((kind, side) => kind ?? worn.kinds[side]);
     if (kinds.every((kind, side) => kind === worn.kinds[side])) return;
-    if (worn.calibrated) this.mirror.tell(`Now ${[...new Set(kinds)].join(' and ')}:`, ...INVITE);
+    if (worn.calibrated) this.mirror.write(`Now ${[...new Set(kinds)].join(' and ')}:`, ...INVITE);
     Object.assign(worn, { kinds, calibrated: false });
     delete document.documentElement.dataset.calibrated;
     worn.stream.offsets = usualOffsets(kinds);
     worn.stream.reset();
   }
 
-  stand(head) {
+  placeMirror(head) {
     this.mirror.stand(head.position, headingOf(head.rotation));
     this.worn.placed = true;
   }
@@ -163,17 +163,17 @@ class Wear {
     const { worn, mirror } = this;
     if (worn.due === null) return;
     const left = (worn.due - performance.now()) / 1000;
-    if (left > 0) return mirror.tell(`T-pose ... ${Math.ceil(left)}`, INVITE[1]);
+    if (left > 0) return mirror.write(`T-pose ... ${Math.ceil(left)}`, INVITE[1]);
     worn.due = null;
     try {
       const tall = this.tall(trackers[0]);
       worn.stream.calibrate(...trackers, worn.network.body.height / tall);
       Object.assign(worn, { tall, calibrated: true });
       document.documentElement.dataset.calibrated = 'yes';
-      this.stand(trackers[0]);
-      mirror.tell(`Calibrated, ${worn.tall.toFixed(2)} m tall.`, 'Pull a trigger or pinch to do it again.');
+      this.placeMirror(trackers[0]);
+      mirror.write(`Calibrated, ${worn.tall.toFixed(2)} m tall.`, 'Pull a trigger or pinch to do it again.');
     } catch (error) {
-      mirror.tell('Not calibrated:', ...error.message.split('; '), INVITE[0]);
+      mirror.write('Not calibrated:', ...error.message.split('; '), INVITE[0]);
     }
   }
 
@@ -198,11 +198,11 @@ class Wear {
       if (pose.positions) this.mirror.show(pose.positions);
     }, error => {
       worn.waiting--;
-      this.mirror.tell('The network stopped:', error.message);
+      this.mirror.write('The network stopped:', error.message);
     });
   }
 
-  tell() {
+  showFacts() {
     const { worn } = this;
     this.framesText.textContent = worn.frames;
     this.rateText.textContent = rateOf(worn);
@@ -213,8 +213,8 @@ class Wear {
     this.p95Text.textContent = percentile(worn.times, 95).toFixed(1);
   }
 
-  ended() {
-    this.tell();
+  end() {
+    this.showFacts();
     this.worn = null;
     this.mirror.visible(false);
     this.mirror.through(false);

@@ -7,7 +7,7 @@ const AWAY = 1.3; // metres from the wearer to the mirror
 const [WIDTH, HEIGHT] = [1.3, 2.1]; // metres of the mirror
 const FEW = [12, 1]; // sides and rings of a limb: it has one colour, and is drawn for two eyes and a mirror
 const SKIN = 0x27a9e1;
-const PANEL = [1024, 256]; // pixels of the words
+const PANEL = [1024, 256]; // pixels of the board
 const FACE = ['#14191f', '#e3e8ee'];
 
 export class WornScene {
@@ -56,9 +56,9 @@ export class WornScene {
   }
 
   panel() {
-    this.words = document.createElement('canvas');
-    [this.words.width, this.words.height] = PANEL;
-    this.texture = new THREE.CanvasTexture(this.words);
+    this.boardCanvas = document.createElement('canvas');
+    [this.boardCanvas.width, this.boardCanvas.height] = PANEL;
+    this.texture = new THREE.CanvasTexture(this.boardCanvas);
     this.texture.colorSpace = THREE.SRGBColorSpace;
     const mesh = new THREE.Mesh(new THREE.PlaneGeometry(WIDTH, WIDTH / 4), new THREE.MeshBasicMaterial({ map: this.texture }));
     mesh.position.set(0, HEIGHT + 0.25, 0);
@@ -66,10 +66,10 @@ export class WornScene {
   }
 
   // Write lines on the board above the mirror.
-  tell(...lines) {
+  write(...lines) {
     if (this.board === lines.join('\n')) return;
     this.board = lines.join('\n');
-    const pen = this.words.getContext('2d');
+    const pen = this.boardCanvas.getContext('2d');
     [pen.fillStyle, pen.font, pen.textAlign, pen.textBaseline] = [FACE[0], '52px system-ui, sans-serif', 'center', 'middle'];
     pen.fillRect(0, 0, ...PANEL);
     pen.fillStyle = FACE[1];
