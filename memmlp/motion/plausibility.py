@@ -12,15 +12,17 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import HEAD, JOINTS, PARENTS, builtin_rest_joints
-from memmlp.motion.clip import Clip, is_known_rate, nearest_rate
+from memmlp.motion.clip import PIECE, Clip, is_known_rate, nearest_rate
 
 ANKLES, KNEES, ELBOWS = (
     [JOINTS.index(f"{side}_{joint}") for side in ("left", "right")] for joint in ("ankle", "knee", "elbow")
 )
+LEGS = [JOINTS.index(f"{side}_{joint}") for side in ("left", "right") for joint in ("hip", "knee")]
 MOST_TURN = 4 * math.pi  # rotation vectors need no more than pi; fits wind up to 2 pi and more
 MOST_SPEED = 30.0  # m/s; the fastest runner reached 12.4
 MOST_HEIGHT = 10.0  # metres of the pelvis over z = 0, beyond which feet must stand still at times
@@ -29,6 +31,9 @@ RATES = (20.0, 500.0)  # Hz between which motion is recorded; others may be mist
 STIFF = 0.01  # radians by which a joint that does not turn may turn in a clip
 BACKWARDS = 0.3  # radians of knees and elbows that bend the wrong way; stretched ones came to 0.08
 SAMPLES = 50  # frames that are tested for posture
+JUMP = 8.0  # steps of the frames around it; recorded motion came to 5, a cut or a jump by 1 m begins at 13
+AROUND, SLOWEST = 9, 0.3  # frames, and m/s that are added to their median step, as resting bodies tremble
+FROZEN, TURNING = 0.5, 0.1  # seconds without any change of trans, in which a leg turns faster, rad/s
 
 
 def check_plausible(path: Path, clip: Clip) -> str:
@@ -84,6 +89,29 @@ def find_faults(clip: Clip) -> Iterator[str]:
     if abs(lowest) > LOWEST and not _feet_hold(clip):
         where = f"the lowest joint is at z = {lowest:.1f} m and none stands still while the pelvis moves"
         yield f"{where}, so trans may have other units or axes than metres with Z up, or lack the heights"
+    yield from _find_jumps(clip)
+
+
+def _find_jumps(clip: Clip) -> Iterator[str]:
+    """Yield the largest jump from one frame to the next, and the longest time for which trans is frozen."""
+    if len(clip) < AROUND:
+        return
+    pieces = [
+        np.arange(start, min(start + PIECE, len(clip) - 1) + 1) for start in range(0, len(clip) - 1, PIECE)
+    ]
+    positions = (_pose_sample(clip, piece) for piece in pieces)
+    steps = np.concatenate([np.linalg.norm(np.diff(at, axis=0), axis=-1).mean(1) for at in positions])
+    ratio = steps / (median_filter(steps, AROUND, mode="nearest") + SLOWEST / clip.fps)
+    if ratio.max() > JUMP:
+        frame = int(ratio.argmax())
+        far = f"the joints move by {steps[frame]:.2f} m on average from frame {frame} to the next"
+        yield f"{far}, many times as far as before and after: a jump, or a cut"
+    still = (np.diff(clip.trans, axis=0) == 0).all(-1)
+    turns = np.abs(np.diff(clip.poses[:, LEGS], axis=0)).max((1, 2)) * clip.fps
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], still & (turns > TURNING), [False]]).astype(int)))
+    longest = int(np.diff(ends)[::2].max(initial=0))
+    if longest > FROZEN * clip.fps:
+        yield f"trans does not change in {longest} successive frames while the legs turn, so it may be lost"
 
 
 def _is_y_up(clip: Clip) -> bool:

@@ -1,5 +1,6 @@
 """Plausibility: degrees, other units and another axis are refused; whatever people do is not."""
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -73,6 +74,22 @@ def test_a_rate_at_which_hardly_anybody_records_is_reported():
         assert f"a frame rate of {fps:g} Hz" in faults(odd)
         assert said in faults(odd)
     assert not any(faults(replace(clip, fps=usual)) for usual in (20.0, 59.94, 60.0, 250.0, 480.0))
+
+
+def test_jumps_cuts_and_a_frozen_translation_are_reported():
+    for activity in ("walking", "running"):
+        clip = synthesize_clip(activity, 3, seconds=12)
+        assert faults(clip) == ""
+        jump, frozen = clip.trans.copy(), clip.trans.copy()
+        jump[200, 0] += 1.0
+        assert re.search("from frame (199|200) to the next", faults(replace(clip, trans=jump)))
+        poses, trans = (np.delete(values, slice(200, 500), 0) for values in (clip.poses, clip.trans))
+        assert "from frame 199 to the next" in faults(replace(clip, poses=poses, trans=trans))
+        frozen[200:260] = frozen[200]
+        assert "trans does not change in 59 successive frames" in faults(replace(clip, trans=frozen))
+        assert "trans does not" not in faults(
+            replace(clip, trans=frozen, poses=clip.poses * 0 + clip.poses[0])
+        )
 
 
 def test_a_pose_that_is_held_throughout_is_reported():

@@ -2,8 +2,8 @@
 
 Copies are found by their frames, so a file that was saved again is a copy. Two further kinds are found in
 the motion: copies at another frame rate (`find_resampled_copies`), and clips that share a stretch, such as
-overlapping cuts (`find_shared_stretches`). Both also compare clips with mirror images, since some data
-sets contain their motion mirrored. Clips without motion do not count as copies.
+overlapping cuts or a clip played backwards (`find_shared_stretches`). Both also compare clips with mirror
+images, since some data sets contain their motion mirrored. Clips without motion do not count as copies.
 
 If the split divides all clips in the folder, copies are drawn together, like any group. A published list may
 have copies in several parts: then those in training give way to those in validation, and both to those in
@@ -216,7 +216,19 @@ def _mark_turns(turns: np.ndarray) -> Marks:
     inside = sorted(frame for frame in extrema if REACH <= frame < len(turns) - REACH)
     stretches = ((frame, turns[frame - REACH : frame + REACH + 1]) for frame in inside)
     moving = [frame for frame, each in stretches if _degrees(each, turns[frame]).max(0).mean() >= MOVING]
-    return Marks(np.array(moving, int), sums[moving].astype(np.float32))
+    return Marks(np.array(moving, int), _interpolate_extrema(sums, np.array(moving, int)).astype(np.float32))
+
+
+def _interpolate_extrema(sums: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """Return sums (N, 24) at the extrema of the first one (M, 24), which may lie between two frames.
+
+    So they do not depend on the times at which the motion was sampled.
+    """
+    before, at, after = sums[frames - 1], sums[frames], sums[frames + 1]
+    slope, curvature = (after - before) / 2, after - 2 * at + before
+    shift = np.divide(-slope[:, 0], curvature[:, 0], out=np.zeros(len(frames)), where=curvature[:, 0] != 0)
+    shift = shift.clip(-0.5, 0.5)[:, None]
+    return at + shift * slope + shift**2 / 2 * curvature
 
 
 def _degrees(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -262,11 +274,16 @@ def find_shared_stretches(
 
 
 def _are_alike(one: np.ndarray, frame: int, other: np.ndarray, other_frame: int) -> bool:
-    """Return whether two clips have the same rotations around one frame of each.
+    """Return whether two clips have the same rotations around one frame of each, forwards or backwards.
 
-    A frame's number is uncertain by one, since extrema are flat.
+    A frame's number is uncertain by one, since extrema are flat. The frames of one clip may lie between those
+    of the other, if both were reduced from a higher rate.
     """
     first = one[frame - REACH : frame + REACH + 1]
-    starts = (max(other_frame + shift - REACH, 0) for shift in (-1, 0, 1))
-    stretches = (other[start : start + len(first)] for start in starts)
-    return any(len(first) == len(second) and _degrees(first, second).mean() <= ALIKE for second in stretches)
+    near = other[max(other_frame - REACH - 1, 0) : other_frame + REACH + 2]
+    between = (near[1:] + near[:-1]) / 2
+    return any(
+        _degrees(first, frames[start : start + len(first)]).mean() <= ALIKE
+        for frames in (near, near[::-1], between, between[::-1])
+        for start in range(len(frames) - len(first) + 1)
+    )

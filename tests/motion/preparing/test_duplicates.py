@@ -158,10 +158,25 @@ def test_a_clip_that_only_begins_like_another_is_not_a_copy(root: Path, monkeypa
     assert survey(root).duplicates == {}
 
 
-@pytest.mark.parametrize("change", [elsewhere, lambda clip: rounded(cut(mirrored(clip), 97, 230))])
+def backwards(clip: Clip) -> Clip:
+    return replace(clip, poses=clip.poses[::-1], trans=clip.trans[::-1])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [elsewhere, lambda clip: rounded(cut(mirrored(clip), 97, 230)), lambda clip: backwards(cut(clip, 5))],
+)
 def test_a_clip_that_shares_a_stretch_is_found(root: Path, change: Callable[[Clip], Clip]):
     for activity in ACTIVITIES:
         write_clip(root / "b" / f"{activity}.npz", change(recorded(activity)))
+    assert survey(root).duplicates == {f"b/{activity}": f"a/{activity}" for activity in ACTIVITIES}
+
+
+def test_frames_between_those_of_another_clip_are_a_copy(root: Path):
+    for activity in ACTIVITIES:
+        twice = resample(recorded(activity), 120.0)[0]
+        odd = replace(twice, poses=twice.poses[1::2], trans=twice.trans[1::2], fps=60.0)
+        write_clip(root / "b" / f"{activity}.npz", odd)
     assert survey(root).duplicates == {f"b/{activity}": f"a/{activity}" for activity in ACTIVITIES}
 
 
