@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from memmlp.config.open_run import OpenedRun
+    from memmlp.evaluation.ik import LBFGS
     from memmlp.live.spaces import SpaceName
     from memmlp.live.stream import RotationFormat
     from memmlp.networks.motion_model import MotionModel
@@ -225,13 +226,14 @@ class TrainedRun(os.PathLike[str]):
         offsets: Offsets | None = None,
         height: float | None = None,
         floor: float = 0.0,
+        ik: LBFGS | None = None,
     ) -> Stream:
         """Return a live stream of the network, from its ONNX file; the arguments are those of `Stream`.
 
         Raises InputError as `Stream` does, and if the run has no ONNX file yet.
         """
         return Stream(
-            self._run, space=space, rotations=rotations, offsets=offsets, height=height, floor=floor
+            self._run, space=space, rotations=rotations, offsets=offsets, height=height, floor=floor, ik=ik
         )
 
     @cached_property

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
 from time import perf_counter
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
@@ -29,11 +29,14 @@ from memmlp.live.wearer import TILTED, Offsets, check_offsets, make_wearer
 from memmlp.motion.body import FEATURES
 from memmlp.runs.run import Run
 
+if TYPE_CHECKING:
+    from memmlp.evaluation.ik import LBFGS
+
 APART = 0.1  # metres between the hands, at least, in a T-pose
 FAR = 0.25  # metres; a device farther from a T-pose's joint is not attached there
 ROUNDED = 5e-4  # metres by which heights may differ, as on a page that shows millimetres
 FORGOTTEN = "the calibration was for another height and is forgotten"
-NEEDED = ("joints", "parents", "rest", "fps", "T", "features")
+NEEDED = ("joints", "parents", "rest", "fps", "T", "branches", "features")
 AGAIN = "export it again with memmlp export RUN --out FILE.onnx"
 
 RotationFormat = Literal["matrix", "quaternion"]
@@ -48,6 +51,7 @@ class ExportedNetwork(OnnxStream):
         body: its joints, their tree and the rest pose.
         fps: frames per second.
         frames: the window's length T.
+        has_position_branch: whether the network predicts positions itself.
 
     Raises:
         InputError: if the file is not such a network, or lacks some of its metadata.
@@ -68,6 +72,7 @@ class ExportedNetwork(OnnxStream):
             rest = np.array(json.loads(meta["rest"]), np.float64)
             self.body = BodyTree(json.loads(meta["joints"]), json.loads(meta["parents"]), rest)
             self.fps, self.frames = float(meta["fps"]), int(meta["T"])
+            self.has_position_branch = "position" in json.loads(meta["branches"])
         except (ValueError, TypeError, LookupError):
             raise InputError(f"{path}: its metadata are damaged; {AGAIN}") from None
         if not 1 <= self.fps <= 1000:
@@ -146,6 +151,7 @@ class Stream:
         offsets: the offsets of the joints from the devices; None for zero offsets.
         height: the wearer's body height, metres; None for the height of the network's body.
         floor: the height of the floor in the space, metres.
+        ik: inverse kinematics towards the position branch (`memmlp.evaluation.ik.LBFGS()`); needs torch.
 
     Attributes:
         wearer: height and floor (`memmlp.live.wearer`), as `fit` sets them.
@@ -166,6 +172,7 @@ class Stream:
         offsets: Offsets | None = None,
         height: float | None = None,
         floor: float = 0.0,
+        ik: LBFGS | None = None,
     ):
         self.space = space_of(space)
         if rotations not in ROTATION_FORMATS:
@@ -174,6 +181,9 @@ class Stream:
             raise InputError(f"source={source!r}: expected a run, its folder, or an ONNX file")
         run = source if isinstance(source, Run) else Run(Path(source))
         self.network = ExportedNetwork(run.preferred_onnx if run.folder.is_dir() else run.folder)
+        if ik is not None and not self.network.has_position_branch:
+            raise InputError(f"ik: must be None; {self.network.path} does not have a position branch")
+        self.ik = ik
         self.offsets = None if offsets is None else check_offsets(offsets)
         self.wearer = make_wearer(self.network.body, height, floor)
         self.step_seconds = 0.0
@@ -268,7 +278,7 @@ class Stream:
             else:
                 self.network.advance()
             self.step_seconds += perf_counter() - began
-        local, scale = sixd_to_matrix(self.network.rotation6d), self.wearer.scale
+        local, scale = sixd_to_matrix(self._rotations()), self.wearer.scale
         self._last = BodyFrame(
             frames[-1].time,
             local,
@@ -281,6 +291,21 @@ class Stream:
             restarted,
         )
         return self._last
+
+    def _rotations(self) -> np.ndarray:
+        """Return the last step's rotations (22, 6), after inverse kinematics if there is any."""
+        sixd, position = self.network.rotation6d, self.network.position
+        if self.ik is None:
+            return sixd
+        import torch
+
+        from memmlp.motion.network_coordinates import World
+        from memmlp.motion.normalizer import Normalizer
+
+        world = Normalizer.raw(World(), torch.tensor(self.network.body.rest))
+        motion = torch.from_numpy(np.concatenate([sixd.reshape(1, -1), position.reshape(1, -1)], 1))
+        solved = self.ik.solve(world, motion, torch.from_numpy(self._sparse[None]))
+        return solved.numpy().reshape(-1, 6)
 
     def calibrate(self, head: TrackerPose, left: TrackerPose, right: TrackerPose) -> Offsets:
         """Learn the offsets from a person who stands upright in T-pose, and use them from now on.

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 import memmlp
 from memmlp.common.errors import InputError
 from memmlp.deploy.export import export
+from memmlp.evaluation.ik import LBFGS
 from memmlp.evaluation.modes import joint_positions, local_rotations, stream
 from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.spaces import SPACES
@@ -56,6 +57,15 @@ def file(network, tmp_path_factory) -> Path:
 def undisturbed(file) -> np.ndarray:
     """Return the joints (240, 22, 3) of the undisturbed 60 Hz stream."""
     return wearer.joints(wearer.play(Stream(file), PERSON.positions, PERSON.rotations))
+
+
+def test_inverse_kinematics_bring_the_pose_to_the_position_branch(network, file):
+    solved = wearer.play(Stream(file, ik=LBFGS()), PERSON.positions[:20], PERSON.rotations[:20])
+    frames = PERSON.frames[:19]
+    motion = stream(network, [frames])[0]
+    expected = LBFGS().solutions(network.normalizer, motion, frames[:, :SPARSE_DIM])["combined"]
+    there = network.normalizer.pose(expected, frames[:, :SPARSE_DIM]).numpy()
+    assert wearer.apart(wearer.joints(solved[1:]), there).max() < 0.1
 
 
 def largest_difference(network, file: Path, person: wearer.Person) -> float:
