@@ -56,7 +56,8 @@ def _differences(config: Mapping[str, Any]) -> Iterator[str]:
         changed = [key for key in profile if key not in SET_BY_MODELS and profile[key] != usual.get(key)]
         chosen = [sizes, *(f"profile.{key}={value_text(profile[key])}" for key in changed)]
         yield from chosen[profile["sizes"] == "small" :]
-    options = {slot: option_in_slot(config, slot) for slot in SLOTS if slot in config}
+    named = [slot for slot in SLOTS if slot in config and (config[slot] is None or "name" in config[slot])]
+    options = {slot: option_in_slot(config, slot) for slot in named}
     custom = [slot for slot, option in options.items() if option and not _is_shipped(slot, option)]
     for slots in (["model"], [slot for slot in options if slot != "model"]):  # a model brings other options
         default = _default(tuple(chosen))
