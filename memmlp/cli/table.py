@@ -72,6 +72,9 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
     is_flag=True,
     help="Measure networks without a run untrained; for tables of costs alone (16, 17).",
 )
+@click.option(
+    "--seeds-needed", is_flag=True, help="Show how many seeds would find the paper's effects on this data."
+)
 @config_dir_option
 @plugins_option
 @outputs_option
@@ -86,6 +89,7 @@ def table(
     together: tuple[str, ...],
     add: tuple[Path, ...],
     untrained: bool,
+    seeds_needed: bool,
     outputs: Path,
 ) -> None:
     """Show the table of a sweep: NAME is a file's path, a shipped sweep, a table's number, or `all`.
@@ -102,6 +106,9 @@ def table(
         found = gather(name, overrides, outputs, SHOWN_MODES[mode], functools.cache(load), selection)
     finally:
         gc.enable()
+    if seeds_needed:
+        print_needed_seeds(found, SHOWN_MODES[mode])
+        return
     tables = [functools.reduce(rows_measured_in_browsers.add_rows, measured, one.table) for one in found]
     if form is None and out is None:
         print_tables(tables)
@@ -111,6 +118,19 @@ def table(
         click.echo(text, nl=False)
     else:
         write(out, text)
+
+
+def print_needed_seeds(found: Sequence[SweepTable], modes: Sequence[str]) -> None:
+    """Print, sweep by sweep, how many seeds the paper's effects need."""
+    from memmlp.report.tables.effects import compute_needed_seeds
+    from memmlp.report.tables.table_text import make_caption
+
+    for one in found:
+        rows = [("variant", "mode", "metric", "paper", "here", "seeds", "needed")]
+        for row in compute_needed_seeds(one.sweep, one.runs, modes):
+            numbers = f"{row.paper:+.2f}", f"{row.measured:+.2f}", str(row.seeds)
+            rows.append((*row.key, *numbers, str(row.needed or "no number is enough")))
+        click.echo("\n".join([make_caption(one.table), *aligned(rows, left=3), ""]))
 
 
 class TableSelection(NamedTuple):

@@ -305,7 +305,7 @@ class Stream:
         world = Normalizer.raw(World(), torch.tensor(self.network.body.rest))
         motion = torch.from_numpy(np.concatenate([sixd.reshape(1, -1), position.reshape(1, -1)], 1))
         solved = self.ik.solve(world, motion, torch.from_numpy(self._sparse[None]))
-        return solved.numpy().reshape(-1, 6)
+        return np.asarray(solved).reshape(-1, 6)
 
     def calibrate(self, head: TrackerPose, left: TrackerPose, right: TrackerPose) -> Offsets:
         """Learn the offsets from a person who stands upright in T-pose, and use them from now on.

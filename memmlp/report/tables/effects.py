@@ -17,11 +17,12 @@ from memmlp.report.tables.statistics import (
     compute_detectable,
     compute_equivalence_p,
     correct_by_holm,
+    count_needed_seeds,
     decide,
     estimate_paired_effects,
 )
 from memmlp.report.tables.table import STEADY, Effect, Key
-from memmlp.sweep.definition import COSTS, TIMES, Sweep, Variant
+from memmlp.sweep.definition import COSTS, MODES, TIMES, Sweep, Variant
 
 RunsBySeed = Mapping[int, Measured]  # a variant's finished runs by seed
 
@@ -210,6 +211,42 @@ def estimate_effects(
 def count_testable(pairs: Mapping[Key, Paired]) -> int:
     """Return how many comparisons have a p-value, so that Holm's correction is over them."""
     return sum(pair.testable for pair in pairs.values())
+
+
+class NeededSeeds(NamedTuple):
+    """How many seeds a comparison needs to find an effect of the paper's size with a power of 80 %.
+
+    Attributes:
+        key: the comparison.
+        paper: the paper's difference.
+        measured: the measured mean difference.
+        seeds: the number of seeds so far.
+        needed: the number of seeds needed; None if no number is enough with these clips.
+    """
+
+    key: Key
+    paper: float
+    measured: float
+    seeds: int
+    needed: int | None
+
+
+def compute_needed_seeds(
+    sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]
+) -> list[NeededSeeds]:
+    """Return the seeds needed by all testable comparisons whose effect the paper prints.
+
+    The correction is over the testable comparisons of both modes, as in the table.
+    """
+    shown = use_existing_branches(sweep, runs)
+    pairs, variants = pair_differences(shown, runs, MODES), {one.label: one for one in shown.variants}
+    found = []
+    for key, pair in pairs.items():
+        effect = find_paper_effect(shown, variants[key.label], key.metric)
+        if effect and key.mode in modes and pair.testable:
+            needed = count_needed_seeds(pair.matrix, effect, count_testable(pairs), pair.groups)
+            found.append(NeededSeeds(key, effect, float(pair.matrix.mean()), len(pair.matrix), needed))
+    return found
 
 
 def _judged(

@@ -21,6 +21,7 @@ groups have the larger effects.)
 
 from __future__ import annotations
 
+import bisect
 import functools
 import itertools
 from collections.abc import Sequence
@@ -61,6 +62,12 @@ class Error:
     seeds: float
     groups: float
     conditional: str = ""
+
+    @property
+    def parts(self) -> np.ndarray:
+        """The parts (3, K) of seeds, groups and noise in the variances of the means."""
+        seeds, clips, noise = self.variances
+        return np.stack([np.maximum(seeds - noise, 0), np.maximum(clips - noise, 0), noise])
 
     def half(self, level: float | np.ndarray) -> np.ndarray:
         """Return half the width (K,) of intervals that miss with at most the probability `level`, () or (K,).
@@ -236,9 +243,36 @@ def compute_detectable(
     known = estimate_error(differences, groups)
     if known.conditional:
         return np.full(len(differences), np.nan)
-    seeds, clips, noise = known.variances
-    parts = np.stack([np.maximum(seeds - noise, 0), np.maximum(clips - noise, 0), noise])
-    return find_effects(parts, differences.shape[1], known.groups, LEVEL / comparisons, power)
+    return find_effects(known.parts, differences.shape[1], known.groups, LEVEL / comparisons, power)
+
+
+def count_needed_seeds(
+    differences: np.ndarray, effect: float, comparisons: int, groups: Groups = None, most: int = 1000
+) -> int | None:
+    """Return the fewest seeds with which an effect would be found with a power of 80 %.
+
+    It is computed as in `compute_detectable`, with the parts of seeds and noise divided by the seeds.
+
+    Args:
+        differences: the differences of one comparison (S, C).
+        effect: the effect to be found, in the unit of the differences.
+        comparisons: how many comparisons Holm's correction is over.
+        groups: the group of each clip (C,).
+        most: the largest number of seeds to consider.
+
+    Returns:
+        The number; None if `most` seeds are not enough, and with one seed or one group.
+    """
+    known = estimate_error(differences[None], groups)
+    if known.conditional:
+        return None
+
+    def is_enough(seeds: int) -> bool:
+        share = len(differences) / seeds
+        parts = known.parts * [[share], [1], [share]]
+        return bool(find_effects(parts, seeds, known.groups, LEVEL / comparisons, 0.8)[0] <= abs(effect))
+
+    return bisect.bisect_left(range(most), True, lo=2, key=is_enough) if is_enough(most) else None
 
 
 def find_effects(parts: np.ndarray, seeds: int, groups: float, level: float, power: float) -> np.ndarray:

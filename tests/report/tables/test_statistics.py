@@ -16,6 +16,7 @@ from memmlp.report.tables.statistics import (
     compute_equivalence_p,
     correct_by_holm,
     correct_sequentially,
+    count_needed_seeds,
     decide,
     divide_level,
     estimate_error,
@@ -292,3 +293,17 @@ def test_looks_keep_the_error_where_one_level_for_all_would_not():
         kept |= least <= level
         wasted |= least <= 0.05
     assert kept.mean() <= 0.06 < 0.09 < wasted.mean()
+
+
+def test_needed_seeds_are_the_first_that_suffice():
+    d = differences(4, 20, 1, (1, 0, 0.02, 0, 1), tables=1)[0]
+    few, many = count_needed_seeds(d, 12.0, TABLE), count_needed_seeds(d, -6.0, TABLE)
+    assert few is not None
+    assert many is not None
+    assert 2 <= few < many
+    assert count_needed_seeds(d, 6.0, TABLE, most=many - 1) is None
+    measured = compute_detectable(d[None], TABLE)[0]
+    assert count_needed_seeds(d, 1.0001 * measured, TABLE) == 4
+    assert count_needed_seeds(d, 0.9999 * measured, TABLE) == 5
+    few_clips = differences(4, 4, 1, (1, 0, 10, 0, 0.1), tables=1)[0]
+    assert count_needed_seeds(few_clips, 3.0, TABLE) is None
