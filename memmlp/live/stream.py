@@ -294,7 +294,7 @@ class Stream:
 
     def _rotations(self) -> np.ndarray:
         """Return the last step's rotations (22, 6), after inverse kinematics if there is any."""
-        sixd, position = self.network.rotation6d, self.network.position
+        sixd: np.ndarray = self.network.rotation6d
         if self.ik is None:
             return sixd
         import torch
@@ -303,7 +303,9 @@ class Stream:
         from memmlp.motion.normalizer import Normalizer
 
         world = Normalizer.raw(World(), torch.tensor(self.network.body.rest))
-        motion = torch.from_numpy(np.concatenate([sixd.reshape(1, -1), position.reshape(1, -1)], 1))
+        motion = torch.from_numpy(
+            np.concatenate([sixd.reshape(1, -1), self.network.position.reshape(1, -1)], 1)
+        )
         solved = self.ik.solve(world, motion, torch.from_numpy(self._sparse[None]))
         return np.asarray(solved).reshape(-1, 6)
 
