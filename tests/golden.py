@@ -392,7 +392,7 @@ def record() -> None:
     if wrong:
         sys.exit(f"raise the version of {', '.join(wrong)}: their numbers changed")
     kept = {case: {"recipe": version_of(case), "numbers": now[case] | known.get(case, {})} for case in CASES}
-    PATH.write_text(json.dumps(kept, indent=1) + "\n")
+    PATH.write_text(json.dumps(kept, indent=1, sort_keys=True) + "\n")
 
 
 if __name__ == "__main__":
