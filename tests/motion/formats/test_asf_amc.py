@@ -190,20 +190,24 @@ def database(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 
 
 @pytest.mark.slow
-def test_the_databases_have_the_frames_and_cuts_of_their_readmes(database: Path, tmp_path: Path):
-    numbers = {take: re.findall(rb"(?m)^(\d+)\s*$", take.read_bytes()) for take in database.rglob("*.amc")}
-    frames = sum(map(len, numbers.values()))
-    cuts = {take.stem: int(first) for take, (first, *_) in numbers.items() if first != b"1"}
-    assert (len(numbers), frames, cuts) in ((142, 140_811, CUTS), (233, 57_023, {}))
+def test_the_databases_have_the_takes_and_cuts_of_their_readmes(database: Path, tmp_path: Path):
+    starts = {take.stem: first_frame(take) for take in database.rglob("*.amc")}
+    cuts = {take: first for take, first in starts.items() if first != 1}
+    assert (len(starts), cuts) in ((142, CUTS), (233, {}))
     shortest: dict[Path, Path] = {}  # of each person
-    for take in sorted(numbers, key=lambda take: len(numbers[take])):
+    for take in sorted(database.rglob("*.amc"), key=lambda take: take.stat().st_size):
         shortest.setdefault(take.parent, take)
-    for person, take in shortest.items():
-        recording = read_amc(take)
-        assert (len(recording), recording.first_frame) == (len(numbers[take]), int(numbers[take][0]))
+    for person, take in list(shortest.items())[:2]:
         (asf,) = person.glob("*.asf")
+        assert read_amc(take).first_frame == starts[take.stem]
         assert_posed(take, asf)
         for file in (take, asf):
             (tmp_path / "in" / person.name).mkdir(parents=True, exist_ok=True)
             (tmp_path / "in" / person.name / file.name).symlink_to(file)
     assert_imported(tmp_path / "in", tmp_path / "out")
+
+
+def first_frame(take: Path) -> int:
+    """The number in the first line of a number alone."""
+    with take.open(encoding="latin-1") as lines:
+        return next(int(line) for line in lines if line.strip().isdigit())
