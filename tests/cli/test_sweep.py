@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
 import shutil
 import signal
 import sys
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import yaml
-from command_line import BRIEF, MAIN, run, run_apart
-from processes import PATIENCE, forked, ignoring_interrupts, started, until
+from command_line import BRIEF, run
+from processes import PATIENCE, forked, until
 
 from memmlp.cli.main import main
 from memmlp.cli.workers import split_executor
@@ -36,8 +34,7 @@ def home(tmp_path_factory) -> Path:
     """Run a sweep of three variants, one of which diverges, in a folder of its own."""
     folder = tmp_path_factory.mktemp("sweep")
     write(folder, VARIANTS)
-    said = run_apart(folder, "sweep", "trial.yaml", *TINY, "--workers", "1", code=1)
-    (folder / "first.txt").write_text(said)
+    (folder / "first.txt").write_text(command(folder, "executor=debug", code=1))
     return folder
 
 
@@ -192,27 +189,24 @@ def test_a_look_at_other_seeds_or_without_the_data_leaves_a_sweep_as_it_was(
 
 
 def as_typed(folder: Path, *arguments: str) -> None:
-    """What `processes.forked` does for a command line that is the whole process."""
+    """What `processes.forked` does for a command line that is the whole process, which hears Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     os.chdir(folder)
     sys.argv = ["memmlp", *arguments]
     main()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_sweep_ends_its_workers_and_goes_on_later(tmp_path: Path, ending: int):
-    """By Ctrl-C as a user starts it, under nohup; by a scheduler's signal, for which it may be forked."""
+@pytest.mark.parametrize(
+    ("ending", "words"), [(signal.SIGINT, ("--workers", "1")), (signal.SIGTERM, ("executor=debug",))]
+)
+def test_an_interrupted_sweep_ends_its_workers(tmp_path: Path, ending: int, words: tuple[str, ...]):
+    """By Ctrl-C with a worker, or by a scheduler's signal where the command does the work itself."""
     write(tmp_path, {"none": ["memory=none"]})
-    words = ["sweep", "trial.yaml", *TINY, "optim.steps=100000"]
     file = tmp_path / "said.txt"
     file.touch()
-    with ExitStack() as stack:
-        if ending == signal.SIGINT:
-            stack.enter_context(ignoring_interrupts())
-            log = stack.enter_context(file.open("w"))
-            process = stack.enter_context(started([*MAIN, *words], cwd=tmp_path, stdout=log, stderr=log))
-        else:
-            process = stack.enter_context(forked(as_typed, tmp_path, *words, said=str(file), **os.environ))
+    words = ("sweep", "trial.yaml", *TINY, "optim.steps=100000", *words)
+    with forked(as_typed, tmp_path, *words, said=str(file)) as process:
         begun = lambda: any(run.step for run in list_runs(tmp_path / "outputs"))  # noqa: E731
         until(begun, "the run's first steps", process)
         run = list_runs(tmp_path / "outputs")[0]
@@ -248,14 +242,6 @@ def test_bad_input_is_one_line(tmp_path: Path):
         said = run(tmp_path, "sweep", *words, code=2)
         assert line in said, words
         assert said.count("\n") == 1
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (memmlp[ray])")
-def test_a_sweep_on_a_local_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("RAY_worker_niceness", "0")  # by default they wait for whatever else is tested
-    write(tmp_path, {"none": ["memory=none"]})
-    assert "1 of 1 runs done" in run_apart(tmp_path, "sweep", "trial.yaml", *TINY, "executor=ray")
 
 
 def test_executor_words_are_no_overrides_of_the_runs():

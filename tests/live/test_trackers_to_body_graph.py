@@ -73,14 +73,13 @@ def test_it_is_the_stream(name, folder: Path, step_files):
         full.reset()
 
 
-@pytest.mark.parametrize("name", ["avatar_poser", "rpm"])
-def test_baselines_have_it_too(name: str, tmp_path: Path):
-    """As it was trained, too: without operators whose work depends on the data, and in every opset."""
-    network, file = exported.NETWORKS[name](), tmp_path / "full.onnx"
+def test_a_baseline_has_it_too(tmp_path: Path):
+    """As it was trained, too: without operators whose work depends on the data, and in other opsets."""
+    network, file = exported.NETWORKS["avatar_poser"](), tmp_path / "full.onnx"
     export_full(network, file, RUN, "unity")
     native = onnx.load(file)
     assert exported.data_dependent(native.graph) == set()
-    for opset in (15, 18, OPSETS[-1]):
+    for opset in (15, OPSETS[-1]):
         onnx.save(convert(native, opset), file)
         assert full_differences(network, file, PERSON.frames[:30], "unity").max() <= TOLERANCE
 

@@ -6,10 +6,12 @@ import importlib.util
 import os
 import signal
 import time
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
 import pytest
+from command_line import BRIEF, run
 from processes import until
 
 from memmlp.common.errors import InputError
@@ -57,18 +59,18 @@ def test_ray_is_refused_where_it_is_not():
 
 
 @pytest.fixture
-def two_gpus():
-    """A Ray cluster on this machine that says it has two GPUs."""
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Ray]:
+    """Ray on this machine, which says that it has two GPUs."""
     ray = pytest.importorskip("ray")
-    ray.init(num_cpus=2, num_gpus=2, include_dashboard=False, log_to_driver=False, configure_logging=False)
-    yield ray
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # by default they wait for whatever else is tested
+    monkeypatch.setattr(ray, "init", partial(ray.init, num_cpus=2, num_gpus=2))
+    yield Ray(parse({}))
     ray.shutdown()
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_workers_have_a_gpu_each_and_the_dead_are_known(two_gpus, tmp_path: Path):
-
+def test_workers_have_a_gpu_each_the_dead_are_known_and_a_sweep_is_done(cluster: Ray, tmp_path: Path):
     def stay() -> None:
         """Write the GPUs that this worker sees into a file named by its process, and stay."""
         mine = tmp_path / f"{os.getpid()}.tmp"
@@ -76,7 +78,6 @@ def test_workers_have_a_gpu_each_and_the_dead_are_known(two_gpus, tmp_path: Path
         mine.rename(mine.with_suffix(".txt"))
         time.sleep(6000)
 
-    cluster = Ray(parse({}))
     assert (cluster.gpus, cluster.num_gpus) == (True, 1)
     workers = cluster.submit(partial(os.getenv, "CUDA_VISIBLE_DEVICES"), 1)
     until(lambda: not workers[0].alive(), "the worker ends")
@@ -98,3 +99,6 @@ def test_workers_have_a_gpu_each_and_the_dead_are_known(two_gpus, tmp_path: Path
     (worker,) = bare.submit(partial(os.getenv, "CUDA_VISIBLE_DEVICES"))
     until(lambda: not worker.alive(), "the worker ends")
     assert worker.complaint() == ""
+    (tmp_path / "trial.yaml").write_text("variants: {none: [memory=none]}")
+    words = ["sweep", "trial.yaml", *BRIEF, "export.graph=off", "executor=ray", "ray.num_gpus=0"]
+    assert "1 of 1 runs done" in run(tmp_path, *words, "--workers", "1")
