@@ -159,7 +159,7 @@ class TrainedRun(os.PathLike[str]):
 
         It is None where that is not known. Raises InputError if a file of results is damaged.
         """
-        return self._run.evaluations_as_configured.combined_by
+        return self._run.evaluations_as_configured.combined_solvers
 
     def per_clip(self) -> pd.DataFrame:
         """Return a DataFrame with one row for each mode, branch and test clip.

@@ -18,7 +18,7 @@ def identity(
 
 
 def begun(outputs: Path, config: dict = CONFIG, kind: str = "memmlp") -> Run:
-    run = Run.of(outputs, identity(config, kind))
+    run = Run.from_id(outputs, identity(config, kind))
     run.begin(kind, config, data="d", prerequisite=None)
     return run
 

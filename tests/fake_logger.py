@@ -85,7 +85,7 @@ class FakeShown:
 
 def a_run(outputs: Path, name: str = "0" * 16, steps: int = 3, **config: object) -> Run:
     """A run that has started, with some steps."""
-    run = Run.of(outputs, name)
+    run = Run.from_id(outputs, name)
     run.begin("memmlp", {"seed": 0, **config}, data="d" * 64, prerequisite=None, stages=[])
     for step in range(1, steps + 1):
         run.log(step, {"loss": 1 / step})

@@ -49,7 +49,7 @@ def fake_run(
     groups: Mapping[str, str] | None = None,
 ) -> Run:
     """A finished run whose errors are `factor` times the usual ones, with effects of seed, clip and both."""
-    run = Run.of(outputs, hashlib.sha256(f"{name} {seed}".encode()).hexdigest()[:16])
+    run = Run.from_id(outputs, hashlib.sha256(f"{name} {seed}".encode()).hexdigest()[:16])
     latency = {
         "median_ms": 0.8 * factor, "p95_ms": 1.1 * factor, "ratio_to_yardstick": 0.6, "parameters": 356_798,
         "macs": 13_000_000, "flops": 26_000_000, "onnx_bytes": 1_900_000,

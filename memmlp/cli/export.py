@@ -140,11 +140,11 @@ def copy_deployed(run: Run, out: Path, form: Form, max_growth: float) -> str | N
 
     for folder in sorted(run.deployments.glob("*")):
         deployed = run.deployment(folder.name)
-        record, settings, path = deployed.record, deployed.settings, deployed.file(form.precision)
+        record, settings, path = deployed.record, deployed.settings, deployed.onnx_path(form.precision)
         graphs = settings.get("graph", "auto"), record.get("graph")  # as requested then, and as made
         if form.full or form.graph not in graphs or form.opset != settings.get("opset", 18):
             continue
-        if not (deployed.done and deployed.current) or path.name not in record["artifacts"]:
+        if not (deployed.done and deployed.is_current) or path.name not in record["artifacts"]:
             continue
         if record["artifacts"][path.name] != file_digest(path):
             continue

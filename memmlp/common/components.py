@@ -1,10 +1,11 @@
 """The registry: components are declared where they are defined, and found by slot and name.
 
-A component without keys is a class decorated with `component`. The keys of any other component are a
-dataclass that extends `Settings`, whose name ends in "Settings", decorated in place of the class. This
-dataclass is read without importing its module, since that imports torch: only the module's constants, its
-settings and the settings that it imports are executed. So settings may use no more than these,
-`memmlp.common.settings`, and what `dataclasses`, `typing`, `collections.abc` and `math` have.
+A component without keys is a class decorated with `component`. For a component with keys, the decorated class
+is a dataclass with these keys. It extends `Settings`, and its name ends in "Settings".
+
+Settings are read without importing their module, since that would import torch. Only the module's constants,
+its settings and the settings that it imports are executed. So settings may use only these,
+`memmlp.common.settings`, `dataclasses`, `typing`, `collections.abc` and `math`.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from memmlp.common.settings import Settings, one_of
 
 DECORATOR = re.compile(r'^@component\(\s*"(\w+)",\s*"(\w+)"([^)]*)\)', re.MULTILINE)
 PLAIN = re.compile(r"dataclasses|typing|collections\.abc|math|memmlp\.common\.components|(.+\.)?settings")
-"""The modules that declarations may import as they are."""
+"""The modules that are really imported when declarations are read."""
 
 SLOTS = (
     "model",
@@ -42,7 +43,7 @@ SLOTS = (
     "prerequisite",
     "optim",
 )
-"""The groups of the config with components of the network and its training as options."""
+"""The config groups from which a network and its training are composed."""
 
 _Kind = TypeVar("_Kind", bound=Callable[..., Any])
 _roots: dict[str, Path] = {"memmlp": Path(__file__).parent.parent}
@@ -51,15 +52,17 @@ _roots: dict[str, Path] = {"memmlp": Path(__file__).parent.parent}
 def component(
     slot: str, name: str, *, version: int = 1, builds: str | None = None
 ) -> Callable[[_Kind], _Kind]:
-    """Declare a component by its settings or its class; all arguments are literals, which are read as text.
+    """Declare a component, by decorating its settings or its class.
+
+    All arguments must be literals, since they are read as text.
 
     Args:
-        slot: the group of the config.
-        name: the component's name in the config, which enters the id of runs.
-        version: the component version, to be raised when the component's results change: then its runs are
-            made again.
-        builds: the name of the class in the same module that is built, either with the argument `settings`
-            or with the keys as arguments; None if it is the decorated class.
+        slot: the config group.
+        name: the component's name in the config; it is part of run ids.
+        version: the component version. Raise it when the component's results change, so that its runs are
+            repeated.
+        builds: the name of the class to build, in the same module; None for the decorated class. The class
+            gets either the argument `settings` or the keys as arguments.
     """
 
     def declare(kind: _Kind) -> _Kind:
@@ -81,11 +84,11 @@ class Component:
     """A declared component.
 
     Attributes:
-        slot: the group of the config.
+        slot: the config group.
         name: the component's name in the config.
         version: the component version.
-        builds: the class that is built; None for the settings' class itself.
-        package: the package that it belongs to: "memmlp" or a user's.
+        builds: the name of the class to build; None for the decorated class.
+        package: the component's package: "memmlp" or a user's package.
         module: the module that declares it.
         path: the module's file.
     """
@@ -100,40 +103,40 @@ class Component:
 
     @property
     def settings(self) -> type[Settings]:
-        """The class of the settings, read without importing the module."""
+        """The settings class, read without importing the module."""
         space = read_declarations(self.module, self.path)
-        if (found := _of_option(space, self)) is None:  # it has no keys
+        if (settings := _of_option(space, self)) is None:  # it has no keys
             label = f"{self.slot}_{self.name}"
-            found = dataclass(type(label, (Settings,), {"__module__": space["__name__"]}))
-            space[label] = component(self.slot, self.name)(found)
-        return found
+            settings = dataclass(type(label, (Settings,), {"__module__": space["__name__"]}))
+            space[label] = component(self.slot, self.name)(settings)
+        return settings
 
     @property
     def kind(self) -> type:
-        """The class that is built; its module is imported."""
+        """The class to build; reading this property imports its module."""
         module = importlib.import_module(self.module)
         return getattr(module, self.builds) if self.builds else _of_option(vars(module), self)
 
-    def build(self, node: Mapping[str, Any], *given: Any, **more: Any) -> Any:
-        """Build the component from its keys in the config, besides the arguments given.
+    def build(self, node: Mapping[str, Any], *args: Any, **kwargs: Any) -> Any:
+        """Build the component from its keys in the config and further arguments.
 
-        A class that has the parameter `settings` takes the keys as an object, others as arguments.
+        A class with the parameter `settings` gets the keys in an object. Other classes get them as arguments.
         """
         if self.builds and "settings" in inspect.signature(self.kind).parameters:
-            return self.kind(*given, settings=self.make_settings(node), **more)
-        return self.kind(*given, **{key: value for key, value in node.items() if key != "name"}, **more)
+            return self.kind(*args, settings=self.make_settings(node), **kwargs)
+        return self.kind(*args, **{key: value for key, value in node.items() if key != "name"}, **kwargs)
 
     def make_settings(self, node: Mapping[str, Any]) -> Any:
-        """Return the settings as an object of the imported module's class, with the values of a config."""
+        """Return the settings with the values of a config; this imports the component's module."""
         kind: Any = _of_option(vars(importlib.import_module(self.module)), self)
         return kind(**{key: value for key, value in node.items() if key != "name"})
 
 
 def find(slot: str, name: str) -> Component:
-    """Return a component.
+    """Return the component with a name in a slot.
 
     Raises:
-        InputError: if no package in use has it.
+        InputError: if no package in use declares it.
     """
     try:
         return declared()[slot, name]
@@ -149,20 +152,20 @@ def names(slot: str) -> list[str]:
 
 
 def chosen(config: Mapping[str, Any], slot: str) -> type[Settings] | None:
-    """Return the settings' class of the component that a config has in a slot; None if the slot is empty."""
+    """Return the settings class of the component in a config's slot; None if the slot is empty."""
     node = config.get(slot)
     return find(slot, node["name"]).settings if node else None
 
 
 def collect_attribute(kind: type[Settings], attribute: str) -> dict[str, Any]:
-    """Return `defaults` or `recipe` of a settings' class together with those of its bases."""
+    """Return the attribute `defaults` or `recipe`, merged over a settings class and its base classes."""
     own = [vars(base).get(attribute, {}) for base in reversed(kind.__mro__)]
     return {key: value for each in own for key, value in each.items()}
 
 
 @functools.cache
 def declared() -> dict[tuple[str, str], Component]:
-    """Return all components by slot and name, those of users' packages in use included.
+    """Return all components by slot and name, including components of users' packages.
 
     Raises:
         InputError: if two packages declare the same option.
@@ -173,17 +176,17 @@ def declared() -> dict[tuple[str, str], Component]:
             for one in _in_file(package, path):
                 if other := found.get((one.slot, one.name)):
                     raise InputError(
-                        f"{path}: {one.slot}={one.name}: {other.path} has an option of that name"
+                        f"{path}: {one.slot}={one.name} exists already in {other.path}; rename one of them"
                     )
                 found[one.slot, one.name] = one
     return found
 
 
 def add_package(package: str, root: Path | None) -> None:
-    """Add the components of a user's package, in a folder or in one file; None takes them away again.
+    """Add the components of a user's package, which is a folder or a single file; with None, remove them.
 
     Raises:
-        InputError: if it declares an option that exists.
+        InputError: if the package declares an option that already exists.
     """
     _roots.pop(package, None)
     if root:
@@ -212,10 +215,10 @@ def _in_file(package: str, path: Path) -> Iterable[Component]:
 
 @functools.cache
 def read_declarations(module: str, path: Path) -> dict[str, Any]:
-    """Return the declarations of a module's file by name, executed without importing the module.
+    """Execute the declarations in a module's file without importing the module, and return them by name.
 
     Raises:
-        InputError: if a declaration needs more than the module docstring allows.
+        InputError: if a declaration needs more than this module's docstring allows.
     """
     space = ModuleType(f"{module}:declarations")
     sys.modules[space.__name__] = space  # where dataclasses and OmegaConf look up annotations
@@ -233,12 +236,12 @@ def read_declarations(module: str, path: Path) -> dict[str, Any]:
         exec(code, vars(space))
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
-        raise InputError(f"{path}: a component's declaration cannot be read: {reason}") from error
+        raise InputError(f"{path}: cannot read the declaration of a component ({reason})") from error
     return vars(space)
 
 
 def _imported(node: ast.ImportFrom) -> dict[str, Any]:
-    """Return the settings' classes that a statement imports from another module with declarations."""
+    """Return the settings classes that a statement imports from another module of a package in use."""
     module = str(node.module)
     for package, root in _roots.items():
         path = root.joinpath(*module.removeprefix(f"{package}.").split(".")).with_suffix(".py")
@@ -258,9 +261,9 @@ def _is_constant(node: ast.stmt) -> bool:
     return True
 
 
-def _of_option(found: Mapping[str, Any], one: Component) -> Any:
-    """Return the component's decorated object among the names of its module; None without one."""
+def _of_option(namespace: Mapping[str, Any], one: Component) -> Any:
+    """Return the object in a module's namespace that declares the component; None if there is none."""
     option = f"{one.slot}={one.name}"
     return next(
-        (kind for kind in found.values() if getattr(kind, "__dict__", {}).get("option") == option), None
+        (kind for kind in namespace.values() if getattr(kind, "__dict__", {}).get("option") == option), None
     )

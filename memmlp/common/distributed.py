@@ -1,8 +1,8 @@
-"""Data-parallel training of one run by several processes, as torchrun starts them.
+"""Data-parallel training of one run by several processes, which torchrun starts.
 
-Every process draws the whole batch of a step, from the same seed, and works on its own rows. The gradients
-are averaged over all processes, so the run is the same as one trained by a single process. Without torchrun
-there is one process, and the functions here have no effect.
+Every process draws the whole batch of each step from the same seed, and works on its own rows. The gradients
+are averaged over all processes, so the run equals a run of a single process. Without torchrun there is one
+process, and the functions here have no effect.
 """
 
 from __future__ import annotations
@@ -22,33 +22,33 @@ TIMEOUT = timedelta(days=7)  # others wait while the first process prepares, val
 
 
 class _Step:
-    """The state of this process: whether it works on its share of a batch."""
+    """The state of this process: whether it works on a slice of the batch."""
 
     shared = False
 
 
 def world_size() -> int:
-    """Return how many processes train the run; 1 without torchrun."""
+    """Return the number of processes that train the run; 1 without torchrun."""
     return int(os.environ["WORLD_SIZE"]) if "TORCHELASTIC_RUN_ID" in os.environ else 1
 
 
 def rank() -> int:
-    """Return this process' number among all."""
+    """Return the rank of this process among all processes."""
     return int(os.environ["RANK"]) if world_size() > 1 else 0
 
 
 def local_rank() -> int:
-    """Return this process' number among those on its machine, which is also the index of its GPU."""
+    """Return the rank of this process among the processes on its machine; it is also the index of its GPU."""
     return int(os.environ["LOCAL_RANK"]) if world_size() > 1 else 0
 
 
 def is_first() -> bool:
-    """Return whether this process is the first, which writes files."""
+    """Return whether this process has rank 0; only this one writes files."""
     return rank() == 0
 
 
 def connect(kind: str) -> None:
-    """Join the other processes, unless that was done before; `kind` is the device's kind, such as "cuda"."""
+    """Connect this process to the others, unless it is connected; `kind` is a device type, such as "cuda"."""
     from torch import distributed
 
     if world_size() == 1 or distributed.is_initialized():
@@ -61,7 +61,7 @@ def connect(kind: str) -> None:
 
 
 def disconnect() -> None:
-    """Leave the other processes once all have received the last message; otherwise a late receiver aborts."""
+    """Disconnect from the other processes, after waiting for all: otherwise a late receiver would abort."""
     if world_size() > 1:
         from torch import distributed
 
@@ -70,19 +70,19 @@ def disconnect() -> None:
 
 
 def broadcast(value: T) -> T:
-    """Send the first process' value to all processes, and return it in each; all have to call this."""
+    """Return the first process' value in all processes; every process must call this."""
     if world_size() == 1:
         return value
     from torch import distributed
 
-    carried: list[Any] = [value]
-    distributed.broadcast_object_list(carried, src=0)
-    return carried[0]
+    values: list[Any] = [value]
+    distributed.broadcast_object_list(values, src=0)
+    return values[0]
 
 
 @contextlib.contextmanager
 def share_batch() -> Iterator[None]:
-    """Within this context, tensors are this process' share of a batch, if there are several processes."""
+    """In this context, batches are split: each process works on its own rows."""
     _Step.shared = world_size() > 1
     try:
         yield
@@ -91,17 +91,17 @@ def share_batch() -> Iterator[None]:
 
 
 def is_shared() -> bool:
-    """Return whether this process is working on its share of a batch, inside `share_batch()`."""
+    """Return whether this process works on its own rows of a batch, inside `share_batch()`."""
     return _Step.shared
 
 
 def local_rows(batch: Tensor) -> Tensor:
-    """Return this process' rows of a whole batch (B, ...); the number of processes divides B."""
+    """Return this process' rows of a whole batch (B, ...); B is a multiple of the number of processes."""
     return batch.chunk(world_size())[rank()] if _Step.shared else batch
 
 
 def gather_rows(rows: Tensor) -> Tensor:
-    """Return the rows (b, ...) of all processes together (B, ...), without gradients."""
+    """Concatenate the rows (b, ...) of all processes to the whole batch (B, ...), without gradients."""
     if not _Step.shared:
         return rows
     import torch
@@ -113,11 +113,11 @@ def gather_rows(rows: Tensor) -> Tensor:
 
 
 def draw_rows(draw: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
-    """Draw random numbers for the whole batch, as a single process does, and return this process' rows.
+    """Draw random numbers for the whole batch, like a single process would, and return this process' rows.
 
     Args:
-        draw: draws, given a tensor with the shape of the whole batch.
-        like: this process' rows (b, ...) of that tensor; its values are not used for the other rows.
+        draw: a function that draws random numbers, given a tensor with the shape of the whole batch.
+        like: a tensor with the shape of this process' rows (b, ...).
     """
     if not _Step.shared:
         return draw(like)
@@ -125,7 +125,7 @@ def draw_rows(draw: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
 
 
 def average(values: Tensor) -> Tensor:
-    """Return a tensor's mean over all processes, whose shares of the batch are equally large."""
+    """Return a tensor's mean over all processes; each has the same number of rows."""
     if world_size() == 1:
         return values
     from torch import distributed
@@ -136,7 +136,7 @@ def average(values: Tensor) -> Tensor:
 
 
 def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
-    """Replace the gradients by their means over all processes."""
+    """Replace each gradient by its mean over all processes."""
     if world_size() == 1:
         return
     import torch

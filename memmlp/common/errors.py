@@ -10,15 +10,15 @@ BREAKING = ("Cc", "Cs", "Zl", "Zp")  # Unicode's controls, surrogates, line and 
 
 
 def one_line(text: str) -> str:
-    r"""Return the text with escapes for all characters that would break its line or a terminal, like \n."""
+    r"""Return the text with line breaks and control characters escaped, such as \n."""
     return "".join(repr(c)[1:-1] if unicodedata.category(c) in BREAKING else c for c in text)
 
 
 class InputError(ValueError):
-    """Bad user input; the message names the file or key, what is wrong and what is expected.
+    """Bad user input; the message names the file or key, the problem and the expected input.
 
-    The command line prints it without a traceback and exits with code 2. It is one line, even if it has a
-    file name with a line feed.
+    The command line prints the message without a traceback and exits with code 2. Line breaks in the message,
+    for example from file names, are escaped.
     """
 
     def __init__(self, message: str) -> None:
@@ -26,7 +26,7 @@ class InputError(ValueError):
 
 
 def why_unreadable(error: Exception) -> str:
-    """Return why a text or YAML file could not be read, without the file's name."""
+    """Return the reason why a text or YAML file could not be read, without the file's name."""
     if isinstance(error, OSError):
         return "no such file" if error.errno == errno.ENOENT else error.strerror or str(error)
     if (mark := getattr(error, "problem_mark", None)) is not None:
@@ -46,7 +46,7 @@ def require(module: str, extra: str, purpose: str) -> ModuleType:
     Args:
         module: the module, such as "matplotlib" or "av".
         extra: the extra of memmlp that installs it, such as "plots".
-        purpose: what needs it, with which the message begins: an override, an option or a file.
+        purpose: the override, option or file that needs the package; the message begins with it.
 
     Raises:
         InputError: if the package is not installed.
@@ -63,12 +63,12 @@ class TrainingDiverged(RuntimeError):
 
 
 class LeaseLost(RuntimeError):
-    """Another process took over the folder that this one held, because this one stood still for too long.
+    """Another process took over this process' folder, because this process was frozen for too long.
 
-    Nothing more is written there. The message is one line; the exit code is 1.
+    This process writes nothing more to the folder. The message is one line; the exit code is 1.
     """
 
 
 def is_disk_error(error: Exception) -> bool:
-    """Return whether an error means that the disk is full or read-only, so the run itself did not fail."""
+    """Return whether the disk is full or read-only; then the run itself did not fail."""
     return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS)

@@ -1,6 +1,6 @@
-"""Atomic writing of files, and JSON that can hold every number.
+"""Atomic writing of files, and JSON with NaN and infinities.
 
-JSON has no NaN and infinities, so they are stored as the strings "nan", "inf" and "-inf".
+JSON does not have NaN and infinities, so they are stored as the strings "nan", "inf" and "-inf".
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ def now() -> str:
 
 
 def to_number(value: Any) -> Any:
-    """Convert NaN and infinities, which JSON holds as strings, back to numbers; other values stay."""
+    """Convert the strings "nan", "inf" and "-inf" back to numbers; return other values unchanged."""
     return float(value) if value in ("nan", "inf", "-inf") else value
 
 
 def plain(value: Any) -> Any:
-    """Return the value in a form that JSON can hold.
+    """Return the value in a form that can be stored as JSON.
 
     Tuples become lists, keys become strings, and NaN and infinities become strings.
     """
@@ -43,19 +43,19 @@ def plain(value: Any) -> Any:
 
 
 def atomic_write(path: Path, content: bytes | str) -> None:
-    """Write a file completely or not at all, as `atomic_file` does."""
+    """Write a file completely or not at all (`atomic_file`)."""
     with atomic_file(path) as file:
         file.write(content.encode() if isinstance(content, str) else content)
 
 
 @contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[BinaryIO]:
-    """Open a file for writing that will be complete or absent, even if the machine stops.
+    """Open a file for writing; it appears only once it is complete, even if the machine crashes.
 
-    It is written under a temporary name, then synced and renamed.
+    The file is written under a temporary name, then synced and renamed.
 
     Raises:
-        LeaseLost: if this process held the file's folder and has lost it (memmlp.common.lease).
+        LeaseLost: if this process lost its lease of the file's folder (memmlp.common.lease).
     """
     unfinished = temporary(path)
     try:
@@ -72,7 +72,7 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON atomically, with the keys in the order given."""
+    """Write JSON atomically; the keys keep their order."""
     atomic_write(path, json.dumps(plain(value), indent=2, allow_nan=False) + "\n")
 
 
@@ -92,15 +92,15 @@ def file_digest(path: Path) -> str:
 
 
 def digest(value: Any) -> str:
-    """Return the SHA-256 digest (hex) of a value that JSON can hold.
+    """Return the SHA-256 digest (hex) of a JSON value.
 
-    A value that JSON can't hold is converted to text, so a dataclass has to be given as its `asdict`.
+    Other values are converted to text; convert a dataclass with `asdict` first.
     """
     return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the object in a JSON file, or an empty one if the file is missing or does not parse."""
+    """Return the object in a JSON file; empty if the file is missing or not valid JSON."""
     try:
         value = json.loads(path.read_bytes())
     except (OSError, ValueError):

@@ -1,19 +1,20 @@
-"""Leases: a folder belongs to one process at a time, also on file systems without locks.
+"""Leases: only one process at a time owns a folder, even on file systems without locks.
 
-To take a folder, a process makes the file `.lease-N` with the next number. Only one process can make it, and
-the highest number is the owner's, who touches its file every few seconds (heartbeat). To release the folder,
-the owner renames its file to `.lease-N-free` with the next number, so that numbers only grow. The next claim
-may be made
+To claim a folder, a process creates the file `.lease-N` with the next number; only one process can succeed.
+The claim with the highest number is valid. Its owner touches the file every few seconds (heartbeat). To
+release the folder, the owner renames its file to `.lease-N-free` with the next number. So numbers only grow.
+The next claim may be made
 
 - by any process, if the last claim is free or belongs to a dead process on this machine;
 - by a process that has seen the last claim unchanged for LEASE, by its own clock. Clocks of different
   machines are never compared, since they may differ by hours.
 
-A process that stands still for longer than LEASE loses its folder, even if it wakes up later. Therefore it
-checks its lease before it publishes anything there (`publish`, `check_owner`). The next owner first removes
-the unfinished files of earlier owners, so even a process frozen between check and rename publishes nothing.
+A process that is frozen for longer than LEASE loses its folder, even if it continues later. Therefore it
+checks its lease before it publishes a file there (`publish`, `check_owner`). The next owner first removes
+the unfinished files of earlier owners. So a process that was frozen between check and rename publishes
+nothing.
 
-Locks of the kernel are not used: on network file systems they may be missing, or granted twice.
+Kernel locks are not used: on network file systems they may be missing, or granted twice.
 """
 
 from __future__ import annotations
@@ -38,32 +39,32 @@ from typing import Any, NamedTuple
 
 from memmlp.common.errors import LeaseLost
 
-LEASE = 60.0  # seconds without a heartbeat, as another process sees it, after which a claim is over
+LEASE = 60.0  # seconds without a heartbeat after which other processes may take over a folder
 BEAT = 5.0  # seconds between two heartbeats
-PAUSE = 0.2  # seconds between two looks at a folder for which a process waits
+PAUSE = 0.2  # seconds between two attempts to claim a folder
 
 PROC = Path("/proc")
-ENDED = ("Z", "X")  # states of a process that has ended, though its parent has not collected it yet
+ENDED = ("Z", "X")  # states of an ended process that its parent has not collected yet
 
 
 @functools.cache
 def process_space() -> str:
-    """Return a digest of machine, boot and container, within which a number identifies a process."""
+    """Return a digest of machine, boot and container; together with it, a pid identifies a process."""
     try:
         namespace = os.readlink(PROC / "self/ns/pid")
     except OSError:
         namespace = ""
-    words = [platform.node(), _text(PROC / "sys/kernel/random/boot_id"), namespace]
-    return hashlib.sha256("\n".join(words).encode()).hexdigest()[:12]
+    parts = [platform.node(), _text(PROC / "sys/kernel/random/boot_id"), namespace]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
 
 
 def current_process() -> dict[str, Any]:
-    """Describe this process, so that any process that can read the description can ask `is_alive`."""
+    """Describe this process; other processes can pass the description to `is_alive`."""
     return {"pid": os.getpid(), "born": _birth(os.getpid()), "place": process_space()}
 
 
 def is_alive(process: Mapping[str, Any]) -> bool | None:
-    """Return whether a process (`current_process`) is alive; None if it is on another machine."""
+    """Return whether a process (`current_process`) is alive; None if it runs on another machine."""
     if process.get("place") != process_space():
         return None
     pid = int(process["pid"])
@@ -71,19 +72,19 @@ def is_alive(process: Mapping[str, Any]) -> bool | None:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    except PermissionError:  # it is another user's
+    except PermissionError:  # the process belongs to another user
         pass
     return _stat(pid)[:1] not in [[state] for state in ENDED] and _birth(pid) == process.get("born")
 
 
 def _birth(pid: int) -> str | None:
-    """Return when a process was started, in the kernel's ticks: a later one with the same number differs."""
+    """Return the start time of a process in kernel ticks; it tells processes with the same pid apart."""
     fields = _stat(pid)
     return fields[19] if len(fields) > 19 else None
 
 
 def _stat(pid: int) -> list[str]:
-    """Return the kernel's fields of a process, from its state on; empty without /proc."""
+    """Return the fields of /proc/PID/stat from the process state on; empty without /proc."""
     return _text(PROC / str(pid) / "stat").rpartition(")")[2].split()
 
 
@@ -95,41 +96,41 @@ def _text(path: Path) -> str:
 
 
 class Changes:
-    """Measures how long values have been unchanged, by this process' clock, which never jumps."""
+    """Measures for how long values have been unchanged, by a clock that never jumps."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic):
         self.clock = clock
         self.seen: dict[Hashable, tuple[object, float]] = {}
 
-    def seconds_unchanged(self, key: Hashable, look: Callable[[], object]) -> float:
-        """Look at a value, and return for how long it has certainly been unchanged; 0 at the first look.
+    def seconds_unchanged(self, key: Hashable, read: Callable[[], object]) -> float:
+        """Read a value, and return for how many seconds it has certainly been unchanged; 0 at the first call.
 
         Args:
             key: the value's name.
-            look: returns the value.
+            read: a function that returns the value.
         """
-        before = self.clock()  # if this process is frozen while it looks, the time must not count
-        value = look()
-        known = self.seen.get(key)
-        if known is None or known[0] != value:
+        before = self.clock()  # if this process is frozen while it reads, that time must not count
+        value = read()
+        last = self.seen.get(key)
+        if last is None or last[0] != value:
             self.seen[key] = (value, self.clock())
             return 0.0
-        return before - known[1]
+        return before - last[1]
 
 
 _changes = Changes()
 _leases: dict[Path, Lease] = {}
-"""The leases of this process by the folders that it owns."""
+"""The leases of this process, by folder."""
 
 
 class Claim(NamedTuple):
-    """A claim on a folder, as it was read.
+    """A claim on a folder, read from its file.
 
     Attributes:
         number: the claim's number.
         free: whether the owner has released the folder.
         text: the content of the claim's file.
-        touched: when the file was last touched, nanoseconds of the file system's clock.
+        touched: time of the last heartbeat, in nanoseconds of the file system's clock.
     """
 
     number: int
@@ -139,16 +140,17 @@ class Claim(NamedTuple):
 
     @property
     def owner(self) -> dict[str, Any] | None:
-        """The process that holds the claim; None if it is free, or can't be read, for example yet."""
+        """The process that made the claim; None if the folder is free or the claim is not readable (yet)."""
         with contextlib.suppress(ValueError):
             owner = json.loads(self.text)
             return owner if isinstance(owner, dict) and not self.free else None
         return None
 
-    def open(self, idle: float) -> bool | None:
-        """Return whether the folder may be taken, given for how many seconds the claim has been unchanged.
+    def can_be_taken_over(self, idle: float) -> bool | None:
+        """Return whether another process may claim the folder; None if it has to wait for LEASE.
 
-        None means that it may be taken after LEASE without a heartbeat.
+        Args:
+            idle: for how many seconds the claim has been unchanged.
         """
         alive = is_alive(self.owner) if self.owner else None
         if self.free or alive is False or idle > LEASE:
@@ -157,11 +159,11 @@ class Claim(NamedTuple):
 
 
 class Lock:
-    """The lock of a folder; a thread may hold it several times.
+    """The lock of a folder; a thread that holds it may lock it again.
 
     Args:
-        folder: the folder in which claims are made.
-        name: the folder inside it that is locked; by default `folder` itself.
+        folder: the folder with the claims' files.
+        name: the subfolder to lock; by default, `folder` itself is locked.
     """
 
     def __init__(self, folder: Path, name: str = ""):
@@ -170,95 +172,96 @@ class Lock:
         self.description = f"{self.target.parent.name.removesuffix('s')} {self.target.name}"
 
     @contextlib.contextmanager
-    def hold(self, say: Callable[[str], None] | None = None, wait: bool = True) -> Iterator[Lease | None]:
-        """Hold the lock, and yield the lease; None if another process has it.
+    def hold(self, report: Callable[[str], None] | None = None, wait: bool = True) -> Iterator[Lease | None]:
+        """Hold the lock during the context, and yield the lease; None if another process holds the lock.
 
-        Within the context, everything that this process publishes below the folder is checked: once another
-        process has taken over the folder, LeaseLost is raised instead.
+        If another process takes over the folder, any attempt of this process to publish a file there raises
+        LeaseLost.
 
         Args:
-            say: gets a line about the process for which this one waits; by default the line goes to stderr.
-            wait: whether to wait while another process has the lock.
+            report: gets a line if this process has to wait; by default, the line goes to stderr.
+            wait: whether to wait while another process holds the lock.
         """
         key, thread = _resolved(self.target), (os.getpid(), threading.get_ident())
         if key in _leases and _leases[key].thread == thread:
             yield _leases[key]
             return
         self.folder.mkdir(parents=True, exist_ok=True)
-        lease = self._take()
+        lease = self._try_to_claim()
         if lease is None and wait:
-            (say or _to_stderr)(f"{self.description} is in use by {self.holder}; waiting for it")
-            while (lease := self._take()) is None:
+            line = f"{self.description} is in use by {self.holder_description}; waiting until it is free"
+            (report or _to_stderr)(line)
+            while (lease := self._try_to_claim()) is None:
                 time.sleep(PAUSE)
         if lease is None:
             yield None
             return
         _leases[key] = lease
         try:
-            with lease.heartbeat():
+            with lease.keep_alive():
                 yield lease
         finally:
             del _leases[key]
 
     @property
     def owner(self) -> dict[str, Any] | None:
-        """The description of the process that holds the lock; None if none does, or it is not known."""
-        last = self._last()
+        """The process that holds the lock (`current_process`); None if it is unknown or the lock is free."""
+        last = self._read_last_claim()
         return last.owner if last else None
 
     @property
-    def holder(self) -> str:
-        """The process that holds the lock, in words."""
+    def holder_description(self) -> str:
+        """A readable description of the process that holds the lock."""
         owner = self.owner
         if not owner:
             return "another process"
-        where = "" if owner["place"] == process_space() else " of another machine"
+        where = "" if owner["place"] == process_space() else " on another machine"
         return f"process {owner['pid']}{where} since {owner['since']}"
 
     @property
-    def held(self) -> bool | None:
-        """Whether the process that holds the lock is alive, if that is known; None if no process holds it.
+    def is_held(self) -> bool | None:
+        """Whether a live process holds the lock; False if its process died, None if the lock is free.
 
-        A process on another machine counts as alive until it has not shown a heartbeat for LEASE.
+        A process on another machine counts as dead after LEASE without a heartbeat.
         """
-        last, idle = self._watch()
-        return None if last is None or last.free else not last.open(idle)
+        last, idle = self._read_last_claim_and_age()
+        return None if last is None or last.free else not last.can_be_taken_over(idle)
 
-    def _watch(self) -> tuple[Claim | None, float]:
+    def _read_last_claim_and_age(self) -> tuple[Claim | None, float]:
         """Return the last claim, and for how many seconds this process has seen it unchanged."""
-        seen: list[Claim | None] = []
+        claims: list[Claim | None] = []
 
-        def look() -> Claim | None:
-            seen.append(self._last())
-            return seen[-1]
+        def read() -> Claim | None:
+            claims.append(self._read_last_claim())
+            return claims[-1]
 
-        idle = _changes.seconds_unchanged((self.folder.absolute(), self.prefix), look)
-        return seen[-1], idle
+        idle = _changes.seconds_unchanged((self.folder.absolute(), self.prefix), read)
+        return claims[-1], idle
 
-    def _last(self) -> Claim | None:
-        """Return the last claim, which is the valid one; None if there was never any."""
-        while claims := self.claims():
+    def _read_last_claim(self) -> Claim | None:
+        """Return the last claim, which is the valid one; None if there is no claim."""
+        while claims := self.list_claims():
             (number, owned), path = claims[-1]
             with (
                 contextlib.suppress(FileNotFoundError),  # it has been superseded meanwhile
-                open(path, encoding="utf-8") as file,  # on NFS opening asks the server
+                open(path, encoding="utf-8") as file,  # on NFS, opening a file refreshes it from the server
             ):
                 return Claim(number, not owned, file.read(), os.fstat(file.fileno()).st_mtime_ns)
         return None
 
-    def claims(self) -> list[tuple[tuple[int, bool], Path]]:
-        """Return the claims in ascending order: their numbers, whether they are owned, and their files."""
+    def list_claims(self) -> list[tuple[tuple[int, bool], Path]]:
+        """Return number, whether the folder is owned, and file of each claim, in ascending order."""
         try:
             names = os.listdir(self.folder)
         except FileNotFoundError:
             return []
-        found = (re.fullmatch(re.escape(self.prefix) + r"(\d+)(-free)?", name) for name in names)
-        return sorted(((int(match[1]), not match[2]), self.folder / match[0]) for match in found if match)
+        matches = (re.fullmatch(re.escape(self.prefix) + r"(\d+)(-free)?", name) for name in names)
+        return sorted(((int(match[1]), not match[2]), self.folder / match[0]) for match in matches if match)
 
-    def _take(self) -> Lease | None:
-        """Make the next claim if the last one is over, and return the lease; None if it is not."""
-        last, idle = self._watch()
-        if last and not last.open(idle):
+    def _try_to_claim(self) -> Lease | None:
+        """Make the next claim if the folder can be taken over, and return the lease; otherwise None."""
+        last, idle = self._read_last_claim_and_age()
+        if last and not last.can_be_taken_over(idle):
             return None
         number = last.number + 1 if last else 1
         path = self.folder / f"{self.prefix}{number}"
@@ -274,11 +277,11 @@ class Lock:
             raise
         finally:
             os.close(handle)
-        *earlier, ((highest, _), _) = self.claims() or [((0, False), path)]
-        if highest != number:  # this process was frozen after it looked, and others came and went
+        *earlier, ((highest, _), _) = self.list_claims() or [((0, False), path)]
+        if highest != number:  # this process was frozen meanwhile, and others made later claims
             path.unlink(missing_ok=True)
             return None
-        for _, old in earlier:  # in ascending order, so that if cut short none of them becomes the last
+        for _, old in earlier:  # in ascending order: if interrupted, an old claim must not become the last
             old.unlink(missing_ok=True)
         _remove_unfinished(self.target, number)
         return Lease(self, number, path)
@@ -288,9 +291,9 @@ class Lease:
     """This process' claim on a folder.
 
     Attributes:
-        number: the claim's number, higher than those of all owners before.
+        number: the claim's number, higher than all earlier numbers.
         path: the claim's file.
-        lost: whether another process is known to have taken over the folder.
+        lost: whether this process knows that another one has taken over the folder.
     """
 
     def __init__(self, lock: Lock, number: int, path: Path):
@@ -298,31 +301,31 @@ class Lease:
         self.thread = (os.getpid(), threading.get_ident())
 
     def check(self) -> None:
-        """Touch the claim, and raise LeaseLost if another process has made a later one."""
+        """Touch the claim. Raises LeaseLost if another process has made a later claim."""
         try:
             os.utime(self.path)
         except OSError as error:
             if error.errno not in (errno.ENOENT, errno.ESTALE):
                 raise
             self.lost = True
-        self.lost = self.lost or self.lock.claims()[-1:] != [((self.number, True), self.path)]
+        self.lost = self.lost or self.lock.list_claims()[-1:] != [((self.number, True), self.path)]
         if self.lost:
             raise LeaseLost(
-                f"{self.lock.description}: another process took it over, because this one stood still for "
-                f"longer than {LEASE:.0f} s; this one writes nothing more there"
+                f"{self.lock.description}: another process took over the folder, because this process was "
+                f"frozen for longer than {LEASE:.0f} s; this process writes nothing more to it"
             )
 
     @contextlib.contextmanager
-    def heartbeat(self) -> Iterator[None]:
+    def keep_alive(self) -> Iterator[None]:
         """Touch the claim regularly during the context, then release the folder."""
         ended = threading.Event()
 
-        def beat() -> None:
+        def touch_regularly() -> None:
             while not (self.lost or ended.wait(BEAT)):
                 with contextlib.suppress(OSError, LeaseLost):
                     self.check()
 
-        thread = threading.Thread(target=beat, daemon=True)
+        thread = threading.Thread(target=touch_regularly, daemon=True)
         thread.start()
         try:
             yield
@@ -335,45 +338,45 @@ class Lease:
 
 
 def check_owner(path: Path) -> None:
-    """Raise LeaseLost if this process held the path's folder and has lost it.
+    """Raise LeaseLost if this process has lost its lease of the path's folder.
 
-    Call this before appending to a file or removing it. A freeze of the process after the check is not
-    noticed.
+    Call this before appending to a file or removing it. It can't detect a freeze between the check and the
+    write.
     """
     if lease := _lease_of(path):
         lease.check()
 
 
 def temporary(path: Path) -> Path:
-    """Return a unique name for the unfinished form of a file or folder, beside it."""
+    """Return a unique path, in the same folder, under which a file or folder is written before `publish`."""
     lease = _lease_of(path)
     owner = f".lease-{lease.number}" if lease else ""
     return path.with_name(f".{path.name}{owner}.{uuid.uuid4().hex[:12]}.tmp")
 
 
 def publish(unfinished: Path, path: Path) -> None:
-    """Give a finished file or folder its final name.
+    """Move a finished file or folder to its final path.
 
     Args:
-        unfinished: its present name, from `temporary`.
-        path: its final name.
+        unfinished: the path from `temporary`.
+        path: the final path.
 
     Raises:
-        LeaseLost: if this process held the path's folder and has lost it.
+        LeaseLost: if this process has lost its lease of the path's folder.
     """
     check_owner(path)
     try:
         os.replace(unfinished, path)
     except FileNotFoundError:
-        check_owner(path)  # the next owner removed it
+        check_owner(path)  # the next owner removed the unfinished file
         raise
 
 
 def _remove_unfinished(folder: Path, number: int) -> None:
-    """Remove the unfinished files of owners with lower numbers, below a folder and of the folder itself."""
+    """Remove the unfinished files that owners with lower numbers left in a folder and beside it."""
     for path in [*folder.rglob(".*.lease-*.tmp"), *folder.parent.glob(f".{folder.name}.lease-*.tmp")]:
         owner = re.search(r"\.lease-(\d+)\.[0-9a-f]+\.tmp$", path.name)
-        if owner is None or int(owner[1]) >= number:  # a later owner's, if this process was frozen meanwhile
+        if owner is None or int(owner[1]) >= number:  # of a later owner
             continue
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
@@ -382,13 +385,13 @@ def _remove_unfinished(folder: Path, number: int) -> None:
 
 
 def _lease_of(path: Path) -> Lease | None:
-    """Return the lease of the folder that contains the path; None if this process holds none."""
+    """Return this process' lease of a folder that contains the path; None if there is no lease."""
     resolved = _resolved(path)
     return next((_leases[one] for one in (resolved, *resolved.parents) if one in _leases), None)
 
 
 def _resolved(path: Path) -> Path:
-    """Return the path with the links in its folder resolved; its last part stays as it is."""
+    """Return the path with links in its parent folder resolved; a link at its end is kept."""
     return Path(os.path.realpath(path.parent)) / path.name
 
 

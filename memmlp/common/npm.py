@@ -1,7 +1,7 @@
-"""Pinned packages from the npm registry with files for pages: fetched once, checked, and kept.
+"""Downloads, checks and caches the npm packages that pages use; their versions are pinned.
 
-The registry is `NPM_CONFIG_REGISTRY`, or else registry.npmjs.org.
-Tarballs are kept below the user's cache folder. They are read member by member, and never unpacked.
+The registry is `NPM_CONFIG_REGISTRY`, or registry.npmjs.org by default.
+Tarballs are kept in the user's cache folder. They are read member by member, and never unpacked.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from memmlp.common.progress import announce
 
 DEFAULT_REGISTRY = "https://registry.npmjs.org/"
 FOLDER = "MEMMLP_NPM"
-"""The environment variable of a folder of tarballs, as `npm pack` writes them, that is searched first."""
+"""The environment variable that names a folder with tarballs from `npm pack`; it is searched first."""
 
 TIMEOUT = 60  # seconds without a byte
 MAX_SIZE = 300_000_000  # bytes of a tarball
@@ -31,12 +31,12 @@ MAX_SIZE = 300_000_000  # bytes of a tarball
 
 @dataclass(frozen=True)
 class Package:
-    """A package of one version.
+    """An npm package with a pinned version.
 
     Attributes:
-        name: the package's name, with its scope if it has one.
-        version: the package's version.
-        integrity: the digest of its tarball in npm's form: "sha512-" and the digest in base 64.
+        name: the package's name, including its scope.
+        version: the pinned version.
+        integrity: the tarball's digest in npm's format: "sha512-" and the digest in base 64.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Package:
 
     @property
     def file(self) -> str:
-        """The tarball's file name, as in `npm pack`."""
+        """The tarball's file name, the same that `npm pack` gives it."""
         return f"{self.name.removeprefix('@').replace('/', '-')}-{self.version}.tgz"
 
     def url(self, registry: str) -> str:
@@ -79,11 +79,11 @@ IWER = Package(  # a headset in software, for tests
 
 
 def read(package: Package, names: Collection[str]) -> dict[str, bytes]:
-    """Return files of a package, by their names in the package, such as "dist/ort.min.mjs".
+    """Return the content of files in a package, by file name, such as "dist/ort.min.mjs".
 
     Raises:
         InputError: if the package can't be downloaded.
-        KeyError: if it has no such file.
+        KeyError: if the package does not have a file.
     """
     found = {}
     with tarfile.open(tarball(package), "r:gz") as archive:
@@ -99,15 +99,15 @@ def read(package: Package, names: Collection[str]) -> dict[str, bytes]:
 
 
 def tarball(package: Package) -> Path:
-    """Return the tarball of a package, with its digest checked; it is fetched if it is not kept yet.
+    """Return a package's tarball, downloading it if it is not in the cache; its digest is checked.
 
     Raises:
-        InputError: if it can't be fetched, or does not have the pinned digest.
+        InputError: if the tarball can't be downloaded, or does not have the pinned digest.
     """
     if (given := os.environ.get(FOLDER)) and (path := Path(given) / package.file).is_file():
         if _has_digest(package, path.read_bytes()):
             return path
-        raise InputError(f"{path}: not {package} as pinned ({package.integrity[:20]}...)")
+        raise InputError(f"{path}: must be {package} with the pinned digest {package.integrity[:20]}...")
     path = cache() / package.file
     if not (path.is_file() and _has_digest(package, path.read_bytes())):
         content = _download(package, registry())
@@ -117,7 +117,7 @@ def tarball(package: Package) -> Path:
 
 
 def cache() -> Path:
-    """Return the folder where tarballs are kept."""
+    """Return the folder where downloaded tarballs are kept."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "memmlp" / "npm"
 
 
@@ -130,19 +130,21 @@ def registry() -> str:
 
 
 def _download(package: Package, host: str) -> bytes:
-    """Fetch a package's tarball. Raises InputError if that fails, or if the file is another one."""
-    announce(f"fetch {package} from the npm registry; it is kept in {cache()}")
-    instead = f"or set {FOLDER} to a folder with {package.file}, as npm pack {package} writes it"
+    """Download a package's tarball. Raises InputError if the download fails or has a wrong digest."""
+    announce(f"download {package} from the npm registry and keep it in {cache()}")
+    instead = f"or run npm pack {package} and set {FOLDER} to the folder with {package.file}"
     try:
         with urllib.request.urlopen(package.url(host), timeout=TIMEOUT) as answer:
             content = answer.read(MAX_SIZE)
     except (OSError, ValueError, HTTPException) as error:  # a ValueError: not a valid address
         reason = error.reason if isinstance(error, URLError) else why_unreadable(error)
         raise InputError(
-            f"{package}: cannot be fetched from the npm registry ({reason}); try again, {instead}"
+            f"{package}: cannot be downloaded from the npm registry ({reason}); try again, {instead}"
         ) from None
     if not _has_digest(package, content):
-        raise InputError(f"{package}: the npm registry sent another file than the pinned one; {instead}")
+        raise InputError(
+            f"{package}: the file from the npm registry does not have the pinned digest; try again, {instead}"
+        )
     return content
 
 

@@ -7,17 +7,17 @@ from dataclasses import dataclass
 from typing import Any
 
 SIGNS = "+~"
-"""What an override may begin with: + and ++ add a key, ~ removes it."""
+"""The signs at the start of an override: + and ++ add a key, ~ removes a key."""
 
 
 @dataclass(frozen=True)
 class Override:
-    """An override [SIGNS]KEY[=VALUE] as it is typed on a command line.
+    """An override [SIGNS]KEY[=VALUE] from a command line.
 
     Attributes:
         text: the whole override.
         signs: "", "+", "++" or "~".
-        key: the dotted key, or the group whose option it chooses.
+        key: a dotted key, or a config group.
         value: the text after the first "="; None for an override without one.
     """
 
@@ -28,7 +28,7 @@ class Override:
 
     @classmethod
     def parse(cls, text: str) -> Override:
-        """Split an override's text; every text is accepted, and Hydra checks the value."""
+        """Split an override's text. Every text is accepted; Hydra checks it later."""
         left, equals, value = text.partition("=")
         key = left.lstrip(SIGNS)
         return cls(text, left[: len(left) - len(key)], key, value if equals else None)
@@ -40,7 +40,7 @@ class Override:
 
     @property
     def options(self) -> list[str]:
-        """The options that a group's override names: one, or those of a list [A,B]; null names no option."""
+        """The options in an override of a group: one, several for a list [A,B], none for null."""
         names = [name.strip(" '\"") for name in (self.value or "").strip("[] ").split(",")]
         return [name for name in names if name not in ("", "null")]
 
@@ -59,7 +59,7 @@ def last_by_key(texts: Iterable[str]) -> dict[str, Override]:
 
 
 def value_text(value: Any) -> str:
-    """Return a value as the text that an override has for it."""
+    """Return a value as the text to use in an override."""
     if isinstance(value, list):
         return f"[{','.join(map(value_text, value))}]"
     if value is None:

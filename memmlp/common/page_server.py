@@ -1,8 +1,9 @@
-"""The HTTP server of a local page: who may send requests, and how files and events are sent.
+"""The HTTP server of a local page: access control, files and events.
 
-At the loopback address, a request must name that address (another name would be DNS rebinding), and must not
-come from another site's page. At any other address, each request needs the token: first in the printed
-address, then in a cookie, so that the browser's history does not contain it.
+At the loopback address, the Host header of a request must name that address; this prevents DNS rebinding.
+Requests from pages of other sites are refused. At any other address, each request needs the token. The
+printed address contains the token; the server then moves it to a cookie, to keep it out of the browser's
+history.
 """
 
 from __future__ import annotations
@@ -33,21 +34,21 @@ TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css", "vrm":
 
 
 def read_page_file(package: str, name: str) -> bytes:
-    """Return a file of a page, which lies in the folder `page` of a package."""
+    """Return the content of a file in the folder `page` of a package."""
     return resources.files(package).joinpath("page", *name.split("/")).read_bytes()
 
 
 def content_type(name: str) -> str:
-    """Return the content type of a page's file."""
+    """Return the content type for a file name."""
     return f"{TYPES[name.rsplit('.', 1)[-1]]}; charset=utf-8"
 
 
 def security_policy(index: str, *scripts: str) -> str:
-    """Return a page's Content-Security-Policy: its own scripts, its import map, and no other hosts.
+    """Return a page's Content-Security-Policy; it allows the page's own scripts and import map only.
 
     Args:
         index: the page's HTML, with an import map.
-        scripts: further sources of scripts.
+        scripts: further allowed sources of scripts.
     """
     inline = re.search(r'<script type="importmap">(.*?)</script>', index, re.DOTALL)
     assert inline is not None
@@ -60,14 +61,14 @@ def security_policy(index: str, *scripts: str) -> str:
 
 
 class Access:
-    """The rules of a server.
+    """The access rules of a server.
 
     Args:
         host: the address at which the server listens.
-        token: what requests need at any address but the loopback address; None for a new random token.
+        token: the token that requests need, except at the loopback address; None for a new random token.
 
     Attributes:
-        token: the token; None at the loopback address, which does not need one.
+        token: the token; None at the loopback address.
     """
 
     def __init__(self, host: str, token: str | None = None):
@@ -75,7 +76,7 @@ class Access:
         self.token = None if is_loopback(host) else token or secrets.token_urlsafe(24)
 
     def allows(self, path: str, headers: Message, port: int) -> bool:
-        """Return whether a request may be answered, given its host, its origin and its token."""
+        """Return whether a request may be answered, judging by its host, origin and token."""
         url = urllib.parse.urlsplit(path)
         if headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
             return headers.get("Sec-Fetch-Mode") == "navigate" and url.path == "/"
@@ -86,13 +87,13 @@ class Access:
         return secrets.compare_digest(given.encode(), self.token.encode())
 
     def allows_change(self, path: str, headers: Message, port: int) -> bool:
-        """Return whether a request may change something: it must not come from another site's page."""
+        """Return whether a request may change data; requests from pages of other sites may not."""
         origin = headers.get("Origin")  # browsers send it with every POST
         return origin in (None, f"http://{headers.get('Host', '')}") and self.allows(path, headers, port)
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether an address is 127.0.0.1 or localhost, at which no other machine can reach this one."""
+    """Return whether an address is 127.0.0.1 or localhost; other machines can't connect to it."""
     try:
         return host == "localhost" or (ip_address(host).is_loopback and ip_address(host).version == 4)
     except ValueError:
@@ -100,19 +101,19 @@ def is_loopback(host: str) -> bool:
 
 
 def check_token(host: str, token: str | None) -> None:
-    """Raise InputError for a token that is too short, or not needed at an address."""
+    """Raise InputError if a token is too short, or if the address does not need a token."""
     if token is not None and is_loopback(host):
-        raise InputError("--token: is only for --host; the loopback address does not need it")
+        raise InputError("--token: must not be set for the loopback address; set --host too, or drop --token")
     if token is not None and len(token) < MIN_LENGTH:
         raise InputError(f"--token: must have at least {MIN_LENGTH} characters")
 
 
 def _cookie(headers: Message, port: int) -> str:
     try:
-        found = SimpleCookie(headers.get("Cookie", "")).get(f"{COOKIE}_{port}")
+        cookie = SimpleCookie(headers.get("Cookie", "")).get(f"{COOKIE}_{port}")
     except CookieError:
         return ""
-    return urllib.parse.unquote(found.value) if found else ""
+    return urllib.parse.unquote(cookie.value) if cookie else ""
 
 
 class PageHandler(BaseHTTPRequestHandler):
@@ -122,16 +123,16 @@ class PageHandler(BaseHTTPRequestHandler):
     timeout = 60
 
     def answer(self, path: str, query: Mapping[str, str]) -> None:
-        """Send the answer to an allowed GET request; the path does not begin with a slash."""
+        """Send the answer to an allowed GET request; `path` does not begin with a slash."""
         raise NotImplementedError
 
     def do_GET(self) -> None:
-        """Answer a request, unless the access rules refuse it."""
+        """Check the access rules, then answer the request."""
         with contextlib.suppress(ConnectionError, TimeoutError):  # raised when the page was closed
             url, port = urllib.parse.urlsplit(self.path), self.server.server_port
             query = dict(urllib.parse.parse_qsl(url.query))
             if not self.server.access.allows(self.path, self.headers, port):
-                self.send(403, TEXT, b"not allowed; open the address that the command printed\n")
+                self.send(403, TEXT, b"access denied; open the address that the command printed\n")
             elif "token" in query:  # it moves to a cookie
                 cookie = f"{COOKIE}_{port}={urllib.parse.quote(query['token'])}"
                 attributes = "HttpOnly; SameSite=Strict; Path=/"
@@ -140,12 +141,12 @@ class PageHandler(BaseHTTPRequestHandler):
                 self.answer(urllib.parse.unquote(url.path).lstrip("/"), query)
 
     def send(self, code: int, kind: str, content: bytes, headers: Mapping[str, str] | None = None) -> None:
-        """Send an answer with its content type and further headers."""
+        """Send an answer; `kind` is its content type."""
         self._send_head(code, kind, {"Content-Length": str(len(content)), **(headers or {})})
         self.wfile.write(content)
 
     def send_events(self, events: Iterable[bytes]) -> None:
-        """Send server-sent events as they come, until their end or that of the page."""
+        """Send server-sent events one by one, until the events end or the page is closed."""
         self.close_connection = True
         self._send_head(200, "text/event-stream", {"Connection": "close"})
         for event in events:
@@ -172,16 +173,16 @@ class PageHandler(BaseHTTPRequestHandler):
 
 
 class PageServer(ThreadingHTTPServer):
-    """Serves a page, from its own threads, inside a `with` block.
+    """Serves a page in background threads, inside a `with` block.
 
     Args:
         handler: the class that answers requests.
-        port: the port; 0 for any free one.
-        host: the address to serve at; at 127.0.0.1 only this machine reaches it.
-        token: what every request needs at any other address; None for a new random token.
+        port: the port; 0 for any free port.
+        host: the address to serve at; at 127.0.0.1, only this machine can open the page.
+        token: the token that requests need at other addresses; None for a new random token.
 
     Attributes:
-        headers: headers of every answer, besides those of safety.
+        headers: headers of every answer, in addition to the security headers.
 
     Raises:
         InputError: if the address does not belong to this machine, or the port is in use.
@@ -199,11 +200,11 @@ class PageServer(ThreadingHTTPServer):
             super().__init__((host, port), handler)
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
-            expected = "expected an address of this machine and a free port (--port 0: any)"
+            expected = "must be an address of this machine and a free port (0 for any)"
             raise InputError(f"--host {host} --port {port}: {reason}; {expected}") from None
 
     def server_bind(self) -> None:
-        """Bind to the address without a name lookup, even while a page of an earlier server is open."""
+        """Bind to the address without a name lookup, even if a page of an earlier server is still open."""
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.socket.bind(self.server_address)
         self.server_address = name, port, *_ = self.socket.getsockname()
@@ -211,19 +212,19 @@ class PageServer(ThreadingHTTPServer):
 
     @property
     def url(self) -> str:
-        """The page's address, with the token if one is needed.
+        """The page's address, including the token if one is needed.
 
-        A server at all addresses gives one that other machines can reach.
+        If the server listens at all addresses, this is the address for other machines.
         """
         name = own_address() if self.server_name == EVERYWHERE else self.server_name
         token = self.access.token
         return f"http://{name}:{self.server_port}/" + (f"?token={urllib.parse.quote(token)}" if token else "")
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore the error: a request that one page breaks off does not concern the others."""
+        """Ignore the error: an interrupted request does not affect other pages."""
 
     def end_events(self) -> None:
-        """End the events of all pages; called before the server stops."""
+        """End the event streams of all pages; this is called before the server stops."""
 
     def __enter__(self) -> Self:
         self.thread = threading.Thread(target=self.serve_forever, args=(0.05,), daemon=True)
@@ -238,7 +239,7 @@ class PageServer(ThreadingHTTPServer):
 
 
 def own_address() -> str:
-    """Return this machine's address in its network, at which other machines reach it; nothing is sent."""
+    """Return the address at which other machines can reach this one; no data is sent."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))  # an address for documentation (RFC 5737)

@@ -1,4 +1,4 @@
-"""This process and its children: garbage collection, signals, imports, and its share of a core."""
+"""This process and its children: garbage collection, signals, imports, and CPU core usage."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from collections.abc import Callable, Iterator
 
 GC_THRESHOLDS = (10_000, 20, 20)  # by default 700, 10 and 10
 
-MIN_CORE_SHARE = 0.9  # with less of a core, other work disturbed a measurement
+MIN_CORE_SHARE = 0.9  # below this fraction of a core, other processes disturbed a measurement
 
 
 def collect_garbage_rarely() -> None:
-    """Make the garbage collector run rarely, and not at the process' end.
+    """Make the garbage collector run rarely, and not when the process ends.
 
-    Call this at the start of a process. Importing torch makes hundreds of thousands of objects, none of which
-    is garbage; searching them repeatedly takes a third of the time of a command that does little else.
+    Call this at the start of a process. Importing torch creates hundreds of thousands of live objects.
+    Scanning them repeatedly takes a third of the time of a short command.
     """
     gc.set_threshold(*GC_THRESHOLDS)
     atexit.register(gc.freeze)
@@ -30,7 +30,7 @@ def collect_garbage_rarely() -> None:
 
 @contextlib.contextmanager
 def finish_uninterrupted(finish: Callable[[], object]) -> Iterator[None]:
-    """Call a function at the end of the context, even if another Ctrl-C or SIGTERM arrives meanwhile."""
+    """Call a function at the end of the context; Ctrl-C and SIGTERM are ignored while it runs."""
     try:
         yield
     finally:
@@ -44,7 +44,7 @@ def finish_uninterrupted(finish: Callable[[], object]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def termination_interrupts() -> Iterator[None]:
-    """Treat a request to end (SIGTERM) like a Ctrl-C."""
+    """Treat SIGTERM like Ctrl-C during the context."""
 
     def interrupt(number: int, frame: object) -> None:
         raise KeyboardInterrupt
@@ -57,11 +57,11 @@ def termination_interrupts() -> Iterator[None]:
 
 
 def import_environment() -> dict[str, str]:
-    """Return the environment variables by which another Python process imports what this one does.
+    """Return environment variables with which another Python process imports the same modules.
 
-    Without them, `python -m` looks into the working folder first, where another copy of the package may lie.
-    The standard library and site-packages are left out, because a job may start another interpreter on its
-    way (`conda activate` on a cluster).
+    Without them, `python -m` searches the working folder first. It may contain another copy of the package.
+    The standard library and site-packages are left out, because a job on a cluster may start another
+    interpreter (`conda activate`).
     """
     library = sysconfig.get_path("stdlib")
     zipped = f"python{sys.version_info.major}{sys.version_info.minor}.zip"
@@ -78,7 +78,7 @@ def import_environment() -> dict[str, str]:
 
 @contextlib.contextmanager
 def children_import_the_same() -> Iterator[None]:
-    """Set `import_environment` within the context, for libraries that pass on this process' environment."""
+    """Set `import_environment` in this process during the context, so that child processes inherit it."""
     before = {name: os.environ.get(name) for name in import_environment()}
     os.environ.update(import_environment())
     try:
@@ -92,16 +92,16 @@ def children_import_the_same() -> Iterator[None]:
 
 
 class CoreClock:
-    """Measures for how much of the time since its creation the calling thread had a core.
+    """Measures the fraction of time in which the calling thread ran on a CPU core.
 
-    Other threads don't count: it is right where the calling thread does all the work, as in a session of
-    ONNX Runtime on one thread.
+    Other threads are not counted. Use it only where the calling thread does all the work, such as in a
+    single-threaded session of ONNX Runtime.
     """
 
     def __init__(self) -> None:
         self._start, self._busy = time.perf_counter(), time.thread_time()
 
     @property
-    def share(self) -> float:
-        """The share so far, 0 to 1."""
+    def fraction(self) -> float:
+        """The fraction since this object was created, 0 to 1."""
         return (time.thread_time() - self._busy) / (time.perf_counter() - self._start)

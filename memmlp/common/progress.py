@@ -1,4 +1,4 @@
-"""Progress reports on long work: bars with the remaining time on a terminal, elsewhere lines for a log."""
+"""Progress of long work: bars with the remaining time on a terminal, otherwise lines for a log."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-INTERVAL = 30.0  # seconds between two lines about the progress of the same work
+INTERVAL = 30.0  # seconds between two progress lines
 
 _label: ContextVar[str] = ContextVar("label of the larger work", default="")
 _listener: ContextVar[Callable[[str], None] | None] = ContextVar("listener to lines about work", default=None)
@@ -26,14 +26,14 @@ def to_stderr(line: str) -> None:
 
 
 def to_log(line: str) -> None:
-    """Write a line to stderr, unless stderr is a terminal, which shows the bars."""
+    """Write a line to stderr, unless stderr is a terminal: a terminal shows progress bars instead."""
     if not sys.stderr.isatty():
         to_stderr(line)
 
 
 @contextmanager
 def announce_to(listener: Callable[[str], None] = to_log) -> Iterator[None]:
-    """Send the lines about work in this context to a listener: what begins, and the progress at times."""
+    """Send announcements and progress lines of this context to a listener."""
     token = _listener.set(listener)
     try:
         yield
@@ -42,20 +42,20 @@ def announce_to(listener: Callable[[str], None] = to_log) -> Iterator[None]:
 
 
 def announce(line: str) -> None:
-    """Send a line about the work, such as what begins now, to the listener, if any (`announce_to`)."""
+    """Send a line to the listener (`announce_to`), if there is one, such as the name of the next step."""
     if listener := _listener.get():
         listener(line)
 
 
 def notify(line: str) -> None:
-    """Send what the user should know, such as skipped files: as `announce` does, but on a terminal, too."""
+    """Send a line that the user should see, such as skipped files; unlike `announce`, also on a terminal."""
     if listener := _listener.get():
         (to_stderr if listener is to_log else listener)(line)
 
 
 @contextmanager
 def label_progress(name: str) -> Iterator[None]:
-    """Label the progress bars of this context with the larger work that they are a part of: a validation."""
+    """Label all progress bars of this context with the name of the larger work, such as a validation."""
     token = _label.set(name)
     try:
         yield
@@ -64,14 +64,14 @@ def label_progress(name: str) -> Iterator[None]:
 
 
 class Count:
-    """Counts how much of some work is done.
+    """Counts the finished items of some work.
 
-    A terminal shows a bar; a listener (`announce_to`) gets a line every INTERVAL seconds.
+    A terminal shows a bar. A listener (`announce_to`) gets a line every INTERVAL seconds.
 
     Args:
         display: draws the bar.
         row: the bar's row in the display.
-        unit: what is counted, such as frames.
+        unit: the unit of the count, such as frames.
     """
 
     def __init__(self, display: Progress, row: TaskID, unit: str = ""):
@@ -79,19 +79,19 @@ class Count:
         self.announced = time.monotonic()
 
     def advance(self) -> None:
-        """Count one more."""
+        """Count one more finished item."""
         self.display.advance(self.row)
         if time.monotonic() - self.announced >= INTERVAL:
             self.announced = time.monotonic()
             announce(self.line)
 
-    def note(self, text: str) -> None:
-        """Replace the text after the numbers, such as the loss."""
+    def set_note(self, text: str) -> None:
+        """Replace the text behind the numbers, such as the loss."""
         self.display.update(self.row, note=text)
 
     @property
     def line(self) -> str:
-        """The progress in a line, such as "Mem-MLP: 400 of 4000 steps, loss 2.31, 6 min left"."""
+        """The progress line, such as "Mem-MLP: 400 of 4000 steps, loss 2.31, 6 min left"."""
         task = self.display.tasks[0]
         total = "" if task.total is None else f" of {task.total:.0f}"
         count = f"{task.completed:.0f}{total} {self.unit}".rstrip()
@@ -110,12 +110,12 @@ def show_progress(
 
     Args:
         description: the name of the work.
-        total: how much there is to do; None if that is not known.
-        done: how much of it is done already.
-        shown: whether this process shows it.
-        unit: what is counted, such as frames.
+        total: the number of items; None if unknown.
+        done: the number of items that are already finished.
+        shown: whether this process shows the bar.
+        unit: the unit of the count, such as frames.
     """
-    from rich import progress  # here, since the help of all commands does without it
+    from rich import progress  # imported here, since printing help does not need it
     from rich.console import Console
 
     console = Console(stderr=True)
@@ -143,10 +143,10 @@ def progress_bar(
     """Yield the items while a progress bar counts them.
 
     Args:
-        items: what to iterate over.
+        items: the items to iterate over.
         description: the bar's label.
         total: the number of items, if `items` has no length.
-        unit: what the items are, such as frames.
+        unit: the unit of the count, such as frames.
     """
     if total is None and isinstance(items, Sized):
         total = len(items)

@@ -1,4 +1,4 @@
-"""Settings: how the keys of a config are declared, with their rules, defaults and sizes. Imports no torch."""
+"""Declares config keys, with their rules, defaults and sizes. This module does not import torch."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 MISSING = "???"
-"""The value of a key that has no default, as OmegaConf writes it."""
+"""OmegaConf's value for a key without a default."""
 
 SIZES = ("tiny", "small", "paper")
-"""The values of `profile.sizes`: for tests, for a CPU, and those of the paper."""
+"""The values of `profile.sizes`: sizes for tests, sizes for a CPU, and the paper's sizes."""
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,8 @@ class Rule:
     """A rule for the values of a key.
 
     Attributes:
-        words: what a value must be, in words that follow "must be".
-        allows: returns whether a value obeys the rule.
+        words: the description of allowed values; messages put it behind "must be".
+        allows: a function that returns whether a value obeys the rule.
     """
 
     words: str
@@ -30,14 +30,14 @@ class Rule:
 
 
 def one_of(*words: str) -> Rule:
-    """Return the rule that a value is one of a few words."""
+    """Return the rule that a value must be one of the words."""
     return Rule(" or ".join(words), lambda value: value in words)
 
 
 def within(low: float, high: float = math.inf, *words: str, strict: bool = False) -> Rule:
-    """Return the rule that a value is a finite number within limits, or one of a few words.
+    """Return the rule that a value must be a finite number within limits, or one of the words.
 
-    The limits are included unless `strict`.
+    The limits themselves are allowed unless `strict`.
     """
 
     def allows(value: Any) -> bool:
@@ -52,27 +52,27 @@ def within(low: float, high: float = math.inf, *words: str, strict: bool = False
 
 
 def at_least(low: float) -> Rule:
-    """Return the rule that a number has a lower limit, which is included."""
+    """Return the rule that a number must be at least `low`."""
     return within(low)
 
 
 def positive() -> Rule:
-    """Return the rule that a number is above 0."""
+    """Return the rule that a number must be above 0."""
     return within(0, strict=True)
 
 
 def fraction() -> Rule:
-    """Return the rule that a number is in [0, 1]."""
+    """Return the rule that a number must be in [0, 1]."""
     return within(0, 1)
 
 
 def seed() -> Rule:
-    """Return the rule for a seed of torch's random numbers."""
+    """Return the rule that a number must be a valid seed for torch."""
     return within(0, 2**63 - 1)
 
 
 def each(rule: Rule | None = None, empty: bool = False) -> Rule:
-    """Return the rule that a value is a list without repetitions, and that each item obeys another rule."""
+    """Return the rule that a value must be a list of distinct items which obey another rule."""
 
     def allows(value: Any) -> bool:
         items = list(value)
@@ -86,17 +86,17 @@ def each(rule: Rule | None = None, empty: bool = False) -> Rule:
 
 
 def text() -> Rule:
-    """Return the rule that a text has more than white space."""
+    """Return the rule that a text must contain more than white space."""
     return Rule("text that is not empty", lambda value: bool(value.strip()))
 
 
 def matching(pattern: str, words: str) -> Rule:
-    """Return the rule that a text matches a regular expression, which `words` describe."""
+    """Return the rule that a text must match a regular expression; `words` describes the expression."""
     return Rule(words, lambda value: bool(re.fullmatch(pattern, value)))
 
 
 def existing(kind: str, *words: str) -> Rule:
-    """Return the rule that a value is the path of an existing "file" or "folder", or one of a few words."""
+    """Return the rule that a value must be a path of an existing "file" or "folder", or one of the words."""
 
     def allows(value: Any) -> bool:
         path = Path(value)
@@ -106,14 +106,14 @@ def existing(kind: str, *words: str) -> Rule:
 
 
 def clip_folders() -> Rule:
-    """Return the rule that a value is the path of an existing folder of clips, or a list of several."""
+    """Return the rule that a value must be the path of an existing folder, or a list of such paths."""
 
     def allows(value: Any) -> bool:
         paths = [value] if isinstance(value, str) else list(value) if isinstance(value, Iterable) else []
-        known = all(isinstance(path, str) and Path(path).is_dir() for path in paths)
-        return bool(paths) and known and len(set(map(Path, paths))) == len(paths)
+        exist = all(isinstance(path, str) and Path(path).is_dir() for path in paths)
+        return bool(paths) and exist and len(set(map(Path, paths))) == len(paths)
 
-    words = "an existing folder of npz clips, such as memmlp data import makes, or a list of several"
+    words = "an existing folder of npz clips, such as from memmlp data import, or a list of such folders"
     return Rule(words, allows)
 
 
@@ -121,16 +121,16 @@ DEVICE = matching(r"auto|cpu|mps|cuda(:\d+)?", "auto or cpu or cuda or cuda:INDE
 
 
 def setting(rule: Rule | None = None, default: Any = MISSING, **by_profile: Any) -> Any:
-    """Declare a key of the config.
+    """Declare a config key.
 
-    The comment behind the declaration says what the key means; the reference page shows it.
+    The comment behind the declaration explains the key; the reference page shows this comment.
 
     Args:
-        rule: the rule that its values obey; None allows every value of its type.
-        default: the default; MISSING for a key that has to be given.
-        by_profile: in place of one default, either `tiny`, `small` and `paper`, of which `profile.sizes`
-            chooses one, or `default` and `literal`, of which `profile.reading` chooses one. With
-            `width_fraction`, a size is that fraction of `profile.width` where this is set.
+        rule: the rule for its values; None allows every value of its type.
+        default: the default value; MISSING if users must set the key.
+        by_profile: several defaults. `profile.sizes` chooses one of `tiny`, `small` and `paper`;
+            `profile.reading` chooses `default` or `literal`. If `width_fraction` is given and `profile.width`
+            is set, the default is this fraction of the width.
     """
     metadata = {"rule": rule}
     if "literal" in by_profile:
@@ -143,7 +143,7 @@ def setting(rule: Rule | None = None, default: Any = MISSING, **by_profile: Any)
 
 
 def sized(tiny: Any, small: Any, paper: Any, width_fraction: float = 0) -> str:
-    """Return a config value of three, from which `profile.sizes` chooses; see `setting`."""
+    """Return the config text that lets `profile.sizes` choose one of three values (`setting`)."""
     return _choice("size", tiny, small, paper, *([width_fraction] if width_fraction else []))
 
 
@@ -153,18 +153,18 @@ def _choice(resolver: str, *values: Any) -> str:
 
 
 def group(kind: type, **values: Any) -> Any:
-    """Declare a key that is a group of keys, of a dataclass; `values` are their defaults."""
+    """Declare a group of keys by a dataclass; `values` replace its defaults."""
     return field(default_factory=lambda: kind(**values))
 
 
 @dataclass
 class Settings:
-    """The keys of a component: the base of all settings that `memmlp.common.components` declares.
+    """The config keys of a component; the base class of all settings (`memmlp.common.components`).
 
     Attributes:
         name: the component's name in the config; the decorator `component` sets it.
-        defaults: options of other groups that come with the component, by group; the command line wins.
-        recipe: values of other dotted keys that come with the component; the command line wins.
+        defaults: options that the component sets in other groups, by group; the command line wins.
+        recipe: values that the component sets for other dotted keys; the command line wins.
         option: "SLOT=NAME"; the decorator sets it.
     """
 
@@ -176,26 +176,26 @@ class Settings:
 
     @classmethod
     def problems(cls, config: Any) -> Iterator[str]:
-        """Yield why the component cannot be used with a config, one line "KEY=VALUE: must be X" each.
+        """Yield the reasons why the component cannot be used with a config, as lines "KEY=VALUE: must be X".
 
         Args:
-            config: the whole config, in which every key has a value of its type that obeys its rule.
+            config: the whole config; types and rules of its keys have been checked.
         """
         yield from ()
 
 
 @dataclass
 class MetricSettings(Settings):
-    """The facts of a custom metric; its component has the slot "metric" and builds a function.
+    """The properties of a custom metric; its component has the slot "metric" and builds a function.
 
-    The function takes the prediction and the truth of one clip and returns one number.
+    The function takes the prediction and the ground truth of one clip and returns one number.
 
     Attributes:
-        unit: the unit; empty for a number without one.
-        smallest: the smallest difference that matters, in the unit: two methods may differ by this much and
-            still count as equally good.
-        better: which values are better, "lower" or "higher".
-        of: what the function takes: "positions" (N, 22, 3), metres in the world at 60 Hz, in both branches;
+        unit: the unit; empty for a number without a unit.
+        smallest: the smallest difference that matters, in the unit. Two methods with a smaller difference
+            count as equally good.
+        better: "lower" or "higher", the direction of better values.
+        of: the input of the function: "positions" (N, 22, 3), metres in the world at 60 Hz, in both branches;
             "rotations" (N, 22, 3, 3), local except for the global root's, in the rotation branch.
     """
 

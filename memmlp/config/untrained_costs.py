@@ -34,7 +34,7 @@ def with_costs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> tuple[dict[str, 
     costs: dict[str, RunsBySeed] = {}
     with show_progress("networks", len(without)) as count:
         for variant in without:
-            count.note(variant.label)  # a large one takes minutes
+            count.set_note(variant.label)  # a large one takes minutes
             costs[variant.label] = {
                 sweep.seeds_of(variant)[0]: measure_costs(sweep.all_overrides(variant), timed)
             }

@@ -95,7 +95,7 @@ class Deployment:
             "parity_frames": len(clip),
         }
         if isinstance(network, StreamingGraph) and self.precision != "fp32":
-            path = deployed.file(self.precision)
+            path = deployed.onnx_path(self.precision)
             lower(self.precision, deployed.onnx, path, network, train)
             cost = compare_accuracy(deployed.onnx, path, self.precision, network.normalizer, test)
             times = latency.measure_step(path, self.latency_steps)

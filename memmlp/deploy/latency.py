@@ -68,7 +68,7 @@ def measure_step(path: Path, steps: int = 200) -> dict[str, Any]:
         **_milliseconds("", ours),
         **_milliseconds("yardstick_", theirs),
         "ratio_to_yardstick": float(np.median(ours) / np.median(theirs)),
-        "core_share": clock.share,
+        "core_share": clock.fraction,
         "steps": len(ours),
         "threads": 1,
     }
@@ -112,7 +112,7 @@ def in_turn(keys: Iterable[Key], rounds: int, time_round: Callable[[Key], np.nda
         for key in order:
             clock = CoreClock()
             seconds[key].append(time_round(key))
-            shares[key].append(clock.share)
+            shares[key].append(clock.fraction)
         order.reverse()
     return {key: InTurn(np.array(seconds[key]), np.array(shares[key])) for key in seconds}
 

@@ -31,7 +31,7 @@ def measure_pose(path: Path, steps: int) -> dict[str, float]:
     return {
         "pose_median_ms": 1000 * float(np.median(seconds)),
         "pose_p95_ms": 1000 * float(np.percentile(seconds, 95)),
-        "pose_core_share": clock.share,
+        "pose_core_share": clock.fraction,
     }
 
 

@@ -1,4 +1,4 @@
-"""The folder of a deployment: a run's ONNX files and the measurements on them."""
+"""The folder of a deployment: a run's ONNX files and their measurements."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ ONNX_FILES = {
     "int8_blocks": "step.int8_blocks.onnx",
     "fp16": "step.fp16.onnx",
 }
-"""The name of the ONNX file of each precision (`export.precision`)."""
+"""The ONNX file names, by precision (`export.precision`)."""
 INT8_PRECISIONS = ("int8", "int8_blocks")
-"""The precisions that are used live where they are accurate enough: at the paper's sizes they are faster."""
+"""The precisions for live use, if accurate enough: at the paper's sizes, they are faster than float32."""
 
 MAX_GROWTH, MAX_JITTER_GROWTH = 0.01, 0.10
-"""The largest relative growths of MPJPE and Jitter with which a lower precision may replace float32."""
+"""A lower precision may replace float32 if MPJPE and Jitter grow at most by these fractions."""
 
 LATENCY = "latency.json"
 FILES = (LATENCY, *ONNX_FILES.values())
-"""A deployment's files, in the order in which they are removed: the measurements first."""
+"""A deployment's files in order of removal: the measurements first."""
 
 
 class DeploymentFolder:
@@ -34,89 +34,91 @@ class DeploymentFolder:
 
     Attributes:
         folder: the folder.
-        onnx: the float32 ONNX file.
-        int8: the int8 ONNX file, if there is one.
-        latency: the record of the measurements; it is written last.
+        onnx: path of the float32 ONNX file.
+        int8: path of the int8 ONNX file, which may not exist.
+        latency: path of the file with the measurements; it is written last.
     """
 
     def __init__(self, folder: Path):
         self.folder = folder
-        self.onnx = self.file("fp32")
-        self.int8 = self.file("int8")
+        self.onnx = self.onnx_path("fp32")
+        self.int8 = self.onnx_path("int8")
         self.latency = folder / LATENCY
 
-    def file(self, precision: str) -> Path:
-        """Return the ONNX file of a precision, one of ONNX_FILES, whether or not it was made."""
+    def onnx_path(self, precision: str) -> Path:
+        """Return the path of the ONNX file for a precision (a key of ONNX_FILES); it may not exist."""
         return self.folder / ONNX_FILES[precision]
 
     @property
     def done(self) -> bool:
-        """Whether the deployment is complete, and belongs to the run of its folder."""
+        """Whether the deployment is complete and belongs to the run in whose folder it is."""
         record = self.record
         whole = all((self.folder / name).is_file() for name in record.get("artifacts", {}))
         return bool(record) and whole and belongs(record.get("run"), self.folder.parent.parent)
 
     @property
-    def current(self) -> bool:
+    def is_current(self) -> bool:
         """Whether the deployment was made with the current component versions."""
         return self.folder.name == deployment_id_of(self.settings)
 
     @property
     def component_versions(self) -> dict[str, int]:
-        """The component versions with which it was made; empty if these are not the current ones."""
-        return deployment_versions(self.settings) if self.current else {}
+        """The component versions of the deployment; empty if some of them are outdated."""
+        return deployment_versions(self.settings) if self.is_current else {}
 
     def finish(self, record: Mapping[str, Any]) -> None:
-        """Write the measurements, with the files' digests; this marks the deployment as complete."""
-        files = map(self.file, ONNX_FILES)
+        """Write the measurements and the files' digests; this marks the deployment as complete."""
+        files = map(self.onnx_path, ONNX_FILES)
         artifacts = {path.name: file_digest(path) for path in files if path.exists()}
         write_json(self.latency, {**record, "made": now(), "made_by": environment(), "artifacts": artifacts})
 
     @property
     def record(self) -> dict[str, Any]:
-        """The measurements: sizes, times, accuracy of lower precision; empty if there are none."""
+        """The measurements (sizes, times, accuracy of lower precisions); empty before `finish`."""
         return read_json(self.latency)
 
     @property
-    def made(self) -> str:
-        """When the deployment was made, UTC in ISO 8601; empty if it was not."""
+    def creation_time(self) -> str:
+        """The time of `finish`, UTC in ISO 8601; empty before it."""
         return str(self.record.get("made", ""))
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The settings of the deployment, as they were asked for."""
+        """The requested settings of the deployment; empty before `finish`."""
         return dict(self.record.get("settings", {}))
 
     @property
-    def accurate_int8(self) -> Path | None:
-        """The int8 ONNX file, if there is one that is accurate enough to replace float32; else None."""
+    def accurate_int8_file(self) -> Path | None:
+        """An existing int8 ONNX file that is accurate enough to replace float32; None without one."""
         record = self.record
         accurate = [name for name in INT8_PRECISIONS if accurate_enough(record.get(name, {}))]
-        return next((self.file(name) for name in accurate if self.file(name).exists()), None)
+        return next((self.onnx_path(name) for name in accurate if self.onnx_path(name).exists()), None)
 
 
 def accurate_enough(cost: Mapping[str, Any]) -> bool:
-    """Return whether a file of lower precision may replace float32, given the growth of its errors.
+    """Return whether a lower precision is accurate enough to replace float32.
 
-    Both growths have to be known: NaN, or a record without them, is not enough.
+    Args:
+        cost: the relative growth of its errors, "growth" and "jitter_growth". Missing and NaN count as
+            inaccurate.
     """
     growth, jitter = (cost.get(name, math.inf) for name in ("growth", "jitter_growth"))
     return growth <= MAX_GROWTH and jitter <= MAX_JITTER_GROWTH
 
 
 def deployed_precision(latency: Mapping[str, Any]) -> str:
-    """Return the precision that was asked for in a deployment, if it has that file; else fp32."""
+    """Return the requested precision of a deployment if it was exported; otherwise "fp32"."""
     precision = str((latency.get("settings") or {}).get("precision", "fp32"))
     return precision if precision in latency else "fp32"
 
 
 def as_deployed(latency: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the measurements of a streaming step, with size and times of the file that was asked for."""
+    """Return a deployment's measurements, with size and times of the requested precision at the top level."""
     return {**latency, **latency.get(deployed_precision(latency), {})}
 
 
 def with_times_as_deployed(results: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a run's results, each deployment's with the numbers of the file that was asked for on top."""
+    """Return a run's results with each deployment's numbers replaced by those of the requested precision."""
 
     def merge(latency: Mapping[str, Any]) -> dict[str, Any]:
         deployed = as_deployed(latency)
@@ -131,7 +133,7 @@ def with_times_as_deployed(results: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def timed_on(record: Mapping[str, Any]) -> str:
-    """Return the processor and ONNX Runtime with which a deployment was measured; "?" if that is unknown."""
+    """Return the processor and ONNX Runtime version of a deployment's measurements; "?" if unknown."""
     made_by = record.get("made_by") or {}
     runtime = (made_by.get("packages") or {}).get("onnxruntime")
     if not made_by.get("cpu"):

@@ -22,14 +22,14 @@ import memmlp
 
 PACKAGE = Path(memmlp.__file__).parent
 NOT_NUMBERS = ("cli", "config", "live", "report", "runs/loggers", "sweep")
-"""Folders with code that does not affect results; only `live` measures one, the time of a pose."""
+"""Folders with code that does not affect results (only `live` measures a result: the time of a pose)."""
 WIRING = ("config/build.py", "config/build_request.py")
-"""Files of these folders that count nevertheless, since they decide what reaches the constructors."""
-PATCH = 1_000_000  # at most so many characters of changes are kept with a run
+"""Exceptions in these folders: files that affect results, since they call the constructors."""
+PATCH = 1_000_000  # maximum length of the code patch in a run's folder, characters
 MIXED = "mixed"
-"""The value in place of a digest for a file that changed while the run was made."""
+"""Replaces the digest of a file that changed between two attempts of a run."""
 NOT_USERS = ("memmlp", "torch", "numpy", *sys.stdlib_module_names)
-"""Modules that are not the user's, wherever they lie."""
+"""Modules that never belong to the user, whatever their path."""
 
 
 def environment() -> dict[str, Any]:
@@ -61,7 +61,7 @@ def _version(package: str) -> str | None:
 
 @functools.cache
 def _git() -> dict[str, Any] | None:
-    """Return the commit of the package's checkout, and whether files are changed; None outside a checkout."""
+    """Return the commit of the package and whether its files were modified; None outside a git checkout."""
     try:
         _in_git("ls-files", "--error-unmatch", "__init__.py")
         commit = _in_git("rev-parse", "HEAD")
@@ -77,37 +77,37 @@ def _in_git(*args: str) -> str:
 
 @functools.cache
 def changes() -> str:
-    """Return a patch from the package's commit to the code of this process, with the names of new files.
+    """Return a patch from the package's commit to the code of this process, and the names of untracked files.
 
-    It is empty if nothing was changed, or if the package is not in a checkout. As commit and digests do, it
-    stays as it was when this process first asked: what is edited later is not what the process runs.
+    The patch is empty without modifications or outside a git checkout. It is created once for each process,
+    since the process does not run later edits.
     """
     git = _git()
     if not git or not git["dirty"]:
         return ""
     with contextlib.suppress(OSError, subprocess.SubprocessError):
         new = _in_git("ls-files", "--others", "--exclude-standard", "--", ".")
-        listed = "".join(f"# not in the commit: {name}\n" for name in new.splitlines())
-        return (listed + _in_git("diff", "HEAD", "--", ".") + "\n")[:PATCH]
+        header = "".join(f"# not in the commit: {name}\n" for name in new.splitlines())
+        return (header + _in_git("diff", "HEAD", "--", ".") + "\n")[:PATCH]
     return ""
 
 
 def code_digests(packages: Iterable[str] = ()) -> dict[str, str]:
-    """Return a digest of the code in each file on which a run's numbers depend.
+    """Return a code digest for each file that affects the numbers of a run.
 
-    Comments and docstrings don't matter. Files of users' packages are named PACKAGE:FILE.
+    Comments and docstrings are ignored. Files of users' packages are named PACKAGE:FILE.
     """
     return {name: code_digest(content) for name, content in code_files(packages).items()}
 
 
 def code_files(packages: Iterable[str] = ()) -> dict[str, bytes]:
-    """Return the content of each file of `code_digests`, as this process runs it."""
+    """Return the content of each file that affects the numbers of a run, as this process runs it."""
     users = _user_files(packages).items()
     return _package_code() | {f"{name}:{file}": code for name, files in users for file, code in files.items()}
 
 
 def describe_sources(packages: Iterable[str] = ()) -> dict[str, dict[str, str]]:
-    """Return what a run's manifest has on its code: digests of each file's code and of its bytes."""
+    """Return the manifest entries about the code: digests of each file's code and of its bytes."""
     files = code_files(packages)
     return {
         "sources": {name: code_digest(content) for name, content in files.items()},
@@ -121,9 +121,9 @@ def byte_digest(content: bytes) -> str:
 
 
 def changed_since(manifest: Mapping[str, Any]) -> list[str]:
-    """Return the files with other code than when a run with this manifest began (see `changed`).
+    """Return the files that have changed since a run with this manifest began (`changed`).
 
-    A file is parsed only if its bytes differ from those of the run: parsing all takes half a second.
+    Only files with different bytes are parsed, since parsing all files takes half a second.
     """
     before, unread = manifest.get("sources", {}), manifest.get("source_bytes", {})
     files = code_files(manifest.get("plugins", ())) if before else {}
@@ -137,10 +137,9 @@ def changed_since(manifest: Mapping[str, Any]) -> list[str]:
 
 
 def changed(before: Mapping[str, str], after: Mapping[str, str]) -> list[str]:
-    """Return the files with different code in two records (`code_digests`).
+    """Return the files with different digests in two results of `code_digests`.
 
-    A file that is in only one of them is not compared: new code runs only if other code, or the config, names
-    it.
+    Files in only one of them are ignored: new code runs only if other code or the config changed, too.
     """
     return sorted(name for name in before.keys() & after.keys() if before[name] != after[name])
 
@@ -152,16 +151,16 @@ def _package_code() -> dict[str, bytes]:
 
 
 def _counts(path: Path) -> bool:
-    """Return whether a run's numbers depend on the file at this path below the package."""
+    """Return whether a file affects the numbers of a run, given its path relative to the package."""
     unused = path.parts[0].startswith("_") or any(map(path.is_relative_to, NOT_NUMBERS))
     return path.as_posix() in WIRING or not unused
 
 
 @functools.cache
 def code_digest(code: bytes) -> str:
-    """Return a digest of Python code, 12 hex digits, that ignores layout, comments and docstrings.
+    """Return a digest of Python code (12 hex digits) that ignores layout, comments and docstrings.
 
-    It is a digest of the bytes if they are not Python of this version.
+    If the code can't be parsed, return a digest of its bytes.
     """
     try:
         tree = ast.parse(code.decode())
@@ -174,9 +173,9 @@ def code_digest(code: bytes) -> str:
 
 
 def _user_files(packages: Iterable[str]) -> dict[str, dict[str, bytes]]:
-    """Return the content of the Python files of users' packages, by package and file; nothing is imported.
+    """Return the content of all Python files in users' packages, by package and file, without imports.
 
-    A package that is not found does not have files.
+    If a package is not found, its entry is empty.
     """
     return {
         name: {file: _user_code(path) for file, path in _package_files(name).items()} for name in packages
@@ -184,7 +183,7 @@ def _user_files(packages: Iterable[str]) -> dict[str, dict[str, bytes]]:
 
 
 def user_packages(names: Iterable[str]) -> dict[str, dict[str, str | None]]:
-    """Return the version and a digest of the code of users' packages, by name."""
+    """Return the version and code digest of each user's package, by name."""
     digests = {
         name: {file: code_digest(code) for file, code in files.items()}
         for name, files in _user_files(names).items()
@@ -196,7 +195,7 @@ def user_packages(names: Iterable[str]) -> dict[str, dict[str, str | None]]:
 
 
 def _user_version(name: str) -> str | None:
-    """Return a package's own version, or that of the distribution that contains it."""
+    """Return a user package's `__version__`, otherwise the version of the distribution with the package."""
     spec = _find_spec(name)
     text = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
     if version := re.search(r'^__version__ = "(.+)"$', text, re.MULTILINE):
@@ -207,12 +206,12 @@ def _user_version(name: str) -> str | None:
 
 @functools.cache
 def _user_code(path: Path) -> bytes:
-    """Return a file's content when this process first asked: later edits are not what the process runs."""
+    """Read a file once for each process, since the process does not run later edits."""
     return path.read_bytes()
 
 
 def _package_files(name: str) -> dict[str, Path]:
-    """Return the Python files of a user's package by their paths below it; none if it is not found."""
+    """Return the Python files of a user's package, by relative path; empty if the package is not found."""
     spec = _find_spec(name)
     if spec is None:
         return {}
@@ -224,16 +223,16 @@ def _package_files(name: str) -> dict[str, Path]:
 
 
 def _find_spec(name: str) -> ModuleSpec | None:
-    """Return where a user's package lies, without importing it or its parents; None if it is not found."""
+    """Find a user's package without importing it or its parents; None if it is not found."""
     top, *submodules = name.split(".")
     try:
         spec = None if top in NOT_USERS else importlib.util.find_spec(top)
-    except ValueError:  # a module that was made by hand
+    except ValueError:  # a module without a spec, created by code
         return None
     for part in submodules:
         if spec is None or spec.submodule_search_locations is None:
             return None
-        # By its last name only: with the whole name, a folder without __init__.py needs its parent imported.
+        # Search by the last name: with the whole name, a namespace package would need its parent imported.
         spec = PathFinder.find_spec(part, list(spec.submodule_search_locations))
     return spec
 
@@ -247,23 +246,23 @@ def _cpu() -> str:
 
 
 MACHINE = ("device", "gpu", "gpu_index", "threads", "processes", "precision", "cpu")
-"""What can change a result's last digits, and which of a machine's GPUs it was."""
+"""Manifest keys of hardware that can change the last digits of a result."""
 
 PREREQUISITES = "prerequisite_runs"
-"""The key of the manifest with the origins of a run's prerequisite runs."""
+"""The manifest key with the origins of a run's prerequisite runs."""
 
 FACTS = ("component_versions", "git", "version", "sources", "plugins", "packages", *MACHINE)
-"""What the manifest of a prerequisite run has on its code and its machine."""
+"""Manifest keys about a run's code and machine, copied from prerequisite runs."""
 
 
 def prerequisite_origins(manifest: Mapping[str, Any], weights: str | None) -> list[dict[str, Any]]:
-    """Return the origins of the prerequisite runs of a run that begins, the nearest first.
+    """Return the origins of all prerequisite runs for a new run, the direct one first.
 
-    Each has the run's `id` and `kind`, the SHA-256 of its `weights`, and the known FACTS.
+    Each origin has the `id` and `kind` of a run, the SHA-256 of its `weights`, and the known FACTS.
 
     Args:
-        manifest: the manifest of the finished run whose weights the run uses.
-        weights: the SHA-256 of these weights.
+        manifest: the manifest of the direct prerequisite run.
+        weights: the SHA-256 of its weights.
     """
     own = {"id": manifest.get("id"), "kind": manifest.get("kind"), "weights": weights}
     facts = {name: manifest[name] for name in FACTS if name in manifest}
@@ -276,36 +275,37 @@ def recorded_prerequisites(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def prerequisite_versions(manifest: Mapping[str, Any]) -> dict[str, int]:
-    """Return the component versions with which a run's prerequisite runs were trained, from its manifest."""
+    """Return the component versions of the prerequisite runs in a run's manifest, by component."""
     every = [one.get("component_versions") or {} for one in recorded_prerequisites(manifest)]
     return {name: number for versions in every for name, number in versions.items()}
 
 
 def join_origins(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
-    """Join the origins of a training before and after it was resumed; if they differ, both are kept.
+    """Merge the facts about code and machine before and after a training was resumed.
 
-    A file with code that changed in between gets "mixed" in place of a digest. Prerequisite runs that changed
-    since (trained again, under the same ids) follow the present ones.
+    Different values are both kept. The digest of a changed file is replaced by "mixed". Current prerequisite
+    runs come first, then earlier versions of prerequisite runs that were trained again.
 
     Args:
-        before: the manifest so far, empty for a training from the start.
-        after: the origin of the resumed training.
+        before: the manifest before resuming; empty if the training starts from scratch.
+        after: the new facts.
     """
-    found = dict(after)
+    merged = dict(after)
     for key in MACHINE:
-        words = [before[key]] if key in before and before[key] != after.get(key) else []
-        found[key] = ", ".join(map(str, [*words, after[key]])) if words else after.get(key)
+        earlier_values = [before[key]] if key in before and before[key] != after.get(key) else []
+        values = [*earlier_values, after.get(key)]
+        merged[key] = ", ".join(map(str, values)) if earlier_values else after.get(key)
     old, new = before.get("git"), after.get("git")
     if old and new:
         other = old.get("before") or (old["commit"] if old["commit"] != new["commit"] else None)
-        found["git"] = {**new, "dirty": old["dirty"] or new["dirty"]} | ({"before": other} if other else {})
-    known = before.get("sources", after["sources"])
-    found["sources"] = after["sources"] | dict.fromkeys(changed(known, after["sources"]), MIXED)
+        merged["git"] = {**new, "dirty": old["dirty"] or new["dirty"]} | ({"before": other} if other else {})
+    sources = before.get("sources", after["sources"])
+    merged["sources"] = after["sources"] | dict.fromkeys(changed(sources, after["sources"]), MIXED)
     prerequisite = after.get(PREREQUISITES, [])
     if earlier := [one for one in before.get(PREREQUISITES, []) if one not in prerequisite]:
-        found[PREREQUISITES] = [*prerequisite, *earlier]
+        merged[PREREQUISITES] = [*prerequisite, *earlier]
     for name, package in (before.get("plugins") or {}).items():
         now = (after.get("plugins") or {}).get(name, package)
         if now["digest"] != package["digest"]:
-            found["plugins"] = {**found["plugins"], name: {**now, "digest": MIXED}}
-    return found
+            merged["plugins"] = {**merged["plugins"], name: {**now, "digest": MIXED}}
+    return merged

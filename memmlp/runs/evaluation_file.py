@@ -1,4 +1,4 @@
-"""The files of evaluations; each contains its own digest."""
+"""Evaluation files; each contains its own digest."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ from memmlp.runs.identity import (
 )
 
 COMBINED = "combined"
-"""The branch of the rotations after inverse kinematics, by the solver in the settings of the evaluation."""
+"""The branch with rotations after inverse kinematics; the evaluation's settings name the solver."""
 
 
 def write_report(path: Path, report: Mapping[str, Any]) -> None:
-    """Write the file of an evaluation: results, time, environment, and a digest."""
+    """Write an evaluation file: the report with time, environment and a digest."""
     path.parent.mkdir(parents=True, exist_ok=True)
     content = plain({**report, "made": now(), "made_by": environment()})
     write_json(path, content | {"digest": _content_digest(content)})
 
 
 def read_report(path: Path) -> dict[str, Any]:
-    """Read the file of an evaluation. Raises InputError if it is damaged."""
+    """Read an evaluation file. Raises InputError if it is damaged."""
     report = read_json(path)
     check_report(path, report)
     return report
 
 
 def check_report(path: Path, report: Mapping[str, Any]) -> None:
-    """Raise InputError if what was read from the file of an evaluation is not a report."""
+    """Raise InputError if the content of an evaluation file is not a valid report."""
     if not {"mode", "mean", "clips"} <= report.keys():
-        raise InputError(f"{path}: cannot be read; remove it, and repeat the run's command to evaluate again")
+        raise InputError(f"{path}: damaged; remove it and repeat the run's command to evaluate again")
 
 
 def intact(path: Path) -> bool:
-    """Return whether an evaluation's file is unchanged, and is in the folder for which it was written."""
+    """Return whether an evaluation file is unchanged and has its original name and folder."""
     content = read_json(path)
     same = content.pop("digest", None) == _content_digest(content)
     named = content.get("name", path.stem) == path.stem
@@ -53,34 +53,35 @@ def intact(path: Path) -> bool:
 
 
 def current(path: Path, report: Mapping[str, Any]) -> bool:
-    """Return whether an evaluation was made with the current component versions."""
+    """Return whether an evaluation used the current component versions."""
     settings = report.get("settings") or {}
     return {"mode", "ik"} <= settings.keys() and path.stem == evaluation_id_of(settings)
 
 
 def describe_outdated(path: Path, report: Mapping[str, Any]) -> str | None:
-    """Return which components of an evaluation have changed since, as "mode.window 2 -> 3"; None if none has.
+    """Return the changed component versions of an evaluation, such as "mode.window 2 -> 3", or None.
 
-    Custom metrics of packages that are not in use are not compared.
+    Custom metrics from packages that are not in use are ignored.
     """
-    known = {
+    comparable = {
         name: number for name, number in report.get("component_versions", {}).items() if version_of(name)
     }
-    return ", ".join(outdated(known)) or None
+    return ", ".join(outdated(comparable)) or None
 
 
 def preference(path: Path, report: Mapping[str, Any], config: Mapping[str, Any]) -> tuple[bool, bool, str]:
-    """Return a key that sorts a run's evaluations, the one that counts last.
+    """Return a sort key for a run's evaluations; the preferred evaluation comes last.
 
-    Current component versions matter most, then the inverse kinematics of the run's config, then the time.
+    The order is by current component versions, then by the inverse kinematics in the run's config, then by
+    time.
     """
     settings = report.get("settings") or {}
-    own = solver_of(settings) == solver_of(config.get("evaluation") or {})
-    return current(path, report), own, str(report.get("made"))
+    configured = solver_of(settings) == solver_of(config.get("evaluation") or {})
+    return current(path, report), configured, str(report.get("made"))
 
 
 def combined_by(reports: Sequence[Mapping[str, Any]]) -> dict[str, str | None]:
-    """Return by mode which inverse kinematics (`solver_of`) made the branch `combined` of the last report."""
+    """Return the inverse kinematics (`solver_of`) of the branch `combined`, by mode; the last report wins."""
     return {
         str(report.get("mode")): solver_of(report.get("settings") or {})
         for report in reports
@@ -89,9 +90,9 @@ def combined_by(reports: Sequence[Mapping[str, Any]]) -> dict[str, str | None]:
 
 
 def keep_one_solver(reports: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return reports in which the branch `combined` of a mode is by one inverse kinematics only, the last.
+    """Remove the branch `combined` where its inverse kinematics differs from the mode's last report.
 
-    Reports with another lose that branch, so that joined results never mix two.
+    So merged results never mix two kinds of inverse kinematics.
     """
     last = combined_by(reports)
 
@@ -109,19 +110,19 @@ def _without_combined(report: Mapping[str, Any]) -> dict[str, Any]:
     return {**report, "mean": mean, "clips": clips}
 
 
-def name_solvers(results: Mapping[str, Any], by: Mapping[str, str | None]) -> dict[str, Any]:
-    """Return results with the inverse kinematics in the name of the branch `combined`: "combined-lbfgs-15".
+def name_solvers(results: Mapping[str, Any], solvers: Mapping[str, str | None]) -> dict[str, Any]:
+    """Return results with the branch `combined` renamed after its solver, such as "combined-lbfgs-15".
 
     Args:
-        results: by mode and branch; what else is in them stays.
-        by: the inverse kinematics by mode (`combined_by`).
+        results: results by mode and branch; other entries are kept.
+        solvers: the inverse kinematics by mode (`combined_by`).
     """
 
-    def named(mode: str, branch: str) -> str:
-        return f"{branch}-{by[mode]}" if branch == COMBINED and by.get(mode) else branch
+    def rename(mode: str, branch: str) -> str:
+        return f"{branch}-{solvers[mode]}" if branch == COMBINED and solvers.get(mode) else branch
 
     return {
-        mode: {named(mode, branch): errors for branch, errors in branches.items()}
+        mode: {rename(mode, branch): errors for branch, errors in branches.items()}
         if isinstance(branches, Mapping)
         else branches
         for mode, branches in results.items()
@@ -133,57 +134,60 @@ def _content_digest(content: Mapping[str, Any]) -> str:
 
 
 class EvaluationsAsConfigured:
-    """The evaluations with the settings of a run's config.
+    """A run's evaluations that match the run's config.
 
     Attributes:
-        paths: their files, the one that counts last (`preference`).
+        paths: the evaluation files; the preferred one is last (`preference`).
     """
 
     def __init__(self, folder: Path, config: Mapping[str, Any]):
-        """Read the evaluations of a folder that match the config.
+        """Read the matching evaluations in a folder.
 
         Args:
-            folder: the run's folder of evaluations.
+            folder: the run's evaluations folder.
             config: the run's config.
         """
         every = {path: read_json(path) for path in sorted(folder.glob("*.json"))}
-        own = [
+        matching = [
             (path, one) for path, one in every.items() if used_as_configured(one.get("settings", {}), config)
         ]
-        self._found = dict(sorted(own, key=lambda one: preference(one[0], one[1], config)))
-        self.paths = list(self._found)
+        self._matching = dict(sorted(matching, key=lambda one: preference(one[0], one[1], config)))
+        self.paths = list(self._matching)
 
     @property
     def results(self) -> dict[str, dict[str, dict[str, float | None]]]:
-        """The mean errors, by mode, branch and metric; `combined` is by one kind of inverse kinematics.
+        """The mean errors, by mode, branch and metric; `combined` is from one kind of inverse kinematics.
 
         Raises:
             InputError: if a file is damaged.
         """
-        found: dict[str, dict[str, dict[str, float | None]]] = {}
-        for report in keep_one_solver(self._reports()):
-            branches = found.setdefault(report["mode"], {})
-            for branch, errors in report["mean"].items():  # custom metrics may be in one branch only
+        results: dict[str, dict[str, dict[str, float | None]]] = {}
+        for report in keep_one_solver(self._read_reports()):
+            branches = results.setdefault(report["mode"], {})
+            for branch, errors in report["mean"].items():  # a custom metric may exist in one branch only
                 numbers = {name: to_number(value) for name, value in errors.items()}
                 branches[branch] = {**branches.get(branch, {}), **numbers}
-        return found
+        return results
 
     @property
-    def combined_by(self) -> dict[str, str | None]:
-        """The inverse kinematics of the branch `combined` in `results`, by mode: "arms", "lbfgs-15".
+    def combined_solvers(self) -> dict[str, str | None]:
+        """The inverse kinematics of the branch `combined`, by mode, such as "arms"; None if unknown.
 
-        It is None where that is not known. Raises InputError as `results` does.
+        Raises:
+            InputError: if a file is damaged.
         """
-        return combined_by(self._reports())
+        return combined_by(self._read_reports())
 
     @property
     def outdated(self) -> dict[str, str]:
-        """The changed component versions of each mode whose `results` were measured with earlier ones."""
-        last = {report.get("mode"): describe_outdated(path, report) for path, report in self._found.items()}
+        """The changed component versions, by mode; modes with current versions are left out."""
+        last = {
+            report.get("mode"): describe_outdated(path, report) for path, report in self._matching.items()
+        }
         return {str(mode): changed for mode, changed in last.items() if changed}
 
-    def _reports(self) -> list[dict[str, Any]]:
-        """Return the reports. Raises InputError if one is damaged."""
-        for path, report in self._found.items():
+    def _read_reports(self) -> list[dict[str, Any]]:
+        """Return the reports. Raises InputError if a report is damaged."""
+        for path, report in self._matching.items():
             check_report(path, report)
-        return list(self._found.values())
+        return list(self._matching.values())

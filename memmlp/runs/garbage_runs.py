@@ -1,4 +1,4 @@
-"""Runs that are no longer needed: failed ones, ones with older component versions, and orphans."""
+"""Finds and deletes unneeded runs: failed runs, runs with older component versions, and orphans."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Garbage(NamedTuple):
     Attributes:
         run: the run.
         kind: one of REASONS.
-        reason: why it may be deleted.
-        size: bytes in its folder.
+        reason: the reason why it may be deleted.
+        size: the size of its folder, bytes.
     """
 
     run: Run
@@ -36,32 +36,37 @@ class Garbage(NamedTuple):
 def garbage(outputs: Path, kinds: Iterable[str] = REASONS) -> list[Garbage]:
     """Find the runs that may be deleted.
 
-    Runs in progress, runs with a tag or a note, and runs that a remaining run needs are never among them.
+    Runs in progress, runs with a tag or a note, and prerequisites of remaining runs are never returned.
 
     Args:
         outputs: the outputs folder.
-        kinds: which of REASONS to look for.
+        kinds: the REASONS to search for.
     """
     runs = list_runs(outputs)
-    orphans, wanted = _orphans(outputs, runs), set(kinds)
-    found = {}
+    orphans, requested = _orphans(outputs, runs), set(kinds)
+    candidates = {}
     for run in runs:
         kind, reason = _reason(run, orphans)
-        if kind in wanted and not _marked(run) and run.state(False) != "running":
-            found[run.id] = Garbage(run, kind, reason, _size(run.folder))
-    while found.keys() & (used := {run.manifest.get("prerequisite") for run in runs if run.id not in found}):
-        found = {run_id: one for run_id, one in found.items() if run_id not in used}
-    return list(found.values())
+        if kind in requested and not _marked(run) and run.state(False) != "running":
+            candidates[run.id] = Garbage(run, kind, reason, _size(run.folder))
+    while candidates.keys() & (used := _list_prerequisites(run for run in runs if run.id not in candidates)):
+        candidates = {run_id: one for run_id, one in candidates.items() if run_id not in used}
+    return list(candidates.values())
 
 
-def delete(one: Garbage) -> bool:
+def delete(garbage_run: Garbage) -> bool:
     """Delete a run's folder, its marker first. Returns False if the run is in use, or has tags or a note."""
-    with one.run.lock(wait=False) as mine:
-        if not mine or _marked(one.run):
+    run = garbage_run.run
+    with run.lock(wait=False) as lease:
+        if not lease or _marked(run):
             return False
-        one.run.reset()
-        shutil.rmtree(one.run.folder)
+        run.reset()
+        shutil.rmtree(run.folder)
     return True
+
+
+def _list_prerequisites(runs: Iterable[Run]) -> set[str | None]:
+    return {run.manifest.get("prerequisite") for run in runs}
 
 
 def _reason(run: Run, orphans: Mapping[str, str]) -> tuple[str, str]:
@@ -75,22 +80,22 @@ def _reason(run: Run, orphans: Mapping[str, str]) -> tuple[str, str]:
 
 
 def _orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
-    """Return the orphans' ids, each with the reason why it is an orphan.
+    """Return the reason why a run is an orphan, by run id.
 
-    Orphans are VQ-VAEs and parts that no run uses and no plan contains, and folders of runs that never
+    Orphans are prerequisite runs that are in no plan and that no run uses, and folders of runs that never
     started.
     """
     planned = {task["id"] for path in _plans(outputs) for task in _listed(path, "tasks")}
-    used = {run.manifest.get("prerequisite") for run in runs} | planned
+    used = _list_prerequisites(runs) | planned
     kinds = {run.id: str(run.manifest.get("kind") or NETWORK) for run in runs}
-    alone = [run_id for run_id, kind in kinds.items() if kind != NETWORK and run_id not in used]
+    unused = [run_id for run_id, kind in kinds.items() if kind != NETWORK and run_id not in used]
     empty = [run for run in runs if not run.manifest]
-    found = {run_id: f"a {describe_kind(kinds[run_id])} that no run uses" for run_id in alone}
-    return found | {run.id: "an empty folder" for run in empty}
+    reasons = {run_id: f"no run uses this {describe_kind(kinds[run_id])}" for run_id in unused}
+    return reasons | {run.id: "an empty folder" for run in empty}
 
 
 def _plans(outputs: Path) -> Iterator[Path]:
-    """Yield the plan files of sweeps, and those on which a living process, such as a search, works."""
+    """Yield the plan files of sweeps, and of searches in progress."""
     yield from outputs.glob("sweeps/*/plan.json")
     for path in outputs.glob("*/*/controllers/*.process"):
         if (process := read_json(path)) and is_alive(process) is not False:
@@ -98,8 +103,8 @@ def _plans(outputs: Path) -> Iterator[Path]:
 
 
 def _listed(path: Path, key: str) -> Iterator[Mapping[str, Any]]:
-    found = read_json(path).get(key)
-    yield from (one for one in found or () if isinstance(one, dict) and "id" in one)
+    entries = read_json(path).get(key)
+    yield from (one for one in entries or () if isinstance(one, dict) and "id" in one)
 
 
 def _marked(run: Run) -> bool:

@@ -1,6 +1,6 @@
-"""Finds and describes runs below an outputs folder; their tags and notes.
+"""Finds and describes runs in an outputs folder, and edits their tags and notes.
 
-Tags and notes are in the file `notes.json` of a run's folder, and do not affect its id.
+Tags and notes are stored in the file `notes.json` of a run's folder. They do not affect its id.
 """
 
 from __future__ import annotations
@@ -17,40 +17,42 @@ from memmlp.runs.identity import ID, NETWORK
 from memmlp.runs.run import Run
 
 MINUTE = 60 * 60  # frames at 60 Hz
-LITTLE = 30 * MINUTE  # frames: 1/23 of those that `profile=small` draws
+LITTLE = 30 * MINUTE  # frames; `profile=small` draws 23 times as many
 
 
 def list_runs(outputs: Path | str) -> list[Run]:
-    """Return the runs below an outputs folder, the newest first."""
+    """Return all runs in an outputs folder, newest first."""
     folders = sorted((Path(outputs) / "runs").glob("*/"))
     runs = [Run(folder) for folder in folders if ID.fullmatch(folder.name)]
     return sorted(runs, key=lambda run: str(run.manifest.get("started", "")), reverse=True)
 
 
 def find_run(outputs: Path | str, name: str) -> Run:
-    """Find a run by its id, the beginning of its id, or its folder.
+    """Find a run by its id, the first digits of its id, or its folder.
 
     Raises:
-        InputError: if no run or more than one fits.
+        InputError: if no run or several runs match.
     """
     is_folder = bool(name) and (Path(name) / "manifest.json").is_file()
     if is_folder and ("/" in name or not ID.fullmatch(name)):
         return Run(Path(name).resolve())
-    known = list_runs(outputs)
-    matches = sorted(run.id for run in known if name and run.id.startswith(name))
+    runs = list_runs(outputs)
+    matches = sorted(run.id for run in runs if name and run.id.startswith(name))
     if len(matches) == 1:
-        return Run.of(outputs, matches[0])
+        return Run.from_id(outputs, matches[0])
     if matches:
         shown = ", ".join(matches[:8]) + (", ..." if len(matches) > 8 else "")
-        raise InputError(f"run '{name}': {len(matches)} ids begin with it: {shown}")
+        raise InputError(f"run '{name}': {len(matches)} run ids begin with it: {shown}")
     if is_folder:
         return Run(Path(name).resolve())
     where = Path(outputs) / "runs"
-    raise InputError(f"run '{name}': no such folder, and no id of {len(known)} runs in {where} begins so")
+    raise InputError(
+        f"run '{name}': must be a run's folder, or the first digits of one of {len(runs)} run ids in {where}"
+    )
 
 
 def is_trained(run: Run) -> bool:
-    """Return whether a run is a finished run of a motion network, not one of a VQ-VAE."""
+    """Return whether a run is a finished run of a motion network, not a prerequisite run."""
     return run.done and run.manifest.get("kind") == NETWORK
 
 
@@ -66,21 +68,20 @@ def describe_kind(kind: str) -> str:
 
 
 def run_name(manifest: Mapping[str, Any], config: Mapping[str, Any]) -> str:
-    """Return the name that a run got when it began, which tells how its config differs from the default.
+    """Return a run's name, which shows how its config differs from the default config.
 
     Args:
         manifest: the run's manifest.
-        config: the run's config, by dotted key, for a run without a name.
+        config: the run's config by dotted key; it is used if the manifest does not have a name.
     """
     seed = "" if config.get("seed") is None else f" · seed {config['seed']}"
     return str(manifest.get("name") or describe_kind(str(manifest.get("kind") or "run")) + seed)
 
 
 def frames_seen(run: Run) -> float:
-    """Return how many frames a run's network saw in all training steps together; 0 if that is unknown.
+    """Return the number of frames that a run's network saw in all training steps; 0 if unknown.
 
-    For a refiner, this includes the frames that the network before it saw, and the pieces of its own
-    training.
+    For a refiner, the frames of the network that it refines are included.
     """
     config = run.config
     refiner, optim, model = (config.get(name) or {} for name in ("refiner", "optim", "model"))
@@ -93,10 +94,10 @@ def frames_seen(run: Run) -> float:
 
 
 def hardly_trained(frames: float) -> str:
-    """Return a warning if a network saw less than half an hour of motion in training; empty otherwise.
+    """Return a warning if a network saw less than half an hour of motion in training; otherwise "".
 
     Args:
-        frames: how many frames it saw, as `frames_seen` counts them; 0 if that is unknown.
+        frames: the number of frames from `frames_seen`; 0 if unknown.
     """
     if not 0 < frames < LITTLE:
         return ""
@@ -112,8 +113,8 @@ class Notes:
     """A run's tags and note.
 
     Attributes:
-        tags: short words, sorted.
-        note: a text; empty for none.
+        tags: the tags, sorted.
+        note: the note; empty if there is none.
     """
 
     tags: tuple[str, ...] = ()
@@ -121,37 +122,37 @@ class Notes:
 
 
 def notes_path(run: Run) -> Path:
-    """Return the file of a run's tags and note."""
+    """Return the path of the file with a run's tags and note."""
     return run.folder / "notes.json"
 
 
 def read_notes(run: Run) -> Notes:
-    """Return a run's tags and note; empty ones if there are none or the file is damaged."""
-    found = read_json(notes_path(run))
-    tags, note = found.get("tags"), found.get("note")
+    """Return a run's tags and note; both are empty if the file is missing or damaged."""
+    content = read_json(notes_path(run))
+    tags, note = content.get("tags"), content.get("note")
     words = [tag for tag in tags if isinstance(tag, str)] if isinstance(tags, list) else []
     return Notes(tuple(sorted(set(words))), note if isinstance(note, str) else "")
 
 
 def add_tags(run: Run, tags: Iterable[str]) -> Notes:
-    """Add tags to a run. Raises InputError for a tag that is not a short word."""
-    known = read_notes(run)
-    return _write(run, Notes(tuple(sorted({*known.tags, *map(_checked, tags)})), known.note))
+    """Add tags to a run. Raises InputError for an invalid tag."""
+    notes = read_notes(run)
+    return _write(run, Notes(tuple(sorted({*notes.tags, *map(_checked, tags)})), notes.note))
 
 
 def remove_tags(run: Run, tags: Iterable[str]) -> Notes:
     """Remove tags from a run. Raises InputError for a tag that the run does not have."""
-    known, gone = read_notes(run), set(tags)
-    if missing := sorted(gone - set(known.tags)):
-        has = ", ".join(known.tags) or "none"
-        raise InputError(f"tag '{missing[0]}': run {run.id} does not have it; its tags: {has}")
-    return _write(run, Notes(tuple(tag for tag in known.tags if tag not in gone), known.note))
+    notes, removed = read_notes(run), set(tags)
+    if missing := sorted(removed - set(notes.tags)):
+        existing = ", ".join(notes.tags) or "none"
+        raise InputError(f"tag '{missing[0]}': run {run.id} does not have this tag; its tags: {existing}")
+    return _write(run, Notes(tuple(tag for tag in notes.tags if tag not in removed), notes.note))
 
 
 def set_note(run: Run, note: str) -> Notes:
-    """Replace a run's note; an empty one removes it. Raises InputError for one that is too long."""
+    """Replace a run's note; an empty note removes it. Raises InputError if the note is too long."""
     if len(note) > MAX_LENGTH:
-        raise InputError(f"note: must have at most {MAX_LENGTH} characters, not {len(note)}")
+        raise InputError(f"note: must have at most {MAX_LENGTH} characters, but has {len(note)}")
     return _write(run, Notes(read_notes(run).tags, note.strip()))
 
 

@@ -1,4 +1,4 @@
-"""A run's log of metrics: one JSON line for each record, append-only."""
+"""A run's metrics log: an append-only file with one JSON line for each record."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class LogRecord(NamedTuple):
 
 
 def parse_record(line: bytes) -> LogRecord:
-    """Return the record in a line. Raises ValueError, KeyError or TypeError for a line without one."""
+    """Parse a line of the log. Raises ValueError, KeyError or TypeError if it is not a record."""
     entry = json.loads(line)
     values = {key: float(value) for key, value in entry["values"].items()}
     return LogRecord(entry["step"], entry["phase"], values, entry["time"])
@@ -46,10 +46,10 @@ class MetricsLog:
         self._whole = False
 
     def append(self, step: int, values: Mapping[str, float], phase: str) -> None:
-        """Append one line, in one write: a kill damages at most that line.
+        """Append one line in a single write, so that a kill can damage only this line.
 
         Raises:
-            LeaseLost: if the run has another owner now.
+            LeaseLost: if another process has taken over the run.
             OSError: if the disk is full; the log is then unchanged.
         """
         check_owner(self.path)
@@ -58,16 +58,16 @@ class MetricsLog:
         entry = {"step": step, "phase": phase, "time": round(time.time(), 3), "values": dict(values)}
         line = json.dumps(plain(entry), allow_nan=False).encode() + b"\n"
         with open(self.path, "ab", buffering=0) as file:
-            check_owner(self.path)  # after opening: `repair` gives the next owner another file
+            check_owner(self.path)  # check again: `repair` of the next owner replaces the file
             self._whole = False
             if file.write(line) < len(line):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
             self._whole = True
 
     def repair(self) -> None:
-        """Replace the log by a copy of it, without an incomplete last line.
+        """Replace the log by a copy without an incomplete last line.
 
-        What an earlier owner of the run writes to the old file is lost.
+        Later writes of an earlier owner go to the old file and are lost.
         """
         if self.path.exists():
             content = self.path.read_bytes()
@@ -75,9 +75,9 @@ class MetricsLog:
         self._whole = True
 
     def read(self) -> list[LogRecord]:
-        """Read all records, leaving out an incomplete last line.
+        """Return all records, without an incomplete last line.
 
-        If a resumed run repeated a step, its last record is used.
+        If a resumed run repeated a step, the last record of the step is returned.
 
         Raises:
             InputError: if a line is damaged; the message names file and line.

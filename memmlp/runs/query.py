@@ -1,6 +1,6 @@
-"""Conditions on runs, such as "memory=gru and stream.MPJPE<6.3", and the values that they can use.
+"""Parses conditions on runs, such as "memory=gru and stream.MPJPE<6.3", and collects the values of runs.
 
-A condition is made of comparisons, `and` and `or`; `and` binds more tightly.
+A condition consists of comparisons, `and` and `or`; `and` binds more tightly.
 """
 
 from __future__ import annotations
@@ -27,22 +27,24 @@ ORDER: dict[str, Callable[[Any, Any], bool]] = {
     "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge,
 }  # fmt: skip
 COMPARISONS = ("=", "==", "!=", *ORDER)
-SHORT = 8  # digits of a digest that tell data apart
+SHORT = 8  # number of digits in a shortened digest
 
 
 def record(run: Run) -> dict[str, Any]:
-    """Return the values that conditions can use for a run, by key.
+    """Return the values of a run that conditions can use, by key.
 
-    They are its id, kind, status, name, started, prerequisite, user, tag and note; its data by name (`data`)
-    and by digest (`data_digest`); the keys of its config, with slots also by their names (`memory` for
-    `memory.name`); and its results, with those of the rotation branch also without the branch (`stream.MPJPE`
-    for `stream.rotation.MPJPE`), and after inverse kinematics with its name (`stream.combined-arms.MPJPE`).
-    Times and size are those of the file that the config asks for; those of another, if only that was
-    exported, have its name in the key (`latency-int8.median_ms`).
+    - Facts: id, kind, status, name, started, prerequisite, user, tag, note, `data` (the data's name) and
+      `data_digest`.
+    - All config keys. A slot's name is a short key for its option: `memory` for `memory.name`.
+    - Results, such as `stream.rotation.MPJPE`. For the rotation branch, there is also a short key:
+      `stream.MPJPE`. The branch after inverse kinematics has the solver in its name:
+      `stream.combined-arms.MPJPE`.
+    - Times and size of the file that the config asks for. If only another file was exported, its settings are
+      in the key: `latency-int8.median_ms`.
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
-    found = name_solvers(run.results, run.evaluations_as_configured.combined_by)
-    results = {key: to_number(value) for key, value in flatten(with_times_as_deployed(found)).items()}
+    named = name_solvers(run.results, run.evaluations_as_configured.combined_solvers)
+    results = {key: to_number(value) for key, value in flatten(with_times_as_deployed(named)).items()}
     flat = flatten(config)
     short = {key.replace(".rotation.", "."): value for key, value in results.items()}
     slots = {slot: option_in_slot(config, slot) for slot in SLOTS if slot in config}
@@ -55,33 +57,32 @@ def record(run: Run) -> dict[str, Any]:
 
 
 def data_labels(records: Sequence[Record]) -> list[str]:
-    """Return the name of each record's data, with a short digest if different data have the same name.
+    """Return a label for each record's data: its name, with a short digest if the name is ambiguous.
 
-    A record without a name for its data, such as a VQ-VAE's, gets the name that another record has for the
-    same data.
+    The record of a VQ-VAE does not name its data; it gets the name from another record with the same data.
     """
     digests = [str(one.get("data_digest") or "") for one in records]
     named = {
         digest: one["data.name"] for digest, one in zip(digests, records, strict=True) if "data.name" in one
     }
-    known = [named.get(digest) for digest in digests]
-    several = {name for name in known if len({d for d, own in named.items() if own == name}) > 1}
+    names = [named.get(digest) for digest in digests]
+    ambiguous = {name for name in names if len({d for d, own in named.items() if own == name}) > 1}
     return [
-        " ".join(filter(None, (name, digest[:SHORT] if name is None or name in several else ""))) or "-"
-        for name, digest in zip(known, digests, strict=True)
+        " ".join(filter(None, (name, digest[:SHORT] if name is None or name in ambiguous else ""))) or "-"
+        for name, digest in zip(names, digests, strict=True)
     ]
 
 
 def differing(configs: Sequence[Mapping[str, Any]], data: Sequence[str] = ()) -> list[str]:
-    """Return the config keys that change a result and differ among these configs.
+    """Return the config keys that can change a result and have different values in the configs.
 
-    If the option in a slot differs, its name stands for the keys that only this option has, unless runs with
-    that option differ in them. Keys of the data are included only if data with the same name differ in them;
-    otherwise the names tell the data apart.
+    If a slot has different options, only the slot is returned. Keys inside the slot are returned only if
+    configs with the same key have different values. Keys of the data are returned only if they differ between
+    data sets with the same name.
 
     Args:
         configs: the configs.
-        data: the digests of their data.
+        data: the data digest of each config.
     """
     flats = [flatten(config) for config in configs]
     counting = {key for config in configs for key in training_config(config)} | _of_data(flats, data)
@@ -101,7 +102,7 @@ def differing(configs: Sequence[Mapping[str, Any]], data: Sequence[str] = ()) ->
 
 
 def _of_data(flats: Sequence[Mapping[str, Any]], digests: Sequence[str]) -> set[str]:
-    """Return the data's keys that differ between data with the same name."""
+    """Return the `data` keys that differ between data sets with the same name."""
     named: dict[Any, dict[str, Mapping[str, Any]]] = {}
     for flat, digest in zip(flats, digests, strict=False):
         named.setdefault(flat.get("data.name"), {}).setdefault(digest, flat)
@@ -114,7 +115,7 @@ def _of_data(flats: Sequence[Mapping[str, Any]], digests: Sequence[str]) -> set[
 
 
 def as_typed(value: Any) -> str:
-    """Return a value as it is typed in a condition and shown in a column."""
+    """Format a value for a condition or a table column."""
     if isinstance(value, list | tuple):
         return f"[{','.join(map(as_typed, value))}]"
     if isinstance(value, bool):
@@ -125,29 +126,35 @@ def as_typed(value: Any) -> str:
 
 
 def check_key(key: str, records: Iterable[Record], option: str) -> None:
-    """Raise InputError if no run has the key."""
+    """Raise InputError if no record has the key."""
     keys = {name for one in records for name in one}
     if key not in keys:
         near = difflib.get_close_matches(key, keys, n=1)
         hint = f"did you mean {near[0]}? " if near else ""
         raise InputError(
-            f"{option}: no run has the key '{key}'; {hint}use keys of the config (memory, optim.lr), results "
+            f"{option}: no run has the key '{key}'; {hint}use a config key (memory, optim.lr), a result "
             "(stream.MPJPE), id, kind, status, name, data, started, tag or note"
         )
 
 
 class Query(NamedTuple):
-    """A condition, the keys in it, and those among them that it compares with < or > as numbers."""
+    """A parsed condition.
+
+    Attributes:
+        condition: a function that returns whether a record satisfies the condition.
+        keys: the keys in the condition.
+        numbers: the keys that are compared with <, <=, > or >=, so their values must be numbers.
+    """
 
     condition: Condition
     keys: tuple[str, ...]
     numbers: tuple[str, ...]
 
-    def of(self, records: Sequence[Record], option: str = "--where") -> list[bool]:
-        """Return for each record whether it satisfies the condition.
+    def test_records(self, records: Sequence[Record], option: str = "--where") -> list[bool]:
+        """Return whether the condition holds, for each record.
 
         Raises:
-            InputError: for unknown keys, and for keys that have words and are compared as numbers.
+            InputError: if a key is unknown, or if a key in `numbers` has text values only.
         """
         for key in self.keys if records else ():
             check_key(key, records, option)
@@ -155,21 +162,21 @@ class Query(NamedTuple):
             values = [one[key] for one in records if key in one]
             if values and all(isinstance(value, str | list | tuple) for value in values):
                 raise InputError(
-                    f"{option}: {key} is not a number in any run ({as_typed(values[0])}); use = or !="
+                    f"{option}: {key} must be a number for < or >, but is {as_typed(values[0])}; use = or !="
                 )
         return [self.condition(one) for one in records]
 
 
 def parse(text: str) -> Query:
-    """Parse a condition. Raises InputError, in one line, if it is not valid."""
+    """Parse a condition. Raises InputError if it is not valid."""
     tokens = _Tokens(text)
     groups: list[list[Condition]] = [[]]
     while True:
-        groups[-1].append(tokens.comparison())
-        if tokens.ended:
+        groups[-1].append(tokens.read_comparison())
+        if tokens.is_at_end:
             break
-        if (word := tokens.next("and or or")[1]) not in ("and", "or"):
-            raise tokens.error(f"'{word}' is not expected")
+        if (word := tokens.read_token("and or or")[1]) not in ("and", "or"):
+            raise tokens.make_error(f"expected and or or, but found '{word}'")
         if word == "or":
             groups.append([])
     keys, numbers = tuple(dict.fromkeys(tokens.keys)), tuple(dict.fromkeys(tokens.numbers))
@@ -177,7 +184,7 @@ def parse(text: str) -> Query:
 
 
 class _Tokens:
-    """The tokens of a condition, which are read one after another."""
+    """Reads the tokens of a condition one by one."""
 
     def __init__(self, text: str):
         self.text, self.rest = text, text.strip()
@@ -185,65 +192,65 @@ class _Tokens:
         self.numbers: list[str] = []
 
     @property
-    def ended(self) -> bool:
+    def is_at_end(self) -> bool:
         return not self.rest
 
-    def next(self, expected: str) -> tuple[str, str]:
+    def read_token(self, expected: str) -> tuple[str, str]:
         """Return the kind and text of the next token."""
-        if self.ended:
-            raise self.error(f"it ends where {expected} is expected")
-        found = TOKEN.match(self.rest)
-        if found is None:
-            raise self.error(f"'{self.rest[:20]}' cannot be parsed")
-        self.rest = self.rest[found.end() :].strip()
-        return found.lastgroup or "", found[found.lastgroup or 0]
+        if self.is_at_end:
+            raise self.make_error(f"expected {expected} at the end")
+        match = TOKEN.match(self.rest)
+        if match is None:
+            raise self.make_error(f"'{self.rest[:20]}' cannot be parsed")
+        self.rest = self.rest[match.end() :].strip()
+        return match.lastgroup or "", match[match.lastgroup or 0]
 
-    def comparison(self) -> Condition:
+    def read_comparison(self) -> Condition:
         """Return the condition of the next comparison, and record its key."""
-        kind, key = self.next("a key")
+        kind, key = self.read_token("a key")
         if kind != "word" or key in ("and", "or"):
-            raise self.error(f"'{key}' stands where a key is expected")
-        _, sign = self.next(f"a comparison after {key}")
+            raise self.make_error(f"expected a key, but found '{key}'")
+        _, sign = self.read_token(f"a comparison after {key}")
         if sign not in COMPARISONS:
-            raise self.error(f"after {key} comes '{sign}'")
-        kind, value = self.next(f"a value after {key}{sign}")
+            raise self.make_error(f"expected a comparison after {key}, but found '{sign}'")
+        kind, value = self.read_token(f"a value after {key}{sign}")
         if kind == "op":
-            raise self.error(f"after {key}{sign} comes '{value}'")
+            raise self.make_error(f"expected a value after {key}{sign}, but found '{value}'")
         if sign in ORDER and _number(value) is None and key != "started":
-            raise self.error(f"{key}{sign}{value}: {sign} compares with a number")
+            raise self.make_error(f"expected a number after {key}{sign}, but found '{value}'")
         if key == "status" and value not in (*STATUSES, "damaged"):
-            known = ", ".join([*STATUSES, "damaged"])
-            raise InputError(f"--where '{self.text}': status={value}: must be one of {known}")
+            statuses = ", ".join([*STATUSES, "damaged"])
+            raise InputError(f"--where '{self.text}': status={value} must be one of {statuses}")
         self.keys.append(key)
-        if key == "started" and sign in ORDER:  # times in ISO 8601, as much of them as is typed
+        if key == "started" and sign in ORDER:  # ISO 8601 times, which may be typed in part, like 2025-03
             return lambda one: bool(one.get(key)) and ORDER[sign](str(one[key]), value)
         self.numbers += [key] if sign in ORDER else []
         return lambda one: _holds(one.get(key), sign, value)
 
-    def error(self, reason: str) -> InputError:
+    def make_error(self, reason: str) -> InputError:
         return InputError(f"--where '{self.text}': {reason}; use comparisons (= != < <= > >=), and, or")
 
 
-def _holds(own: Any, sign: str, value: str) -> bool:
-    """Return whether a comparison holds.
+def _holds(actual: Any, sign: str, value: str) -> bool:
+    """Return whether a comparison is true.
 
-    A missing value is neither smaller nor larger than anything, and neither is NaN, which satisfies only !=.
+    With a missing value or NaN, comparisons with < and > are false.
     """
     if sign in ORDER:
         number = _number(value)
-        known = isinstance(own, int | float) and not isinstance(own, bool)
-        return known and number is not None and ORDER[sign](own, number)
-    return _equal(own, value) == (sign != "!=")
+        comparable = isinstance(actual, int | float) and not isinstance(actual, bool)
+        return comparable and number is not None and ORDER[sign](actual, number)
+    return _equal(actual, value) == (sign != "!=")
 
 
-def _equal(own: Any, value: str) -> bool:
-    """Return whether a run's value equals a typed one; a number may also be typed as it is shown."""
-    if isinstance(own, tuple):  # tags: it has the tag
-        return value in own
-    if isinstance(own, int | float) and not isinstance(own, bool):
-        return _number(value) in (own, float(as_typed(own)))
-    typed = value.lower() if isinstance(own, bool | None) else value.replace(", ", ",")
-    return as_typed(own) == typed
+def _equal(actual: Any, value: str) -> bool:
+    """Return whether a run's value equals a typed one; a number may be typed rounded, like tables show it."""
+    if isinstance(actual, tuple):  # the tags of a run
+        return value in actual
+    if isinstance(actual, int | float) and not isinstance(actual, bool):
+        return _number(value) in (actual, float(as_typed(actual)))
+    typed = value.lower() if isinstance(actual, bool | None) else value.replace(", ", ",")
+    return as_typed(actual) == typed
 
 
 def _number(text: str) -> float | None:

@@ -1,7 +1,7 @@
 """Run folders: lock, manifest, metrics log, completion. The folder is the only record of a run.
 
-A run is done when it is trained. Its evaluations and deployments are below its folder, each in a file or
-folder that is named by its identity and is either complete or absent.
+A run is done when it is trained. Its folder contains its evaluations and deployments. Each is a file or
+folder that is named by its id. It is complete or absent.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from memmlp.runs.identity import belongs, deployment_settings, describe_other_ex
 from memmlp.runs.metrics_log import LogRecord, MetricsLog
 
 STAGE_WORDS = {"training": "training", "evaluation": "evaluating", "deployment": "exporting"}
-"""What a process does that works on a stage of a run."""
+"""The status of a run while a process works on a stage, by stage."""
 
 STATUSES = (*STAGE_WORDS.values(), "done", "trained", "lost", "failed", "stopped", "new")
-"""The statuses of runs; a lost run's process died (see `Run.state`)."""
+"""The statuses of runs (`Run.state`)."""
 
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the C loader is six times as fast
 
@@ -42,7 +42,7 @@ def _parse(text: str) -> Any:
 
 
 def latency_name(deployed: DeploymentFolder, config: Mapping[str, Any]) -> str:
-    """Return the name of a deployment's results: "latency", or another file's, such as "latency-int8"."""
+    """Return "latency", or for another file than the config asks for, a name such as "latency-int8"."""
     return "-".join(filter(None, ["latency", describe_other_export(deployed.settings, config)]))
 
 
@@ -52,13 +52,13 @@ class Run:
     Attributes:
         folder: the folder; its name is the run's `id`.
         id: 16 hex digits.
-        config_path: the resolved config; `config` is its content.
-        manifest_path: the facts about the run; `manifest` is its content.
-        metrics_path: the metrics log; `metrics()` is its content.
-        checkpoint: the last checkpoint.
-        model: the trained weights.
-        picture: the picture of truth and prediction.
-        results_path: results of a VQ-VAE's run.
+        config_path: the file with the resolved config (`config`).
+        manifest_path: the file with facts about the run (`manifest`).
+        metrics_path: the file of the metrics log (`metrics()`).
+        checkpoint: the file of the last checkpoint.
+        model: the file of the trained weights.
+        picture: the picture of ground truth and prediction.
+        results_path: the file with the results of a VQ-VAE.
         evaluations: the folder of evaluations.
         deployments: the folder of deployments.
         marker: the file that marks the run as done.
@@ -78,7 +78,7 @@ class Run:
         "config.yaml",
         "manifest.json",
     )
-    """A run's own files, in the order in which a reset removes them: results before what they are of."""
+    """All files of a run in order of removal: results before the files on which they depend."""
 
     def __init__(self, folder: Path | str):
         self.folder = Path(folder)
@@ -96,148 +96,145 @@ class Run:
         self._lock, self._log = Lock(self.folder), MetricsLog(self.metrics_path)
 
     @classmethod
-    def of(cls, outputs: Path | str, run_id: str) -> Run:
-        """Return the run with that id below an outputs folder, whether or not it exists."""
+    def from_id(cls, outputs: Path | str, run_id: str) -> Run:
+        """Return the run with an id in an outputs folder; its folder may not exist."""
         return cls(Path(outputs) / "runs" / run_id)
 
     def evaluation(self, identity: str) -> Path:
-        """Return the file of an evaluation, whether or not it was made."""
+        """Return the path of an evaluation file; it may not exist."""
         return self.evaluations / f"{identity}.json"
 
     def deployment(self, identity: str) -> DeploymentFolder:
-        """Return the folder of a deployment, whether or not it was made."""
+        """Return the folder of a deployment; it may not exist."""
         return DeploymentFolder(self.deployments / identity)
 
     def has(self, stage: str) -> bool:
-        """Return whether the evaluation or deployment with that identity was made."""
+        """Return whether the run has the evaluation or deployment with this id."""
         return self.evaluation(stage).is_file() or self.deployment(stage).done
 
     @property
     def wanted(self) -> tuple[str, ...]:
-        """The identities of the evaluations and the deployment that were last asked for.
-
-        Empty for a prerequisite run.
-        """
+        """The ids of the evaluations and the deployment in the last request; empty for a prerequisite run."""
         return tuple(self.manifest.get("stages", ()))
 
     def want(self, stages: Sequence[str]) -> None:
-        """Record which evaluations and which deployment are asked for, by their identities."""
+        """Record the ids of the requested evaluations and deployment."""
         if self.manifest.get("stages") != list(stages):
             self.write_manifest({"stages": list(stages)})
 
     @property
     def complete(self) -> bool:
-        """Whether the run is trained and has the evaluations and the deployment that were last asked for."""
+        """Whether the run is trained and has all requested evaluations and deployments."""
         return self.done and all(map(self.has, self.wanted))
 
     @property
     def preferred_deployment(self) -> DeploymentFolder:
-        """The deployment to use live, among those that use the network as the run's config does.
+        """The deployment for live use; it uses the network in the same way as the run's config.
 
-        One with the current component versions is preferred, then one whose int8 file is accurate enough,
-        then one of the file that the config asks for, then the one that was made last.
+        The order of preference is: current component versions, an accurate int8 file, the export settings of
+        the config, the latest.
         """
         config = self.config
         return self._best_deployment(
             config,
             lambda one: (
-                one.current, bool(one.accurate_int8), not describe_other_export(one.settings, config),
-                one.made,
+                one.is_current, bool(one.accurate_int8_file),
+                not describe_other_export(one.settings, config), one.creation_time,
             ),
         )  # fmt: skip
 
     @property
     def deployment_as_configured(self) -> DeploymentFolder:
-        """The deployment with the measurements that are shown (see `deployment_shown`)."""
-        return self.deployment_shown(self.config)
+        """The deployment with the measurements for tables (`find_shown_deployment`)."""
+        return self.find_shown_deployment(self.config)
 
-    def deployment_shown(self, config: Mapping[str, Any]) -> DeploymentFolder:
-        """Return the deployment with the measurements that are shown, given the run's config.
+    def find_shown_deployment(self, config: Mapping[str, Any]) -> DeploymentFolder:
+        """Return the deployment with the measurements for tables, given the run's config.
 
-        It is of the file that the config asks for, whatever else was exported since; if there are several,
-        one with the present component versions, then one with just the config's settings, then the last. Only
-        if it is missing, another is shown and named (`latency_name`).
+        The order of preference is: the export settings of the config, current component versions, exactly the
+        settings of the config, the latest. `latency_name` names different export settings.
         """
-        asked = deployment_settings(config)
+        requested = deployment_settings(config)
         return self._best_deployment(
             config,
             lambda one: (
-                not describe_other_export(one.settings, config), one.current, one.settings == asked, one.made,
+                not describe_other_export(one.settings, config), one.is_current,
+                one.settings == requested, one.creation_time,
             ),
         )  # fmt: skip
 
     def _best_deployment(
         self, config: Mapping[str, Any], rank: Callable[[DeploymentFolder], tuple[Any, ...]]
     ) -> DeploymentFolder:
-        made = [DeploymentFolder(path.parent) for path in self.deployments.glob("*/latency.json")]
-        own = [one for one in made if one.done and used_as_configured(one.settings, config)]
-        return max(own, key=rank, default=None) or DeploymentFolder(self.deployments / "none")
+        every = [DeploymentFolder(path.parent) for path in self.deployments.glob("*/latency.json")]
+        matching = [one for one in every if one.done and used_as_configured(one.settings, config)]
+        return max(matching, key=rank, default=None) or DeploymentFolder(self.deployments / "none")
 
     @property
     def preferred_onnx(self) -> Path:
-        """The ONNX file to use: int8 if that is accurate enough (`export.precision`), else float32.
+        """The ONNX file for live use: int8 if it is accurate enough (`export.precision`), otherwise float32.
 
         Raises:
-            InputError: if the run is finished and has no ONNX file (`export.graph=off`), or the file was
-                changed since it was made.
+            InputError: if a finished run does not have an ONNX file (`export.graph=off`), or if the file has
+                changed since the export.
         """
         deployment = self.preferred_deployment
         if self.done and not self.deployments.is_dir():
             make = f"memmlp eval {self.folder} export.graph=auto"
-            raise InputError(f"{self.folder}: has no step.onnx; make one with {make}")
-        file = deployment.accurate_int8 or deployment.onnx
+            raise InputError(f"{self.folder}: does not have step.onnx; export it with {make}")
+        file = deployment.accurate_int8_file or deployment.onnx
         digest = deployment.record.get("artifacts", {}).get(file.name)
         if digest and not self._same(str(file.relative_to(self.folder)), digest):
-            raise InputError(f"{file}: not the file that was exported; do the run again with force=true")
+            raise InputError(f"{file}: changed since it was exported; repeat the run with force=true")
         return file
 
     @property
     def onnx(self) -> Path:
-        """The float32 ONNX file of the deployment to use."""
+        """The float32 ONNX file of `preferred_deployment`."""
         return self.preferred_deployment.onnx
 
     def __repr__(self) -> str:
         return f"Run({str(self.folder)!r})"
 
     def lock(
-        self, say: Callable[[str], None] | None = None, wait: bool = True
+        self, report: Callable[[str], None] | None = None, wait: bool = True
     ) -> AbstractContextManager[Lease | None]:
-        """Hold the run's lock for this process, which may hold it already; yields the lease.
+        """Hold the run's lock during the context, and yield the lease; a thread may lock a run repeatedly.
 
-        Once another process has taken over the run, any attempt of this one to write to it raises LeaseLost.
+        If another process takes over the run, any attempt of this process to write to it raises LeaseLost.
 
         Args:
-            say: gets a line about the process for which this one waits; by default the line goes to stderr.
-            wait: whether to wait while another process holds the run; otherwise None is yielded.
+            report: gets a line if this process has to wait; by default, the line goes to stderr.
+            wait: whether to wait while another process holds the lock. Without waiting, None is yielded.
         """
-        return self._lock.hold(say, wait)
+        return self._lock.hold(report, wait)
 
     @property
     def status(self) -> str:
-        """The run's status, one of STATUSES: what a process is doing with it, or else its progress."""
-        if doing := self.doing:
-            return doing
+        """The run's status, one of STATUSES: the activity of a process, otherwise the run's progress."""
+        if activity := self.activity:
+            return activity
         word = self.state(self.complete and not self.failure)
-        return "trained" if word == "running" else word  # held by a process, at no stage
+        return "trained" if word == "running" else word  # a process holds the run without working on a stage
 
     @property
-    def doing(self) -> str | None:
-        """What a process is doing with the run, one of STAGE_WORDS; None if no process works on it."""
-        if not self._lock.held:
+    def activity(self) -> str | None:
+        """The activity of the process that works on the run (STAGE_WORDS); None without such a process."""
+        if not self._lock.is_held:
             return None
         attempts = self.manifest.get("attempts") or [{}]
         word = STAGE_WORDS.get(attempts[-1].get("stage"), "training")
         return None if self.done and word == "training" else word
 
     def state(self, complete: bool) -> str:
-        """Return the state of the work on the run, given whether that work is complete.
+        """Return the state of the run, given whether the caller considers it complete.
 
-        One of: done, running (a process works on it), lost (its process died), failed, trained (a wanted
-        evaluation or deployment was not made yet), stopped, new.
+        The states are: done, running (a process works on it), lost (its process died), failed, trained (a
+        requested evaluation or deployment is missing), stopped, new.
         """
         if complete:
             return "done"
-        if (held := self._lock.held) is not None:
+        if (held := self._lock.is_held) is not None:
             return "running" if held else "lost"
         if self.failure:
             return "failed"
@@ -247,24 +244,24 @@ class Run:
 
     @property
     def failure(self) -> str | None:
-        """Why the run failed, in one line; None if it did not."""
+        """The reason why the run failed, in one line; None if it has not failed."""
         return read_json(self.folder / "FAILED").get("reason")
 
     def fail(self, reason: str, details: str = "") -> None:
-        """Record why the run failed."""
+        """Record the reason why the run failed."""
         write_json(
             self.folder / "FAILED", {"reason": " ".join(reason.split()), "when": now(), "details": details}
         )
 
     def retry(self) -> None:
-        """Forget the failure, and the attempts that led to it."""
+        """Remove the record of the failure, and stop counting the attempts that led to it."""
         if self.failure:
             self.reset_deaths()
         check_owner(self.folder)
         (self.folder / "FAILED").unlink(missing_ok=True)
 
     def reset_deaths(self) -> None:
-        """Stop counting attempts so far as ones that died: the run ended well, or is to be tried again."""
+        """Stop counting earlier attempts as dead: the run has succeeded, or is tried again."""
         manifest = self.manifest
         attempts = len(manifest.get("attempts", []))
         if attempts > manifest.get("forgiven", 0):
@@ -275,15 +272,15 @@ class Run:
     ) -> None:
         """Write config.yaml and the manifest of a run that starts or resumes.
 
-        If the code was changed since its commit, a patch is written beside them.
+        If the code has uncommitted changes, a patch is written to the run's folder.
 
         Args:
-            kind: what is trained (see `Identity`).
+            kind: the kind of the run (`Identity.kind`).
             config: the resolved config.
             data: digest of the prepared data.
-            prerequisite: id of the run whose weights this one uses.
-            facts: further entries of the manifest, such as component versions, device and threads, the
-                origins of its prerequisite runs (`prerequisite_runs`), and the user's packages (`plugins`).
+            prerequisite: id of the run that provides weights for this run.
+            facts: further manifest entries, such as component versions, device, threads, `prerequisite_runs`
+                (their origins) and `plugins` (the user's packages).
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         atomic_write(self.config_path, yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
@@ -292,32 +289,32 @@ class Run:
         identity = {"id": self.id, "kind": kind, "data": data, "prerequisite": prerequisite}
         before = self.manifest if self.checkpoint.exists() else {}
         sources = describe_sources(facts.get("plugins", ()))
-        made = join_origins(before, {**facts, **environment(), **sources})
+        origin = join_origins(before, {**facts, **environment(), **sources})
         self.attempt("training")
         times = {"started": self.manifest.get("started", now()), "finished": None, "seconds": {}}
-        self.write_manifest(identity | times | made)
+        self.write_manifest(identity | times | origin)
 
     def record_seconds(self, stage: str, seconds: float) -> None:
-        """Record in the manifest the seconds of a stage, summed over all processes that worked on it."""
-        known = self.manifest.get("seconds", {})
-        self.write_manifest({"seconds": {**known, stage: round(seconds, 3)}})
+        """Record the duration of a stage in the manifest, summed over all attempts."""
+        recorded = self.manifest.get("seconds", {})
+        self.write_manifest({"seconds": {**recorded, stage: round(seconds, 3)}})
 
     def attempt(self, stage: str) -> None:
-        """Record that a process begins to work on a stage of the run."""
+        """Record that this process begins to work on a stage of the run."""
         self.retry()
-        begun = {"started": now(), "pid": os.getpid(), "host": host(), "step": self.step, "stage": stage}
-        self.write_manifest({"attempts": [*self.manifest.get("attempts", []), begun]})
+        attempt = {"started": now(), "pid": os.getpid(), "host": host(), "step": self.step, "stage": stage}
+        self.write_manifest({"attempts": [*self.manifest.get("attempts", []), attempt]})
 
     def write_manifest(self, fields: Mapping[str, Any]) -> None:
         """Add fields to the manifest, or replace them.
 
         Raises:
-            InputError: if the manifest that is there can't be read: what it had would be lost.
+            InputError: if the existing manifest can't be read, since its content would be lost.
         """
-        known = self.manifest
-        if not known and self.manifest_path.exists():
-            raise InputError(f"{self.manifest_path}: damaged; remove the run folder to make the run again")
-        write_json(self.manifest_path, known | dict(fields))
+        manifest = self.manifest
+        if not manifest and self.manifest_path.exists():
+            raise InputError(f"{self.manifest_path}: damaged; remove the run folder to repeat the run")
+        write_json(self.manifest_path, manifest | dict(fields))
 
     @property
     def manifest(self) -> dict[str, Any]:
@@ -332,49 +329,46 @@ class Run:
             InputError: if the file is damaged.
         """
         try:
-            found = copy.deepcopy(_parse(self.config_path.read_text())) if self.config_path.exists() else {}
+            config = copy.deepcopy(_parse(self.config_path.read_text())) if self.config_path.exists() else {}
         except (yaml.YAMLError, UnicodeDecodeError):
-            found = None
-        if not isinstance(found, dict):
-            raise InputError(
-                f"{self.config_path}: cannot be read; remove the run folder to make the run again"
-            )
-        return found
+            config = None
+        if not isinstance(config, dict):
+            raise InputError(f"{self.config_path}: damaged; remove the run folder to repeat the run")
+        return config
 
     @property
     def results(self) -> dict[str, Any]:
         """The results with the run's own settings: mode -> branch -> metric, and "latency".
 
-        Where only another file was exported than the config asks for, that is in the latter's name:
-        "latency-int8", "latency-naive" (`deployment_shown`).
+        If only another file was exported than the config asks for, the key names the difference:
+        "latency-int8", "latency-naive" (`find_shown_deployment`).
 
-        A VQ-VAE's run has its own results instead. Where a branch was evaluated by several kinds of inverse
-        kinematics, that of the run's config counts, else the last one
-        (`evaluations_as_configured.combined_by`); tables ask for an evaluation by its identity.
+        If a mode was evaluated with several kinds of inverse kinematics, the one in the run's config counts,
+        otherwise the last one. The results of a VQ-VAE have other keys.
 
         Raises:
-            InputError: if the file of an evaluation is damaged.
+            InputError: if an evaluation file is damaged.
         """
-        found = read_json(self.results_path) | self.evaluations_as_configured.results
+        results = read_json(self.results_path) | self.evaluations_as_configured.results
         config = self.config
-        deployed = self.deployment_shown(config)
-        return found | ({latency_name(deployed, config): deployed.record} if deployed.record else {})
+        deployed = self.find_shown_deployment(config)
+        return results | ({latency_name(deployed, config): deployed.record} if deployed.record else {})
 
     @property
     def evaluations_as_configured(self) -> EvaluationsAsConfigured:
-        """The evaluations with the settings of the run's config, as they are now."""
+        """The evaluations that match the run's config, read anew."""
         return EvaluationsAsConfigured(self.evaluations, self.config)
 
     @property
     def changed_sources(self) -> list[str]:
-        """The files with code that has changed since the run was made; empty if that is unknown.
+        """The code files that have changed since the run began; empty if unknown.
 
-        Files of the user's packages are included, if these are found.
+        Files of the user's packages are included if the packages are found.
         """
         return changed_since(self.manifest)
 
     def log(self, step: int, values: Mapping[str, float], phase: str = "train") -> None:
-        """Append one line to the metrics log, in one write: a kill damages at most that line."""
+        """Append one line to the metrics log (`MetricsLog.append`)."""
         self._log.append(step, values, phase)
 
     @property
@@ -383,11 +377,11 @@ class Run:
         return max((entry.step for entry in self.metrics()), default=0)
 
     def metrics(self) -> list[LogRecord]:
-        """Read the metrics log (see `MetricsLog.read`)."""
+        """Return all records of the metrics log (`MetricsLog.read`)."""
         return self._log.read()
 
     def finish(self, artifacts: Sequence[str]) -> None:
-        """Mark the run as done: write the marker with the artifacts' digests, last and atomically."""
+        """Mark the run as done, by writing the marker file with the artifacts' digests."""
         finished = now()
         self.write_manifest({"finished": finished})
         digests = {name: file_digest(self.folder / name) for name in artifacts}
@@ -395,35 +389,33 @@ class Run:
 
     @property
     def done(self) -> bool:
-        """Whether the run is finished, and the folder does not belong to another run's id."""
+        """Whether the training is finished, and the marker file belongs to this run."""
         marker = read_json(self.marker)
         return "artifacts" in marker and belongs(marker.get("id"), self.folder)
 
     @property
     def weights_digest(self) -> str | None:
-        """The SHA-256 of the weights as the training left them; None before it is finished."""
+        """The SHA-256 of the weights at the end of training; None before."""
         return read_json(self.marker).get("artifacts", {}).get(self.model.name)
 
     def weights(self) -> Path:
-        """Return the file of the trained weights.
+        """Return the file of the trained weights, after checking its digest.
 
         Raises:
-            InputError: if the file was changed since the training.
+            InputError: if the file has changed since the training.
         """
         digest = self.weights_digest
         if digest and not self._same(self.model.name, digest):
-            raise InputError(
-                f"{self.model}: not the weights that were trained; do the run again with force=true"
-            )
+            raise InputError(f"{self.model}: changed since the training; repeat the run with force=true")
         return self.model
 
     def verify(self) -> list[str]:
-        """Return the artifacts of a finished run that are missing or were changed since."""
+        """Return the artifacts of a finished run that are missing or have changed."""
         artifacts = dict(read_json(self.marker).get("artifacts", {}))
         for latency in sorted(self.deployments.glob("*/latency.json")):
             where = latency.parent.relative_to(self.folder)
-            made = read_json(latency).get("artifacts", {})
-            artifacts |= {str(where / name): digest for name, digest in made.items()}
+            exported = read_json(latency).get("artifacts", {})
+            artifacts |= {str(where / name): digest for name, digest in exported.items()}
         changed = [name for name, digest in artifacts.items() if not self._same(name, digest)]
         reports = sorted(self.evaluations.glob("*.json"))
         return changed + [str(path.relative_to(self.folder)) for path in reports if not intact(path)]
@@ -433,7 +425,7 @@ class Run:
         return path.is_file() and file_digest(path) == digest
 
     def reset(self) -> None:
-        """Remove the run's own files, with the marker first, and nothing else."""
+        """Remove all files of the run, the marker first; keep other files in its folder."""
         if not self.folder.exists():
             return
         check_owner(self.folder)
@@ -442,7 +434,7 @@ class Run:
         self._remove((*self.FILES, self.marker.name))
 
     def clear_stages(self) -> None:
-        """Remove the evaluations and deployments, which belong to earlier weights."""
+        """Remove the evaluations and deployments, since they belong to earlier weights."""
         self._remove(self.STAGES)
 
     def _remove(self, names: Iterable[str]) -> None:
@@ -452,6 +444,6 @@ class Run:
             for path in (*self.folder.glob(name), *self.folder.glob(temporary)):
                 path.unlink(missing_ok=True)
         for folder in (*self.deployments.glob("*/"), self.evaluations, self.deployments):
-            with contextlib.suppress(OSError):  # it does not exist, or holds files of the user's
+            with contextlib.suppress(OSError):  # it does not exist, or contains files of the user
                 folder.rmdir()
         sync_folder(self.folder)

@@ -92,7 +92,7 @@ class Plan:
     def run(self, label: str, seed: int) -> Run | None:
         """Return the run of a variant with a seed, finished or not; None if its identity is not known."""
         found = self._by_entry.get((label, seed))
-        return Run.of(self.outputs, found) if found else None
+        return Run.from_id(self.outputs, found) if found else None
 
     @cached_property
     def _by_entry(self) -> dict[tuple[str, int], str]:
@@ -100,7 +100,7 @@ class Plan:
 
     def run_of(self, task: RunTask | Entry) -> Run:
         """Return the run of a task or entry."""
-        return Run.of(self.outputs, task.id)
+        return Run.from_id(self.outputs, task.id)
 
     def complete(self, task: RunTask | Entry) -> bool:
         """Return whether the run is trained and has all wanted stages."""

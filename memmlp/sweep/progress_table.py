@@ -178,7 +178,7 @@ def total_steps(task: RunTask) -> int:
 
 def progress_text(run: Run, total: int) -> str:
     """Describe a run that a process is working on: steps of its training, remaining time and loss."""
-    if (doing := run.doing) in ("evaluating", "exporting"):
+    if (doing := run.activity) in ("evaluating", "exporting"):
         return doing
     log = [entry for entry in run.metrics() if entry.phase == "train"]
     if not log:

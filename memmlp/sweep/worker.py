@@ -76,7 +76,7 @@ def attempt(plan: Plan, task: RunTask, perform: Perform) -> bool:
         OSError: if the disk is full or read-only, which affects every task.
     """
     run = plan.run_of(task)
-    if task.prerequisite and not Run.of(plan.outputs, task.prerequisite).done:
+    if task.prerequisite and not Run.from_id(plan.outputs, task.prerequisite).done:
         return False
     with run.lock(wait=False) as mine:
         if not mine:

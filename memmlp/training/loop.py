@@ -194,7 +194,7 @@ def record(
         loss = float(result.loss.detach())
         terms = {name: float(term.detach()) for name, term in result.terms.items()}
         run.log(step, {"loss": loss, **terms, **task.report()})
-        count.note(f"loss {loss:.3g}")
+        count.set_note(f"loss {loss:.3g}")
     count.advance()
     if step % optim.validate_every == 0 or last:
         values = validate(task, average)

@@ -127,7 +127,7 @@ def finished_outcome(request: RunRequest) -> Outcome | None:
     if request.config["force"] or request.config["save_predictions"] or request.motion.digest() is None:
         return None
     data = request.motion.prepare()
-    run = Run.of(request.outputs, request.identity(data.digest).id)
+    run = Run.from_id(request.outputs, request.identity(data.digest).id)
     if not run.done or not all(map(run.has, request.stage_ids)) or unmeasured(request, run):
         return None
     announce_data(data)

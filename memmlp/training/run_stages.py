@@ -109,7 +109,7 @@ def _train_along(experiment: Experiment) -> None:
     while (stage := distributed.broadcast("")) != "end":
         data = experiment.motion.prepare()  # the first process has prepared it
         identities = experiment.identities(data.digest)
-        runs = [Run.of(experiment.outputs, identity.id) for identity in identities]
+        runs = [Run.from_id(experiment.outputs, identity.id) for identity in identities]
         number = [identity.kind for identity in identities].index(stage)
         training = (*experiment.prerequisites, experiment.training)[number]
         weights = runs[number - 1].weights() if number else None
@@ -127,7 +127,7 @@ def run_experiment(experiment: Experiment, on_validation: ValidationCallback | N
     config = experiment.config
     data = experiment.motion.prepare()
     announce_data(data)
-    run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
+    run = Run.from_id(experiment.outputs, experiment.identity(data.digest).id)
     if not run.done:
         if experiment.evaluations:
             data.open("test")  # raises the error of absent test clips before the training, not after it
@@ -219,7 +219,7 @@ def find_or_train(
     before: Run | None,
 ) -> Run:
     """Return the finished prerequisite run with that identity, training it upon `before` if necessary."""
-    run = Run.of(experiment.outputs, identity.id)
+    run = Run.from_id(experiment.outputs, identity.id)
     with run.lock():
         if run.done:
             return run
@@ -245,7 +245,7 @@ def recording_outcome(experiment: Experiment, run: Run, again: bool = False) -> 
     missing = again or not run.done or not all(map(run.has, experiment.stage_ids))
     missing = missing or bool(unmeasured(experiment, run))
     loggers = experiment.loggers if missing else Loggers((), experiment.outputs)
-    with loggers.following(run):
+    with loggers.show_run(run):
         try:
             yield
         except (LeaseLost, BrokenPipeError):
@@ -330,7 +330,7 @@ def deploy_run(experiment: Experiment, run: Run, data: Prepared) -> None:
         record = deployment.deploy(model, deployed, run.id, *clips)
         record |= measure_pose(deployed.onnx, deployment.latency_steps)
         if (precision := deployment.precision) in record:
-            record[precision] |= measure_pose(deployed.file(precision), deployment.latency_steps)
+            record[precision] |= measure_pose(deployed.onnx_path(precision), deployment.latency_steps)
         settings = deployment_settings(experiment.config)
         deployed.finish({"run": run.manifest["id"], "settings": settings, **record})
 

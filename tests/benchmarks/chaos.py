@@ -123,7 +123,7 @@ def storm(
             if code not in (None, 0) or (code == 0 and killed < kills):
                 processes[index] = launch()
     end = time.monotonic() + PATIENCE
-    while any(Lock(folder).held for folder in outputs.glob("runs/*/")) and time.monotonic() < end:
+    while any(Lock(folder).is_held for folder in outputs.glob("runs/*/")) and time.monotonic() < end:
         time.sleep(0.1)
 
 
@@ -158,7 +158,7 @@ def check(folder: Path) -> list[str]:
     starts = [attempt["started"] for attempt in attempts if attempt["stage"] == "training"]
     if max(starts) > run.manifest["finished"]:
         problems.append("trained again after it was finished")
-    if Lock(folder).held:
+    if Lock(folder).is_held:
         problems.append("is still held")
     return problems
 

@@ -27,7 +27,7 @@ def outputs(tmp_path: Path) -> Path:
     """Make a folder with two finished runs and one that is not finished."""
     folder = tmp_path / "outputs"
     for name, seed in ((A, 0), (B, 1), (C, 2)):
-        run = Run.of(folder, name)
+        run = Run.from_id(folder, name)
         run.begin(
             "memmlp", {"seed": seed, "memory": {"layers": [2, 4, 6, 8] * 9}}, data="d" * 64, prerequisite=None
         )
@@ -45,14 +45,14 @@ def lines_up(ran: Ran, width: int) -> bool:
 
 def test_list_names_the_older_ones(memmlp: Memmlp, outputs: Path):
     for i in range(25):
-        Run.of(outputs, f"{i:016x}").begin("vqvae", {}, data="d", prerequisite=None)
+        Run.from_id(outputs, f"{i:016x}").begin("vqvae", {}, data="d", prerequisite=None)
     assert memmlp("runs", "list").out.count("VQ-VAE") < 25
     assert "8 older ones" in memmlp("runs", "list").out
     assert memmlp("runs", "list", "--all").out.count("VQ-VAE") == 25
 
 
 def test_finished_vqvaes_are_counted_and_listed_where_asked_for(memmlp: Memmlp, outputs: Path):
-    run = Run.of(outputs, "d" * 16)
+    run = Run.from_id(outputs, "d" * 16)
     run.begin("vqvae", {}, data="d" * 64, prerequisite=None)
     assert "VQ-VAE" in memmlp("runs", "list").out
     run.finish([])
@@ -104,7 +104,7 @@ def test_list_names_the_networks_that_hardly_saw_motion(memmlp: Memmlp, outputs:
     assert said not in memmlp("runs", "list").out
     little = {"model": {"frames": 41}, "optim": {"steps": 20, "batch": 8}}
     for digit in "de":
-        run = Run.of(outputs, digit * 16)
+        run = Run.from_id(outputs, digit * 16)
         run.begin("memmlp", little, data="d" * 64, prerequisite=None)
         if digit == "d":
             write_json(run.results_path, RESULTS)
@@ -112,28 +112,28 @@ def test_list_names_the_networks_that_hardly_saw_motion(memmlp: Memmlp, outputs:
     assert f"{said} dddddddd\n" in memmlp("runs", "list").out
     assert "run dddddddd: hardly trained" in memmlp("runs", "diff", "a", "d").out
     for name in (A, B):
-        Run.of(outputs, name).config_path.write_text(json.dumps(little))
+        Run.from_id(outputs, name).config_path.write_text(json.dumps(little))
     assert f"{said} all finished runs\n" in memmlp("runs", "list").out
 
 
 def test_diff_leaves_out_what_changes_no_result(memmlp: Memmlp, outputs: Path):
     for name, memory, made in ((A, "vq", "today"), (B, "none", "tomorrow")):
         config = {"memory": {"name": memory}, "threads": len(memory)}
-        Run.of(outputs, name).begin("memmlp", config, data="d" * 64, prerequisite=None)
+        Run.from_id(outputs, name).begin("memmlp", config, data="d" * 64, prerequisite=None)
         latency = {"median_ms": 1.0, "made": made, "settings": {"steps": len(made)}}
-        write_json(Run.of(outputs, name).results_path, {"latency": latency})
+        write_json(Run.from_id(outputs, name).results_path, {"latency": latency})
     said = memmlp("runs", "diff", A, B).out
     assert ["memory", "vq", "none"] in [line.split() for line in said.splitlines()]
     assert not re.search("threads|made|settings", said)
 
 
 def test_diff_tells_of_another_recipe_and_device(memmlp: Memmlp, outputs: Path):
-    Run.of(outputs, A).write_manifest(
+    Run.from_id(outputs, A).write_manifest(
         {"component_versions": {"features": 1, "memory.vq": 1}, "device": "cpu"}
     )
-    Run.of(outputs, B).write_manifest({"component_versions": {"features": 2}, "device": "cuda"})
+    Run.from_id(outputs, B).write_manifest({"component_versions": {"features": 2}, "device": "cuda"})
     for name, cpu in ((A, "fast"), (B, "slow")):
-        path = Run.of(outputs, name).deployment("fp32-0").latency
+        path = Run.from_id(outputs, name).deployment("fp32-0").latency
         path.parent.mkdir(parents=True)
         path.write_text(json.dumps({"median_ms": 1.0, "made_by": {"cpu": cpu}}))
     rows = [line.split() for line in memmlp("runs", "diff", A, B).out.splitlines()]
@@ -157,7 +157,7 @@ def test_results_by_an_earlier_recipe_are_told(
                 "component_versions": evaluation_versions(settings),
             }
             report |= {"mean": {"rotation": {"MPJPE": 5.0 + number}}, "clips": []}
-            write_report(Run.of(outputs, name).evaluation(evaluation_id_of(settings)), report)
+            write_report(Run.from_id(outputs, name).evaluation(evaluation_id_of(settings)), report)
     said = f"by an earlier version: mode.window 1 -> {number}"
     listed = memmlp("runs", "list").out
     assert f"window results {said}; memmlp eval RUN measures them again: {A[:8]}\n" in listed
@@ -179,7 +179,7 @@ def test_list_shows_what_differs_as_far_as_there_is_room(
     memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch
 ):
     config = {"seed": 1, "memory": {"layers": [2]}}
-    Run.of(outputs, "d" * 16).begin("memmlp", config, data="d" * 64, prerequisite=None)
+    Run.from_id(outputs, "d" * 16).begin("memmlp", config, data="d" * 64, prerequisite=None)
     seen = {}
     for width in ("40", "85", "140"):
         monkeypatch.setenv("COLUMNS", width)
@@ -208,7 +208,7 @@ def test_where_sort_and_columns(memmlp: Memmlp, outputs: Path):
 def test_a_run_that_diverged_is_sorted_behind_all(memmlp: Memmlp, outputs: Path, sort: str, order: list[str]):
     """Its NaN is a word in its file; the order of the others stays that of numbers, not of texts."""
     for name, error in ((A, 12.4), (B, 5.3), (C, float("nan"))):
-        write_json(Run.of(outputs, name).results_path, {"stream": {"rotation": {"MPJPE": error}}})
+        write_json(Run.from_id(outputs, name).results_path, {"stream": {"rotation": {"MPJPE": error}}})
     lines = memmlp("runs", "list", "--sort", sort).out.splitlines()
     assert [line[:16] for line in lines if line[:16] in order] == order
 
@@ -230,7 +230,7 @@ def test_tag_and_note(memmlp: Memmlp, outputs: Path):
 
 
 def test_gc_shows_first_and_deletes_on_yes(memmlp: Memmlp, outputs: Path):
-    run = Run.of(outputs, C)
+    run = Run.from_id(outputs, C)
     assert memmlp("runs", "gc").out == "nothing to delete\n"
     run.fail("loss is nan")
     shown = memmlp("runs", "gc")
@@ -240,7 +240,7 @@ def test_gc_shows_first_and_deletes_on_yes(memmlp: Memmlp, outputs: Path):
     assert memmlp("runs", "gc", "--only", "old").out == "nothing to delete\n"
     assert "deleted 1 runs" in memmlp("runs", "gc", "--yes").out
     assert not run.folder.exists()
-    assert Run.of(outputs, A).folder.exists()
+    assert Run.from_id(outputs, A).folder.exists()
 
 
 def test_export_and_import(memmlp: Memmlp, outputs: Path):
@@ -254,7 +254,7 @@ def test_export_and_import(memmlp: Memmlp, outputs: Path):
 
 def test_values_of_two_inverse_kinematics_are_named_and_not_subtracted(memmlp: Memmlp, outputs: Path):
     for name, ik, value in ((A, "arms", 2.5), (B, "lbfgs", 1.25)):
-        run, settings = Run.of(outputs, name), {"mode": "stream", "ik": ik}
+        run, settings = Run.from_id(outputs, name), {"mode": "stream", "ik": ik}
         report = {"mode": "stream", "settings": settings, "mean": {"combined": {"MPJPE": value}}, "clips": []}
         run.evaluations.mkdir(exist_ok=True)
         write_json(run.evaluation(evaluation_id_of(settings)), report)

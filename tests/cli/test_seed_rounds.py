@@ -50,7 +50,7 @@ class Runs:
         if len(self.made) == self.patience:
             raise KeyboardInterrupt
         if entry.label in self.failing:
-            failed = Run.of(self.outputs, entry.id)
+            failed = Run.from_id(self.outputs, entry.id)
             failed.folder.mkdir(parents=True, exist_ok=True)
             failed.fail("loss is nan")
             return

@@ -210,7 +210,7 @@ def test_an_interrupted_sweep_ends_its_workers(tmp_path: Path, ending: int, word
         begun = lambda: any(run.step for run in list_runs(tmp_path / "outputs"))  # noqa: E731
         until(begun, "the run's first steps", process)
         run = list_runs(tmp_path / "outputs")[0]
-        assert run.doing
+        assert run.activity
         os.kill(process.pid, ending)
         left, said = process.wait(PATIENCE), file.read_text()
     assert left == 130, said

@@ -73,7 +73,7 @@ def test_a_trial_of_two_seeds_goes_on_from_a_search_of_one(home: Path, tmp_path:
     (row,) = csv.DictReader((folder_of(tmp_path) / "trials.csv").read_text().splitlines())
     first, second = row["run"].split()
     assert first == before["run"]
-    assert Run.of(tmp_path / "outputs", second).config["seed"] == 1
+    assert Run.from_id(tmp_path / "outputs", second).config["seed"] == 1
     assert row["MPJPE, run 1"] == before["MPJPE"]
     assert float(row["MPJPE"]) == (float(row["MPJPE, run 1"]) + float(row["MPJPE, run 2"])) / 2
     assert f"{float(row['MPJPE']):.3f} ± {float(row['MPJPE sd']):.3f}" in said

@@ -111,16 +111,16 @@ def test_another_process_waits_and_says_for_whom(tmp_path: Path):
 def test_a_killed_holder_of_this_machine_is_followed_at_once(tmp_path: Path):
     lock = Lock(tmp_path)
     with holding(tmp_path) as (holder, process):
-        assert lock.held
+        assert lock.is_held
         with lock.hold(wait=False) as mine:
             assert mine is None
         holder.kill()
         until(lambda: is_alive(process) is False, "it is dead, though its parent has not asked for its end")
         os.kill(holder.pid, 0)  # its number is still taken
-        assert lock.held is False
+        assert lock.is_held is False
         with taken(lock) as mine:
             assert mine.number == 2
-            assert lock.held
+            assert lock.is_held
 
 
 def test_a_dead_holder_of_another_machine_is_followed_after_its_lease(pair, clock: Clock):
@@ -128,9 +128,9 @@ def test_a_dead_holder_of_another_machine_is_followed_after_its_lease(pair, cloc
     for _ in range(4):
         clock.now += LEASE / 4
         assert two.take() is None
-        assert two(lambda: two.lock.held) is True
+        assert two(lambda: two.lock.is_held) is True
     clock.now += LEASE / 4
-    assert two(lambda: two.lock.held) is False
+    assert two(lambda: two.lock.is_held) is False
     assert two.take().number == 2
 
 
@@ -159,11 +159,11 @@ def test_who_wakes_up_superseded_publishes_nothing(pair, tmp_path: Path, clock: 
         one(atomic_write, result, "one's, late")
     two(atomic_write, result, "two's")
     one.let_go()
-    assert two(lambda: two.lock.held) is True  # what the other let go was no longer its own
+    assert two(lambda: two.lock.is_held) is True  # what the other let go was no longer its own
     two(atomic_write, result, "two's, too")
     two.let_go()
     assert result.read_text() == "two's, too"
-    assert two.lock.held is None
+    assert two.lock.is_held is None
     atomic_write(result, "nobody's")  # who holds nothing is not checked
 
 

@@ -34,7 +34,7 @@ def test_long_work_tells_how_far_it_is(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(progress, "INTERVAL", 0.0)
     with announce_to(told.append), show_progress("network", 4000, done=398) as count:
         count.advance()
-        count.note("loss 2.31")
+        count.set_note("loss 2.31")
         count.advance()
     assert told[0].startswith("network: 399 of 4000")
     assert re.fullmatch(r"network: 400 of 4000, loss 2\.31(, \d+ (s|min) left)?", told[1])

@@ -18,7 +18,7 @@ from memmlp.runs.run import Run
 @pytest.fixture
 def trained(tmp_path: Path) -> Run:
     """A run that has a record alone."""
-    run = Run.of(tmp_path, "0123456789abcdef")
+    run = Run.from_id(tmp_path, "0123456789abcdef")
     run.folder.mkdir(parents=True)
     config = build_experiment(composed(["profile=tiny", "memory=none", f"paths.outputs={tmp_path}"])).config
     run.config_path.write_text(yaml.safe_dump(config))

@@ -145,4 +145,4 @@ def test_a_deployment_in_fp16_and_an_older_opset(small_yardstick, tmp_path):
     place.finish({"run": "0" * 16, "settings": {}, **record})
     assert 0 < record["alone_median_ms"] <= record["alone_p95_ms"]
     assert set(place.record["artifacts"]) == {"step.onnx", "step.fp16.onnx"}
-    assert place.accurate_int8 is None
+    assert place.accurate_int8_file is None

@@ -50,7 +50,7 @@ def test_a_killed_training_resumes_to_the_same_model(tmp_path: Path):
     for folder in (disturbed, whole):
         run(folder, *words)
     (expected,) = (made for made in list_runs(whole / "outputs") if "window" in made.results)
-    killed = Run.of(disturbed / "outputs", expected.id)
+    killed = Run.from_id(disturbed / "outputs", expected.id)
     assert killed.done
     assert killed.model.read_bytes() == expected.model.read_bytes()
     rotation = killed.results["stream"]["rotation"]
@@ -80,7 +80,7 @@ def test_a_search_under_kills_has_every_trial_once(tmp_path: Path, monkeypatch: 
 
 
 def finished(outputs: Path, name: str, weights: bytes = b"w") -> Run:
-    run = Run.of(outputs, name * 16)
+    run = Run.from_id(outputs, name * 16)
     run.begin("memmlp", {}, data="d", prerequisite=None)
     run.want([])  # no evaluation and no export
     run.model.write_bytes(weights)
@@ -94,15 +94,15 @@ def test_every_kind_of_difference_is_found(tmp_path: Path):
         finished(calm, name)
     shutil.copytree(calm, stormy)
     assert chaos.compare(calm, stormy) == []
-    shutil.rmtree(Run.of(stormy, "a" * 16).folder)
+    shutil.rmtree(Run.from_id(stormy, "a" * 16).folder)
     finished(stormy, "f")
     finished(stormy, "b", b"other")
-    Run.of(stormy, "c" * 16).marker.unlink()
+    Run.from_id(stormy, "c" * 16).marker.unlink()
     claim = {**current_process(), "since": "now"}
-    (Run.of(stormy, "d" * 16).folder / ".lease-1").write_text(json.dumps(claim))
-    Run.of(stormy, "e" * 16).model.write_bytes(b"damaged")
+    (Run.from_id(stormy, "d" * 16).folder / ".lease-1").write_text(json.dumps(claim))
+    Run.from_id(stormy, "e" * 16).model.write_bytes(b"damaged")
     again = {"started": "2999-01-01T00:00:00+00:00", "stage": "training"}
-    Run.of(stormy, "0" * 16).write_manifest({"attempts": [again]})
+    Run.from_id(stormy, "0" * 16).write_manifest({"attempts": [again]})
     assert sorted(chaos.compare(calm, stormy)) == [
         f"run {'0' * 16}: trained again after it was finished",
         f"run {'a' * 16} is missing",

@@ -19,7 +19,7 @@ NAME = "0123456789abcdef"
 
 @pytest.fixture
 def run(tmp_path: Path) -> Run:
-    made = Run.of(tmp_path / "here", NAME)
+    made = Run.from_id(tmp_path / "here", NAME)
     made.begin("memmlp", {"seed": 1}, data="d", prerequisite=None)
     made.log(1, {"loss": 1.0})
     made.model.write_bytes(b"weights")
@@ -142,7 +142,7 @@ def test_an_archive_cut_anywhere_is_refused(archive: Path, tmp_path: Path):
 
 
 def test_another_run_of_that_id_stays(run: Run, archive: Path, tmp_path: Path):
-    place = Run.of(tmp_path / "there", NAME)
+    place = Run.from_id(tmp_path / "there", NAME)
     place.begin("memmlp", {}, data="d", prerequisite=None)
     for _ in ("unfinished", "with other weights"):
         with pytest.raises(InputError, match="exists already"):

@@ -74,7 +74,7 @@ CODES, PART, NETWORK = (letter * 16 for letter in "abc")
 
 
 def trained(outputs: Path, name: str, prerequisite: Run | None = None, weights: str = "w", **facts) -> Run:
-    run = Run.of(outputs, name)
+    run = Run.from_id(outputs, name)
     above = (
         {"prerequisite_runs": prerequisite_origins(prerequisite.manifest, prerequisite.weights_digest)}
         if prerequisite
@@ -110,7 +110,7 @@ def test_prerequisites_of_prerequisites_are_known(tmp_path: Path):
 
 
 def test_a_training_that_is_resumed_upon_other_weights_has_both(tmp_path: Path):
-    network = Run.of(tmp_path, NETWORK)
+    network = Run.from_id(tmp_path, NETWORK)
     for weights in ("first", "first", "others"):
         codes = trained(tmp_path, CODES, weights=weights)
         above = prerequisite_origins(codes.manifest, codes.weights_digest)
@@ -123,7 +123,7 @@ def test_a_training_that_is_resumed_upon_other_weights_has_both(tmp_path: Path):
 
 def test_a_training_that_is_resumed_elsewhere_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Its weights come from both machines and both versions of the code."""
-    run = Run.of(tmp_path, "0" * 16)
+    run = Run.from_id(tmp_path, "0" * 16)
 
     def begin(device: str, commit: str, dirty: bool, losses: str) -> dict:
         made = {"git": {"commit": commit, "dirty": dirty}, "cpu": "A"}

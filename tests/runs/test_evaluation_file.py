@@ -41,7 +41,7 @@ def test_combined_is_of_one_inverse_kinematics_which_is_named(tmp_path: Path):
         return (
             run.results["stream"]["combined"],
             read.means["stream"]["combined"],
-            run.evaluations_as_configured.combined_by,
+            run.evaluations_as_configured.combined_solvers,
             keys,
         )
 

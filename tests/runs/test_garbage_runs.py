@@ -19,7 +19,7 @@ FAILED, OLD, GONE, CODES, USED, GOOD, EMPTY = (f"{letter}" * 16 for letter in "0
 def made(
     outputs: Path, name: str, kind: str = "memmlp", prerequisite: str | None = None, version: int = 1
 ) -> Run:
-    run = Run.of(outputs, name)
+    run = Run.from_id(outputs, name)
     run.begin(kind, {}, data="d", prerequisite=prerequisite, component_versions={"metrics": version})
     run.model.write_bytes(b"weights")
     run.finish([run.model.name])
@@ -29,14 +29,14 @@ def made(
 @pytest.fixture
 def outputs(tmp_path: Path) -> Path:
     """One run of each sort."""
-    Run.of(tmp_path, FAILED).begin("memmlp", {}, data="d", prerequisite=None)
-    Run.of(tmp_path, FAILED).fail("loss is nan")
+    Run.from_id(tmp_path, FAILED).begin("memmlp", {}, data="d", prerequisite=None)
+    Run.from_id(tmp_path, FAILED).fail("loss is nan")
     made(tmp_path, OLD, version=0)
     made(tmp_path, GONE)
     made(tmp_path, CODES, "vqvae")
     made(tmp_path, USED, "vqvae", version=0)
     made(tmp_path, GOOD, prerequisite=USED)
-    Run.of(tmp_path, EMPTY).folder.mkdir()
+    Run.from_id(tmp_path, EMPTY).folder.mkdir()
     sweep = tmp_path / "sweeps" / "mine"
     sweep.mkdir(parents=True)
     now = {"label": "a", "seed": 0, "id": GOOD}
@@ -58,8 +58,8 @@ def test_failed_old_and_orphaned_runs_may_go(outputs: Path):
 
 
 def test_what_people_marked_or_somebody_is_at_or_a_run_builds_upon_stays(outputs: Path):
-    add_tags(Run.of(outputs, FAILED), ["keep"])
-    with Run.of(outputs, OLD).lock():
+    add_tags(Run.from_id(outputs, FAILED), ["keep"])
+    with Run.from_id(outputs, OLD).lock():
         assert {FAILED, OLD, USED} & set(found(outputs)) == set()
 
 
@@ -92,8 +92,8 @@ def test_a_plan_that_does_not_name_a_run_condemns_none(outputs: Path, file: str,
 def test_a_trained_run_whose_export_failed_stays(outputs: Path):
     made(outputs, "7" * 16).fail("step.int8.onnx: ONNX Runtime differs")
     assert "7" * 16 not in found(outputs)
-    Run.of(outputs, "8" * 16).begin("memmlp", {}, data="d", prerequisite=None)
-    Run.of(outputs, "8" * 16).fail("loss is nan")
+    Run.from_id(outputs, "8" * 16).begin("memmlp", {}, data="d", prerequisite=None)
+    Run.from_id(outputs, "8" * 16).fail("loss is nan")
     assert found(outputs)["8" * 16] == "failed"
 
 
@@ -115,7 +115,7 @@ def test_a_finished_vqvae_of_a_search_under_way_stays(outputs: Path):
 
 def test_a_network_upon_an_older_vqvae_may_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Its own component versions do not include those of its prerequisite runs."""
-    run = Run.of(tmp_path, OLD)
+    run = Run.from_id(tmp_path, OLD)
     above = [{"id": CODES, "component_versions": {"codebook.ema": VERSIONS["codebook.ema"]}}]
     run.begin(
         "memmlp",

@@ -46,7 +46,7 @@ def test_no_such_run_is_one_line(tmp_path: Path):
 
 
 def test_a_bare_folder_name_is_found_and_an_ambiguous_beginning_lists_the_runs(tmp_path: Path, monkeypatch):
-    runs = [Run.of(tmp_path, "ab" + digit * 14) for digit in "01"]
+    runs = [Run.from_id(tmp_path, "ab" + digit * 14) for digit in "01"]
     for run in runs:
         run.begin("memmlp", {}, data="d", prerequisite=None)
     with pytest.raises(InputError, match=r"2 ids .*: ab0+, ab1+"):

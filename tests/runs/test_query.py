@@ -24,7 +24,7 @@ ONE = {
 
 
 def holds(text: str) -> bool:
-    return parse(text).of([ONE])[0]
+    return parse(text).test_records([ONE])[0]
 
 
 HOLDING = [
@@ -48,7 +48,7 @@ def test_conditions_hold_or_not():
 
 
 def test_what_a_run_does_not_have_is_neither_smaller_nor_larger():
-    assert parse("a<1 or a>=1").of([{"a": 0}, {"b": 0}]) == [True, False]
+    assert parse("a<1 or a>=1").test_records([{"a": 0}, {"b": 0}]) == [True, False]
 
 
 WRONG = [
@@ -79,10 +79,10 @@ def test_a_network_that_diverged_fulfils_no_comparison(own: float | str, tmp_pat
     """Files hold NaN as a word, which as a text is larger than any number."""
     one = measured(tmp_path, own)
     for text in ("<1", "<=1", ">1", ">=1", "=1", "=nan", "<nan", ">nan"):
-        assert parse(f"stream.MPJPE{text}").of([one]) == [False]
-    assert parse("stream.MPJPE!=1").of([one]) == [True]
+        assert parse(f"stream.MPJPE{text}").test_records([one]) == [False]
+    assert parse("stream.MPJPE!=1").test_records([one]) == [True]
     infinite = measured(tmp_path / "other", float("inf"))
-    assert [parse(f"stream.MPJPE{text}").of([infinite]) for text in (">1e300", "<6")] == [[True], [False]]
+    assert [parse(f"stream.MPJPE{text}").test_records([infinite]) for text in (">1e300", "<6")] == [[True], [False]]
 
 
 def measured(folder: Path, value: float | str) -> dict[str, Any]:
@@ -95,7 +95,7 @@ def measured(folder: Path, value: float | str) -> dict[str, Any]:
 def test_a_number_equals_what_is_shown_of_it():
     for own in (0.000123456, 1234567.0, 6.51234, 3):
         conditions = f"a={as_typed(own)}", f"a!={as_typed(own)}", f"a={own!r}", f"a={own * 1.01!r}"
-        assert [parse(text).of([{"a": own}])[0] for text in conditions] == [True, False, True, False]
+        assert [parse(text).test_records([{"a": own}])[0] for text in conditions] == [True, False, True, False]
 
 
 def test_a_run_may_be_asked_for_slots_results_and_facts(tmp_path: Path):
@@ -105,7 +105,7 @@ def test_a_run_may_be_asked_for_slots_results_and_facts(tmp_path: Path):
     add_tags(run, ["good"])
     one = record(run)
     text = "memory=gru and memory.layers=[2] and stream.MPJPE=6.5 and stream.position.MPJPE=7 and tag=good"
-    assert parse(f"{text} and status=stopped and id={run.id} and stream.rotation.MPJPE<7").of([one]) == [True]
+    assert parse(f"{text} and status=stopped and id={run.id} and stream.rotation.MPJPE<7").test_records([one]) == [True]
 
 
 def test_times_are_those_of_the_file_that_was_asked_for(tmp_path: Path):
@@ -159,4 +159,4 @@ def test_data_have_a_digest_only_where_two_have_one_name(tmp_path: Path):
     assert data_labels([synth, vqvae, mocap]) == ["synth", "synth", "mocap"]
     assert data_labels([synth, mocap, other]) == ["synth", "mocap bbbbbbbb", "mocap cccccccc"]
     assert data_labels([unknown]) == ["dddddddd"]
-    assert parse("data=synth").of([synth, mocap]) == [True, False]
+    assert parse("data=synth").test_records([synth, mocap]) == [True, False]

@@ -45,7 +45,7 @@ def test_a_run_is_done_when_its_marker_is_whole(tmp_path: Path):
 def test_a_folder_under_anothers_id_is_no_run(tmp_path: Path):
     """Its numbers would stand for a training that never was. A copy of another name is one."""
     run = complete(tmp_path)
-    other = Run.of(tmp_path, "0123456789abcdef")
+    other = Run.from_id(tmp_path, "0123456789abcdef")
     shutil.copytree(run.folder, other.folder)
     copy = Run(shutil.copytree(run.folder, tmp_path / "best"))
     assert (run.done, other.done, copy.done) == (True, False, True)
@@ -234,8 +234,8 @@ def test_the_status_names_the_stage_that_somebody_is_at(tmp_path: Path):
         assert run.status == "done"  # somebody holds it who works on no later stage of it
         for stage, word in (("evaluation", "evaluating"), ("deployment", "exporting")):
             run.attempt(stage)
-            assert (run.doing, run.status, run.state(False)) == (word, word, "running")
-    assert (run.doing, run.status) == (None, "done")
+            assert (run.activity, run.status, run.state(False)) == (word, word, "running")
+    assert (run.activity, run.status) == (None, "done")
     run.fail("the evaluation's memory")
     assert (run.status, run.done) == ("failed", True)
 

@@ -52,7 +52,7 @@ def test_prerequisite_runs_come_first_and_each_task_once(tmp_path: Path):
     seen: list[str] = []
 
     def perform(plan: Plan, task: RunTask) -> None:
-        assert task.prerequisite is None or Run.of(plan.outputs, task.prerequisite).done
+        assert task.prerequisite is None or Run.from_id(plan.outputs, task.prerequisite).done
         seen.append(task.id)
         finish(plan, task)
 

@@ -54,7 +54,7 @@ def test_a_run_leaves_everything(home):
     assert run.results["stream"]["rotation"]["MPJPE"] > 0
     assert run.results["latency"]["steps"] >= 200
     assert run.results["latency"]["onnx_parity"] < 1e-4
-    prerequisite = Run.of(home / "outputs", run.manifest["prerequisite"])
+    prerequisite = Run.from_id(home / "outputs", run.manifest["prerequisite"])
     assert prerequisite.done
     assert prerequisite.manifest["kind"] == "vqvae"
     (known,) = run.manifest["prerequisite_runs"]
@@ -186,7 +186,7 @@ def test_every_experiment_trains_and_streams(home, name, monkeypatch: pytest.Mon
 @pytest.fixture
 def begun(tmp_path: Path) -> tuple[Any, Run]:
     """What an experiment's outcome is recorded with, and a run that has begun."""
-    run = Run.of(tmp_path, "0" * 16)
+    run = Run.from_id(tmp_path, "0" * 16)
     run.begin("memmlp", {}, data="d", prerequisite=None)
     return SimpleNamespace(loggers=Loggers((), tmp_path), stage_ids=(), outputs=tmp_path), run
 

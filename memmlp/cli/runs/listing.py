@@ -67,7 +67,7 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
     found = runs if every or query else [run for run in runs if not _is_finished_part(run)]
     newest = found if every or query or sort else found[:NEWEST]
     records = {run.id: record_of(run) for run in newest}
-    fits = query.of(list(records.values())) if query else [True] * len(records)
+    fits = query.test_records(list(records.values())) if query else [True] * len(records)
     listed = [run for run, fit in zip(newest, fits, strict=True) if fit]
     if sort:
         listed = _sorted_by(listed, records, sort)

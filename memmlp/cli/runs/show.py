@@ -52,7 +52,7 @@ def show(run: str, config: bool, outputs: Path) -> None:
     console().print(_pairs(_summary(found)))
     if is_trained(found):
         for source, measured in load(found.folder).by_source().items():
-            means = name_solvers(measured.means, found.evaluations_as_configured.combined_by)
+            means = name_solvers(measured.means, found.evaluations_as_configured.combined_solvers)
             console().print(_pairs(flatten(means), title=f"results on {source}"))
     if found.results:
         console().print(_pairs(measured_numbers(found), title="results"))
@@ -198,7 +198,7 @@ def measured_numbers(run: Run) -> dict[str, Any]:
     from memmlp.runs.evaluation_file import name_solvers
     from memmlp.runs.identity import flatten
 
-    results = name_solvers(run.results, run.evaluations_as_configured.combined_by)
+    results = name_solvers(run.results, run.evaluations_as_configured.combined_solvers)
     return {
         key: value
         for key, value in flatten(with_times_as_deployed(results)).items()

@@ -55,7 +55,7 @@ def make_state_finder(plan: Plan) -> DescribeRun:
         if entry is None:
             return None
         run = plan.run_of(entry)
-        state = run.doing or run.state(plan.complete(entry))
+        state = run.activity or run.state(plan.complete(entry))
         if state == "trained":
             return "trained, an evaluation or export is missing"
         return state if state not in ("new", "done") else None

@@ -221,7 +221,7 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
         folder: the run's folder.
         stages: identities of the evaluations and the deployment to read. By default, or if none of these
             exist, all evaluations that use the network as the run's own config does, and the deployment that
-            the run shows (`Run.deployment_shown`).
+            the run shows (`Run.find_shown_deployment`).
 
     Raises:
         InputError: if a file is damaged; the message names it.

@@ -66,7 +66,7 @@ class Replays:
         Returns:
             `state` is "computing", "failed" (with `reason`) or "ready".
         """
-        run = Run.of(self.outputs, run_id)
+        run = Run.from_id(self.outputs, run_id)
         key = (run_id, clip, mode, run.marker.stat().st_mtime_ns if run.done else 0)  # the run may be redone
         with self.lock:
             if key not in self.motions:

@@ -46,7 +46,7 @@ def write_page(answers: Answers, names: Collection[str], about: str, replays: bo
         "about": about,
         "runs": {**rows, "rows": [row for row in rows["rows"] if row["id"] in ids], "outputs": ""},
         "body": answers.answer("body", {}),
-        "curves": {run_id: _read_curves(Run.of(answers.outputs, run_id)) for run_id in sorted(ids)},
+        "curves": {run_id: _read_curves(Run.from_id(answers.outputs, run_id)) for run_id in sorted(ids)},
         "sweeps": {"sweeps": [row for row in sweeps if row["name"] in shown], "damaged": {}},
         "searches": answers.searches.list_rows(),
         **{f"sweeps/{name}": answers.sweeps.describe(name) for name in shown},

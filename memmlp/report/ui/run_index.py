@@ -162,10 +162,10 @@ def _read_metrics(run: Run, config: Mapping[str, Any], damage: list[str]) -> dic
     found: dict[str, Any] = {}
     try:
         evaluations = EvaluationsAsConfigured(run.evaluations, config)
-        found |= flatten(name_solvers(evaluations.results, evaluations.combined_by))
+        found |= flatten(name_solvers(evaluations.results, evaluations.combined_solvers))
     except (InputError, KeyError, TypeError, AttributeError):
         damage.append("evaluations")
-    deployed = run.deployment_shown(config)
+    deployed = run.find_shown_deployment(config)
     name, record = latency_name(deployed, config), as_deployed(deployed.record)
     found |= {f"{name}.{key}": record[key] for key in COSTS if key in record}
     if run.results_path.exists():

@@ -108,7 +108,7 @@ def describe_run(index: RunIndex, run_id: str, control: str | None, places: Plac
         control: the id of the run with which its variant is compared; None for none.
         places: the sweeps and searches by run.
     """
-    facts, run = index.runs[run_id], Run.of(index.outputs, run_id)
+    facts, run = index.runs[run_id], Run.from_id(index.outputs, run_id)
     config = _read_flat_config(run)
     return {
         **facts,
@@ -118,7 +118,7 @@ def describe_run(index: RunIndex, run_id: str, control: str | None, places: Plac
         "control": control
         and {
             **{key: index.runs[control][key] for key in ("id", "name", "data")},
-            "config": _read_flat_config(Run.of(index.outputs, control)),
+            "config": _read_flat_config(Run.from_id(index.outputs, control)),
         },
         "manifest": flatten(run.manifest),
         "clips": read_clips(run),
@@ -140,7 +140,7 @@ def read_clips(run: Run) -> list[dict[str, Any]]:
         return []
     try:
         found, evaluations = load(run.folder).clips, run.evaluations_as_configured
-        solvers = evaluations.combined_by
+        solvers = evaluations.combined_solvers
         frames = {
             report["name"]: report.get("frames")
             for path in evaluations.paths

@@ -83,7 +83,7 @@ class Answers:
                 return {**rows, "state": state, "outputs": str(self.outputs.absolute())}
             case "curves", False:
                 known = [one for one in ID.findall(query.get("runs", "")) if one in self.index.runs]
-                found = [Run.of(self.outputs, run_id) for run_id in known[:MAX_CURVES]]
+                found = [Run.from_id(self.outputs, run_id) for run_id in known[:MAX_CURVES]]
                 return {"curves": {run.id: runs.read_curves(run) for run in found}}
             case "body", False:
                 return describe_body()

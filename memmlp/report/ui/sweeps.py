@@ -157,7 +157,7 @@ class Sweeps:
         if not facts["done"] or facts["status"] not in ("done", "trained", "lost"):
             return facts["status"]
         run = plan.run_of(task)
-        return "done" if all(map(run.has, task.stages)) else run.doing or run.state(False)
+        return "done" if all(map(run.has, task.stages)) else run.activity or run.state(False)
 
     def _describe_cell(self, entry: Entry, state: str, value: float | None) -> dict[str, Any]:
         facts = self.index.runs.get(entry.id, {})

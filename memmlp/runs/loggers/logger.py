@@ -1,7 +1,7 @@
-"""Shows runs in loggers while they happen, by threads that read the runs' folders.
+"""Shows runs in loggers while they are in progress, by threads that read the runs' folders.
 
-The metrics log on disk is the queue between a run and its loggers: the run never waits for a logger, and
-nothing is lost if a logger is slow or fails. `memmlp loggers sync` fills in what a logger missed.
+The metrics log on disk is the queue between a run and its loggers. So the run never waits for a logger, and
+no data is lost if a logger is slow or fails. `memmlp loggers sync` adds missing data later.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ ORIGIN = ("kind", "data", "prerequisite", "started", "version", "user", "host", 
 
 
 class CurvePoint(NamedTuple):
-    """A value of a curve.
+    """A point of a curve.
 
     Attributes:
         key: the curve's name, PHASE/NAME.
@@ -47,24 +47,24 @@ class CurvePoint(NamedTuple):
 
 @dataclass(frozen=True)
 class RunFacts:
-    """The facts in a run's folder, besides its curves.
+    """All facts about a run that loggers show, without its curves.
 
     Attributes:
         id: the run's id.
         name: the run's readable name.
         folder: the run's folder.
         status: "running", "done", "failed" or "killed".
-        reason: why it failed; None if it did not.
+        reason: the reason why it failed; None if it has not failed.
         started, ended: seconds since 1970; `ended` is None while it runs.
         config: the run's config by dotted key, as text.
         origin: facts about its origin, by name.
-        tags: the tags that users gave it.
-        note: the users' note; empty for none.
+        tags: the run's tags.
+        note: the run's note; empty if there is none.
         data: name and digest of its data.
-        results: its results by name, as points at the last training step.
-        outdated: which results are by earlier component versions, with what has changed since; else empty.
-        files: the small files that are worth showing.
-        fingerprint: a digest of everything that a logger shows of the run, with its curves.
+        results: its results, as points at the last training step.
+        outdated: the modes with outdated results and their changed component versions; empty if current.
+        files: the files to upload.
+        fingerprint: a digest of everything that loggers show, including curves.
     """
 
     id: str
@@ -86,7 +86,7 @@ class RunFacts:
 
     @property
     def texts(self) -> dict[str, str]:
-        """The facts that a reader should see as text: status, reason of a failure, outdated results."""
+        """The facts to show as text: status, reason of a failure, outdated results."""
         texts = {"status": self.status, "reason": self.reason or "", "outdated results": self.outdated}
         return {name: text for name, text in texts.items() if text}
 
@@ -96,7 +96,7 @@ def read_run(run: Run, running: bool = False) -> RunFacts:
 
     Args:
         run: the run.
-        running: whether a process works on it; if not, its end is read from the folder.
+        running: whether the run is in progress; otherwise its final state is read.
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
     failure, finished = read_json(run.folder / "FAILED"), manifest.get("finished")
@@ -104,8 +104,8 @@ def read_run(run: Run, running: bool = False) -> RunFacts:
     records = run.metrics()
     started = _seconds(manifest.get("started"))
     ended = _seconds(failure.get("when") or finished) or max((one.time for one in records), default=started)
-    evaluations, deployed = run.evaluations_as_configured, run.deployment_shown(config)
-    results = flatten(name_solvers(with_times_as_deployed(run.results), evaluations.combined_by))
+    evaluations, deployed = run.evaluations_as_configured, run.find_shown_deployment(config)
+    results = flatten(name_solvers(with_times_as_deployed(run.results), evaluations.combined_solvers))
     step = max((record.step for record in records), default=0)
     git = manifest.get("git") or {}
     origin = {name: manifest.get(name) for name in ORIGIN}
@@ -140,10 +140,10 @@ def read_run(run: Run, running: bool = False) -> RunFacts:
 
 
 class Tail:
-    """Reads a run's metrics log: at first all lines so far, then the lines added since.
+    """Reads a run's metrics log: first all existing lines, then only new lines.
 
     Attributes:
-        repeated: whether an added line was of a step that was read before, as of a run that was resumed.
+        repeated: whether a step was logged again, because the run was resumed.
     """
 
     def __init__(self, run: Run):
@@ -151,7 +151,7 @@ class Tail:
         self.last: dict[str, int] = {}  # the last step of each phase
 
     def read(self) -> list[CurvePoint]:
-        """Return the values of the new lines; of a step that is repeated in them, the last ones."""
+        """Return the values of new lines; for a repeated step, only its last values."""
         if not self.path.exists():
             return []
         with open(self.path, "rb") as file:
@@ -178,22 +178,22 @@ def _seconds(moment: str | None) -> float:
     return datetime.fromisoformat(moment).timestamp() if moment else 0.0
 
 
-PACE = 1.0  # seconds between two looks at a run's log
-MAX_PAUSE = 60.0  # seconds between two tries of a logger that fails
-MAX_WAIT = 30.0  # seconds for which a run's end waits for its loggers
+PACE = 1.0  # seconds between two reads of a run's log
+MAX_PAUSE = 60.0  # maximum seconds before a failed logger is tried again
+MAX_WAIT = 30.0  # maximum seconds that a run waits for its loggers at its end
 
 
 class ShownRun(Protocol):
     """A run in a logger. Every method may block and may raise."""
 
     def log(self, points: Sequence[CurvePoint]) -> None:
-        """Show further values of the curves."""
+        """Show new points of the curves."""
 
     def end(self, facts: RunFacts) -> None:
-        """Show the run's end or failure, its results, files and fingerprint; nothing more follows."""
+        """Show the run's final state: status, results, files and fingerprint. This is the last update."""
 
     def close(self) -> None:
-        """Release the run, whether or not it ended."""
+        """Release all resources; this may happen before the run's end."""
 
 
 class RunLogger(Protocol):
@@ -207,13 +207,13 @@ class RunLogger(Protocol):
 
     @property
     def place(self) -> str:
-        """Where the logger shows runs: an address or a folder."""
+        """The address or folder where the logger shows runs."""
 
     def fingerprint(self, run_id: str) -> str | None:
-        """Return the fingerprint of the facts with which a run ended in the logger; None if it did not."""
+        """Return the fingerprint that `ShownRun.end` stored for a run; None if the run has not ended here."""
 
     def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> ShownRun:
-        """Show a run with exactly these facts and points, replacing whatever the logger had of it."""
+        """Show a run with these facts and points; all earlier data of the run in the logger is replaced."""
 
 
 class Session:
@@ -224,8 +224,8 @@ class Session:
         self.shown: ShownRun | None = None
 
     def update(self) -> None:
-        """Show what is new in a run that goes on."""
-        with self._closing_on_failure():
+        """Show new points of a run in progress."""
+        with self._close_on_failure():
             if self.shown is None:
                 if self.run.manifest_path.exists():
                     self._begin(read_run(self.run, running=True))
@@ -235,19 +235,19 @@ class Session:
     def end(self) -> None:
         """Show the run's final state."""
         if not self.run.manifest_path.exists():
-            return  # it never started
-        with self._closing_on_failure():
+            return  # the run never started
+        with self._close_on_failure():
             facts = read_run(self.run)
             shown = self.shown or self._begin(facts)
             if points := self.tail.read():
                 shown.log(points)
-            if self.tail.repeated:  # loggers can't take back what the run logged before it was resumed
+            if self.tail.repeated:  # loggers can't remove points that were logged before the run was resumed
                 shown = self._begin(facts)
             shown.end(facts)
         self.close()
 
     def close(self) -> None:
-        """Release the run."""
+        """Release all resources."""
         shown, self.shown = self.shown, None
         if shown is not None:
             shown.close()
@@ -259,8 +259,8 @@ class Session:
         return self.shown
 
     @contextlib.contextmanager
-    def _closing_on_failure(self) -> Iterator[None]:
-        """Close the run after a failure, since it is unknown how much the logger received."""
+    def _close_on_failure(self) -> Iterator[None]:
+        """Close the run after a failure, since the logger may have received only a part of the data."""
         try:
             yield
         except BaseException:
@@ -271,7 +271,7 @@ class Session:
 
 @dataclass(frozen=True)
 class Loggers:
-    """The loggers in which an experiment's runs are shown.
+    """The loggers that show the runs of an experiment.
 
     Attributes:
         loggers: the loggers.
@@ -282,40 +282,40 @@ class Loggers:
     outputs: Path
 
     @contextlib.contextmanager
-    def following(self, run: Run) -> Iterator[None]:
-        """Show a run during the context, and then its end or failure.
+    def show_run(self, run: Run) -> Iterator[None]:
+        """Show a run during the context, then its final state.
 
-        A logger never stops the run. One that fails costs a line on stderr, and one that is slow at most
-        MAX_WAIT at the end of the run.
+        A logger never stops the run. If a logger fails, a warning goes to stderr. If it is slow, the run
+        waits at its end for at most MAX_WAIT.
         """
         ended = threading.Event()
-        threads = self._start(lambda logger: _follow(Session(logger, run), ended), f"run {run.id}")
+        threads = self._start_threads(lambda logger: _follow(Session(logger, run), ended), f"run {run.id}")
         try:
             yield
         finally:
             ended.set()
             _join(threads)
 
-    def _start(self, work: Callable[[RunLogger], object], subject: str) -> list[threading.Thread]:
+    def _start_threads(self, work: Callable[[RunLogger], object], subject: str) -> list[threading.Thread]:
         threads = []
         for one in self.loggers:
-            warning = f"{subject} is not shown in {one.name}"  # see `_join`
+            warning = f"{subject} is not shown in {one.name}"  # `_join` prints it
             threads.append(threading.Thread(target=work, args=(one,), name=warning, daemon=True))
             threads[-1].start()
         return threads
 
 
 def _join(threads: Sequence[threading.Thread]) -> None:
-    """Wait for threads, for at most MAX_WAIT, and report those that are not done."""
+    """Wait for threads for at most MAX_WAIT, and print a warning about each unfinished thread."""
     end = time.monotonic() + MAX_WAIT
     for thread in threads:
         thread.join(max(end - time.monotonic(), 0))
         if thread.is_alive():
-            _warn(f"{thread.name}: it is too slow")
+            _warn(f"{thread.name}: the logger is too slow")
 
 
 def _follow(session: Session, ended: threading.Event) -> None:
-    """Show a run until it has ended; report the first failure, and try again after growing pauses."""
+    """Show a run until its end. After a failure, warn once and try again with growing pauses."""
     pause, failed = PACE, False
 
     def attempt(action: Callable[[], None]) -> bool:
@@ -337,7 +337,7 @@ def _follow(session: Session, ended: threading.Event) -> None:
 
 def _warn(line: str) -> None:
     with contextlib.suppress(OSError, ValueError):
-        print(f"memmlp: warning: {line}; memmlp loggers sync adds it", file=sys.stderr, flush=True)
+        print(f"memmlp: warning: {line}; run memmlp loggers sync to add it", file=sys.stderr, flush=True)
 
 
 def _reason(error: BaseException) -> str:
@@ -345,23 +345,23 @@ def _reason(error: BaseException) -> str:
 
 
 def sync(
-    logger: RunLogger, runs: Iterable[Run], say: Callable[[str], None], full: bool = False
+    logger: RunLogger, runs: Iterable[Run], report: Callable[[str], None], full: bool = False
 ) -> Counter[str]:
-    """Update a logger, so that it has exactly the content of each run's folder.
+    """Update a logger with the content of each run's folder; runs in progress are skipped.
 
     Args:
         logger: the logger.
         runs: the runs.
-        say: gets a line about each run that could not be shown.
-        full: whether runs that are up to date are shown again.
+        report: gets a line about each failure.
+        full: whether runs that are up to date are sent again.
 
     Returns:
-        How many runs were "shown", were up to date ("same"), are in progress ("live"), or "failed".
+        The number of runs that were "shown", up to date ("same"), in progress ("live") and "failed".
     """
     counts: Counter[str] = Counter()
     for run in runs:
         try:
-            if run.doing:
+            if run.activity:
                 counts["live"] += 1
             elif not full and logger.fingerprint(run.id) == read_run(run).fingerprint:
                 counts["same"] += 1
@@ -370,5 +370,5 @@ def sync(
                 counts["shown"] += 1
         except Exception as error:
             counts["failed"] += 1
-            say(f"run {run.id} is not shown in {logger.name}: {_reason(error)}")
+            report(f"run {run.id} is not shown in {logger.name}: {_reason(error)}")
     return counts

@@ -1,4 +1,4 @@
-"""Shows runs in MLflow: one MLflow run for each run folder, identified by a tag."""
+"""Shows runs in MLflow: one MLflow run for each run folder, with a tag for the run's id."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ENVIRONMENT = {
     "DO_NOT_TRACK": "true",
     "GIT_PYTHON_REFRESH": "quiet",
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
-    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",  # a logger that fails is tried again anyway
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",  # failed loggers are tried again anyway
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
 }
 EXPERIMENT = "memmlp"
@@ -37,7 +37,7 @@ PARAM_LENGTH, TAG_LENGTH, PARAMS, METRICS = 6000, 5000, 100, 1000  # MLflow's li
 @component("loggers", "mlflow", builds="MLflow")
 @dataclass
 class MLflowSettings(Settings):
-    """Shows runs in MLflow while they happen; `memmlp mlflow` opens its page.
+    """Shows runs in MLflow while they are in progress; `memmlp mlflow` opens its page.
 
     It needs pip install 'memmlp[mlflow]'.
     """
@@ -47,10 +47,10 @@ class MLflowSettings(Settings):
 
 @dataclass(frozen=True)
 class MLflow:
-    """Shows runs in MLflow. Its packages print nothing, and only errors become lines.
+    """Shows runs in MLflow; all output of MLflow's packages is suppressed.
 
     Attributes:
-        uri: the tracking store; None for MLFLOW_TRACKING_URI, or else a sqlite file in the outputs folder.
+        uri: the tracking store; None for MLFLOW_TRACKING_URI, or a sqlite file in the outputs folder.
         outputs: the outputs folder.
 
     Raises:
@@ -67,18 +67,18 @@ class MLflow:
 
     @property
     def place(self) -> str:
-        """The URI of the store in which MLflow keeps its runs."""
+        """The URI of MLflow's tracking store."""
         local = f"sqlite:///{self.outputs.absolute() / 'mlflow.db'}"
         return self.uri or os.environ.get("MLFLOW_TRACKING_URI") or local
 
     def fingerprint(self, run_id: str) -> str | None:
-        """Return the fingerprint of the facts with which a run ended in MLflow; None if it did not."""
+        """Return the fingerprint that MLflow stores for a finished run; None without one."""
         with self.client() as (client, experiment):
             runs = client.search_runs([experiment], f"tags.`memmlp.run_id` = '{run_id}'")
         return runs[0].data.tags.get("memmlp.fingerprint") if len(runs) == 1 else None
 
     def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> ShownInMLflow:
-        """Show a run; an MLflow run that exists is replaced, since MLflow can't remove values."""
+        """Show a run; an existing MLflow run is replaced, since MLflow can't remove values."""
         from mlflow.entities import Dataset, DatasetInput, Param
 
         with self.client() as (client, experiment):
@@ -87,7 +87,7 @@ class MLflow:
             params = [Param(key, value[:PARAM_LENGTH]) for key, value in facts.config.items()]
             for batch in _batches(params, PARAMS):
                 client.log_batch(run_id, params=batch)
-            name, digest = facts.data  # MLflow has room for 36 characters of a digest; the whole one is a tag
+            name, digest = facts.data  # MLflow allows 36 characters of a digest; a tag has all of it
             client.log_inputs(run_id, [DatasetInput(Dataset(name, digest[:36], "local", "{}"), [])])
         shown = ShownInMLflow(self, run_id)
         shown.log(points)
@@ -95,7 +95,7 @@ class MLflow:
 
     @contextlib.contextmanager
     def client(self) -> Iterator[tuple[MlflowClient, str]]:
-        """Yield a client and the experiment's id; a sqlite store is used by one process at a time."""
+        """Yield a client and the experiment's id; only one process at a time uses a sqlite store."""
         os.environ.update({name: os.environ.get(name, value) for name, value in ENVIRONMENT.items()})
         warnings.filterwarnings("ignore", module=r"(mlflow|alembic|sqlalchemy|pydantic)\b")
         from filelock import FileLock
@@ -119,23 +119,23 @@ class MLflow:
 
 @dataclass(frozen=True)
 class ShownInMLflow:
-    """A run as shown in MLflow.
+    """A run in MLflow.
 
     Attributes:
         logger: the logger.
-        mlflow_id: MLflow's own id of the run.
+        mlflow_id: the run's id in MLflow.
     """
 
     logger: MLflow
     mlflow_id: str
 
     def log(self, points: Sequence[CurvePoint]) -> None:
-        """Send values, in batches."""
+        """Send points in batches."""
         with self.logger.client() as (client, _):
             _log(client, self.mlflow_id, points)
 
     def end(self, facts: RunFacts) -> None:
-        """Send results, tags and files, and end MLflow's run with the run's own status."""
+        """Send results, tags and files, and set the final status of the MLflow run."""
         from mlflow.entities import RunTag
 
         with self.logger.client() as (client, _):
@@ -148,13 +148,13 @@ class ShownInMLflow:
             client.set_terminated(self.mlflow_id, STATUS[facts.status], int((facts.ended or 0) * 1000))
 
     def close(self) -> None:
-        """Do nothing: MLflow keeps no run open."""
+        """Do nothing: MLflow does not keep runs open."""
 
 
 def _replace_run(
     client: MlflowClient, experiment: str, key: str, name: str, tags: Mapping[str, str], start: float | None
 ) -> str:
-    """Create a run in the place of those with the same value of a tag, and return its id in MLflow."""
+    """Create an MLflow run, delete older runs with the same value of tag `key`, and return its MLflow id."""
     value = tags[key].replace("'", "\\'")
     for old in client.search_runs([experiment], f"tags.`{key}` = '{value}'"):
         client.delete_run(old.info.run_id)

@@ -1,4 +1,4 @@
-"""Writes runs as TensorBoard's event files; it needs tensorboardX, not TensorBoard."""
+"""Writes runs as TensorBoard event files; this needs tensorboardX, but not TensorBoard."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from memmlp.common.errors import check_installed
 from memmlp.common.settings import Settings
 from memmlp.runs.loggers.logger import CurvePoint, RunFacts
 
-MAX_NAME = 120  # characters of a folder's name
+MAX_NAME = 120  # maximum length of a folder name, characters
 FINGERPRINT = "memmlp-fingerprint"
 
 
 @component("loggers", "tensorboard", builds="TensorBoard")
 @dataclass
 class TensorBoardSettings(Settings):
-    """Writes runs as event files below outputs/tensorboard (needs pip install 'memmlp[tensorboard]')."""
+    """Writes runs as event files to outputs/tensorboard (needs pip install 'memmlp[tensorboard]')."""
 
 
 @dataclass(frozen=True)
 class TensorBoard:
-    """Shows runs as folders of event files below outputs/tensorboard, each replaced when its run begins.
+    """Writes each run as a folder of event files in outputs/tensorboard.
 
     Attributes:
         outputs: the outputs folder.
@@ -44,16 +44,16 @@ class TensorBoard:
 
     @property
     def place(self) -> str:
-        """The folder for `tensorboard --logdir`."""
+        """The folder to pass to `tensorboard --logdir`."""
         return str(self.outputs.absolute() / "tensorboard")
 
     def fingerprint(self, run_id: str) -> str | None:
-        """Return the fingerprint of the facts with which a run's file ended; None if it did not."""
+        """Return the fingerprint in a run's folder of event files; None if the run has not ended there."""
         files = (folder / FINGERPRINT for folder in self._folders(run_id))
         return next((file.read_text() for file in files if file.exists()), None)
 
     def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> ShownInTensorBoard:
-        """Write a run's event file from its beginning; an earlier file is removed."""
+        """Start a new event file for a run, and remove older ones."""
         for old in self._folders(facts.id):
             shutil.rmtree(old)
         shown = ShownInTensorBoard(Path(self.place) / _folder_name(facts.name, facts.id))
@@ -65,27 +65,27 @@ class TensorBoard:
 
 
 class ShownInTensorBoard:
-    """A run with an open event file in a folder."""
+    """A run with an open event file."""
 
     def __init__(self, folder: Path):
         from tensorboardX import SummaryWriter
 
-        # flush() writes only what the writer's thread has already taken from its queue; 120 s is the default
+        # flush() alone is not enough, since the writer's thread has a queue; the default is 120 s
         self.folder, self.writer = folder, SummaryWriter(str(folder), flush_secs=1)
 
     def log(self, points: Sequence[CurvePoint]) -> None:
-        """Write values to disk."""
+        """Write points to disk."""
         for point in points:
             self.writer.add_scalar(point.key, point.value, point.step, walltime=point.time)
         self.writer.flush()
 
     def write_texts(self, texts: Mapping[str, str]) -> None:
-        """Write texts, in Markdown."""
+        """Write texts; they may contain Markdown."""
         for key, text in texts.items():
             self.writer.add_text(key, text)
 
     def end(self, facts: RunFacts) -> None:
-        """Write the results, and as text the run's status, its tags and note, and its config."""
+        """Write the results; write status, tags, note and config as text."""
         config = _markdown("key", "value", facts.config)
         self.write_texts({**facts.texts, "tags": ", ".join(facts.tags), "note": facts.note, "config": config})
         self.log(facts.results)
@@ -101,6 +101,6 @@ def _markdown(key: str, value: str, rows: Mapping[str, Any]) -> str:
 
 
 def _folder_name(name: str, run_id: str = "") -> str:
-    """Return a name with the beginning of the run's id as the name of a folder, which TensorBoard shows."""
+    """Return the folder name that TensorBoard shows for a run: its name and the first digits of its id."""
     ending = f" · {run_id[:8]}" if run_id else ""
     return re.sub(r"[^\w=.,·+() -]", "_", name)[: MAX_NAME - len(ending)] + ending

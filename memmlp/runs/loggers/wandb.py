@@ -1,4 +1,4 @@
-"""Writes runs as W&B's offline runs, with W&B's own client; `wandb sync` uploads them."""
+"""Writes runs as W&B offline runs with the wandb package; `wandb sync` uploads them."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ FINGERPRINT = "memmlp-fingerprint"
 @component("loggers", "wandb", builds="WandB")
 @dataclass
 class WandBSettings(Settings):
-    """Writes runs as W&B's offline runs below outputs/wandb (needs pip install 'memmlp[wandb]')."""
+    """Writes runs as W&B offline runs to outputs/wandb (needs pip install 'memmlp[wandb]')."""
 
     project: str = setting(text(), "memmlp")  # to which `wandb sync` uploads
 
 
 @dataclass(frozen=True)
 class WandB:
-    """Shows runs as W&B's offline runs below outputs/wandb, each replaced when its run begins.
+    """Writes runs as W&B offline runs to outputs/wandb.
 
     Attributes:
-        project: the project to which `wandb sync` uploads them.
+        project: the W&B project for uploads with `wandb sync`.
         outputs: the outputs folder.
 
     Raises:
@@ -50,32 +50,32 @@ class WandB:
 
     @property
     def place(self) -> str:
-        """The folder of the offline runs."""
+        """The folder with the offline runs."""
         return str(self.outputs.absolute() / "wandb")
 
     def fingerprint(self, run_id: str) -> str | None:
-        """Return the fingerprint of the facts with which a run ended; None if it did not."""
+        """Return the fingerprint in a run's offline run; None if the run has not ended there."""
         files = (folder / FINGERPRINT for folder in self._folders(run_id))
         return next((file.read_text() for file in files if file.exists()), None)
 
     def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> ShownInWandB:
-        """Write a run from its beginning; an earlier offline run of it is removed."""
+        """Start a new offline run, and remove older ones of the same run."""
         config = {**facts.config, "run": {**facts.origin, "folder": str(facts.folder)}}
-        run = self._start(
+        run = self._start_offline_run(
             facts.id, facts.name, tags=list(facts.tags), notes=facts.note or None, config=config
         )
         shown = ShownInWandB(run, self._folders(facts.id)[0])
         shown.log(points)
         return shown
 
-    def _start(self, run_id: str, name: str, **options: Any) -> Any:
+    def _start_offline_run(self, run_id: str, name: str, **options: Any) -> Any:
         os.environ.update(OFFLINE)
         import wandb
 
         stamps = {old.name.split("-")[2] for old in self._folders(run_id)}
         for old in self._folders(run_id):
             shutil.rmtree(old)
-        while time.strftime("%Y%m%d_%H%M%S") in stamps:  # a folder of the same name would stay empty
+        while time.strftime("%Y%m%d_%H%M%S") in stamps:  # wandb would leave a folder with the same name empty
             time.sleep(0.05)
         Path(self.place).mkdir(parents=True, exist_ok=True)
         settings = wandb.Settings(
@@ -92,19 +92,19 @@ class WandB:
 
 
 class ShownInWandB:
-    """A run that W&B's client has open, in a folder."""
+    """A run with an open W&B offline run."""
 
     def __init__(self, run: Any, folder: Path):
         self.run, self.folder = run, folder
 
     def log(self, points: Sequence[CurvePoint]) -> None:
-        """Log the values of each step as a row of W&B's history."""
+        """Write the points of each step as a row of the run's history."""
         ordered = sorted(points, key=lambda point: point.step)
         for step, row in groupby(ordered, lambda point: point.step):
             self.run.log({point.key: point.value for point in row}, step=step)
 
     def end(self, facts: RunFacts) -> None:
-        """Write results into the run's summary, and end it with the run's own status."""
+        """Write results to the summary and upload files, then set the final status."""
         self.run.summary.update({point.key: point.value for point in facts.results} | facts.texts)
         for path in facts.files:
             self.run.save(str(path), base_path=str(facts.folder), policy="now")
@@ -112,5 +112,5 @@ class ShownInWandB:
         (self.folder / FINGERPRINT).write_text(facts.fingerprint)
 
     def close(self) -> None:
-        """Close the run's file; a run that did not end counts as crashed."""
+        """Close the offline run; W&B treats a run without an end as crashed."""
         self.run.finish(exit_code=1)

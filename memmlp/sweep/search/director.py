@@ -145,7 +145,7 @@ class Director:
         """
         outputs = self.plan.outputs
         return sum(
-            max(1, sum(not Run.of(outputs, name).done for name in one.runs)) for one in self.running.values()
+            max(1, sum(not Run.from_id(outputs, name).done for name in one.runs)) for one in self.running.values()
         )
 
     def _report(self, trial: Trial, run: Run) -> int:

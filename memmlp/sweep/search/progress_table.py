@@ -43,7 +43,7 @@ class SearchBoard(Screen):
             return [
                 f"trial {trial.number}: {_describe_runs(trial, runs)}"
                 for trial, runs in running_trials(study, self.outputs)
-                if any(run.doing for run in runs)
+                if any(run.activity for run in runs)
             ]
 
         count = f"{len(ended)} of {study.search.n_trials}"
@@ -60,7 +60,7 @@ def describe_end(trial: FrozenTrial) -> str:
 
 def runs_of(trial: FrozenTrial, outputs: Path) -> list[Run]:
     """Return the runs that a trial has needed so far."""
-    return [Run.of(outputs, run_id) for run_id in trial.user_attrs.get("runs", ())]
+    return [Run.from_id(outputs, run_id) for run_id in trial.user_attrs.get("runs", ())]
 
 
 def running_trials(study: Study, outputs: Path) -> list[tuple[FrozenTrial, list[Run]]]:
@@ -88,7 +88,7 @@ def render(study: Study, outputs: Path) -> Group:
 
 
 def _describe_runs(trial: FrozenTrial, runs: Sequence[Run]) -> Text:
-    current = next((run for run in runs if run.doing), None)
+    current = next((run for run in runs if run.activity), None)
     count = sum(run.done for run in runs if run is not current)
     done = f"{count} seeds done, " if count else ""
     if current is None:

@@ -60,7 +60,7 @@ def run_of(outputs: Path, variant: str = "gru", seed: int = 0) -> Run:
 
 def started_run(outputs: Path, name: str = "abcdef0123456789", step: int = 500) -> Run:
     """Make a run that trains: no marker, a log as far as a step."""
-    run = Run.of(outputs, name)
+    run = Run.from_id(outputs, name)
     run.folder.mkdir(parents=True)
     run.config_path.write_text("memory:\n  name: lstm\nseed: 7\noptim:\n  steps: 2000\n")
     run.manifest_path.write_text(

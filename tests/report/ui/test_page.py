@@ -210,7 +210,7 @@ def test_rounds_of_a_sweep(browser: Browser, tmp_path: Path):
 
 
 def test_news_are_shown_without_a_touch(browser: Browser, server: RunsServer, home: Path):
-    run = Run.of(home, "abcdef0123456789")
+    run = Run.from_id(home, "abcdef0123456789")
     go(browser, server.url, f"run/{run.id}", "document.querySelector('.plot svg')")
     data = "document.querySelector('.plot svg')?.ariaLabel"
     browser.wait(f"{data}?.includes('ends at 4.5')")

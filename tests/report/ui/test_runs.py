@@ -73,7 +73,7 @@ def test_a_step_done_twice_counts_once(tmp_path: Path):
     curves = read_curves(run)
     assert curves["train loss"] == [[0, 100], [5.0, 9.0]]
     assert curves["train other"] == [[100], [None]]
-    assert read_curves(Run.of(tmp_path, "0" * 16)) == {}
+    assert read_curves(Run.from_id(tmp_path, "0" * 16)) == {}
 
 
 def test_thinning_keeps_ends_and_peaks():

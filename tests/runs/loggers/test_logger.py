@@ -30,14 +30,14 @@ def loggers_of(outputs: Path, *servers: Server) -> Loggers:
 
 def test_without_loggers_there_is_no_thread_and_no_file(tmp_path: Path):
     run, threads = a_run(tmp_path), threading.active_count()
-    with loggers_of(tmp_path).following(run):
+    with loggers_of(tmp_path).show_run(run):
         assert threading.active_count() == threads
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
 
 
 def test_a_run_is_shown_while_it_goes_on_and_to_its_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     run, server = a_run(tmp_path), Server()
-    with loggers_of(tmp_path, server).following(run):
+    with loggers_of(tmp_path, server).show_run(run):
         until(lambda: server.values.get(run.id) == losses(3), "the curve so far")
         assert server.status[run.id] == "running"
         run.log(4, {"loss": 1 / 4})
@@ -50,7 +50,7 @@ def test_a_run_is_shown_while_it_goes_on_and_to_its_end(tmp_path: Path, capsys: 
 def test_a_failure_of_the_run_is_shown(tmp_path: Path):
     run, server = a_run(tmp_path), Server()
     run.fail("why")
-    with contextlib.suppress(KeyError), loggers_of(tmp_path, server).following(run):
+    with contextlib.suppress(KeyError), loggers_of(tmp_path, server).show_run(run):
         raise KeyError
     assert server.status[run.id] == "failed"
 
@@ -58,7 +58,7 @@ def test_a_failure_of_the_run_is_shown(tmp_path: Path):
 def test_a_server_that_comes_back_has_everything_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """Values whose receipt was lost are among them."""
     run, server = a_run(tmp_path), Server(drops=True)
-    with loggers_of(tmp_path, server).following(run):
+    with loggers_of(tmp_path, server).show_run(run):
         until(lambda: server.begun == 2 and server.values[run.id] == losses(3), "the curve, once")
         server.down = True
         run.log(4, {"loss": 1 / 4})
@@ -74,7 +74,7 @@ def test_a_server_that_comes_back_has_everything_once(tmp_path: Path, capsys: py
 
 def test_a_logger_that_stays_down_costs_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     run, server = a_run(tmp_path), Server(down=True)
-    with loggers_of(tmp_path, server).following(run):
+    with loggers_of(tmp_path, server).show_run(run):
         module.time.sleep(0.1)
         run.finish([])
     assert run.done
@@ -85,7 +85,7 @@ def test_a_logger_that_hangs_holds_up_neither_the_run_nor_another(tmp_path: Path
     monkeypatch.setattr(module, "MAX_WAIT", 0.3)
     hung, other = Server(gate=threading.Event()), Server()
     run = a_run(tmp_path)
-    with loggers_of(tmp_path, hung, other).following(run):
+    with loggers_of(tmp_path, hung, other).show_run(run):
         run.finish([])
     until(lambda: other.status.get(run.id) == "done", "the other's end")
     assert capsys.readouterr().err.count("not shown in fake0: it is too slow") == 1
@@ -106,7 +106,7 @@ def test_a_resumed_run_that_repeats_steps_is_replaced_at_its_end(tmp_path: Path)
 
 def test_a_run_that_never_began_is_not_shown(tmp_path: Path):
     server = Server()
-    with loggers_of(tmp_path, server).following(Run.of(tmp_path, "1" * 16)):
+    with loggers_of(tmp_path, server).show_run(Run.from_id(tmp_path, "1" * 16)):
         pass
     assert server.status == {}
 

@@ -28,7 +28,7 @@ CONFIG = {
 
 
 def a_run(outputs: Path, name: str = "0" * 16) -> Run:
-    run = Run.of(outputs, name)
+    run = Run.from_id(outputs, name)
     run.begin("memmlp", CONFIG, data="d", prerequisite="u")
     for step in range(1, 6):
         run.log(step, {"loss": 1 / step, "bad": math.nan})
@@ -130,7 +130,7 @@ def test_many_values_go_in_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         log_batch(client, run_id, metrics=metrics, params=params, tags=tags)
 
     monkeypatch.setattr(MlflowClient, "log_batch", spy)
-    run = Run.of(tmp_path, "2" * 16)
+    run = Run.from_id(tmp_path, "2" * 16)
     run.begin("memmlp", {f"key{i}": i for i in range(250)}, data="d", prerequisite=None)
     for step in range(600):
         run.log(step, {"a": 1.0, "b": 2.0})
